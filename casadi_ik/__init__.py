@@ -1,0 +1,1 @@
+"""Arm-hand inverse kinematics from fingertip contacts."""

@@ -1,0 +1,36 @@
+"""The exceptions casadi_ik raises on bad input.
+
+Not converging is never an exception: it is a `Status` of the solution. An exception means that
+the question itself was malformed, and its message says in one line where, what was found and
+what was expected.
+"""
+
+from __future__ import annotations
+
+
+class CasadiIKError(Exception):
+    """Base of every error that casadi_ik raises on purpose."""
+
+
+class DescriptionError(CasadiIKError):
+    """A robot, object or grasp file (or the data in it) is malformed."""
+
+
+class UnknownNameError(CasadiIKError):
+    """A robot, grasp, method, finger, joint or option of that name does not exist."""
+
+
+class InputError(CasadiIKError):
+    """An argument has the wrong shape, type or value (non-finite, zero normal, ...)."""
+
+
+class UnsupportedError(CasadiIKError):
+    """The method cannot be used with this robot; the message says which property is missing."""
+
+
+class KernelError(CasadiIKError):
+    """Generated code could not be compiled or loaded."""
+
+
+class LogError(CasadiIKError):
+    """A log cannot be written or read."""

@@ -1,0 +1,1 @@
+"""What is to be touched: contacts, grasps and objects, numpy only."""

@@ -1,0 +1,1 @@
+"""Kernels: a CasADi Function becomes a fast callable."""

@@ -1,0 +1,166 @@
+"""Named fields over a flat vector: one description for the graph, the loop and the log.
+
+A step graph works on flat vectors of doubles. A `Layout` names the pieces of such a vector, packs
+and unpacks them (symbols as well as numbers), and gives the numpy record type in which the loop
+stores a row, which is byte for byte the row's CDR payload in the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.errors import InputError
+
+STORAGE = ("f8", "f4", "u4", "i4", "u1")
+"""How a field may be stored in a record, widest first."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """One named piece of a vector.
+
+    Attributes:
+        name: Identifier, also the column name in the log.
+        shape: () for a scalar; arrays are stored row by row.
+        dtype: Storage in a record, one of `STORAGE`; the vector itself always holds doubles.
+        unit: SI unit, "" if dimensionless.
+        doc: What it is, one line.
+    """
+
+    name: str
+    shape: tuple[int, ...] = ()
+    dtype: str = "f8"
+    unit: str = ""
+    doc: str = ""
+
+    @property
+    def size(self) -> int:
+        """Number of doubles in the vector."""
+        return int(np.prod(self.shape, dtype=int))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """An ordered set of fields.
+
+    Attributes:
+        fields: The fields in the order of the vector. For a record the order is by falling width
+            (8, 4, 1 bytes), so that the packed row needs no padding; `Layout.record` sorts.
+    """
+
+    fields: tuple[Field, ...]
+    _slices: dict[str, slice] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        slices: dict[str, slice] = {}
+        offset = 0
+        for item in self.fields:
+            if item.name in slices:
+                raise InputError(f"layout: field {item.name!r} appears twice")
+            if item.dtype not in STORAGE:
+                raise InputError(
+                    f"layout: field {item.name!r} has dtype {item.dtype!r}, expected one of {STORAGE}"
+                )
+            slices[item.name] = slice(offset, offset + item.size)
+            offset += item.size
+        object.__setattr__(self, "_slices", slices)
+
+    @classmethod
+    def record(cls, *fields: Field) -> Layout:
+        """A layout whose fields are sorted by falling storage width (stable)."""
+        return cls(tuple(sorted(fields, key=lambda item: -np.dtype(item.dtype).itemsize)))
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return sum(item.size for item in self.fields)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Field names in order."""
+        return tuple(item.name for item in self.fields)
+
+    def __iter__(self) -> Iterator[Field]:
+        return iter(self.fields)
+
+    def slice(self, name: str) -> slice:
+        """Where the field lies in the vector.
+
+        Raises:
+            InputError: No such field.
+        """
+        try:
+            return self._slices[name]
+        except KeyError:
+            raise InputError(
+                f"layout: no field {name!r}; known: {', '.join(self.names)}"
+            ) from None
+
+    @cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """The packed numpy record type of one row (little endian, no padding)."""
+        return np.dtype([(item.name, "<" + item.dtype, item.shape) for item in self.fields])
+
+    def symbols(self, name: str) -> ca.SX:
+        """A dense symbolic vector of this layout, shape (size, 1)."""
+        return ca.SX.sym(name, self.size)
+
+    def pack(self, values: Mapping[str, Any]) -> Any:
+        """Lay values out as a dense vector; symbols give a CasADi vector, numbers an array.
+
+        Args:
+            values: One value per field, no more and no fewer, each of the field's shape
+                (matrices as CasADi or numpy objects).
+
+        Raises:
+            InputError: A field is missing, unknown or of the wrong size.
+        """
+        extra = set(values) - set(self.names)
+        missing = set(self.names) - set(values)
+        if extra or missing:
+            raise InputError(f"layout: missing {sorted(missing)}, unknown {sorted(extra)}")
+        symbolic = any(isinstance(value, (ca.SX, ca.MX)) for value in values.values())
+        parts: list[Any] = []
+        for item in self.fields:
+            value = values[item.name]
+            if symbolic and isinstance(value, (ca.SX, ca.MX)):
+                count = value.numel()
+                part = ca.densify(ca.vec(value.T))
+            else:
+                array = np.asarray(value, dtype=float)
+                count = array.size
+                part = array.reshape(-1)
+            if count != item.size:
+                raise InputError(
+                    f"layout: field {item.name!r} has {count} numbers, expected {item.size}"
+                )
+            parts.append(part)
+        return ca.vertcat(*parts) if symbolic else np.concatenate(parts) if parts else np.zeros(0)
+
+    def unpack(self, vector: Any) -> dict[str, Any]:
+        """The fields of a vector by name: the inverse of `pack`.
+
+        Args:
+            vector: CasADi vector (size, 1), or array (..., size).
+
+        Returns:
+            Scalars and vectors as they are; a 2-D field as a matrix of its shape. Arrays keep
+            their leading dimensions.
+        """
+        result: dict[str, Any] = {}
+        for item in self.fields:
+            if isinstance(vector, np.ndarray):
+                part = vector[..., self._slices[item.name]]
+                result[item.name] = part.reshape(*vector.shape[:-1], *item.shape)
+            else:
+                part = vector[self._slices[item.name]]
+                if len(item.shape) == 2:
+                    part = ca.reshape(part, item.shape[1], item.shape[0]).T
+                result[item.name] = part
+        return result

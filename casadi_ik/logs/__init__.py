@@ -1,0 +1,1 @@
+"""MCAP logs: records, writer, reader, events."""

@@ -1,0 +1,1 @@
+"""What the robot is: frozen data from YAML, numpy only."""

@@ -1,0 +1,1 @@
+"""Loops, phases, status and verdicts."""

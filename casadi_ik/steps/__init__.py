@@ -1,0 +1,1 @@
+"""One iteration of each method, as a graph."""

@@ -1,0 +1,1 @@
+"""How the robot moves: pure CasADi graphs, nothing solved."""
