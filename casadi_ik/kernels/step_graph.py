@@ -1,0 +1,49 @@
+"""The contract between a method's iteration and the loop that runs it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from casadi_ik.errors import InputError
+from casadi_ik.kernels.layout import Layout
+
+RUNNING = 0
+"""The step's status output while the loop has to go on; any other integer ends it."""
+
+
+@dataclass(frozen=True)
+class StepGraph:
+    """One whole iteration of a method as one graph.
+
+    Attributes:
+        name: Identifier (letters, digits, underscores), also the kernel's file name.
+        function: ``(state, parameters) -> (state', record, status)``; all dense column vectors,
+            status a scalar: `RUNNING` or the code with which the loop ends.
+        state: Layout of the state, what an iteration hands to the next.
+        parameters: Layout of the parameters, constant during one solve (targets, tolerances,
+            gains), so that one kernel serves every target.
+        record: Layout of what is logged of each iteration.
+        compilable: False if the graph holds a node that has no C code (an Ipopt call); such a
+            graph runs in CasADi's virtual machine.
+    """
+
+    name: str
+    function: ca.Function
+    state: Layout
+    parameters: Layout
+    record: Layout
+    compilable: bool = True
+
+    def __post_init__(self) -> None:
+        found = (
+            [self.function.numel_in(i) for i in range(self.function.n_in())],
+            [self.function.numel_out(i) for i in range(self.function.n_out())],
+        )
+        expected = (
+            [self.state.size, self.parameters.size],
+            [self.state.size, self.record.size, 1],
+        )
+        if found != expected:
+            raise InputError(f"step graph {self.name!r}: sizes {found}, layouts say {expected}")
