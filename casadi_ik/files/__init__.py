@@ -1,0 +1,1 @@
+"""Description files: YAML with units, and where the shipped ones are."""

@@ -1,0 +1,56 @@
+"""Where the shipped descriptions are: inside the wheel, or beside the package in a checkout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from casadi_ik.errors import DescriptionError, UnknownNameError
+
+
+def models_folder() -> Path:
+    """The folder ``models``.
+
+    Raises:
+        DescriptionError: The installation is incomplete.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "models", package.parent / "models"):
+        if folder.is_dir():
+            return folder
+    raise DescriptionError(f"{package}: the shipped folder 'models' is missing; reinstall")
+
+
+def shipped_names(kind: str) -> tuple[str, ...]:
+    """Names of the shipped descriptions of a kind ("arms", "hands", "arm_hands", ...)."""
+    return tuple(sorted(path.stem for path in (models_folder() / kind).glob("*.yaml")))
+
+
+def resolve(name_or_path: str | Path, kind: str, beside: Path | None = None) -> Path:
+    """The file behind a shipped name or a path.
+
+    Args:
+        name_or_path: A shipped name, or the path of a YAML file (anything with a path separator
+            or ending in .yaml or .yml).
+        kind: Folder under ``models``.
+        beside: A file relative to whose folder a relative path is looked up first.
+
+    Raises:
+        UnknownNameError: No shipped description has that name.
+        DescriptionError: The path does not exist.
+    """
+    text = str(name_or_path)
+    if isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml")):
+        path = Path(text).expanduser()
+        if beside is not None and not path.is_absolute():
+            path = beside.parent / path
+        if not path.is_file():
+            raise DescriptionError(f"{path}: no such file")
+        return path
+    path = models_folder() / kind / f"{text}.yaml"
+    if text not in shipped_names(kind):
+        noun = kind.replace("_", "-").removesuffix("s")
+        raise UnknownNameError(
+            f"no shipped {noun} is called {text!r}; shipped: {', '.join(shipped_names(kind))} "
+            "(or give the path of a YAML file)"
+        )
+    return path

@@ -1,0 +1,67 @@
+"""Grasp files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from casadi_ik.errors import DescriptionError, InputError
+from casadi_ik.files.reading import Frame, Struct, Vector, convert, frame_matrix, read_yaml
+from casadi_ik.files.shipped import resolve
+from casadi_ik.grasps.grasp import Contact, Grasp
+
+
+class ContactEntry(Struct, frozen=True):
+    """A finger's contact."""
+
+    point: Vector
+    normal: Vector | None = None
+
+
+class ObjectEntry(Struct, frozen=True):
+    """The object that is grasped and where it is."""
+
+    name: str
+    pose: Frame = Frame()
+
+
+class GraspFile(Struct, frozen=True):
+    """``models/grasps/*.yaml``; all but ``contacts`` may be left out."""
+
+    contacts: dict[str, ContactEntry]
+    robot: str = ""
+    description: str = ""
+    object: ObjectEntry | None = None
+    posture: dict[str, float] = msgspec.field(default_factory=dict)
+
+
+def load_grasp(name_or_path: str | Path) -> Grasp:
+    """Load a grasp.
+
+    Args:
+        name_or_path: A shipped name or the path of a YAML file.
+
+    Raises:
+        UnknownNameError: No shipped grasp has that name.
+        DescriptionError: The file is missing or malformed; the message names file and key.
+    """
+    path = resolve(name_or_path, "grasps")
+    entry = convert(read_yaml(path), GraspFile, path)
+    contacts = msgspec.field(default_factory=dict)
+    for finger, contact in entry.contacts.items():
+        try:
+            contacts[finger] = Contact(contact.point, contact.normal)
+        except InputError as error:
+            raise DescriptionError(f"{path}: contacts.{finger}.{error}") from error
+    try:
+        return Grasp(
+            contacts=contacts,
+            robot=entry.robot,
+            name=path.stem,
+            object=entry.object.name if entry.object else "",
+            object_pose=frame_matrix(entry.object.pose) if entry.object else None,
+            posture=entry.posture,
+        )
+    except InputError as error:
+        raise DescriptionError(f"{path}: {error}") from error

@@ -1,0 +1,230 @@
+"""The description of an arm-hand: frozen data, checked once, numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.errors import UnknownNameError
+from casadi_ik.robots.couplings import Coupling
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint of the tree.
+
+    Attributes:
+        name: Unique name.
+        parent: Link it hangs on.
+        child: Link it carries; the child's frame is the joint's frame.
+        type: "revolute" [rad], "prismatic" [m] or "fixed".
+        placement: (4, 4) pose of the joint frame in the parent link at zero.
+        axis: (3,) unit axis in the joint frame.
+        lower: Lower limit [rad or m].
+        upper: Upper limit [rad or m].
+        velocity: Velocity limit [rad/s or m/s], inf if unknown.
+        coupling: What the joint follows; None if it is an actuator itself.
+        part: "arm", "mount" or "hand".
+    """
+
+    name: str
+    parent: str
+    child: str
+    type: str
+    placement: Array
+    axis: Array
+    lower: float
+    upper: float
+    velocity: float
+    coupling: Coupling | None
+    part: str
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """A motor: what the solver sets.
+
+    Attributes:
+        name: Unique name.
+        unit: "rad" or "m".
+        lower: Lower limit.
+        upper: Upper limit.
+        velocity: Velocity limit [unit/s], inf if unknown.
+        part: "arm" or "hand".
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    velocity: float
+    part: str
+
+
+@dataclass(frozen=True, eq=False)
+class Finger:
+    """A finger: the chain from the palm to one contact frame.
+
+    Attributes:
+        name: Unique name.
+        link: Link that carries the contact frame.
+        placement: (4, 4) pose of the contact frame in that link.
+        normal: (3,) outward pad normal, unit, in the contact frame.
+        joints: Names of the movable joints from the palm to the contact, in order.
+    """
+
+    name: str
+    link: str
+    placement: Array
+    normal: Array
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RobotDescription:
+    """An arm-hand (or a hand alone on a fixed base).
+
+    Attributes:
+        name: Name of the description.
+        root: The base link; contacts and normals are expressed in its frame.
+        joints: All joints, parents before children, fixed ones included.
+        actuators: The motors in the fixed order of q.
+        fingers: The fingers, in the order of `contacts`.
+        thumb: Name of the finger placed first.
+        palm_link: Link the palm frame sits on.
+        palm_placement: (4, 4) pose of the palm frame in that link.
+        home: (n,) home position of the actuators.
+        sources: Where the numbers come from, by tag.
+    """
+
+    name: str
+    root: str
+    joints: tuple[Joint, ...]
+    actuators: tuple[Actuator, ...]
+    fingers: tuple[Finger, ...]
+    thumb: str
+    palm_link: str
+    palm_placement: Array
+    home: Array
+    sources: dict[str, str]
+
+    @cached_property
+    def movable(self) -> tuple[Joint, ...]:
+        """The joints that move, in order: the entries of theta."""
+        return tuple(joint for joint in self.joints if joint.type != "fixed")
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the movable joints, the order of theta."""
+        return tuple(joint.name for joint in self.movable)
+
+    @cached_property
+    def actuator_names(self) -> tuple[str, ...]:
+        """Names of the actuators, the order of q."""
+        return tuple(actuator.name for actuator in self.actuators)
+
+    @cached_property
+    def finger_names(self) -> tuple[str, ...]:
+        """Names of the fingers in order."""
+        return tuple(finger.name for finger in self.fingers)
+
+    @cached_property
+    def lower(self) -> Array:
+        """(n,) lower limits of the actuators."""
+        return _frozen([actuator.lower for actuator in self.actuators])
+
+    @cached_property
+    def upper(self) -> Array:
+        """(n,) upper limits of the actuators."""
+        return _frozen([actuator.upper for actuator in self.actuators])
+
+    @cached_property
+    def joint_lower(self) -> Array:
+        """(m,) lower limits of the movable joints."""
+        return _frozen([joint.lower for joint in self.movable])
+
+    @cached_property
+    def joint_upper(self) -> Array:
+        """(m,) upper limits of the movable joints."""
+        return _frozen([joint.upper for joint in self.movable])
+
+    @cached_property
+    def links(self) -> tuple[str, ...]:
+        """All links, the root first."""
+        return (self.root, *(joint.child for joint in self.joints))
+
+    def finger(self, name: str) -> Finger:
+        """The finger of that name.
+
+        Raises:
+            UnknownNameError: There is none; the message lists the fingers.
+        """
+        for finger in self.fingers:
+            if finger.name == name:
+                return finger
+        raise UnknownNameError(
+            f"robot {self.name!r} has no finger {name!r}; its fingers: "
+            + ", ".join(self.finger_names)
+        )
+
+    def actuator_index(self, name: str) -> int:
+        """Position of an actuator in q.
+
+        Raises:
+            UnknownNameError: There is none; the message lists the actuators.
+        """
+        try:
+            return self.actuator_names.index(name)
+        except ValueError:
+            raise UnknownNameError(
+                f"robot {self.name!r} has no actuator {name!r}; its actuators: "
+                + ", ".join(self.actuator_names)
+            ) from None
+
+    def chain(self, link: str) -> tuple[Joint, ...]:
+        """The joints from the root to a link, in order, fixed ones included.
+
+        Raises:
+            UnknownNameError: There is no such link.
+        """
+        if link not in self.links:
+            raise UnknownNameError(f"robot {self.name!r} has no link {link!r}")
+        by_child = {joint.child: joint for joint in self.joints}
+        chain: list[Joint] = []
+        while link != self.root:
+            chain.append(by_child[link])
+            link = by_child[link].parent
+        return tuple(reversed(chain))
+
+    @cached_property
+    def arm_actuators(self) -> tuple[int, ...]:
+        """Positions in q of the arm's actuators (empty for a hand alone)."""
+        return tuple(i for i, a in enumerate(self.actuators) if a.part == "arm")
+
+    def finger_actuators(self, name: str) -> tuple[int, ...]:
+        """Positions in q of the actuators that move a finger relative to the palm.
+
+        Raises:
+            UnknownNameError: There is no such finger.
+        """
+        by_name = {joint.name: joint for joint in self.joints}
+        found: set[int] = set()
+        for joint_name in self.finger(name).joints:
+            joint = by_name[joint_name]
+            while joint.coupling is not None and joint.coupling.of in by_name:
+                joint = by_name[joint.coupling.of]
+            source = joint.name if joint.coupling is None else joint.coupling.of
+            found.add(self.actuator_index(source))
+        return tuple(sorted(found))
+
+
+def _frozen(values: Sequence[float]) -> Array:
+    array = np.asarray(values, dtype=float)
+    array.flags.writeable = False
+    return array

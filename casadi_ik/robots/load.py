@@ -1,0 +1,293 @@
+"""Arm, hand and arm-hand files become one `RobotDescription`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from casadi_ik.errors import DescriptionError
+from casadi_ik.files.reading import Frame, convert, frame_matrix, read_yaml
+from casadi_ik.files.shipped import resolve
+from casadi_ik.robots.description import Actuator, Array, Finger, Joint, RobotDescription
+from casadi_ik.robots.schema import (
+    ActuatorEntry,
+    ArmFile,
+    ArmHandFile,
+    ContactEntry,
+    HandFile,
+    JointEntry,
+    LinkFrame,
+)
+
+JOINT_TYPES = ("revolute", "prismatic", "fixed")
+
+
+def load_description(name_or_path: str | Path) -> RobotDescription:
+    """Load an arm-hand description.
+
+    Args:
+        name_or_path: A shipped name (`shipped_names("arm_hands")`) or the path of a YAML file,
+            whose ``arm`` and ``hand`` may be shipped names or paths relative to it.
+
+    Raises:
+        UnknownNameError: No shipped description has that name.
+        DescriptionError: A file is missing or malformed; the message names file and key.
+    """
+    path = resolve(name_or_path, "arm_hands")
+    top = convert(read_yaml(path), ArmHandFile, path)
+    hand_path = resolve(top.hand, "hands", beside=path)
+    hand = convert(read_yaml(hand_path), HandFile, hand_path)
+    joints: list[Joint] = []
+    actuators: list[Actuator] = []
+    sources = {**top.sources, **hand.sources}
+    root = hand.root
+    if top.arm is not None:
+        arm_path = resolve(top.arm, "arms", beside=path)
+        arm = convert(read_yaml(arm_path), ArmFile, arm_path)
+        joints += _joints(arm.joints, arm.root, arm.sources, "arm", arm_path)
+        actuators += _actuators(None, joints, "arm", arm_path)
+        tip = _known_link(arm.tip.link, arm.root, joints, f"{arm_path}: tip.link")
+        mount = _pose(arm.tip) @ frame_matrix(top.mount)
+        joints.append(_fixed("mount", tip, hand.root, mount))
+        sources.update(arm.sources)
+        root = arm.root
+    elif top.mount != Frame():
+        joints.append(_fixed("mount", "base", hand.root, frame_matrix(top.mount)))
+        root = "base"
+    hand_joints = _joints(hand.joints, hand.root, hand.sources, "hand", hand_path)
+    joints += hand_joints
+    actuators += _actuators(hand.actuators, hand_joints, "hand", hand_path)
+    _unique((a.name for a in actuators), f"{path}: actuators")
+    _unique((j.name for j in joints), f"{path}: joints")
+    _unique((root, *(j.child for j in joints)), f"{path}: links")
+    palm_link = _known_link(hand.palm.link, hand.root, hand_joints, f"{hand_path}: palm.link")
+    return RobotDescription(
+        name=top.name,
+        root=root,
+        joints=tuple(joints),
+        actuators=tuple(actuators),
+        fingers=_fingers(top, hand, hand_joints, path, hand_path),
+        thumb=top.thumb,
+        palm_link=palm_link,
+        palm_placement=_freeze(_pose(hand.palm)),
+        home=_home(top.home, actuators, path),
+        sources=sources,
+    )
+
+
+def _joints(
+    entries: list[JointEntry], root: str, sources: dict[str, str], part: str, path: Path
+) -> list[Joint]:
+    """Checked joints, parents before children."""
+    names = [entry.name for entry in entries]
+    _unique(names, f"{path}: joints")
+    _unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
+    for entry in entries:
+        where = f"{path}: joint {entry.name!r}"
+        if entry.type not in JOINT_TYPES:
+            raise DescriptionError(f"{where}: type: found {entry.type!r}, expected {JOINT_TYPES}")
+        low, high = entry.limits
+        if not low <= high:
+            raise DescriptionError(f"{where}: limits: lower {low:.6g} is above upper {high:.6g}")
+        if not np.linalg.norm(entry.axis) > 1e-9:
+            raise DescriptionError(f"{where}: axis: is zero, expected a direction")
+        if entry.velocity is not None and not entry.velocity > 0:
+            raise DescriptionError(f"{where}: velocity: found {entry.velocity}, expected > 0")
+        _known_source(entry.source, sources, f"{where}: source")
+    by_parent: dict[str, list[JointEntry]] = {}
+    for entry in entries:
+        by_parent.setdefault(entry.parent, []).append(entry)
+    ordered: list[JointEntry] = []
+    frontier = [root]
+    while frontier:
+        children = by_parent.pop(frontier.pop(0), [])
+        ordered += children
+        frontier += [entry.child for entry in children]
+    if by_parent:
+        stray = next(iter(by_parent.values()))[0]
+        links = {entry.child for entry in entries}
+        problem = "is part of a frame cycle" if stray.parent in links else "is no link"
+        raise DescriptionError(
+            f"{path}: joint {stray.name!r}: parent: {stray.parent!r} {problem}; "
+            f"expected a chain of joints down to the root {root!r}"
+        )
+    ordered.sort(key=lambda entry: names.index(entry.name))
+    return [_joint(entry, part) for entry in _parents_first(ordered, root)]
+
+
+def _parents_first(entries: list[JointEntry], root: str) -> list[JointEntry]:
+    """The file's own order, moved only where a child stands before its parent."""
+    placed, known = [], {root}
+    waiting = list(entries)
+    while waiting:
+        entry = next(item for item in waiting if item.parent in known)
+        waiting.remove(entry)
+        placed.append(entry)
+        known.add(entry.child)
+    return placed
+
+
+def _joint(entry: JointEntry, part: str) -> Joint:
+    axis = np.asarray(entry.axis, dtype=float)
+    return Joint(
+        name=entry.name,
+        parent=entry.parent,
+        child=entry.child,
+        type=entry.type,
+        placement=_freeze(frame_matrix(entry.origin)),
+        axis=_freeze(axis / np.linalg.norm(axis)),
+        lower=entry.limits[0],
+        upper=entry.limits[1],
+        velocity=math.inf if entry.velocity is None else entry.velocity,
+        coupling=entry.coupling,
+        part=part,
+    )
+
+
+def _fixed(name: str, parent: str, child: str, pose: Array) -> Joint:
+    axis = _freeze(np.array([0.0, 0.0, 1.0]))
+    return Joint(
+        name, parent, child, "fixed", _freeze(pose), axis, 0.0, 0.0, math.inf, None, "mount"
+    )
+
+
+def _actuators(
+    entries: dict[str, ActuatorEntry] | None, joints: list[Joint], part: str, path: Path
+) -> list[Actuator]:
+    """The part's actuators, after checking that every coupling ends at one of them."""
+    by_name = {joint.name: joint for joint in joints if joint.type != "fixed"}
+    if entries is None:
+        entries = {name: ActuatorEntry() for name, j in by_name.items() if j.coupling is None}
+    actuators = []
+    for name, entry in entries.items():
+        where = f"{path}: actuators.{name}"
+        joint = by_name.get(name)
+        if joint is not None and joint.coupling is not None:
+            raise DescriptionError(f"{where}: joint {name!r} follows {joint.coupling.of!r} already")
+        if entry.limits is None and joint is None:
+            raise DescriptionError(f"{where}: limits: missing (no joint has this name)")
+        if entry.unit not in ("rad", "m"):
+            raise DescriptionError(f"{where}: unit: found {entry.unit!r}, expected 'rad' or 'm'")
+        low, high = entry.limits or ((joint.lower, joint.upper) if joint else (0.0, 0.0))
+        if not low < high:
+            raise DescriptionError(
+                f"{where}: limits: lower {low:.6g} is not below upper {high:.6g}"
+            )
+        velocity = entry.velocity or (joint.velocity if joint else math.inf)
+        unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit
+        actuators.append(Actuator(name, unit, low, high, velocity, part))
+    for joint in by_name.values():
+        _check_coupling(joint, by_name, set(entries), path)
+    return actuators
+
+
+def _check_coupling(
+    joint: Joint, by_name: dict[str, Joint], actuators: set[str], path: Path
+) -> None:
+    where = f"{path}: joint {joint.name!r}"
+    followed, current = [joint.name], joint
+    while current.coupling is not None:
+        source = current.coupling.of
+        if source in followed:
+            raise DescriptionError(f"{where}: coupling: is a cycle {' -> '.join(followed)}")
+        if source in actuators:
+            return
+        if source not in by_name:
+            raise DescriptionError(
+                f"{where}: coupling.of: unknown joint or actuator {source!r}; known: "
+                + ", ".join([*by_name, *sorted(actuators - set(by_name))])
+            )
+        followed.append(source)
+        current = by_name[source]
+    if current.name not in actuators:
+        raise DescriptionError(
+            f"{where}: has neither a coupling nor an actuator of its own under 'actuators'"
+        )
+
+
+def _fingers(
+    top: ArmHandFile, hand: HandFile, joints: list[Joint], path: Path, hand_path: Path
+) -> tuple[Finger, ...]:
+    _unique(top.fingers, f"{path}: fingers")
+    for name in (*top.fingers, top.thumb):
+        if name not in hand.fingers:
+            raise DescriptionError(
+                f"{path}: fingers: {hand_path.name} has no finger {name!r}; it has "
+                + ", ".join(hand.fingers)
+            )
+    if top.thumb not in top.fingers:
+        raise DescriptionError(f"{path}: thumb: {top.thumb!r} is not among the fingers")
+    by_child = {joint.child: joint for joint in joints}
+    fingers = []
+    for name in top.fingers:
+        entry = hand.fingers[name]
+        where = f"{hand_path}: fingers.{name}"
+        link = _known_link(entry.link, hand.root, joints, f"{where}.link")
+        _known_source(entry.source, hand.sources, f"{where}.source")
+        length = float(np.linalg.norm(entry.normal))
+        if not length > 1e-9:
+            raise DescriptionError(f"{where}.normal: is zero, expected a direction")
+        chain: list[str] = []
+        while link != hand.root:
+            if by_child[link].type != "fixed":
+                chain.append(by_child[link].name)
+            link = by_child[link].parent
+        normal = np.asarray(entry.normal, dtype=float) / length
+        fingers.append(
+            Finger(name, entry.link, _freeze(_pose(entry)), _freeze(normal), tuple(chain[::-1]))
+        )
+    return tuple(fingers)
+
+
+def _home(home: dict[str, float], actuators: list[Actuator], path: Path) -> Array:
+    names = [actuator.name for actuator in actuators]
+    for name in home:
+        if name not in names:
+            raise DescriptionError(
+                f"{path}: home.{name}: no such actuator; known: {', '.join(names)}"
+            )
+    values = []
+    for actuator in actuators:
+        value = home.get(actuator.name, min(max(0.0, actuator.lower), actuator.upper))
+        if not actuator.lower <= value <= actuator.upper:
+            raise DescriptionError(
+                f"{path}: home.{actuator.name}: {value:.6g} is outside the limits "
+                f"[{actuator.lower:.6g}, {actuator.upper:.6g}]"
+            )
+        values.append(value)
+    return _freeze(np.array(values))
+
+
+def _pose(entry: LinkFrame | ContactEntry) -> Array:
+    return frame_matrix(Frame(entry.xyz, entry.rpy))
+
+
+def _known_link(link: str, root: str, joints: list[Joint], where: str) -> str:
+    links = [root, *(joint.child for joint in joints)]
+    if link not in links:
+        raise DescriptionError(f"{where}: unknown link {link!r}; known: {', '.join(links)}")
+    return link
+
+
+def _known_source(tags: str, sources: dict[str, str], where: str) -> None:
+    for tag in tags.replace(",", " ").split():
+        if tag not in sources:
+            raise DescriptionError(f"{where}: unknown tag {tag!r}; sources: {', '.join(sources)}")
+    if not tags.strip():
+        raise DescriptionError(f"{where}: is empty; every number needs its source")
+
+
+def _unique(names: Iterable[str], where: str) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise DescriptionError(f"{where}: {name!r} appears twice")
+        seen.add(name)
+
+
+def _freeze(array: Array) -> Array:
+    array.flags.writeable = False
+    return array

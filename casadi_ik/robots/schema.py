@@ -1,0 +1,89 @@
+"""What may stand in an arm, hand or arm-hand file."""
+
+from __future__ import annotations
+
+import msgspec
+
+from casadi_ik.files.reading import Frame, Struct, Vector
+from casadi_ik.robots.couplings import Coupling
+
+
+class JointEntry(Struct, frozen=True):
+    """A joint; ``coupling`` absent means that it is its own actuator."""
+
+    name: str
+    parent: str
+    child: str
+    axis: Vector
+    limits: tuple[float, float]
+    source: str
+    type: str = "revolute"
+    origin: Frame = Frame()
+    velocity: float | None = None
+    coupling: Coupling | None = None
+
+
+class ActuatorEntry(Struct, frozen=True):
+    """A motor; limits and velocity are the joint's where it drives a joint of the same name."""
+
+    limits: tuple[float, float] | None = None
+    velocity: float | None = None
+    unit: str = "rad"
+    source: str = ""
+
+
+class LinkFrame(Struct, frozen=True):
+    """A frame on a link."""
+
+    link: str
+    xyz: Vector = (0.0, 0.0, 0.0)
+    rpy: Vector = (0.0, 0.0, 0.0)
+    source: str = ""
+
+
+class ContactEntry(Struct, frozen=True):
+    """The contact frame of a finger; ``normal`` is the outward pad normal in that frame."""
+
+    link: str
+    normal: Vector
+    source: str
+    xyz: Vector = (0.0, 0.0, 0.0)
+    rpy: Vector = (0.0, 0.0, 0.0)
+
+
+class ArmFile(Struct, frozen=True):
+    """``models/arms/*.yaml``."""
+
+    name: str
+    root: str
+    tip: LinkFrame
+    joints: list[JointEntry]
+    sources: dict[str, str]
+    description: str = ""
+
+
+class HandFile(Struct, frozen=True):
+    """``models/hands/*.yaml``."""
+
+    name: str
+    root: str
+    palm: LinkFrame
+    joints: list[JointEntry]
+    fingers: dict[str, ContactEntry]
+    sources: dict[str, str]
+    actuators: dict[str, ActuatorEntry] | None = None
+    description: str = ""
+
+
+class ArmHandFile(Struct, frozen=True):
+    """``models/arm_hands/*.yaml``: an arm (or none), a hand, and what joins them."""
+
+    name: str
+    hand: str
+    thumb: str
+    fingers: list[str]
+    arm: str | None = None
+    mount: Frame = Frame()
+    home: dict[str, float] = msgspec.field(default_factory=dict)
+    sources: dict[str, str] = msgspec.field(default_factory=dict)
+    description: str = ""

@@ -1,0 +1,137 @@
+"""Write a robot description as URDF, for viewers and for checking by other libraries."""
+
+from __future__ import annotations
+
+import math
+from xml.etree import ElementTree
+
+import numpy as np
+
+from casadi_ik.robots.couplings import Linear
+from casadi_ik.robots.description import Array, RobotDescription
+
+LINK_RADIUS = {"arm": 0.055, "mount": 0.03, "hand": 0.009}
+"""Radius of the drawn cylinders [m] by part; for looks only."""
+
+COLOURS = {"arm": "0.93 0.55 0.20 1", "mount": "0.35 0.35 0.38 1", "hand": "0.35 0.35 0.38 1"}
+
+
+def to_urdf(robot: RobotDescription) -> str:
+    """The robot as URDF text.
+
+    Every link gets simple cylinders from its frame to its children, and every finger a fixed
+    link ``<finger>_contact`` whose frame is the contact frame. A joint that follows an actuator
+    or joint linearly becomes a mimic joint; lead-screw and four-bar couplings have no URDF form
+    and stay independent joints (set them from `Robot.joints`).
+
+    Args:
+        robot: The description.
+
+    Returns:
+        URDF XML, joint limits in rad and m. Unknown velocity limits are written as 10, unknown
+        efforts as 0, since URDF demands a number.
+    """
+    root = ElementTree.Element("robot", name=robot.name)
+    leaders: dict[str, tuple[str, float, float]] = {}
+    part = {robot.root: "arm"} | {joint.child: joint.part for joint in robot.joints}
+    for link in robot.links:
+        element = ElementTree.SubElement(root, "link", name=link)
+        _draw(element, link, robot, part)
+    for joint in robot.joints:
+        element = ElementTree.SubElement(root, "joint", name=joint.name, type=joint.type)
+        _origin(element, joint.placement)
+        ElementTree.SubElement(element, "parent", link=joint.parent)
+        ElementTree.SubElement(element, "child", link=joint.child)
+        if joint.type == "fixed":
+            continue
+        ElementTree.SubElement(element, "axis", xyz=_numbers(joint.axis))
+        velocity = joint.velocity if math.isfinite(joint.velocity) else 10.0
+        ElementTree.SubElement(
+            element,
+            "limit",
+            lower=repr(joint.lower),
+            upper=repr(joint.upper),
+            effort="0",
+            velocity=repr(velocity),
+        )
+        if isinstance(joint.coupling, Linear):
+            _mimic(element, joint.name, joint.coupling, leaders, robot.joint_names)
+    for finger in robot.fingers:
+        name = f"{finger.name}_contact"
+        ElementTree.SubElement(root, "link", name=name)
+        element = ElementTree.SubElement(root, "joint", name=f"{name}_fixed", type="fixed")
+        _origin(element, finger.placement)
+        ElementTree.SubElement(element, "parent", link=finger.link)
+        ElementTree.SubElement(element, "child", link=name)
+    ElementTree.indent(root)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _mimic(
+    element: ElementTree.Element,
+    name: str,
+    coupling: Linear,
+    leaders: dict[str, tuple[str, float, float]],
+    joints: tuple[str, ...],
+) -> None:
+    """A mimic tag; the first joint on a shared motor leads the others, as URDF has no motors."""
+    if coupling.of in joints:
+        leader, ratio, offset = coupling.of, coupling.ratio, coupling.offset
+    elif coupling.of in leaders:
+        leader, first_ratio, first_offset = leaders[coupling.of]
+        ratio = coupling.ratio / first_ratio
+        offset = coupling.offset - ratio * first_offset
+    else:
+        leaders[coupling.of] = (name, coupling.ratio, coupling.offset)
+        return
+    ElementTree.SubElement(
+        element, "mimic", joint=leader, multiplier=repr(ratio), offset=repr(offset)
+    )
+
+
+def _draw(
+    element: ElementTree.Element, link: str, robot: RobotDescription, part: dict[str, str]
+) -> None:
+    ends = [joint.placement[:3, 3] for joint in robot.joints if joint.parent == link]
+    ends += [finger.placement[:3, 3] for finger in robot.fingers if finger.link == link]
+    for end in ends:
+        length = float(np.linalg.norm(end))
+        if length < 1e-4:
+            continue
+        visual = ElementTree.SubElement(element, "visual")
+        _origin(visual, _along(end))
+        geometry = ElementTree.SubElement(visual, "geometry")
+        radius = LINK_RADIUS[part[link]]
+        ElementTree.SubElement(geometry, "cylinder", radius=repr(radius), length=repr(length))
+        material = ElementTree.SubElement(visual, "material", name=part[link])
+        ElementTree.SubElement(material, "color", rgba=COLOURS[part[link]])
+
+
+def _along(end: Array) -> Array:
+    """Pose half way to `end` with z pointing there."""
+    z = end / np.linalg.norm(end)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    pose[:3, 3] = end / 2
+    return pose
+
+
+def _origin(element: ElementTree.Element, pose: Array) -> None:
+    rotation = pose[:3, :3]
+    horizontal = math.hypot(rotation[0, 0], rotation[1, 0])
+    pitch = math.atan2(-rotation[2, 0], horizontal)
+    if horizontal > 1e-9:
+        roll = math.atan2(rotation[2, 1], rotation[2, 2])
+        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    else:
+        roll = math.atan2(-rotation[1, 2], rotation[1, 1])
+        yaw = 0.0
+    ElementTree.SubElement(
+        element, "origin", xyz=_numbers(pose[:3, 3]), rpy=_numbers(np.array([roll, pitch, yaw]))
+    )
+
+
+def _numbers(values: Array) -> str:
+    return " ".join(repr(float(value)) for value in values)

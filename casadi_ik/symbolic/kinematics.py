@@ -1,0 +1,149 @@
+"""Forward kinematics of an arm-hand as graphs over SE(3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.robots.description import Joint, RobotDescription
+
+ROUNDING = 1e-15
+"""Constants below this are rounding errors of a description's angles and become exact zeros."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A frame in the base frame: ``rotation`` (3, 3), its columns the axes; ``origin`` (3, 1) [m]."""
+
+    rotation: ca.SX
+    origin: ca.SX
+
+    def at(self, placement: NDArray[np.float64]) -> Pose:
+        """The frame that has the constant (4, 4) pose `placement` in this one."""
+        rotation, origin = _constants(placement)
+        return Pose(self.rotation @ rotation, self.origin + self.rotation @ origin)
+
+    def rotate(self, vector: NDArray[np.float64]) -> ca.SX:
+        """A constant (3,) direction of this frame in the base frame, (3, 1)."""
+        return self.rotation @ _sparse(np.asarray(vector, dtype=float).reshape(3, 1))
+
+    def inverse_apply(self, point: ca.SX) -> ca.SX:
+        """A point of the base frame in this frame, (3, 1) [m]."""
+        return self.rotation.T @ (point - self.origin)
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematics:
+    """Every link, axis and contact of a robot as a function of theta.
+
+    Attributes:
+        robot: The description.
+        theta: (m, 1) positions of the movable joints, in the order of `robot.joint_names`.
+        links: Pose of every link.
+        axes: Per movable joint its axis direction (3, 1) in the base frame.
+    """
+
+    robot: RobotDescription
+    theta: ca.SX
+    links: dict[str, Pose]
+    axes: dict[str, ca.SX]
+
+    @property
+    def palm(self) -> Pose:
+        """Pose of the palm frame."""
+        return self.links[self.robot.palm_link].at(self.robot.palm_placement)
+
+    def contact_frame(self, finger: str) -> Pose:
+        """Pose of a finger's contact frame."""
+        entry = self.robot.finger(finger)
+        return self.links[entry.link].at(entry.placement)
+
+    def contact(self, finger: str) -> tuple[ca.SX, ca.SX]:
+        """A finger's contact point (3, 1) [m] and outward pad normal (3, 1), base frame."""
+        frame = self.contact_frame(finger)
+        return frame.origin, frame.rotate(self.robot.finger(finger).normal)
+
+    def twist_columns(
+        self, joints: Sequence[str], link: str, point: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Geometric Jacobian of a point fixed to a link with respect to some joints.
+
+        Args:
+            joints: Names of movable joints; a joint that does not carry the link gets zeros.
+            link: The link.
+            point: (3, 1) the point in the base frame [m].
+
+        Returns:
+            linear (3, len(joints)) [m per joint unit] and angular (3, len(joints)).
+        """
+        carrying = {joint.name: joint for joint in self.robot.chain(link)}
+        linear, angular = [], []
+        for name in joints:
+            joint = carrying.get(name)
+            if joint is None:
+                linear.append(ca.SX.zeros(3, 1))
+                angular.append(ca.SX.zeros(3, 1))
+            elif joint.type == "revolute":
+                axis = self.axes[name]
+                linear.append(ca.cross(axis, point - self.links[joint.child].origin))
+                angular.append(axis)
+            else:
+                linear.append(self.axes[name])
+                angular.append(ca.SX.zeros(3, 1))
+        return ca.horzcat(*linear), ca.horzcat(*angular)
+
+
+def forward(robot: RobotDescription, theta: ca.SX) -> Kinematics:
+    """Forward kinematics.
+
+    Args:
+        robot: The description.
+        theta: (m, 1) positions of the movable joints [rad or m].
+
+    Returns:
+        Poses and axes in the base frame.
+    """
+    index = {name: i for i, name in enumerate(robot.joint_names)}
+    links = {robot.root: Pose(ca.SX.eye(3), ca.SX.zeros(3, 1))}
+    axes: dict[str, ca.SX] = {}
+    for joint in robot.joints:
+        frame = links[joint.parent].at(joint.placement)
+        if joint.type != "fixed":
+            axes[joint.name] = frame.rotate(joint.axis)
+            frame = _moved(frame, joint, theta[index[joint.name]])
+        links[joint.child] = frame
+    return Kinematics(robot, theta, links, axes)
+
+
+def _moved(frame: Pose, joint: Joint, value: ca.SX) -> Pose:
+    if joint.type == "prismatic":
+        return Pose(frame.rotation, frame.origin + frame.rotate(joint.axis) * value)
+    return Pose(frame.rotation @ axis_rotation(joint.axis, value), frame.origin)
+
+
+def axis_rotation(axis: NDArray[np.float64], angle: ca.SX) -> ca.SX:
+    """Rotation about a constant unit axis, (3, 3), with as few operations as the axis allows."""
+    a = np.asarray(axis, dtype=float)
+    outer = np.outer(a, a)
+    cross = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    c, s = ca.cos(angle), ca.sin(angle)
+    # Entry by entry: the sum of constant, cosine and sine parts keeps exact zeros and ones.
+    return (
+        ca.SX(_sparse(outer)) + ca.SX(_sparse(np.eye(3) - outer)) * c + ca.SX(_sparse(cross)) * s
+    )
+
+
+def _constants(placement: NDArray[np.float64]) -> tuple[ca.DM, ca.DM]:
+    return _sparse(placement[:3, :3]), _sparse(placement[:3, 3:])
+
+
+def _sparse(array: NDArray[np.float64]) -> ca.DM:
+    exact = np.where(np.abs(array) < ROUNDING, 0.0, array)
+    # Rotations by quarter turns come out of cosines as 1 - 1e-16; make them exact as well.
+    near = np.round(exact)
+    exact = np.where(np.abs(exact - near) < ROUNDING, near, exact)
+    return ca.sparsify(ca.DM(exact))
