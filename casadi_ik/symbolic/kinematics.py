@@ -17,7 +17,7 @@ ROUNDING = 1e-15
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A frame in the base frame: ``rotation`` (3, 3), its columns the axes; ``origin`` (3, 1) [m]."""
+    """A frame in the base frame: ``rotation`` (3, 3), columns its axes; ``origin`` (3, 1) [m]."""
 
     rotation: ca.SX
     origin: ca.SX

@@ -1,0 +1,323 @@
+"""The enhanced method of Qiu & Kermani 2021 as one step graph: thumb first, then the hand.
+
+Phase 1, thumb reaching: palm orientation, thumb point and thumb normal in a hierarchy.
+Phase 2, hand alignment, every iteration: (1) the other fingers' own inverse kinematics, (2) the
+closed chain moves the palm to where they would reach, (3) the thumb is brought back to its
+contact. A row of the record describes the configuration q it holds: in phase 1 the one the step
+starts from, in phase 2 the one after the fingers' step, which is where the method decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import casadi as ca
+
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.step_graph import StepGraph
+from casadi_ik.robots.description import Array, RobotDescription
+from casadi_ik.steps.finger_step import finger_step_function
+from casadi_ik.steps.palm_estimate import palm_orientation
+from casadi_ik.steps.palm_motion import palm_motion
+from casadi_ik.steps.qiu_parameters import QiuParameters
+from casadi_ik.steps.status import Phase, Status
+from casadi_ik.steps.targets import contact_errors, target_fields, targets
+from casadi_ik.steps.thumb_reaching import (
+    MILLIMETRE,
+    hierarchy_step,
+    palm_orientation_task,
+    thumb_tasks,
+)
+from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated
+from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
+from casadi_ik.symbolic.linear_algebra import (
+    damped_pinv_times,
+    project_to_null_space,
+    weighted_damped_pinv_times,
+)
+from casadi_ik.symbolic.measures import condition_number, singular_values
+from casadi_ik.symbolic.smooth import Expr, safe_norm
+
+NOT_MEASURED = float("nan")
+
+
+class EnhancedStep:
+    """Builds the step graph of an enhanced method for one robot."""
+
+    def __init__(self, robot: RobotDescription, options: QiuParameters) -> None:
+        """Lay out state, parameters and record.
+
+        Args:
+            robot: The description.
+            options: The structural choices; numbers are parameters of the graph.
+        """
+        n, f = len(robot.actuators), len(robot.fingers)
+        self.robot = robot
+        self.options = options
+        self.chain = split(robot, options.borrowed)
+        self.state = Layout(
+            (
+                Field("q", (n,)),
+                Field("phase"),
+                Field("best", doc="smallest summed error of thumb reaching so far"),
+                Field("waited", doc="iterations since `best` fell, or since the last motion"),
+                Field("reached", doc="iterations spent in thumb reaching"),
+            )
+        )
+        self.parameters = Layout(
+            (
+                *target_fields(robot),
+                Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not"),
+                Field("reaching_damping"),
+                Field("chain_damping"),
+                Field("weights", (len(self.chain.active),)),
+                Field("reaching_patience"),
+                Field("reaching_iterations"),
+                Field("step_cap"),
+                Field("stall_step"),
+                Field("stall_patience"),
+            )
+        )
+        self.record = Layout.record(
+            Field("q", (n,), "f8", "rad or m", "actuator positions"),
+            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
+            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
+            Field("palm_error", (), "f4", "rad", "palm orientation task error (phase 1)"),
+            Field("palm_motion", (2,), "f4", "mm, rad", "palm motion demanded (phase 2)"),
+            Field("step_size", (), "f4", "rad or m", "largest motor change of this iteration"),
+            Field("sigma_thumb", (), "f4", "m", "smallest singular value, thumb point Jacobian"),
+            Field("sigma_palm", (), "f4", "", "smallest singular value, palm task (phase 1)"),
+            Field("sigma_closed_chain", (), "f4", "", "smallest singular value of H_p (phase 2)"),
+            Field("condition_closed_chain", (), "f4", "", "condition number of H_p (phase 2)"),
+            Field("limit_mask", (), "u4", "", "bit i: actuator i at or beyond a limit"),
+            Field("phase", (), "u1", "", "1 thumb reaching, 2 hand alignment"),
+            Field("status", (), "u1", "", "0 running, else the final status"),
+        )
+
+    def graph(self) -> StepGraph:
+        """The whole iteration; compilable unless the finger step calls Ipopt."""
+        state = ca.MX.sym("state", self.state.size)
+        parameters = ca.MX.sym("parameters", self.parameters.size)
+        fingers = finger_step_function(self.robot, self.options.finger_step)
+        seen = self._palm_view()(state, parameters)
+        closed = fingers(state[self.state.slice("q")], *seen)
+        align = ca.Function(
+            "align", [state, parameters], list(self._align()(state, parameters, closed))
+        )
+        choose = ca.Function.if_else("phase", self._reach(), align)
+        in_reaching = state[self.state.slice("phase")] < Phase.HAND_ALIGNMENT
+        outputs = choose(in_reaching, state, parameters)
+        compilable = self.options.finger_step != "ipopt"
+        name = f"enhanced_dls_{self.robot.name}"
+        function = ca.Function(name, [state, parameters], list(outputs))
+        return StepGraph(name, function, self.state, self.parameters, self.record, compilable)
+
+    def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
+        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
+        return state, parameters, self.state.unpack(state), self.parameters.unpack(parameters)
+
+    def _palm_view(self) -> ca.Function:
+        """Targets of the fingers but the thumb, seen from the palm: what eq. (5) works with."""
+        state, parameters, s, p = self._inputs()
+        palm = actuated(self.robot, s["q"]).kinematics.palm
+        goals = [goal for name, goal in targets(self.robot, p).items() if name != self.robot.thumb]
+        points = ca.horzcat(*(palm.inverse_apply(goal.point) for goal in goals))
+        normals = ca.horzcat(*(palm.rotation.T @ goal.normal for goal in goals))
+        return ca.Function("palm_view", [state, parameters], [points, normals])
+
+    def _reach(self) -> ca.Function:
+        """One iteration of thumb reaching (section II-B)."""
+        state, parameters, s, p = self._inputs()
+        robot, body, goals = self.robot, actuated(self.robot, s["q"]), targets(self.robot, p)
+        columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
+        palm = palm_orientation_task(
+            body, palm_orientation(robot, goals), columns, self.options.palm_error == "euler"
+        )
+        position, normal = thumb_tasks(body, goals[robot.thumb], columns)
+        solver = _damped(p["reaching_damping"])
+        step = self._spread(hierarchy_step([palm, position, normal], solver), columns)
+        q_next, size = self._moved(s["q"], step, p)
+
+        positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
+        thumb = robot.finger_names.index(robot.thumb)
+        within = ca.logic_and(
+            safe_norm(palm.error) <= p["angle_tolerance"],
+            ca.logic_and(
+                positions[thumb] <= p["position_tolerance"], angles[thumb] <= p["angle_tolerance"]
+            ),
+        )
+        # The three errors in units of their tolerances, so that they can be summed.
+        summed = (
+            safe_norm(palm.error) / p["angle_tolerance"]
+            + positions[thumb] / p["position_tolerance"]
+            + angles[thumb] / p["angle_tolerance"]
+        )
+        better = summed < 0.99 * s["best"]
+        waited = ca.if_else(better, 0.0, s["waited"] + 1)
+        enough = ca.logic_or(
+            waited >= p["reaching_patience"], s["reached"] + 1 >= p["reaching_iterations"]
+        )
+        finished = ca.logic_or(within, enough)
+        after = self.state.pack(
+            {
+                "q": ca.if_else(within, s["q"], q_next),
+                "phase": ca.if_else(finished, float(Phase.HAND_ALIGNMENT), s["phase"]),
+                "best": ca.if_else(better, summed, s["best"]),
+                "waited": ca.if_else(finished, 0.0, waited),
+                "reached": s["reached"] + 1,
+            }
+        )
+        status = ca.SX(float(Status.RUNNING))
+        record = self._row(
+            body,
+            s["q"],
+            positions,
+            angles,
+            step_size=size,
+            status=status,
+            phase=Phase.THUMB_REACHING,
+            palm_error=safe_norm(palm.error),
+            sigma_thumb=_smallest(position.jacobian) * MILLIMETRE,
+            sigma_palm=_smallest(palm.jacobian[:, : len(robot.arm_actuators)]),
+        )
+        return ca.Function("reach", [state, parameters], [after, record, status])
+
+    def _align(self) -> ca.Function:
+        """One iteration of hand alignment (section II-C), after the fingers' own step."""
+        state, parameters, s, p = self._inputs()
+        closed = ca.SX.sym("closed", len(self.robot.actuators))
+        robot, body, goals = self.robot, actuated(self.robot, closed), targets(self.robot, p)
+        positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
+        solved = ca.logic_and(
+            ca.mmax(positions) <= p["position_tolerance"], ca.mmax(angles) <= p["angle_tolerance"]
+        )
+
+        others = {name: goal for name, goal in goals.items() if name != robot.thumb}
+        translation, rotation = palm_motion(body, others)
+        chain = closed_chain(body, self.chain, MILLIMETRE, self.options.platform)
+        J_position, J_orientation = chain.J_cc[:3, :], chain.J_cc[3:, :]
+        damping, weights = p["chain_damping"], p["weights"]
+        active = weighted_damped_pinv_times(
+            J_position, translation, damping, weights
+        ) + project_to_null_space(
+            J_position,
+            weighted_damped_pinv_times(J_orientation, rotation, damping, weights),
+        )
+        moved, chain_size = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
+
+        columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
+        keep = thumb_tasks(actuated(robot, moved), goals[robot.thumb], columns)
+        step = self._spread(hierarchy_step(list(keep), _damped(p["reaching_damping"])), columns)
+        q_next, keep_size = self._moved(moved, step, p)
+
+        size = ca.mmax(ca.fabs(q_next - s["q"]))
+        waited = ca.if_else(size < p["stall_step"], s["waited"] + 1, 0.0)
+        status = ca.if_else(
+            solved,
+            float(Status.SOLVED),
+            ca.if_else(
+                waited >= p["stall_patience"], float(Status.STALLED), float(Status.RUNNING)
+            ),
+        )
+        after = self.state.pack(
+            {
+                "q": ca.if_else(status == Status.RUNNING, q_next, closed),
+                "phase": s["phase"],
+                "best": s["best"],
+                "waited": waited,
+                "reached": s["reached"],
+            }
+        )
+        thumb_linear, _ = body.contact_jacobian(robot.thumb, columns)
+        spectrum = singular_values(chain.H_p)
+        record = self._row(
+            body,
+            closed,
+            positions,
+            angles,
+            step_size=ca.fmax(chain_size, keep_size),
+            status=status,
+            phase=Phase.HAND_ALIGNMENT,
+            palm_motion=ca.vertcat(safe_norm(translation), safe_norm(rotation)),
+            sigma_thumb=_smallest(thumb_linear),
+            sigma_closed_chain=ca.mmin(spectrum),
+            condition_closed_chain=condition_number(spectrum),
+        )
+        return ca.Function("align_rest", [state, parameters, closed], [after, record, status])
+
+    def _spread(self, step: ca.SX, columns: tuple[int, ...]) -> ca.SX:
+        """A step of some actuators as a step of all (n, 1)."""
+        full = ca.SX.zeros(len(self.robot.actuators), 1)
+        for i, column in enumerate(columns):
+            full[column] = step[i]
+        return full
+
+    def _moved(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
+        """q after a capped step, kept within limits if they are enforced; and the step's size."""
+        size = ca.mmax(ca.fabs(step))
+        q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(size, 1e-12))
+        kept = ca.fmin(ca.fmax(q_next, _column(self.robot.lower)), _column(self.robot.upper))
+        return ca.if_else(p["enforce_limits"] > 0, kept, q_next), size
+
+    def _row(
+        self,
+        body: ActuatedKinematics,
+        q: ca.SX,
+        positions: ca.SX,
+        angles: ca.SX,
+        *,
+        phase: Phase,
+        **measured: Expr,
+    ) -> ca.SX:
+        robot = body.robot
+        at_limit = ca.logic_or(q <= _column(robot.lower), q >= _column(robot.upper))
+        bits = ca.DM([2.0**i for i in range(len(robot.actuators))])
+        values: dict[str, Expr] = {
+            "q": q,
+            "position_error": positions,
+            "angle_error": angles,
+            "palm_error": NOT_MEASURED,
+            "palm_motion": [NOT_MEASURED, NOT_MEASURED],
+            "sigma_palm": NOT_MEASURED,
+            "sigma_closed_chain": NOT_MEASURED,
+            "condition_closed_chain": NOT_MEASURED,
+            "limit_mask": ca.dot(at_limit, bits),
+            "phase": float(phase),
+        }
+        return self.record.pack(values | measured)
+
+
+def parameter_values(
+    step: EnhancedStep, position_tolerance: float, angle_tolerance: float, enforce_limits: bool
+) -> dict[str, Array | float]:
+    """Values of all parameter fields but the targets."""
+    options = step.options
+    weights = [
+        options.virtual_weight if column == VIRTUAL else options.joint_weight
+        for column in step.chain.active
+    ]
+    return {
+        "position_tolerance": position_tolerance,
+        "angle_tolerance": angle_tolerance,
+        "enforce_limits": float(enforce_limits),
+        "reaching_damping": options.reaching_damping,
+        "chain_damping": options.chain_damping,
+        "weights": weights,  # type: ignore[dict-item]
+        "reaching_patience": float(options.reaching_patience),
+        "reaching_iterations": float(options.reaching_iterations),
+        "step_cap": options.step_cap,
+        "stall_step": options.stall_step,
+        "stall_patience": float(options.stall_patience),
+    }
+
+
+def _damped(damping: ca.SX) -> Callable[[ca.SX, ca.SX], ca.SX]:
+    return lambda jacobian, error: damped_pinv_times(jacobian, error, damping)
+
+
+def _smallest(jacobian: ca.SX) -> ca.SX:
+    return ca.mmin(singular_values(jacobian))
+
+
+def _column(values: Array) -> ca.DM:
+    return ca.DM(values.tolist())

@@ -1,0 +1,57 @@
+"""What every method is told of a problem, and how far a configuration is from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from casadi_ik.kernels.layout import Field
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.directions import angle_between
+from casadi_ik.symbolic.kinematics import Kinematics
+from casadi_ik.symbolic.smooth import safe_norm
+
+
+def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
+    """Parameter fields that state the problem: targets and tolerances."""
+    f = len(robot.fingers)
+    return (
+        Field("points", (f, 3), unit="m", doc="contact points, base frame"),
+        Field("normals", (f, 3), doc="outward pad normals, base frame"),
+        Field("position_tolerance", (), unit="m"),
+        Field("angle_tolerance", (), unit="rad"),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """One finger's contact: point (3, 1) [m] and unit normal (3, 1), in one common frame."""
+
+    point: ca.SX
+    normal: ca.SX
+
+
+def targets(robot: RobotDescription, parameters: dict[str, ca.SX]) -> dict[str, Target]:
+    """The targets by finger name, base frame."""
+    return {
+        name: Target(parameters["points"][i, :].T, parameters["normals"][i, :].T)
+        for i, name in enumerate(robot.finger_names)
+    }
+
+
+def contact_errors(
+    kinematics: Kinematics, goal: dict[str, Target], fingers: Sequence[str]
+) -> tuple[ca.SX, ca.SX]:
+    """Distance and angle of each finger from its contact.
+
+    Returns:
+        position errors (f, 1) [m] and angle errors (f, 1) [rad].
+    """
+    positions, angles = [], []
+    for name in fingers:
+        point, normal = kinematics.contact(name)
+        positions.append(safe_norm(goal[name].point - point))
+        angles.append(angle_between(normal, goal[name].normal))
+    return ca.vertcat(*positions), ca.vertcat(*angles)
