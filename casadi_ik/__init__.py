@@ -1,1 +1,36 @@
-"""Arm-hand inverse kinematics from fingertip contacts."""
+"""Arm-hand inverse kinematics from fingertip contacts: fast, exact and explained."""
+
+from casadi_ik import logs
+from casadi_ik.api import Solver
+from casadi_ik.arm_hand import ArmHand, load_robot
+from casadi_ik.errors import CasadiIKError
+from casadi_ik.files.shipped import shipped_names
+from casadi_ik.grasps import Contact, Grasp, load_grasp
+from casadi_ik.solvers import (
+    METHODS,
+    BatchSolution,
+    ContactVerdict,
+    Phase,
+    Solution,
+    Status,
+    Tolerance,
+)
+
+__all__ = [
+    "METHODS",
+    "ArmHand",
+    "BatchSolution",
+    "CasadiIKError",
+    "Contact",
+    "ContactVerdict",
+    "Grasp",
+    "Phase",
+    "Solution",
+    "Solver",
+    "Status",
+    "Tolerance",
+    "load_grasp",
+    "load_robot",
+    "logs",
+    "shipped_names",
+]

@@ -2,5 +2,26 @@
 
 from casadi_ik.grasps.grasp import Contact, Grasp
 from casadi_ik.grasps.load import load_grasp
+from casadi_ik.grasps.objects import GraspObject, load_object
+from casadi_ik.grasps.shapes import (
+    BentCapsule,
+    Box,
+    Cylinder,
+    EllipticCylinder,
+    Shape,
+    Sphere,
+)
 
-__all__ = ["Contact", "Grasp", "load_grasp"]
+__all__ = [
+    "BentCapsule",
+    "Box",
+    "Contact",
+    "Cylinder",
+    "EllipticCylinder",
+    "Grasp",
+    "GraspObject",
+    "Shape",
+    "Sphere",
+    "load_grasp",
+    "load_object",
+]

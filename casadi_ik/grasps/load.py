@@ -48,7 +48,7 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
     """
     path = resolve(name_or_path, "grasps")
     entry = convert(read_yaml(path), GraspFile, path)
-    contacts = msgspec.field(default_factory=dict)
+    contacts: dict[str, Contact] = {}
     for finger, contact in entry.contacts.items():
         try:
             contacts[finger] = Contact(contact.point, contact.normal)

@@ -65,7 +65,8 @@ class Layout:
                 raise InputError(f"layout: field {item.name!r} appears twice")
             if item.dtype not in STORAGE:
                 raise InputError(
-                    f"layout: field {item.name!r} has dtype {item.dtype!r}, expected one of {STORAGE}"
+                    f"layout: field {item.name!r} has dtype {item.dtype!r}, "
+                    f"expected one of {STORAGE}"
                 )
             slices[item.name] = slice(offset, offset + item.size)
             offset += item.size
@@ -98,9 +99,7 @@ class Layout:
         try:
             return self._slices[name]
         except KeyError:
-            raise InputError(
-                f"layout: no field {name!r}; known: {', '.join(self.names)}"
-            ) from None
+            raise InputError(f"layout: no field {name!r}; known: {', '.join(self.names)}") from None
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
@@ -157,7 +156,7 @@ class Layout:
         for item in self.fields:
             if isinstance(vector, np.ndarray):
                 part = vector[..., self._slices[item.name]]
-                result[item.name] = part.reshape(*vector.shape[:-1], *item.shape)
+                result[item.name] = part.reshape((*vector.shape[:-1], *item.shape))
             else:
                 part = vector[self._slices[item.name]]
                 if len(item.shape) == 2:

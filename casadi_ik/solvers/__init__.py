@@ -1,1 +1,25 @@
 """Loops, phases, status and verdicts."""
+
+from casadi_ik.solvers.engine import Engine
+from casadi_ik.solvers.problem import LIMITS, Problems, Tolerance, target_arrays
+from casadi_ik.solvers.recorder import Recorder
+from casadi_ik.solvers.registry import METHODS, build_method, method_summary
+from casadi_ik.solvers.solution import BatchSolution, ContactVerdict, Solution
+from casadi_ik.steps.status import Phase, Status
+
+__all__ = [
+    "LIMITS",
+    "METHODS",
+    "BatchSolution",
+    "ContactVerdict",
+    "Engine",
+    "Phase",
+    "Problems",
+    "Recorder",
+    "Solution",
+    "Status",
+    "Tolerance",
+    "build_method",
+    "method_summary",
+    "target_arrays",
+]

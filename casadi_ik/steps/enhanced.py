@@ -215,9 +215,7 @@ class EnhancedStep:
         status = ca.if_else(
             solved,
             float(Status.SOLVED),
-            ca.if_else(
-                waited >= p["stall_patience"], float(Status.STALLED), float(Status.RUNNING)
-            ),
+            ca.if_else(waited >= p["stall_patience"], float(Status.STALLED), float(Status.RUNNING)),
         )
         after = self.state.pack(
             {

@@ -1,0 +1,205 @@
+"""The robot as a user holds it: its description and its compiled forward kinematics."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from casadi_ik.errors import InputError
+from casadi_ik.kernels import FunctionKernel
+from casadi_ik.robots import RobotDescription, load_description, to_urdf
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.couplings import joint_positions
+from casadi_ik.symbolic.kinematics import Pose
+
+Array = NDArray[np.float64]
+
+
+class ArmHand:
+    """An arm-hand (or a hand on a fixed base), ready to be asked.
+
+    Attributes:
+        description: The frozen data behind it.
+    """
+
+    def __init__(self, description: RobotDescription) -> None:
+        """Wrap a description; kernels are compiled when first used and cached on the machine."""
+        self.description = description
+
+    def __repr__(self) -> str:
+        return f"<ArmHand {self.name}: {len(self.actuators)} actuators, fingers {self.fingers}>"
+
+    @property
+    def name(self) -> str:
+        """Name of the robot."""
+        return self.description.name
+
+    @property
+    def fingers(self) -> tuple[str, ...]:
+        """Names of the fingers, in the order of `contacts`."""
+        return self.description.finger_names
+
+    @property
+    def thumb(self) -> str:
+        """The finger that is placed first."""
+        return self.description.thumb
+
+    @property
+    def actuators(self) -> tuple[str, ...]:
+        """Names of the actuators, in the order of q."""
+        return self.description.actuator_names
+
+    @property
+    def lower(self) -> Array:
+        """(n,) lower limits of the actuators [rad or m]."""
+        return self.description.lower
+
+    @property
+    def upper(self) -> Array:
+        """(n,) upper limits of the actuators [rad or m]."""
+        return self.description.upper
+
+    @property
+    def home(self) -> Array:
+        """(n,) home position [rad or m]."""
+        return self.description.home
+
+    def configuration(self, q: ArrayLike | None, name: str = "q") -> Array:
+        """A configuration as an array, checked; None gives `home`.
+
+        Args:
+            q: (n,) or (k, n) actuator positions [rad or m].
+            name: What to call it in an error.
+
+        Raises:
+            InputError: Wrong shape or a number that is not finite.
+        """
+        if q is None:
+            return self.home.copy()
+        try:
+            array = np.array(q, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name}: found {q!r}, expected numbers") from error
+        n = len(self.actuators)
+        if array.ndim not in (1, 2) or array.shape[-1] != n:
+            raise InputError(f"{name}: found shape {array.shape}, expected ({n},) or (k, {n})")
+        if not np.all(np.isfinite(array)):
+            raise InputError(f"{name}: holds NaN or infinity, expected finite numbers")
+        return array
+
+    def joints(self, q: ArrayLike) -> dict[str, Any]:
+        """Positions of all movable joints after the couplings.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            By joint name a float, or (k,) for a batch [rad or m].
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        (theta,) = self._joints(self.configuration(q))
+        names = self.description.joint_names
+        if theta.ndim == 1:
+            return {name: float(value) for name, value in zip(names, theta, strict=True)}
+        return dict(zip(names, theta.T, strict=True))
+
+    def contacts(self, q: ArrayLike) -> tuple[Array, Array]:
+        """Where the fingertips are and which way they face.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            points (f, 3) [m] and outward pad normals (f, 3), unit, in the base frame; with a
+            leading k for a batch.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        points, normals = self._contacts(self.configuration(q))
+        return points, normals
+
+    def palm(self, q: ArrayLike) -> Array:
+        """(4, 4) or (k, 4, 4) pose of the palm frame in the base frame.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        (pose,) = self._palm(self.configuration(q))
+        return pose
+
+    def links(self, q: ArrayLike) -> dict[str, Array]:
+        """Pose (4, 4) of every link frame in the base frame, for one configuration.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        (poses,) = self._links(self.configuration(q))
+        stacked = poses.reshape(len(self.description.links), 4, 4)
+        return dict(zip(self.description.links, stacked, strict=True))
+
+    def random(self, rng: np.random.Generator, count: int) -> Array:
+        """(count, n) configurations uniform within the limits."""
+        return rng.uniform(self.lower, self.upper, (count, len(self.actuators)))
+
+    def urdf(self) -> str:
+        """The robot as URDF text, see `casadi_ik.robots.to_urdf`."""
+        return to_urdf(self.description)
+
+    @cached_property
+    def _joints(self) -> FunctionKernel:
+        q = self._symbols()
+        return self._kernel("joints", q, [joint_positions(self.description, q)])
+
+    @cached_property
+    def _contacts(self) -> FunctionKernel:
+        q = self._symbols()
+        kinematics = actuated(self.description, q).kinematics
+        pairs = [kinematics.contact(name) for name in self.fingers]
+        points = ca.horzcat(*(point for point, _ in pairs)).T
+        normals = ca.horzcat(*(normal for _, normal in pairs)).T
+        return self._kernel("contacts", q, [points, normals])
+
+    @cached_property
+    def _palm(self) -> FunctionKernel:
+        q = self._symbols()
+        return self._kernel("palm", q, [_matrix(actuated(self.description, q).kinematics.palm)])
+
+    @cached_property
+    def _links(self) -> FunctionKernel:
+        q = self._symbols()
+        links = actuated(self.description, q).kinematics.links
+        poses = [_matrix(links[name]) for name in self.description.links]
+        return self._kernel("links", q, [ca.vertcat(*poses)])
+
+    def _symbols(self) -> ca.SX:
+        return ca.SX.sym("q", len(self.actuators))
+
+    def _kernel(self, name: str, q: ca.SX, outputs: list[ca.SX]) -> FunctionKernel:
+        dense = [ca.densify(output) for output in outputs]
+        return FunctionKernel(ca.Function(f"{self.name}_{name}", [q], dense))
+
+
+def load_robot(name_or_path: str | Path) -> ArmHand:
+    """Load a robot.
+
+    Args:
+        name_or_path: A shipped name (`casadi-ik robots` lists them) or the path of your own YAML.
+
+    Raises:
+        UnknownNameError: No shipped robot has that name.
+        DescriptionError: The file is missing or malformed; the message names file and key.
+    """
+    return ArmHand(load_description(name_or_path))
+
+
+def _matrix(pose: Pose) -> ca.SX:
+    bottom = ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]]))
+    return ca.vertcat(ca.horzcat(pose.rotation, pose.origin), bottom)

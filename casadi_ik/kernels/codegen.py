@@ -1,0 +1,92 @@
+"""From a CasADi Function to the C text of a library: generated code, names, a driver.
+
+The drivers (`drivers/*.c`) are fixed C code that calls "the step" by macros; what they need to
+know of one function arrives as `#define` lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import casadi as ca
+
+from casadi_ik.errors import KernelError
+
+
+@cache
+def driver_text(name: str) -> str:
+    """The text of `drivers/<name>.c`."""
+    return (resources.files("casadi_ik.kernels") / "drivers" / f"{name}.c").read_text(
+        encoding="utf-8"
+    )
+
+
+def define(constants: Mapping[str, int]) -> str:
+    """The constants as `#define` lines."""
+    return "".join(f"#define {name} ({value})\n" for name, value in constants.items())
+
+
+def row_major(function: ca.Function) -> ca.Function:
+    """The same function with dense inputs and outputs whose memory is row by row.
+
+    CasADi works on the nonzeros of matrices, column by column. Transposing inside the graph costs
+    nothing in an SX graph and lets numpy memory go in and out as it is.
+
+    Args:
+        function: Any CasADi Function.
+
+    Returns:
+        The function itself where it is dense and has vectors only; otherwise a function of the
+        same name and argument names, in which an r x c matrix is declared c x r.
+    """
+    count_in, count_out = function.n_in(), function.n_out()
+    shapes_in = [function.size_in(i) for i in range(count_in)]
+    shapes_out = [function.size_out(i) for i in range(count_out)]
+    dense = all(function.sparsity_in(i).is_dense() for i in range(count_in)) and all(
+        function.sparsity_out(i).is_dense() for i in range(count_out)
+    )
+    if dense and all(1 in shape for shape in (*shapes_in, *shapes_out)):
+        return function
+    # Of the two kinds of symbols only one fits, which the stubs cannot know.
+    kind: Any = ca.SX if function.is_a("SXFunction") else ca.MX
+    names_in, names_out = function.name_in(), function.name_out()
+    symbols: list[Any] = [
+        kind.sym(name, columns, rows)
+        for name, (rows, columns) in zip(names_in, shapes_in, strict=True)
+    ]
+    results = function.call([symbol.T for symbol in symbols])
+    outputs = [ca.densify(result.T) for result in results]
+    return ca.Function(function.name(), symbols, outputs, names_in, names_out)
+
+
+def function_source(function: ca.Function) -> str:
+    """The C code of a function and of everything it calls.
+
+    Raises:
+        KernelError: The graph holds a node without C code (a Python callback, an Ipopt call).
+    """
+    name = function.name()
+    options = {"with_header": False, "mex": False, "main": False}
+    generator = ca.CodeGenerator(name, options)
+    try:
+        generator.add(function)
+        text = generator.dump()
+    except RuntimeError as error:
+        raise KernelError(f"kernel {name!r}: no C code can be generated: {error}") from error
+    for line in text.splitlines():
+        if line.lstrip().startswith("#error"):
+            raise KernelError(f"kernel {name!r}: {line.strip().removeprefix('#error').strip()}")
+    return text
+
+
+def library_source(function: ca.Function, driver: str) -> str:
+    """The text of a whole library: the function's code, its names, what drivers share, a driver."""
+    name = function.name()
+    suffixes = ("", "_work", "_checkout", "_release", "_incref")
+    names = "".join(f"#define STEP{suffix} {name}{suffix}\n" for suffix in suffixes)
+    # More than one thread at once may hold memory of a function that needs some.
+    header = "#define CASADI_MAX_NUM_THREADS 64\n"
+    return "\n".join((header, function_source(function), names, driver_text("common"), driver))

@@ -1,0 +1,88 @@
+/* A step run to its end for each solve of a batch.
+ *
+ * Expects the macros N_STATE, N_RECORD, ROW_BYTES, RUNNING, NON_FINITE, FAILED, CODE_LIMIT
+ * and the function store_row(record, row). Everything that must survive a pause lives in the job's arrays, so a
+ * call that returns SLICE_OVER or ROWS_FULL is taken up again by calling once more.
+ */
+
+typedef struct {
+  double *states;              /* (count, N_STATE), start in, end out */
+  const double *parameters;
+  int64_t parameter_step;      /* doubles from one solve to the next, 0 = the same for all */
+  int64_t *iterations;         /* (count), zeros at the start */
+  int32_t *status;             /* (count), RUNNING at the start */
+  double *seconds;             /* (count), zeros at the start */
+  unsigned char *rows;         /* (capacity) rows, or NULL: no trace */
+  int64_t capacity;
+  int64_t used;                /* rows written so far */
+  int64_t count;               /* solves */
+  int64_t solve;               /* first solve not yet finished */
+  int64_t max_iterations;      /* of one solve */
+  double slice;                /* [s] after which Python gets a look at its signals */
+} loop_job;
+
+/* x * 0 is 0 for finite x and NaN otherwise; the sum has no branch and no library call. */
+static int all_finite(const double *x) {
+  double sum = 0;
+  int i;
+  for (i = 0; i < N_STATE; ++i) sum += x[i] * 0.0;
+  return sum == 0;
+}
+
+EXPORT int casadi_ik_loop(loop_job *job) {
+  workspace space;
+  double *now, *next, *record, code, limit;
+  int64_t ticks = 0;
+  int outcome = set_up(&space, 2 * N_STATE + N_RECORD);
+  if (outcome != DONE) return outcome;
+  now = space.extra;
+  next = now + N_STATE;
+  record = next + N_STATE;
+  limit = monotonic() + job->slice;
+
+  for (; job->solve < job->count; ++job->solve) {
+    const int64_t i = job->solve;
+    const double *parameters = job->parameters + i * job->parameter_step;
+    int64_t iteration = job->iterations[i];
+    int32_t status = RUNNING;
+    const double started = monotonic();
+    memcpy(now, job->states + i * N_STATE, N_STATE * sizeof(double));
+    while (status == RUNNING && iteration < job->max_iterations) {
+      if (job->rows && job->used == job->capacity) {
+        outcome = ROWS_FULL;
+        break;
+      }
+      if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {
+        outcome = SLICE_OVER;
+        break;
+      }
+      space.arg[0] = now;
+      space.arg[1] = parameters;
+      space.res[0] = next;
+      space.res[1] = job->rows ? record : NULL;
+      space.res[2] = &code;
+      if (STEP(space.arg, space.res, space.iw, space.w, space.mem)) {
+        status = FAILED;
+        break;
+      }
+      ++iteration;
+      if (job->rows) store_row(record, job->rows + ROW_BYTES * job->used++);
+      /* Written so that a NaN code fails the test too. */
+      if (!(code > -CODE_LIMIT && code < CODE_LIMIT) || !all_finite(next)) {
+        status = NON_FINITE;
+      } else {
+        double *last = now;
+        now = next;
+        next = last;
+        status = (int32_t) code;
+      }
+    }
+    memcpy(job->states + i * N_STATE, now, N_STATE * sizeof(double));
+    job->iterations[i] = iteration;
+    job->status[i] = status;
+    job->seconds[i] += monotonic() - started;
+    if (outcome != DONE) break;
+  }
+  give_back(&space);
+  return outcome;
+}

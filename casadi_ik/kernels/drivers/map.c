@@ -1,0 +1,35 @@
+/* A function over a batch: expects the macros N_IN, N_OUT. */
+
+typedef struct {
+  const double **inputs;       /* first sample of each input */
+  const int64_t *input_steps;  /* doubles from one sample to the next, 0 = the same for all */
+  double **outputs;
+  const int64_t *output_steps;
+  int64_t count;               /* samples */
+  int64_t next;                /* first sample not yet done */
+  double slice;                /* [s] after which Python gets a look at its signals */
+} map_job;
+
+EXPORT int casadi_ik_map(map_job *job) {
+  workspace space;
+  int outcome = set_up(&space, 0);
+  int64_t ticks = 0;
+  double limit = 0;
+  int i;
+  if (outcome != DONE) return outcome;
+  if (job->count - job->next > CLOCK_INTERVAL) limit = monotonic() + job->slice;
+  for (; job->next < job->count; ++job->next) {
+    if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {
+      outcome = SLICE_OVER;
+      break;
+    }
+    for (i = 0; i < N_IN; ++i) space.arg[i] = job->inputs[i] + job->next * job->input_steps[i];
+    for (i = 0; i < N_OUT; ++i) space.res[i] = job->outputs[i] + job->next * job->output_steps[i];
+    if (STEP(space.arg, space.res, space.iw, space.w, space.mem)) {
+      outcome = STEP_FAILED;
+      break;
+    }
+  }
+  give_back(&space);
+  return outcome;
+}

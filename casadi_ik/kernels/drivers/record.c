@@ -1,0 +1,27 @@
+/* Doubles into the storage types of a record; rows are packed, hence memcpy for every number.
+ *
+ * Defined for every double: f4 rounds to nearest and overflows to infinity (IEC 60559); the
+ * integers drop the fraction and saturate, NaN becomes 0. `rows.py` does the same in numpy.
+ */
+static inline double clamped(double x, double low, double high) {
+  return x >= high ? high : x > low ? x : x <= low ? low : 0;
+}
+
+static inline void store_f8(const double *from, unsigned char *to, int count) {
+  memcpy(to, from, (size_t) count * sizeof(double));
+}
+
+#define DEFINE_STORE(NAME, TYPE, CONVERTED)                                          \
+  static inline void store_##NAME(const double *from, unsigned char *to, int count) { \
+    int i;                                                                           \
+    for (i = 0; i < count; ++i) {                                                    \
+      const double x = from[i];                                                      \
+      const TYPE value = (TYPE) (CONVERTED);                                         \
+      memcpy(to + (size_t) i * sizeof(TYPE), &value, sizeof(TYPE));                  \
+    }                                                                                \
+  }
+
+DEFINE_STORE(f4, float, x)
+DEFINE_STORE(u4, uint32_t, clamped(x, 0, 4294967295.0))
+DEFINE_STORE(i4, int32_t, clamped(x, -2147483648.0, 2147483647.0))
+DEFINE_STORE(u1, uint8_t, clamped(x, 0, 255))

@@ -1,0 +1,171 @@
+"""A CasADi Function as a fast callable on numpy arrays, with or without a batch dimension."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.errors import InputError, KernelError
+from casadi_ik.kernels.buffered import BufferedFunction, doubles, memory
+from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.outcome import SLICE, Outcome, check
+
+SYMBOL = "casadi_ik_map"
+
+
+class _Job(ctypes.Structure):
+    """`map_job` of drivers/map.c."""
+
+    _fields_ = (
+        ("inputs", ctypes.c_void_p),
+        ("input_steps", ctypes.c_void_p),
+        ("outputs", ctypes.c_void_p),
+        ("output_steps", ctypes.c_void_p),
+        ("count", ctypes.c_int64),
+        ("next", ctypes.c_int64),
+        ("slice", ctypes.c_double),
+    )
+
+
+class FunctionKernel:
+    """Evaluates a Function, compiled to C if the machine can; several threads may call at once.
+
+    A scalar has the shape (), a column vector (r,), any other matrix (r, c), row by row.
+
+    Attributes:
+        name: The function's name.
+        compiled: Whether calls run in compiled code (otherwise in CasADi's virtual machine, with
+            the same results).
+        input_shapes: Shape of one sample of each input.
+        output_shapes: Shape of one sample of each output.
+    """
+
+    def __init__(self, function: ca.Function, compiled: bool = True) -> None:
+        """Compile the function or load it from the cache.
+
+        Args:
+            function: Any Function; sparse inputs and outputs are made dense.
+            compiled: False keeps to the virtual machine.
+
+        Raises:
+            KernelError: The function has no C code, or the compiler refused it.
+        """
+        self.name = function.name()
+        self.input_shapes = tuple(_shape(function.size_in(i)) for i in range(function.n_in()))
+        self.output_shapes = tuple(_shape(function.size_out(i)) for i in range(function.n_out()))
+        self._names = tuple(function.name_in())
+        self._function = row_major(function)
+        sizes = [function.numel_out(i) for i in range(function.n_out())]
+        self._output_steps = np.array(sizes, dtype=np.int64)
+        library = self._load() if compiled else None
+        self.compiled = library is not None
+        self._map: Any = None if library is None else library[SYMBOL]
+
+    def _load(self) -> ctypes.CDLL | None:
+        counts = {"N_IN": len(self.input_shapes), "N_OUT": len(self.output_shapes)}
+        return load_library(self._function, define(counts) + driver_text("map"), SYMBOL)
+
+    def __call__(self, *inputs: Any) -> tuple[NDArray[np.float64], ...]:
+        """Evaluate one sample or a batch.
+
+        Args:
+            inputs: One array per input, of its shape or with one leading batch dimension k;
+                inputs without it are the same for the whole batch.
+
+        Returns:
+            One new array per output, of shape (k, *shape), or of its shape if no input has a
+            batch dimension.
+
+        Raises:
+            InputError: Wrong number of inputs, a wrong shape, or batches of different lengths.
+            KernelError: The function itself reports a failure.
+        """
+        arrays, count = self._arrays(inputs)
+        lead = () if count is None else (count,)
+        outputs = tuple(np.empty((*lead, *shape)) for shape in self.output_shapes)
+        steps = [
+            array.size // max(count or 0, 1) if array.ndim > len(shape) else 0
+            for array, shape in zip(arrays, self.input_shapes, strict=True)
+        ]
+        run = self._run_compiled if self.compiled else self._run_vm
+        run(arrays, steps, outputs, 1 if count is None else count)
+        return outputs
+
+    def _arrays(self, inputs: tuple[Any, ...]) -> tuple[list[NDArray[np.float64]], int | None]:
+        """The inputs as arrays and the length of the batch, None without one."""
+        if len(inputs) != len(self.input_shapes):
+            raise InputError(
+                f"{self.name}: {len(inputs)} inputs, expected {len(self.input_shapes)} "
+                f"({', '.join(self._names)})"
+            )
+        arrays: list[NDArray[np.float64]] = []
+        count: int | None = None
+        for name, shape, values in zip(self._names, self.input_shapes, inputs, strict=True):
+            array = doubles(values)
+            arrays.append(array)
+            if array.shape == shape:
+                continue
+            if array.shape[1:] != shape or array.ndim != len(shape) + 1:
+                raise InputError(
+                    f"{self.name}: input {name!r} has shape {array.shape}, "
+                    f"expected {shape} or (k, {', '.join(map(str, shape))})"
+                )
+            if count is not None and count != len(array):
+                raise InputError(
+                    f"{self.name}: input {name!r} is a batch of {len(array)}, another of {count}"
+                )
+            count = len(array)
+        return arrays, count
+
+    def _run_compiled(
+        self,
+        arrays: list[NDArray[np.float64]],
+        steps: list[int],
+        outputs: tuple[NDArray[np.float64], ...],
+        count: int,
+    ) -> None:
+        sources = (ctypes.c_void_p * len(arrays))(*map(memory, arrays))
+        strides = (ctypes.c_int64 * len(arrays))(*steps)
+        targets = (ctypes.c_void_p * len(outputs))(*map(memory, outputs))
+        job = _Job(
+            ctypes.addressof(sources),
+            ctypes.addressof(strides),
+            ctypes.addressof(targets),
+            memory(self._output_steps),
+            count,
+            0,
+            SLICE,
+        )
+        while (code := self._map(ctypes.byref(job))) != Outcome.DONE:
+            check(self.name, code)
+
+    def _run_vm(
+        self,
+        arrays: list[NDArray[np.float64]],
+        steps: list[int],
+        outputs: tuple[NDArray[np.float64], ...],
+        count: int,
+    ) -> None:
+        call = BufferedFunction(self._function)
+        sources = [array.reshape(-1) for array in arrays]
+        targets = [output.reshape(-1) for output in outputs]
+        for sample in range(count):
+            for buffer, source, step in zip(call.inputs, sources, steps, strict=True):
+                buffer[:] = source[sample * step : sample * step + buffer.size]
+            if not call():
+                raise KernelError(f"{self.name}: the function reports a failure")
+            for buffer, target in zip(call.outputs, targets, strict=True):
+                target[sample * buffer.size : (sample + 1) * buffer.size] = buffer
+
+
+def _shape(size: tuple[int, int]) -> tuple[int, ...]:
+    """The numpy shape of a CasADi matrix: scalars and columns lose the dimensions of length 1."""
+    rows, columns = size
+    if columns != 1:
+        return (rows, columns)
+    return () if rows == 1 else (rows,)

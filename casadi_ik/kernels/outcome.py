@@ -1,0 +1,36 @@
+"""What a C driver reports back, and how long it may run before it does."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from casadi_ik.errors import KernelError
+
+SLICE = 0.2
+"""Seconds after which a driver returns to Python, so that Ctrl-C works; then it is called again."""
+
+
+class Outcome(IntEnum):
+    """Return values of the drivers (drivers/common.c)."""
+
+    DONE = 0
+    SLICE_OVER = 1
+    ROWS_FULL = 2
+    NO_MEMORY = -1
+    NO_CHECKOUT = -2
+    STEP_FAILED = -3
+
+
+def check(name: str, code: int) -> None:
+    """Raise unless the driver can be called again.
+
+    Raises:
+        MemoryError: No work memory.
+        KernelError: The function failed, or too many threads use one that needs memory objects.
+    """
+    if code == Outcome.NO_MEMORY:
+        raise MemoryError(f"{name}: no work memory")
+    if code == Outcome.NO_CHECKOUT:
+        raise KernelError(f"{name}: too many calls at once of a function with memory objects")
+    if code == Outcome.STEP_FAILED:
+        raise KernelError(f"{name}: the function reports a failure")

@@ -1,0 +1,155 @@
+"""The one way a batch is solved: checked, run (in parallel if asked), judged, recorded."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.errors import InputError
+from casadi_ik.solvers.method import Method, Outcome
+from casadi_ik.solvers.problem import Array, Problems
+from casadi_ik.solvers.recorder import Recorder, SolveRecord, SolveSummary
+from casadi_ik.solvers.solution import BatchSolution
+from casadi_ik.solvers.verdict import judge
+from casadi_ik.steps.status import Status
+
+
+@dataclass(frozen=True, eq=False)
+class Engine:
+    """A method on a robot.
+
+    Attributes:
+        robot: The robot.
+        method: The method, built for this robot.
+    """
+
+    robot: ArmHand
+    method: Method
+
+    def solve(
+        self,
+        problems: Problems,
+        q0: ArrayLike | None,
+        seed: int,
+        jobs: int = 1,
+        recorder: Recorder | None = None,
+    ) -> BatchSolution:
+        """Solve a batch of k targets.
+
+        Args:
+            problems: The targets.
+            q0: (n,) or (k, n) start; None is the robot's home.
+            seed: Of all random numbers.
+            jobs: Threads; compiled loops run side by side.
+            recorder: Who keeps the iterations, if anyone.
+
+        Raises:
+            InputError: Bad q0 or jobs, or targets the method cannot take.
+        """
+        starts = self._starts(q0, len(problems))
+        if jobs < 1:
+            raise InputError(f"jobs: found {jobs}, expected at least 1")
+        started = time.time_ns()
+        outcome = self._run(problems, starts, seed, jobs, recorder is not None)
+        batch = self._judged(problems, outcome)
+        if recorder is not None:
+            self._record(recorder, problems, batch, outcome, seed, started)
+        return batch
+
+    def _starts(self, q0: ArrayLike | None, count: int) -> Array:
+        start = self.robot.configuration(q0, "q0")
+        if start.ndim == 1:
+            return np.tile(start, (count, 1))
+        if len(start) != count:
+            raise InputError(f"q0: found {len(start)} rows, expected 1 or {count}")
+        return start
+
+    def _run(self, problems: Problems, starts: Array, seed: int, jobs: int, trace: bool) -> Outcome:
+        if jobs == 1 or len(problems) < 2 * jobs:
+            return self.method.run(problems, starts, seed, trace)
+        edges = np.linspace(0, len(problems), jobs + 1).astype(int)
+        parts = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        with ThreadPoolExecutor(jobs) as pool:
+            outcomes = list(
+                pool.map(
+                    lambda part: self.method.run(problems.part(part), starts[part], seed, trace),
+                    parts,
+                )
+            )
+        return _joined(outcomes)
+
+    def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
+        verdict = judge(self.robot, problems, outcome.q)
+        success = verdict.ok.all(axis=1)
+        if problems.enforce_limits:
+            success &= verdict.limits_ok
+        status = np.where(success, int(Status.SOLVED), outcome.status)
+        # A method that is content with what the verdict refuses has come to a standstill.
+        status = np.where(~success & (status == Status.SOLVED), int(Status.STALLED), status)
+        return BatchSolution(
+            success=success,
+            status=status,
+            q=outcome.q,
+            iterations=outcome.iterations,
+            restarts=outcome.restarts,
+            time=outcome.time,
+            position_error=verdict.position_error,
+            angle_error=verdict.angle_error,
+            ok=verdict.ok,
+            limits_ok=verdict.limits_ok,
+            phases=outcome.phases,
+        )
+
+    def _record(
+        self,
+        recorder: Recorder,
+        problems: Problems,
+        batch: BatchSolution,
+        outcome: Outcome,
+        seed: int,
+        started: int,
+    ) -> None:
+        form = self.method.trace_format
+        elapsed = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])
+        names = batch.status_names
+        for row in range(len(batch)):
+            summary = SolveSummary(
+                solve_id=row,
+                method=self.method.name,
+                robot=self.robot.name,
+                seed=seed,
+                started=started + int(elapsed[row] * 1e9),
+                time=float(batch.time[row]),
+                status=str(names[row]),
+                success=bool(batch.success[row]),
+                iterations=int(batch.iterations[row]),
+                restarts=int(batch.restarts[row]),
+                phase_iterations={name: int(n[row]) for name, n in batch.phases.items()},
+                q=batch.q[row],
+                fingers=self.robot.fingers,
+                position_error=batch.position_error[row],
+                angle_error=batch.angle_error[row],
+                ok=batch.ok[row],
+                target_points=problems.points[row],
+                target_normals=problems.normals[row],
+            )
+            recorder.record(SolveRecord(summary, form.layout, outcome.trace[row], form.labels))
+
+
+def _joined(parts: list[Outcome]) -> Outcome:
+    return Outcome(
+        q=np.concatenate([part.q for part in parts]),
+        status=np.concatenate([part.status for part in parts]),
+        iterations=np.concatenate([part.iterations for part in parts]),
+        restarts=np.concatenate([part.restarts for part in parts]),
+        time=np.concatenate([part.time for part in parts]),
+        phases={
+            name: np.concatenate([part.phases[name] for part in parts]) for name in parts[0].phases
+        },
+        trace=tuple(trace for part in parts for trace in part.trace),
+    )

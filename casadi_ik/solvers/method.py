@@ -1,0 +1,79 @@
+"""What a method has to offer, and what it gives back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.kernels.layout import Layout
+from casadi_ik.solvers.problem import Array, Problems
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a method made of a batch of k targets.
+
+    Attributes:
+        q: (k, n) configurations reached.
+        status: (k,) codes of `Status`.
+        iterations: (k,) iterations over all phases and restarts.
+        restarts: (k,) how often it began anew.
+        time: (k,) seconds per solve.
+        phases: (k,) iterations by phase name, in the order of the phases.
+        trace: A structured array of rows per solve if asked for, else empty.
+    """
+
+    q: Array
+    status: NDArray[np.int64]
+    iterations: NDArray[np.int64]
+    restarts: NDArray[np.int64]
+    time: Array
+    phases: Mapping[str, NDArray[np.int64]]
+    trace: tuple[NDArray[Any], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class TraceFormat:
+    """How to read a trace.
+
+    Attributes:
+        layout: Fields of a row.
+        labels: Names of codes, bits and elements by field, as in `SolveRecord.labels`.
+    """
+
+    layout: Layout
+    labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+class Method(Protocol):
+    """A named way to solve, built for one robot."""
+
+    name: str
+
+    @property
+    def trace_format(self) -> TraceFormat:
+        """How its traces are to be read."""
+        ...
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """Every number and choice it works with, for the log."""
+        ...
+
+    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+        """Solve a batch.
+
+        Args:
+            problems: The targets.
+            q0: (k, n) configurations to start from.
+            seed: Of all random numbers; row i of a batch gets the same numbers in any batch.
+            trace: Whether to keep every iteration.
+
+        Raises:
+            InputError: The method cannot take these targets (for example a free finger).
+        """
+        ...

@@ -1,0 +1,110 @@
+"""The question in numbers: targets of a batch, and when a contact counts as reached."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from casadi_ik.errors import InputError
+
+Array = NDArray[np.float64]
+
+LIMITS = ("enforce", "ignore")
+"""How joint limits are taken: as part of being solved, or not at all (the paper's reading)."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """When a contact counts as reached.
+
+    Attributes:
+        position: Distance of the contact point [m].
+        angle: Angle of the pad normal [rad].
+
+    Raises:
+        InputError: Not a positive finite number.
+    """
+
+    position: float = 5e-3
+    angle: float = math.radians(3.0)
+
+    def __post_init__(self) -> None:
+        for name, value in (("position", self.position), ("angle", self.angle)):
+            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
+                raise InputError(f"tolerance.{name}: found {value!r}, expected a number > 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Problems:
+    """A batch of targets.
+
+    Attributes:
+        points: (k, f, 3) contact points [m], base frame; NaN marks a free finger.
+        normals: (k, f, 3) unit outward pad normals, base frame; NaN marks a free normal.
+        tolerance: When a contact counts as reached.
+        enforce_limits: Whether limits are part of being solved.
+    """
+
+    points: Array
+    normals: Array
+    tolerance: Tolerance
+    enforce_limits: bool
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def part(self, rows: slice) -> Problems:
+        """Some of the targets."""
+        return Problems(self.points[rows], self.normals[rows], self.tolerance, self.enforce_limits)
+
+
+def target_arrays(points: ArrayLike, normals: ArrayLike, f: int) -> tuple[Array, Array]:
+    """Checked batch targets.
+
+    Args:
+        points: (k, f, 3) [m].
+        normals: (k, f, 3), any length but zero.
+        f: Number of the robot's fingers.
+
+    Returns:
+        Points and unit normals, (k, f, 3).
+
+    Raises:
+        InputError: Wrong shape, infinite numbers, partly NaN vectors, a zero normal, a normal
+            without a point, a row with no contact. The message names row and finger.
+    """
+    arrays = []
+    for name, value in (("points", points), ("normals", normals)):
+        try:
+            array = np.array(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name}: expected an array of numbers") from error
+        if array.ndim != 3 or array.shape[1:] != (f, 3):
+            raise InputError(f"{name}: found shape {array.shape}, expected (k, {f}, 3)")
+        free = np.isnan(array)
+        partly = free.any(axis=2) & ~free.all(axis=2)
+        _refuse(partly, f"{name}: is partly NaN, expected three numbers or three NaN")
+        _refuse(np.isinf(array).any(axis=2), f"{name}: is infinite")
+        arrays.append(array)
+    p, n = arrays
+    if len(p) != len(n):
+        raise InputError(f"points and normals: found {len(p)} and {len(n)} rows, expected as many")
+    length = np.linalg.norm(n, axis=2)
+    _refuse(length < 1e-9, "normals: is zero, expected a direction")
+    free_point = np.isnan(p[..., 0])
+    _refuse(free_point & ~np.isnan(length), "normals: is given for a finger without a point")
+    empty = np.flatnonzero(free_point.all(axis=1))
+    if len(empty):
+        raise InputError(f"points: row {empty[0]} has no contact at all")
+    return p, n / length[..., None]
+
+
+def _refuse(bad: NDArray[np.bool_], problem: str) -> None:
+    found = np.argwhere(bad)
+    if len(found):
+        row, finger = found[0]
+        name, _, rest = problem.partition(": ")
+        raise InputError(f"{name}: row {row}, finger {finger} {rest}")

@@ -1,0 +1,119 @@
+"""The methods of Qiu & Kermani 2021, each one compiled loop."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from casadi_ik.errors import InputError
+from casadi_ik.kernels import LoopKernel
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.solvers.method import Outcome, TraceFormat
+from casadi_ik.solvers.problem import Array, Problems
+from casadi_ik.steps.enhanced import EnhancedStep, parameter_values
+from casadi_ik.steps.qiu_parameters import QiuParameters
+from casadi_ik.steps.status import Phase, Status
+
+
+class EnhancedMethod:
+    """`enhanced-dls`: thumb first, then the arm-thumb closed chain.
+
+    Attributes:
+        name: Name of the method.
+        options: Every choice and number, the paper's by default.
+    """
+
+    def __init__(
+        self,
+        robot: RobotDescription,
+        options: QiuParameters,
+        name: str = "enhanced-dls",
+        compiled: bool = True,
+    ) -> None:
+        """Build the step graph.
+
+        Raises:
+            UnsupportedError: The robot's thumb or fingers are not of the kind the paper needs.
+        """
+        self.name = name
+        self.options = options
+        self._robot = robot
+        self._compiled = compiled
+        self.step = EnhancedStep(robot, options)
+
+    @cached_property
+    def kernel(self) -> LoopKernel:
+        """The compiled loop; the virtual machine if the finger step is Ipopt's."""
+        return LoopKernel(self.step.graph(), self._compiled)
+
+    @property
+    def trace_format(self) -> TraceFormat:
+        """How its traces are to be read."""
+        robot = self._robot
+        phases = {phase.value: phase.name.lower().replace("_", "-") for phase in Phase}
+        labels = {
+            "q": robot.actuator_names,
+            "position_error": robot.finger_names,
+            "angle_error": robot.finger_names,
+            "limit_mask": robot.actuator_names,
+            "phase": tuple(phases.get(code, "") for code in range(max(phases) + 1)),
+            "status": tuple(Status(code).name for code in range(max(Status) + 1)),
+        }
+        return TraceFormat(self.step.record, labels)
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """The parameter record as a plain mapping."""
+        return dataclasses.asdict(self.options)
+
+    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+        """Solve a batch from one start each; see `Method.run`. No random numbers are drawn."""
+        self._check(problems)
+        count = len(problems)
+        values = parameter_values(
+            self.step,
+            problems.tolerance.position,
+            problems.tolerance.angle,
+            problems.enforce_limits,
+        )
+        parameters = np.empty((count, self.step.parameters.size))
+        common = {"points": np.zeros(problems.points.shape[1:]), "normals": None, **values}
+        common["normals"] = common["points"]
+        parameters[:] = self.step.parameters.pack(common)
+        points = self.step.parameters.slice("points")
+        normals = self.step.parameters.slice("normals")
+        parameters[:, points] = problems.points.reshape(count, -1)
+        parameters[:, normals] = problems.normals.reshape(count, -1)
+        states = np.zeros((count, self.step.state.size))
+        states[:, self.step.state.slice("q")] = q0
+        states[:, self.step.state.slice("phase")] = Phase.THUMB_REACHING
+        states[:, self.step.state.slice("best")] = np.finfo(float).max
+        result = self.kernel.run(states, parameters, self.options.max_iterations, trace)
+
+        status = result.status.astype(np.int64)
+        status[result.status == Status.RUNNING] = Status.ITERATION_LIMIT
+        status[result.status < 0] = Status.INVALID
+        reached = result.states[:, self.step.state.slice("reached")][:, 0].astype(np.int64)
+        return Outcome(
+            q=result.states[:, self.step.state.slice("q")],
+            status=status,
+            iterations=result.iterations,
+            restarts=np.zeros(count, dtype=np.int64),
+            time=result.time,
+            phases={"thumb-reaching": reached, "hand-alignment": result.iterations - reached},
+            trace=result.trace,
+        )
+
+    def _check(self, problems: Problems) -> None:
+        for name, array in (("contact", problems.points), ("normal", problems.normals)):
+            free = np.argwhere(np.isnan(array[..., 0]))
+            if len(free):
+                row, finger = free[0]
+                raise InputError(
+                    f"method {self.name!r} needs a {name} for every finger; row {row} has none for "
+                    f"{self._robot.finger_names[finger]!r}"
+                )

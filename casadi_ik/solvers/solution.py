@@ -1,0 +1,132 @@
+"""The answer: configuration, status, and a verdict on every contact."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.solvers.problem import Array
+from casadi_ik.steps.status import Status
+
+
+@dataclass(frozen=True)
+class ContactVerdict:
+    """How well one finger meets its contact.
+
+    Attributes:
+        position_error: Distance from the contact point [m]; NaN if the finger is free.
+        angle_error: Angle from the normal [rad]; NaN if it is free.
+        ok: Within tolerance (what is free is).
+    """
+
+    position_error: float
+    angle_error: float
+    ok: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What became of one grasp.
+
+    Attributes:
+        success: Every contact within tolerance, and every actuator and joint within its limits
+            unless limits are ignored. Recomputed from q, whatever the method says.
+        status: How the solve ended.
+        q: (n,) actuator positions reached [rad or m].
+        iterations: Iterations over all phases and restarts.
+        restarts: How often the method began anew.
+        time: Seconds the solve took.
+        contacts: Verdict by finger.
+        phases: Iterations by phase name, in the order of the phases.
+        limits_ok: Whether every actuator and joint is within its limits.
+        method: Name of the method.
+        robot: Name of the robot.
+        actuators: Names of the entries of q.
+    """
+
+    success: bool
+    status: Status
+    q: Array
+    iterations: int
+    restarts: int
+    time: float
+    contacts: Mapping[str, ContactVerdict]
+    phases: Mapping[str, int]
+    limits_ok: bool
+    method: str
+    robot: str
+    actuators: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class BatchSolution:
+    """What became of a batch of k targets; the fields of `Solution` as arrays.
+
+    Attributes:
+        success: (k,) bool.
+        status: (k,) codes of `Status`.
+        q: (k, n) actuator positions [rad or m].
+        iterations: (k,).
+        restarts: (k,).
+        time: (k,) seconds per solve.
+        position_error: (k, f) [m], NaN where free.
+        angle_error: (k, f) [rad], NaN where free.
+        ok: (k, f) bool.
+        limits_ok: (k,) bool.
+        phases: (k,) iterations by phase name.
+    """
+
+    success: NDArray[np.bool_]
+    status: NDArray[np.int64]
+    q: Array
+    iterations: NDArray[np.int64]
+    restarts: NDArray[np.int64]
+    time: Array
+    position_error: Array
+    angle_error: Array
+    ok: NDArray[np.bool_]
+    limits_ok: NDArray[np.bool_]
+    phases: Mapping[str, NDArray[np.int64]]
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @property
+    def status_names(self) -> NDArray[np.str_]:
+        """(k,) names of the statuses."""
+        return np.array([Status(int(code)).name for code in self.status], dtype=str)
+
+    def solution(
+        self,
+        row: int,
+        method: str,
+        robot: str,
+        actuators: tuple[str, ...],
+        fingers: tuple[str, ...],
+    ) -> Solution:
+        """One row as a `Solution`."""
+        contacts = {
+            name: ContactVerdict(
+                float(self.position_error[row, i]),
+                float(self.angle_error[row, i]),
+                bool(self.ok[row, i]),
+            )
+            for i, name in enumerate(fingers)
+        }
+        return Solution(
+            success=bool(self.success[row]),
+            status=Status(int(self.status[row])),
+            q=self.q[row],
+            iterations=int(self.iterations[row]),
+            restarts=int(self.restarts[row]),
+            time=float(self.time[row]),
+            contacts=contacts,
+            phases={name: int(counts[row]) for name, counts in self.phases.items()},
+            limits_ok=bool(self.limits_ok[row]),
+            method=method,
+            robot=robot,
+            actuators=actuators,
+        )

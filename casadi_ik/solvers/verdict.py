@@ -1,0 +1,61 @@
+"""The verdict: is it solved? Recomputed from q alone, whatever a method believes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.solvers.problem import Array, Problems
+
+LIMIT_SLACK = 1e-9
+"""Rounding allowed at a limit [rad or m]: a coupling's arithmetic may end a hair beyond it."""
+
+TOLERANCE_SLACK = 1e-9
+"""Relative rounding allowed at a tolerance, so that graph and verdict agree on its edge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """How k configurations meet their targets; arrays as in `BatchSolution`."""
+
+    position_error: Array
+    angle_error: Array
+    ok: NDArray[np.bool_]
+    limits_ok: NDArray[np.bool_]
+
+
+def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
+    """Compare configurations with their targets.
+
+    Args:
+        robot: The robot.
+        problems: k targets.
+        q: (k, n) configurations.
+    """
+    points, normals = robot.contacts(q)
+    position = np.linalg.norm(points - problems.points, axis=2)
+    # Kahan's angle: exact at zero and at a half turn, where arc cosine loses half the digits.
+    angle = 2 * np.arctan2(
+        np.linalg.norm(normals - problems.normals, axis=2),
+        np.linalg.norm(normals + problems.normals, axis=2),
+    )
+    slack = 1 + TOLERANCE_SLACK
+    # What is free is NaN and compares as not greater, hence as met.
+    ok = ~(position > problems.tolerance.position * slack) & ~(
+        angle > problems.tolerance.angle * slack
+    )
+    return Verdict(position, angle, ok, within_limits(robot, q))
+
+
+def within_limits(robot: ArmHand, q: Array) -> NDArray[np.bool_]:
+    """(k,) whether every actuator and every joint of (k, n) configurations is within its limits."""
+    theta = np.stack(list(robot.joints(q).values()), axis=1)
+    description = robot.description
+    inside = (q >= robot.lower - LIMIT_SLACK) & (q <= robot.upper + LIMIT_SLACK)
+    joints_inside = (theta >= description.joint_lower - LIMIT_SLACK) & (
+        theta <= description.joint_upper + LIMIT_SLACK
+    )
+    return inside.all(axis=1) & joints_inside.all(axis=1)

@@ -1,0 +1,160 @@
+"""The four-bar that bends a finger's last joint: Chandra et al. 2019, eqs. (9)-(11).
+
+Pivots O = (0, 0) and C = (g, 0) are fixed to the proximal phalanx. The crank OP of length p is
+the middle phalanx at the angle phi, the rod CQ of length q stands at psi, and PQ of length h is
+fixed to the distal phalanx at the angle phi + theta3. All angles are in rad, all lengths in one
+unit.
+
+The loop closes in two ways. `branch` = sigma = +-1 picks one and is the sign of
+sin(phi + theta3 - psi). The paper prints sigma = -1 only, and an `a` in eq. (11) that is the crank
+p (McCarthy's letter): with a = g the formula fails against finite differences. Both branches share
+one form of (11).
+
+Where the linkage cannot be assembled (`toggle` < 0) rod and coupler stay aligned: values and
+derivatives remain finite, and the measure tells.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+
+from casadi_ik.errors import InputError
+from casadi_ik.symbolic.smooth import Expr
+
+MIN_SINE = 1e-9
+"""|sin(phi + theta3 - psi)| is kept above it; this bounds every rate at a toggle."""
+
+
+class FourBar(NamedTuple):
+    """Lengths of crank p, rod q, ground g and coupler h (one unit), and the branch +-1."""
+
+    p: Expr
+    q: Expr
+    g: Expr
+    h: Expr
+    branch: Expr = -1
+
+
+def coefficients(phi: Expr, bar: FourBar) -> tuple[Expr, Expr, Expr]:
+    """A, B, C [length^2] of A cos(psi) + B sin(psi) = C, as printed below eq. (9)."""
+    p, q, g, h = bar[:4]
+    c, s = ca.cos(phi), ca.sin(phi)
+    pq2 = 2 * p * q
+    return pq2 * c - 2 * g * q, pq2 * s, (g * g + p * p + q * q - h * h) - (2 * p * g) * c
+
+
+def toggle(phi: Expr, bar: FourBar) -> Expr:
+    """Distance from the singular position: sin^2 of the angle between rod and coupler.
+
+    (A^2 + B^2 - C^2) / (2 q h)^2: 1 where rod and coupler stand at right angles, 0 where they
+    align and the rates blow up, negative where the linkage cannot be assembled. Smooth.
+    """
+    A, B, C = coefficients(phi, bar)
+    return (A * A + B * B - C * C) / ((2 * bar.q * bar.h) * (2 * bar.q * bar.h))
+
+
+def psi(phi: Expr, bar: FourBar) -> Expr:
+    """Rod angle psi [rad] in (-pi, pi]: atan2(B, A) + sigma acos(C / sqrt(A^2 + B^2))."""
+    rod, _ = _rod(phi, bar)
+    return ca.atan2(rod[1], rod[0])
+
+
+def theta3(phi: Expr, bar: FourBar, reference: Expr = 0.0) -> Expr:
+    """Angle theta3 [rad] of the distal phalanx against the middle one: eq. (9).
+
+    Args:
+        phi: crank angle [rad].
+        bar: the linkage.
+        reference: the result is the value within pi of this angle [rad]; a value amid the
+            working range makes theta3 continuous over it.
+    """
+    (c, s), _ = _rod(phi, bar)
+    x = bar.g + bar.q * c - bar.p * ca.cos(phi)
+    y = bar.q * s - bar.p * ca.sin(phi)
+    turn = phi + reference
+    ct, st = ca.cos(turn), ca.sin(turn)
+    return reference + ca.atan2(y * ct - x * st, x * ct + y * st)
+
+
+def theta3_rate(phi: Expr, bar: FourBar) -> Expr:
+    """Coupling f = d theta3 / d phi of both branches: eq. (11) with a = p. Dimensionless.
+
+    Its numerator p sin(psi - phi) - h sin(phi + theta3 - psi) is g sin(psi), the lever of O about
+    the rod, so f = g sin(psi) / [h sin(phi + theta3 - psi)], where h sin(phi + theta3 - psi) =
+    sigma sqrt(A^2 + B^2 - C^2) / (2 q). Hence f vanishes where rod and ground align.
+    """
+    (_, s), root = _rod(phi, bar)
+    return (2 * bar.g * bar.q) * s / (bar.branch * root)
+
+
+def psi_rate(phi: Expr, bar: FourBar) -> Expr:
+    """Rod rate d psi / d phi = p sin(theta3) / [q sin(phi + theta3 - psi)]. Dimensionless."""
+    (c, s), root = _rod(phi, bar)
+    cp, sp = ca.cos(phi), ca.sin(phi)
+    # h sin(theta3): the component of PQ across the crank.
+    across = (bar.q * s - bar.p * sp) * cp - (bar.g + bar.q * c - bar.p * cp) * sp
+    return 2 * bar.p * across / (bar.branch * root)
+
+
+def phi_from_theta3(theta: Expr, bar: FourBar, inverse_branch: Expr, reference: Expr = 0.0) -> Expr:
+    """Crank angle phi [rad] of a given theta3 [rad]: the inverse of eq. (9).
+
+    Q stands at r = p + h e^(i theta3) in the crank's frame, and |Q - C| = q leaves two angles,
+    mirror images that meet where rod and ground align and f = d theta3 / d phi = 0. So
+    `inverse_branch` is constant only over a range where f keeps its sign. Whether the answer
+    belongs to `bar.branch` is not checked. Out of reach, the angle of nearest approach results.
+
+    Args:
+        theta: theta3 [rad].
+        bar: the linkage; its branch plays no part.
+        inverse_branch: +-1, the sign of sin(psi); see `inverse_branch_from_pose`.
+        reference: the result is the value within pi of this angle [rad].
+    """
+    x, y = bar.p + bar.h * ca.cos(theta), bar.h * ca.sin(theta)
+    square = x * x + y * y
+    along = square + bar.g * bar.g - bar.q * bar.q
+    scale = 2 * bar.g * bar.q * MIN_SINE
+    across = ca.sqrt(ca.fmax(4 * bar.g * bar.g * square - along * along, scale * scale))
+    # angle(Q) = inverse_branch * atan2(across, along); phi = angle(Q) - angle(r).
+    c, s = along, inverse_branch * across
+    cr, sr = ca.cos(reference), ca.sin(reference)
+    cosine, sine = c * x + s * y, s * x - c * y
+    return reference + ca.atan2(sine * cr - cosine * sr, cosine * cr + sine * sr)
+
+
+def branch_from_pose(bar: FourBar, phi: float, theta: float) -> int:
+    """Branch (+1 or -1) of a numeric linkage in a known pose.
+
+    Args:
+        bar: the linkage, numbers; its branch is ignored.
+        phi: crank angle [rad] of the pose.
+        theta: theta3 [rad] of the pose, modulo a turn; need not be exact.
+
+    Raises:
+        InputError: the linkage cannot be assembled at phi.
+    """
+    if float(toggle(ca.DM(phi), bar)) < 0:
+        raise InputError(f"four-bar {tuple(bar[:4])} cannot be assembled at phi = {phi:g} rad")
+
+    def distance(branch: int) -> float:
+        return abs(float(theta3(ca.DM(phi), bar._replace(branch=branch), theta)) - theta)
+
+    return min((-1, 1), key=distance)
+
+
+def inverse_branch_from_pose(bar: FourBar, phi: float) -> int:
+    """Branch (+1 or -1) for `phi_from_theta3` of a numeric linkage in the pose phi [rad]."""
+    return 1 if float(psi(ca.DM(phi), bar)) >= 0 else -1
+
+
+def _rod(phi: Expr, bar: FourBar) -> tuple[tuple[Expr, Expr], Expr]:
+    """(cos psi, sin psi) and the root sqrt(A^2 + B^2 - C^2), kept from vanishing."""
+    A, B, C = coefficients(phi, bar)
+    floor = 2 * bar.q * bar.h * MIN_SINE
+    root = ca.sqrt(ca.fmax(A * A + B * B - C * C, floor * floor))
+    signed = bar.branch * root
+    # Unit length by construction where the loop closes; elsewhere C^2 + root^2 exceeds A^2 + B^2.
+    scale = 1 / ca.sqrt((A * A + B * B) * (C * C + root * root))
+    return (scale * (A * C - signed * B), scale * (B * C + signed * A)), root

@@ -1,0 +1,54 @@
+"""Guards that keep values and first derivatives finite where a formula reads 0/0.
+
+A formula in `s = theta^2` that is analytic at zero is written twice, as its closed form and as
+its Taylor series. Where the series is taken the closed form is evaluated at the fixed point
+where the two meet, so neither it nor its derivative is ever NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import casadi as ca
+
+Expr: TypeAlias = Any
+"""A CasADi matrix: SX, MX or DM (CasADi's stubs cannot express "the same type in and out")."""
+
+
+def even_function(
+    s: Expr, closed: Callable[[Expr], Expr], series: Sequence[float], below: float
+) -> Expr:
+    """Return `closed(s)`, or its Taylor polynomial where `s` is small.
+
+    Args:
+        s: scalar, the square of an angle [rad^2] or of a sine or chord.
+        closed: the formula; never called below `below`.
+        series: Taylor coefficients in powers of `s`, constant first.
+        below: the series is used for `s < below`.
+
+    Returns:
+        Scalar.
+    """
+    polynomial = series[-1]
+    for coefficient in reversed(series[:-1]):
+        polynomial = coefficient + s * polynomial
+    return ca.if_else(s < below, polynomial, closed(ca.fmax(s, below)))
+
+
+def safe_sqrt(s: Expr, floor: float = 1e-300) -> Expr:
+    """Square root with `s` kept above a floor: no NaN, and derivative 0 below the floor.
+
+    Args:
+        s: scalar.
+        floor: smallest value of s [unit of s].
+
+    Returns:
+        Scalar, at least sqrt(floor).
+    """
+    return ca.sqrt(ca.fmax(s, floor))
+
+
+def safe_norm(x: Expr) -> Expr:
+    """Euclidean norm of a vector (n, 1); at the zero vector 1e-150 with derivative 0, not NaN."""
+    return safe_sqrt(ca.dot(x, x))

@@ -1,0 +1,1 @@
+"""Tests of the kernels: what is compiled equals what is not."""

@@ -1,0 +1,99 @@
+"""Steps and functions that the kernel tests share."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from casadi_ik.kernels import RUNNING, Field, Layout, StepGraph
+from casadi_ik.kernels.compiler import find_compiler
+
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
+
+DONE = 7
+RECORD = Layout.record(
+    Field("flag", (), "u1"),
+    Field("x", (4,)),
+    Field("jacobian", (2, 3), "f4"),
+    Field("mask", (), "u4"),
+    Field("signed", (2,), "i4"),
+)
+
+
+def random_expression(inputs: ca.SX, size: int, operations: int, seed: int) -> ca.SX:
+    """A bounded random function of the inputs, in the operations kinematics is made of."""
+    rng = np.random.default_rng(seed)
+    pool = ca.vertsplit(inputs)
+    for _ in range(operations):
+        a, b, c = (pool[i] for i in rng.integers(len(pool), size=3))
+        kind = rng.integers(6)
+        if kind == 0:
+            pool.append(ca.sin(a) * ca.cos(b) + 0.1 * c)
+        elif kind == 1:
+            pool.append(ca.sqrt(1 + a * a) - 1)
+        elif kind == 2:
+            pool.append(ca.if_else(a > b, ca.sin(c), ca.cos(a)))
+        elif kind == 3:
+            pool.append(ca.atan2(a, 1 + b * b))
+        elif kind == 4:
+            pool.append(ca.fmin(ca.fmax(a - b, -1), 1))
+        else:
+            pool.append(ca.exp(-a * a) * b / (1 + c * c))
+    return ca.vertcat(*pool[-size:])
+
+
+def record_of(x: ca.SX, p: ca.SX) -> ca.SX:
+    return RECORD.pack(
+        {
+            "flag": x[0] > 0,
+            "x": x,
+            "jacobian": ca.SX(np.arange(6.0).reshape(2, 3)) * p[0],
+            "mask": 65536 * 65535 + ca.floor(10 * ca.fabs(x[1])),
+            "signed": ca.vertcat(-1, ca.floor(1000 * x[2])),
+        }
+    )
+
+
+def step_of(name: str, function: ca.Function, record: Layout = RECORD) -> StepGraph:
+    return StepGraph(
+        name,
+        function,
+        Layout((Field("x", (function.numel_in(0),)),)),
+        Layout((Field("p", (function.numel_in(1),)),)),
+        record,
+    )
+
+
+def random_step(seed: int = 0) -> StepGraph:
+    """A chaotic step on four numbers; ends by chance, at different iterations."""
+    x, p = ca.SX.sym("x", 4), ca.SX.sym("p", 2)
+    noise = random_expression(ca.vertcat(x, p), 4, 120, seed)
+    new = 2 * ca.sin(3 * noise + 4 * x)
+    status = ca.if_else(ca.fabs(new[0] - p[1]) < 0.01, DONE, RUNNING)
+    function = ca.Function("random_step", [x, p], [new, record_of(new, p), status])
+    return step_of("random_step", function)
+
+
+def branching_step() -> StepGraph:
+    """An MX step whose branches are short-circuited calls."""
+    x, p = ca.SX.sym("x", 4), ca.SX.sym("p", 2)
+    left = ca.Function("left", [x, p], [ca.sin(3 * x) * p[0], record_of(x, p)])
+    right = ca.Function("right", [x, p], [ca.sqrt(1 + x * x) - 2 * ca.cos(x), record_of(-x, p)])
+    branch = ca.Function.conditional("branch", [left], right)
+    xm, pm = ca.MX.sym("x", 4), ca.MX.sym("p", 2)
+    new, record = branch(ca.sum1(xm) > pm[1], xm, pm)
+    status = ca.if_else(ca.fabs(new[0] - pm[1]) < 0.01, DONE, RUNNING)
+    return step_of("branching_step", ca.Function("branching_step", [xm, pm], [new, record, status]))
+
+
+COUNT = Layout.record(Field("count"))
+
+
+def counting_step(name: str = "counting", offset: float = 0.0) -> StepGraph:
+    """Counts up by one and ends (`DONE`) at the parameter."""
+    x, p = ca.SX.sym("x"), ca.SX.sym("p")
+    new = x + 1
+    status = ca.if_else(new >= p, DONE, RUNNING)
+    function = ca.Function(name, [x, p], [new, new + offset, status])
+    return step_of(name, function, COUNT)

@@ -1,0 +1,267 @@
+"""The loop: the same in C and in the VM, every way to end, every record."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from casadi_ik.errors import InputError, KernelError
+from casadi_ik.kernels import (
+    FAILED,
+    NON_FINITE,
+    RUNNING,
+    Field,
+    Layout,
+    LoopKernel,
+    LoopResult,
+    StepGraph,
+)
+from casadi_ik.kernels.loop import FIRST_ROWS
+
+from .graphs import COUNT, DONE, branching_step, counting_step, needs_compiler, random_step, step_of
+
+BOTH = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
+
+
+def starts(count: int, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(count, 4)), rng.normal(size=(count, 2))
+
+
+def assert_same(a: LoopResult, b: LoopResult) -> None:
+    np.testing.assert_array_equal(a.states, b.states)
+    np.testing.assert_array_equal(a.iterations, b.iterations)
+    np.testing.assert_array_equal(a.status, b.status)
+    assert a.rows is not None
+    assert b.rows is not None
+    assert a.rows.tobytes() == b.rows.tobytes()
+
+
+@needs_compiler
+@pytest.mark.parametrize("step", [random_step(0), random_step(1), branching_step()])
+def test_compiled_loop_equals_vm_bit_for_bit(step: StepGraph) -> None:
+    kernel, vm = LoopKernel(step), LoopKernel(step, compiled=False)
+    assert kernel.compiled
+    assert not vm.compiled
+    states, parameters = starts(6)
+    fast = kernel.run(states, parameters, 400, trace=True)
+    assert_same(fast, vm.run(states, parameters, 400, trace=True))
+    # Not vacuous: the solves move, and end at different iterations.
+    assert len(np.unique(fast.iterations)) > 2
+    assert np.unique(fast.states).size > 12
+    assert fast.states.dtype == np.float64
+    assert (fast.iterations.dtype, fast.status.dtype) == (np.int64, np.int32)
+    assert (fast.time > 0).all()
+
+
+@BOTH
+def test_recording_changes_nothing(compiled: bool) -> None:
+    kernel = LoopKernel(random_step(), compiled=compiled)
+    states, parameters = starts(4)
+    kept = states.copy()
+    plain = kernel.run(states, parameters, 50)
+    traced = kernel.run(states, parameters, 50, trace=True)
+    np.testing.assert_array_equal(plain.states, traced.states)
+    np.testing.assert_array_equal(plain.iterations, traced.iterations)
+    assert plain.rows is None
+    assert plain.trace == ()
+    assert [len(rows) for rows in traced.trace] == traced.iterations.tolist()
+    for rows, state in zip(traced.trace, traced.states, strict=True):
+        np.testing.assert_array_equal(rows["x"][-1], state)
+    np.testing.assert_array_equal(states, kept)
+
+
+@BOTH
+def test_ends_by_status_or_by_budget(compiled: bool) -> None:
+    kernel = LoopKernel(counting_step(), compiled=compiled)
+    result = kernel.run(np.zeros((3, 1)), [[4], [10], [99]], 10)
+    assert result.iterations.tolist() == [4, 10, 10]
+    assert result.status.tolist() == [DONE, DONE, RUNNING]
+    assert result.states[:, 0].tolist() == [4, 10, 10]
+
+
+@BOTH
+def test_parameters_for_all_or_for_each(compiled: bool) -> None:
+    kernel = LoopKernel(counting_step(), compiled=compiled)
+    shared = kernel.run(np.zeros((2, 1)), [5], 10)
+    assert shared.iterations.tolist() == [5, 5]
+    # Views with strides and other number types are taken as they come.
+    strided = np.arange(12, dtype=np.int32).reshape(6, 2)[::3, 1:]
+    assert kernel.run(np.zeros((2, 1)), strided, 10).iterations.tolist() == [1, 7]
+
+
+@BOTH
+def test_nothing_to_do(compiled: bool) -> None:
+    kernel = LoopKernel(counting_step(), compiled=compiled)
+    none = kernel.run(np.zeros((0, 1)), [5], 10, trace=True)
+    assert none.states.shape == (0, 1)
+    assert none.trace == ()
+    still = kernel.run(np.full((2, 1), 3.0), [5], 0, trace=True)
+    assert still.states.tolist() == [[3], [3]]
+    assert still.status.tolist() == [RUNNING, RUNNING]
+    assert [len(rows) for rows in still.trace] == [0, 0]
+
+
+@BOTH
+def test_traces_longer_than_the_first_block(compiled: bool) -> None:
+    kernel = LoopKernel(counting_step(), compiled=compiled)
+    ends = [3, 5 * FIRST_ROWS + 1, 1, FIRST_ROWS]
+    result = kernel.run(np.zeros((4, 1)), np.array(ends)[:, None], 10**6, trace=True)
+    assert result.iterations.tolist() == ends
+    assert result.rows is not None
+    assert len(result.rows) == sum(ends)
+    for rows, end in zip(result.trace, ends, strict=True):
+        np.testing.assert_array_equal(rows["count"], np.arange(1, end + 1))
+
+
+@BOTH
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_non_finite_state_ends_the_loop(compiled: bool, bad: float) -> None:
+    x, p = ca.SX.sym("x", 2), ca.SX.sym("p")
+    # One element only becomes bad, and the step claims to have ended well.
+    new = ca.vertcat(x[0] + 1, ca.if_else(x[0] >= 2, p, x[1]))
+    done = ca.if_else(x[0] >= 2, DONE, RUNNING)
+    step = step_of("spoiled", ca.Function("spoiled", [x, p], [new, x[0], done]), COUNT)
+    result = LoopKernel(step, compiled=compiled).run([[0, 7], [-1, 8]], [bad], 9, trace=True)
+    assert result.status.tolist() == [NON_FINITE, NON_FINITE]
+    assert result.states.tolist() == [[2, 7], [2, 8]]
+    assert result.iterations.tolist() == [3, 4]
+    assert [len(rows) for rows in result.trace] == [3, 4]
+
+
+@BOTH
+@pytest.mark.parametrize("code", [np.nan, np.inf, -np.inf, 2.0**31, -(2.0**31)])
+def test_status_that_is_no_code_ends_the_loop(compiled: bool, code: float) -> None:
+    x, p = ca.SX.sym("x"), ca.SX.sym("p")
+    step = step_of("no_code", ca.Function("no_code", [x, p], [x + 1, x, p]), COUNT)
+    result = LoopKernel(step, compiled=compiled).run([[0]], [code], 9)
+    assert result.status.tolist() == [NON_FINITE]
+    assert result.states.tolist() == [[0]]
+
+
+@BOTH
+def test_step_that_fails_ends_its_solve_only(compiled: bool) -> None:
+    x, p = ca.MX.sym("x"), ca.MX.sym("p")
+    guarded = x.attachAssert(x < p, "too large")
+    done = ca.if_else(x >= 9, DONE, RUNNING)
+    step = step_of("guarded", ca.Function("guarded", [x, p], [guarded + 1, x, done]), COUNT)
+    result = LoopKernel(step, compiled=compiled).run([[0], [0]], [[4], [99]], 50, trace=True)
+    assert result.status.tolist() == [FAILED, DONE]
+    assert result.states.tolist() == [[4], [10]]
+    assert [len(rows) for rows in result.trace] == [4, 10]
+
+
+@BOTH
+def test_sparse_step_and_no_parameters(compiled: bool) -> None:
+    x, none = ca.SX.sym("x", 3), ca.SX.sym("p", 0)
+    new = ca.SX(3, 1)
+    new[1] = x[1] + 1
+    record = ca.SX(2, 1)
+    record[1] = x[1]
+    function = ca.Function("sparse", [x, none], [new, record, ca.SX(1, 1)])
+    step = StepGraph(
+        "sparse",
+        function,
+        Layout((Field("x", (3,)),)),
+        Layout(()),
+        Layout((Field("r", (2,)),)),
+    )
+    result = LoopKernel(step, compiled=compiled).run([[1, 2, 3]], np.zeros(0), 2, trace=True)
+    assert result.states.tolist() == [[0, 4, 0]]
+    assert result.trace[0]["r"].tolist() == [[0, 2], [0, 3]]
+
+
+def test_step_without_c_code_runs_in_the_vm() -> None:
+    x, p = ca.SX.sym("x"), ca.SX.sym("p")
+    options = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes"}
+    nlp = ca.nlpsol("nlp", "ipopt", {"x": x, "p": p, "f": (x - p) ** 2}, options)
+    xm, pm = ca.MX.sym("x"), ca.MX.sym("p")
+    best = nlp(x0=xm, p=pm)["x"]
+    function = ca.Function("nlp_step", [xm, pm], [best, best, DONE])
+    layout = Layout((Field("x"),))
+    step = StepGraph("nlp_step", function, layout, layout, layout, compilable=False)
+    kernel = LoopKernel(step)
+    assert not kernel.compiled
+    result = kernel.run([[0.0]], [3.0], 5)
+    assert result.status.tolist() == [DONE]
+    np.testing.assert_allclose(result.states, [[3.0]], atol=1e-6)
+
+
+@needs_compiler
+def test_step_that_wrongly_claims_c_code_is_named() -> None:
+    class Callback(ca.Callback):
+        def __init__(self) -> None:
+            ca.Callback.__init__(self)
+            self.construct("python_node", {})
+
+        def eval(self, arg: Sequence[ca.DM]) -> list[ca.DM]:
+            return list(arg)
+
+    callback = Callback()
+    x, p = ca.MX.sym("x"), ca.MX.sym("p")
+    step = step_of("claims", ca.Function("claims", [x, p], [callback(x), x, 0]), COUNT)
+    with pytest.raises(KernelError, match="claims"):
+        LoopKernel(step)
+
+
+def test_wrong_shapes_are_named() -> None:
+    kernel = LoopKernel(random_step(), compiled=False)
+    states, parameters = starts(3)
+    with pytest.raises(InputError, match=r"states have shape \(4,\), expected \(k, 4\)"):
+        kernel.run(states[0], parameters[0], 5)
+    with pytest.raises(InputError, match=r"expected \(2,\) or \(3, 2\)"):
+        kernel.run(states, parameters[:2], 5)
+    with pytest.raises(InputError, match="max_iterations is -1"):
+        kernel.run(states, parameters, -1)
+
+
+@BOTH
+def test_threads_share_a_kernel(compiled: bool) -> None:
+    kernel = LoopKernel(branching_step(), compiled=compiled)
+    inputs = [starts(3, seed) for seed in range(24)]
+    alone = [kernel.run(*pair, 100, trace=True) for pair in inputs]
+    with ThreadPoolExecutor(6) as pool:
+        together = list(
+            pool.map(lambda pair: kernel.run(pair[0], pair[1], 100, trace=True), inputs)
+        )
+    for a, b in zip(alone, together, strict=True):
+        assert_same(a, b)
+
+
+@needs_compiler
+def test_pauses_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = LoopKernel(random_step())
+    states, parameters = starts(5)
+    whole = kernel.run(states, parameters, 300, trace=True)
+    monkeypatch.setattr("casadi_ik.kernels.loop.SLICE", 0.0)
+    assert_same(kernel.run(states, parameters, 300, trace=True), whole)
+
+
+@needs_compiler
+def test_keyboard_interrupt_reaches_a_compiled_loop() -> None:
+    script = """
+        import os, signal, threading
+        import casadi as ca
+        from casadi_ik.kernels import Field, Layout, LoopKernel, StepGraph
+        x, p = ca.SX.sym("x"), ca.SX.sym("p")
+        one = Layout((Field("x"),))
+        function = ca.Function("endless", [x, p], [x + p, x, 0])
+        kernel = LoopKernel(StepGraph("endless", function, one, one, one))
+        assert kernel.compiled
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+        try:
+            kernel.run([[0.0]], [1.0], 10**15)
+        except KeyboardInterrupt:
+            print("interrupted")
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=60
+    )
+    assert done.stdout == "interrupted\n", done.stderr

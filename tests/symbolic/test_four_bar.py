@@ -1,0 +1,183 @@
+"""The finger's four-bar: closure, both branches, derivatives, toggles and the AR10's numbers."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from algebra_samples import gradient, graph
+
+from casadi_ik.errors import InputError
+from casadi_ik.symbolic import four_bar
+from casadi_ik.symbolic.four_bar import FourBar
+from casadi_ik.symbolic.lead_screw import angle_from_slider
+
+S, B = (1, 1), (5, 1)
+AR10 = FourBar(2.97, 3.47, 0.84, 0.72, -1)
+AR10_PHI = 3.32939008
+AR10_RANGE = np.linspace(0, 1.225, 200)
+
+
+def bar(b):
+    return FourBar(b[0], b[1], b[2], b[3], b[4])
+
+
+psi = graph(lambda phi, b: four_bar.psi(phi, bar(b)), S, B)
+theta3 = graph(lambda phi, b, r: four_bar.theta3(phi, bar(b), r), S, B, S)
+f = graph(lambda phi, b: four_bar.theta3_rate(phi, bar(b)), S, B)
+psi_rate = graph(lambda phi, b: four_bar.psi_rate(phi, bar(b)), S, B)
+toggle = graph(lambda phi, b: four_bar.toggle(phi, bar(b)), S, B)
+inverse = graph(lambda theta, b, s, r: four_bar.phi_from_theta3(theta, bar(b), s, r), S, B, S, S)
+
+
+def linkages(count: int, seed: int = 3):
+    """Random linkages of both branches, at least 1e-3 of sin^2 away from a toggle."""
+    rng = np.random.default_rng(seed)
+    found = 0
+    while found < count:
+        lengths, phi = rng.uniform(0.3, 2, 4), rng.uniform(-np.pi, np.pi)
+        b = np.array([*lengths, rng.choice([-1.0, 1.0])])
+        if float(toggle(phi, b)) > 1e-3:
+            found += 1
+            yield b, phi
+
+
+def test_loop_closes_to_rounding_on_both_branches():
+    branches = []
+    for b, phi in linkages(400):
+        p, q, g, h, sigma = b
+        rod, theta = float(psi(phi, b)), float(theta3(phi, b, 0))
+        P = p * np.array([np.cos(phi), np.sin(phi)])
+        Q = np.array([g + q * np.cos(rod), q * np.sin(rod)])
+        beta = phi + theta
+        assert np.abs(P + h * np.array([np.cos(beta), np.sin(beta)]) - Q).max() < 1e-12
+        assert np.sin(beta - rod) * sigma > 0
+        assert float(toggle(phi, b)) == pytest.approx(np.sin(beta - rod) ** 2, abs=1e-12)
+        branches.append(sigma)
+        # psi as printed below eq. (9), with sigma for the minus sign
+        A, Bc, C = (float(x) for x in four_bar.coefficients(ca.DM(phi), FourBar(*b)))
+        printed = np.arctan2(Bc, A) + sigma * np.arccos(C / np.hypot(A, Bc))
+        assert np.cos(printed - rod) == pytest.approx(1, abs=1e-12)
+    assert {-1.0, 1.0} == set(branches)
+
+
+def test_rates_match_central_differences_ad_and_eq_11_with_the_crank():
+    theta_ad = gradient(lambda phi, b: four_bar.theta3(phi, bar(b)), S, B)
+    psi_ad = gradient(lambda phi, b: four_bar.psi(phi, bar(b)), S, B)
+    step, wrong = 1e-6, []
+    for b, phi in linkages(400, seed=4):
+        p, _, g, h, _ = b
+        if float(toggle(phi, b)) < 1e-2:
+            continue
+        theta, rod = float(theta3(phi, b, 0)), float(psi(phi, b))
+        found = float(f(phi, b))
+        difference = float(theta3(phi + step, b, theta) - theta3(phi - step, b, theta)) / (2 * step)
+        assert found == pytest.approx(difference, rel=1e-6, abs=1e-6)
+        assert found == pytest.approx(float(theta_ad(phi, b)[0]), rel=1e-9, abs=1e-9)
+        assert float(psi_rate(phi, b)) == pytest.approx(
+            float(psi_ad(phi, b)[0]), rel=1e-9, abs=1e-9
+        )
+        lever = h * np.sin(phi + theta - rod)
+        assert found == pytest.approx((p * np.sin(rod - phi) - lever) / lever, rel=1e-9, abs=1e-9)
+        wrong.append(abs((g * np.sin(rod - phi) - lever) / lever - found))
+    assert np.median(wrong) > 0.1  # a = g in eq. (11) is not a rounding matter
+
+
+def test_reference_makes_theta3_continuous_through_the_cut():
+    b = [1.0, 2.0, 0.5, 1.8, -1]
+    phis = np.linspace(0, 2 * np.pi, 721)
+    cut, smooth, last = [], [], 0.0
+    for phi in phis:
+        if float(toggle(phi, b)) < 1e-3:
+            continue
+        cut.append(float(theta3(phi, b, 0)))
+        last = float(theta3(phi, b, last if smooth else cut[0]))
+        smooth.append(last)
+    assert len(smooth) > 300
+    assert np.abs(np.diff(smooth)).max() < 0.1
+    assert np.allclose(np.exp(1j * np.array(cut)), np.exp(1j * np.array(smooth)))
+
+
+def test_ar10_numbers():
+    assert float(theta3(AR10_PHI, AR10, 4.11)) == pytest.approx(4.1110, abs=5e-5)
+    plus = AR10._replace(branch=1)
+    assert float(theta3(AR10_PHI, plus, 2)) == pytest.approx(2.0896, abs=5e-5)
+    q3 = [float(theta3(AR10_PHI + x, AR10, 4.11)) - 4.1102504 for x in AR10_RANGE]
+    # 0 up to the last digits of the published offset; 4.1110 - 4.1103 = 8e-4
+    assert q3[0] == pytest.approx(0, abs=1e-3)
+    assert q3[-1] == pytest.approx(0.606, abs=1e-3)
+    assert np.abs(np.diff(q3)).max() < 0.01
+    # f at the ends of the middle slider's stroke, where q2 = 0.0033 and 1.2251
+    for slider, expected in ((0.0415, -0.035), (0.0575, 1.06)):
+        q2 = float(angle_from_slider(ca.DM(slider), 0.0498, 0.014)) - 0.81437063
+        assert float(f(AR10_PHI + q2, AR10)) == pytest.approx(
+            expected, abs=5e-3 * abs(expected) + 3e-4
+        )
+    assert min(float(toggle(AR10_PHI + x, AR10)) for x in AR10_RANGE) > 0.1
+
+
+def test_inverse_round_trip():
+    count = 0
+    for b, phi in linkages(300, seed=5):
+        if abs(float(f(phi, b))) < 1e-2:
+            continue
+        count += 1
+        theta = float(theta3(phi, b, 0))
+        branch = four_bar.inverse_branch_from_pose(FourBar(*b), phi)
+        assert float(inverse(theta, b, branch, phi + 0.5)) == pytest.approx(phi, abs=1e-10)
+    assert count > 200
+
+
+def test_ar10_inverse_holds_where_the_coupling_is_monotonic():
+    """The rate f changes sign at the start of the AR10's range; beyond, the inverse is unique."""
+    rates = np.array([float(f(AR10_PHI + x, AR10)) for x in AR10_RANGE])
+    signs = [four_bar.inverse_branch_from_pose(AR10, AR10_PHI + x) for x in AR10_RANGE]
+    assert rates[0] < 0
+    turn = float(np.interp(0, rates[:20], AR10_RANGE[:20]))
+    assert 0 < turn < 0.1
+    for x, sign in zip(AR10_RANGE, signs, strict=True):
+        assert sign == (signs[-1] if x > turn else -signs[-1])
+        phi = AR10_PHI + x
+        theta = float(theta3(phi, AR10, 4.11))
+        assert float(inverse(theta, AR10, sign, AR10_PHI + 0.6)) == pytest.approx(phi, abs=1e-7)
+
+
+def test_branch_from_a_known_pose():
+    assert four_bar.branch_from_pose(AR10, AR10_PHI, 4.1103) == -1
+    assert four_bar.branch_from_pose(AR10, AR10_PHI, 4.1103 - 2 * np.pi) == -1
+    assert four_bar.branch_from_pose(AR10, AR10_PHI, 2.09) == 1
+    for b, phi in linkages(50, seed=6):
+        theta = float(theta3(phi, b, 0))
+        assert four_bar.branch_from_pose(FourBar(*b), phi, theta) == b[4]
+    with pytest.raises(InputError, match="cannot be assembled"):
+        four_bar.branch_from_pose(FourBar(1.0, 0.1, 3.0, 0.1), 3.0, 0.0)
+
+
+def test_beyond_assembly_everything_stays_finite_and_the_measure_says_so():
+    gradients = [
+        gradient(lambda phi, b, g=g: g(phi, bar(b)), S, B)
+        for g in (four_bar.psi, four_bar.theta3, four_bar.theta3_rate, four_bar.psi_rate)
+    ]
+    rng = np.random.default_rng(8)
+    outside = 0
+    while outside < 100:
+        b, phi = np.array([*rng.uniform(0.3, 2, 4), rng.choice([-1, 1])]), rng.uniform(-3, 3)
+        if float(toggle(phi, b)) >= 0:
+            continue
+        outside += 1
+        for g in (psi, f, psi_rate):
+            assert g(phi, b).is_regular()
+        assert theta3(phi, b, 0).is_regular()
+        assert all(dg(phi, b).is_regular() for dg in gradients)
+    # exactly at a toggle: crank and ground in line, rod + coupler just long enough
+    b = [1.0, 1.5, 1.0, 0.5, 1]
+    assert float(toggle(np.pi, b)) == pytest.approx(0, abs=1e-12)
+    assert all(dg(np.pi, b).is_regular() for dg in gradients)
+
+
+def test_theta3_is_continuous_into_the_toggle():
+    b = [1.0, 1.0, 1.5, 1.0, -1]
+    phis = np.linspace(0, np.pi, 4001)
+    measures = np.array([float(toggle(x, b)) for x in phis])
+    last = int(np.flatnonzero(measures > 0)[-1])
+    assert measures[last + 1] < 0
+    inside, outside = float(theta3(phis[last], b, 0)), float(theta3(phis[last + 1], b, 0))
+    assert abs(inside - outside) < 0.05

@@ -1,0 +1,184 @@
+"""Rotations against pinocchio and scipy, at the identity and near half turns too."""
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from algebra_samples import (
+    PROPERTY,
+    angles,
+    central_difference,
+    gradient,
+    graph,
+    random_rotation,
+    rotation_vectors,
+    unit_vectors,
+    vectors,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from casadi_ik.symbolic import so3
+
+V, M, Q, S = (3, 1), (3, 3), (4, 1), (1, 1)
+exp = graph(so3.exp_so3, V)
+log = graph(so3.log_so3, M)
+about = graph(so3.rotation_about_axis, V, S)
+quaternion_exp = graph(so3.quaternion_exp, V)
+quaternion_log = graph(so3.quaternion_log, Q)
+from_matrix = graph(so3.quaternion_from_matrix, M)
+to_matrix = graph(so3.quaternion_to_matrix, Q)
+rpy = graph(so3.rpy_to_matrix, V)
+to_rpy = graph(so3.matrix_to_rpy, M)
+euler = graph(so3.euler_zyx, M)
+euler_matrix = graph(so3.euler_zyx_to_angular_velocity, V)
+euler_inverse = graph(so3.angular_velocity_to_euler_zyx, V)
+mean = graph(so3.mean_rotation, M, M)
+project = graph(so3.project_to_rotation, M)
+log_of_exp_gradient = gradient(lambda w: so3.log_so3(so3.exp_so3(w)), V)
+exp_gradient = gradient(so3.exp_so3, V)
+
+
+def svd_projection(A: np.ndarray) -> np.ndarray:
+    U, _, Vt = np.linalg.svd(A)
+    return U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+
+
+@PROPERTY
+@given(rotation_vectors)
+def test_exp_agrees_with_pinocchio(w):
+    assert np.allclose(exp(w).full(), pin.exp3(w), rtol=0, atol=1.6e-15)
+
+
+@PROPERTY
+@given(rotation_vectors)
+def test_log_undoes_exp_from_zero_to_half_a_turn(w):
+    assert np.allclose(log(exp(w)).full()[:, 0], w, rtol=1e-15, atol=4e-15)
+    if np.linalg.norm(w) < np.pi - 1e-5:
+        assert np.allclose(log(exp(w)).full()[:, 0], pin.log3(pin.exp3(w)), rtol=0, atol=1e-10)
+
+
+@PROPERTY
+@given(unit_vectors)
+def test_log_of_half_a_turn_is_one_of_its_two_vectors(axis):
+    w = log(exp(np.pi * axis)).full()[:, 0]
+    assert min(np.abs(w - np.pi * axis).max(), np.abs(w + np.pi * axis).max()) < 1e-14
+
+
+@PROPERTY
+@given(unit_vectors, st.floats(-7, 7))
+def test_rotation_about_an_axis_is_the_exponential(axis, angle):
+    assert np.allclose(about(axis, angle).full(), exp(angle * axis).full(), rtol=0, atol=3e-15)
+
+
+def test_rotation_about_a_coordinate_axis_folds_to_four_entries():
+    angle = ca.SX.sym("angle")
+    R = so3.rotation_about_axis(ca.DM([0, 0, 1]), angle)
+    assert R.is_dense()
+    assert str(R[2, 2]) == "1"
+    assert str(R[0, 2]) == str(R[2, 1]) == "0"
+    assert ca.Function("f", [angle], [R]).n_instructions() < 20
+
+
+@PROPERTY
+@given(vectors, vectors)
+def test_skew_is_the_cross_product(a, b):
+    assert np.allclose(so3.skew(ca.DM(a)).full() @ b, np.cross(a, b), rtol=0, atol=1e-15)
+    assert np.array_equal(so3.unskew(so3.skew(ca.DM(a))).full()[:, 0], a)
+
+
+@PROPERTY
+@given(rotation_vectors)
+def test_quaternions_agree_with_scipy(w):
+    R = Rotation.from_rotvec(w)
+    expected = R.as_quat(scalar_first=True)
+    for q in (quaternion_exp(w).full()[:, 0], from_matrix(R.as_matrix()).full()[:, 0]):
+        assert min(np.abs(q - expected).max(), np.abs(q + expected).max()) < 2e-15
+    assert np.allclose(to_matrix(expected).full(), R.as_matrix(), rtol=0, atol=2e-15)
+    assert np.allclose(quaternion_log(-expected).full()[:, 0], w, rtol=0, atol=4e-15)
+
+
+@PROPERTY
+@given(st.tuples(st.floats(-3.1, 3.1), st.floats(-1.57, 1.57), st.floats(-3.1, 3.1)))
+def test_rpy_is_the_urdf_convention(rpy_angles):
+    R = rpy(rpy_angles).full()
+    assert np.allclose(R, pin.rpy.rpyToMatrix(np.array(rpy_angles)), rtol=0, atol=1e-15)
+    assert np.allclose(to_rpy(R).full()[:, 0], rpy_angles, rtol=0, atol=1e-12)
+    assert np.allclose(euler(R).full()[::-1, 0], rpy_angles, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
+def test_gimbal_lock_keeps_the_rotation(pitch):
+    R = rpy([0.4, pitch, -0.3])
+    found = to_rpy(R).full()[:, 0]
+    assert found[0] == 0
+    assert np.allclose(rpy(found).full(), R.full(), rtol=0, atol=1e-15)
+    assert gradient(so3.matrix_to_rpy, M)(R).is_regular()
+    assert euler_inverse([0.4, pitch, 0.1]).is_regular()
+
+
+@PROPERTY
+@given(st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3)))
+def test_euler_rates(rpy_angles):
+    E, inverse = euler_matrix(rpy_angles).full(), euler_inverse(rpy_angles).full()
+    assert np.allclose(E @ inverse, np.eye(3), rtol=0, atol=1e-13)
+    alpha, beta, gamma = rpy_angles
+    R = rpy([gamma, beta, alpha]).full()
+    dR = central_difference(rpy, np.array([gamma, beta, alpha]))[:, ::-1]
+    for k in range(3):
+        spin = dR[:, k].reshape(3, 3, order="F") @ R.T
+        assert np.allclose(so3.unskew(ca.DM(spin)).full()[:, 0], E[:, k], rtol=0, atol=1e-9)
+
+
+@PROPERTY
+@given(rotation_vectors, angles.filter(lambda a: a < np.pi - 1e-2), unit_vectors)
+def test_mean_of_two_rotations_is_the_svd_projection(w, angle, axis):
+    Ra = pin.exp3(w)
+    Rb = Ra @ pin.exp3(angle * axis)
+    expected = svd_projection(0.5 * (Ra + Rb))
+    assert np.allclose(mean(Ra, Rb).full(), expected, rtol=0, atol=1e-13)
+    assert np.allclose(project(0.5 * (Ra + Rb)).full(), expected, rtol=0, atol=1e-12)
+
+
+def test_mean_at_half_a_turn_apart_is_still_a_rotation():
+    R = mean(np.eye(3), np.diag([1.0, -1.0, -1.0])).full()
+    assert np.allclose(R @ R.T, np.eye(3), rtol=0, atol=1e-15)
+    assert np.linalg.det(R) > 0
+
+
+def test_projection_of_random_matrices_is_the_svd_projection():
+    rng = np.random.default_rng(0)
+    samples = [rng.standard_normal((3, 3)) * 10 ** rng.uniform(-3, 3) for _ in range(300)]
+    samples = [A for A in samples if np.linalg.det(A) > 0 and np.linalg.cond(A) < 1e4]
+    assert len(samples) > 100
+    for A in samples:
+        assert np.allclose(project(A).full(), svd_projection(A), rtol=0, atol=1e-11)
+
+
+@PROPERTY
+@given(rotation_vectors.filter(lambda w: np.linalg.norm(w) < 3.0))
+def test_derivative_of_log_after_exp_is_the_identity(w):
+    assert np.allclose(log_of_exp_gradient(w).full(), np.eye(3), rtol=0, atol=2e-11)
+    assert np.allclose(exp_gradient(w).full(), central_difference(exp, w), rtol=0, atol=1e-9)
+
+
+def test_derivatives_are_finite_at_the_identity_and_at_half_turns():
+    rng = np.random.default_rng(1)
+    log_gradient, mean_gradient = gradient(so3.log_so3, M), gradient(so3.mean_rotation, M, M)
+    turns = [np.diag(d) for d in ([1.0, 1, 1], [1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])]
+    for R in [*turns, *(random_rotation(rng) for _ in range(5))]:
+        assert log_gradient(R).is_regular()
+        assert mean_gradient(R, turns[0]).is_regular()
+    assert gradient(so3.project_to_rotation, M)(np.eye(3)).is_regular()
+    assert gradient(so3.rotation_about_axis, V, S)([0, 0, 1], 0).is_regular()
+    half_turn = gradient(so3.quaternion_log, Q)
+    assert half_turn([0, 1, 0, 0]).is_regular()
+    assert half_turn([-1, 0, 0, 0]).is_regular()
+
+
+def test_graphs_take_mx_and_dm():
+    x = ca.MX.sym("x", 3)
+    f = ca.Function("f", [x], [so3.log_so3(so3.exp_so3(x))])
+    assert np.allclose(f([0.1, 0.2, 0.3]).full()[:, 0], [0.1, 0.2, 0.3], rtol=0, atol=1e-15)
+    assert isinstance(so3.exp_so3(ca.DM([0.1, 0.2, 0.3])), ca.DM)
