@@ -1,0 +1,54 @@
+# Everything runs in .venv, which the first target that needs it makes.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+OUT := out/demo
+
+.PHONY: help demo test lint bench notebooks clean
+
+help:
+	@echo "make demo       set up and solve the grasp of a real object: verdict, picture, log"
+	@echo "make test       set up and run the tests"
+	@echo "make lint       style, types, layers"
+	@echo "make bench      timings on this machine"
+	@echo "make notebooks  execute the notebooks in place"
+	@echo "make clean      remove .venv and outputs"
+
+$(VENV)/python.stamp:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "casadi_ik needs Python 3.11 or newer; say make PYTHON=python3.12"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	touch $@
+
+$(VENV)/demo.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
+	$(PIP) install --quiet -c constraints.txt -e ".[plots]"
+	touch $@
+
+$(VENV)/dev.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
+	$(PIP) install --quiet -c constraints.txt -e ".[test,lint]"
+	touch $@ $(VENV)/demo.stamp
+
+demo: $(VENV)/demo.stamp
+	@mkdir -p $(OUT)
+	$(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup.mcap --out $(OUT)/cup.json \
+	  --picture $(OUT)/cup.png
+	$(BIN)/casadi-ik log info $(OUT)/cup.mcap
+
+test: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest -n auto
+
+lint: $(VENV)/dev.stamp
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports
+
+bench: $(VENV)/demo.stamp
+	$(BIN)/python studies/bench.py
+
+notebooks: $(VENV)/dev.stamp
+	$(BIN)/python -m jupyter nbconvert --to notebook --execute --inplace notebooks/*.ipynb
+
+clean:
+	rm -rf $(VENV) out
