@@ -34,3 +34,11 @@ class KernelError(CasadiIKError):
 
 class LogError(CasadiIKError):
     """A log cannot be written or read."""
+
+
+class PictureError(CasadiIKError):
+    """A picture cannot be written."""
+
+
+class MissingExtraError(CasadiIKError, ImportError):
+    """An optional part of the package is not installed; the message says how to install it."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -91,12 +92,18 @@ def read_yaml(path: Path) -> Any:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise DescriptionError(f"{path}: cannot be read: {reason}") from error
     try:
-        return _with_units(yaml.load(text, Loader=_UniqueKeyLoader))
+        data = yaml.load(text, Loader=_UniqueKeyLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise DescriptionError(f"{path}{where}: not valid YAML: {problem}") from error
+    except (ValueError, RecursionError) as error:  # an impossible date, a bottomless nesting
+        raise DescriptionError(f"{path}: not valid YAML: {error}") from error
+    try:
+        return _with_units(data)
+    except RecursionError as error:
+        raise DescriptionError(f"{path}: nested too deeply, or holds itself") from error
 
 
 def convert(data: Any, type_: type[T], path: Path) -> T:
@@ -108,9 +115,83 @@ def convert(data: Any, type_: type[T], path: Path) -> T:
     try:
         return msgspec.convert(data, type_)
     except msgspec.ValidationError as error:
-        text, _, key = str(error).partition(" - at `$")
-        key = key.rstrip("`").lstrip(".") or "(top level)"
-        raise DescriptionError(f"{path}: {key}: {text[0].lower()}{text[1:]}") from error
+        text, _, place = str(error).partition(" - at `")
+        in_key = place.startswith("key` in `")
+        key, value = _culprit(data, type_, place.removeprefix("key` in `")[1:-1], str(error))
+        text = f"{text[0].lower()}{text[1:]}"
+        if in_key:
+            text = f"one of its keys is no text: {text}"
+        elif isinstance(value, str):
+            match = _QUANTITY.match(value)
+            if match and "float" in text:
+                text = f"unknown unit {match[2]!r}; known: {', '.join(filter(None, UNITS))}"
+            text = f"found {value!r}, {text}"
+        raise DescriptionError(f"{path}: {key or '(top level)'}: {text}") from error
+
+
+def refuse_non_finite(data: Any, path: Path) -> None:
+    """Refuse NaN and infinity anywhere in parsed YAML.
+
+    Raises:
+        DescriptionError: With file and key.
+    """
+    for key, value in _numbers(data, ""):
+        if not math.isfinite(value):
+            raise DescriptionError(f"{path}: {key}: found {value}, expected a finite number")
+
+
+def _numbers(value: Any, key: str) -> Iterator[tuple[str, float]]:
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from _numbers(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            yield from _numbers(item, f"{key}[{i}]")
+    elif isinstance(value, float):
+        yield key, value
+
+
+def _culprit(data: Any, type_: type[Any], place: str, message: str) -> tuple[str, Any]:
+    """Key and value that a validation error is about.
+
+    msgspec writes ``[...]`` for the keys of a mapping of the user's own names; which one it was
+    comes out by leaving out all the others.
+    """
+    key, value, trimmed = "", data, data
+    steps: list[Any] = []
+    for part in re.findall(r"\[\.\.\.\]|\[\d+\]|\.[^.\[]+", place):
+        if part == "[...]" and isinstance(value, dict):
+            for name in value:
+                alone = _replaced(trimmed, steps, {name: value[name]})
+                if _complains(alone, type_, message):
+                    break
+            else:
+                return f"{key}[...]", None
+            trimmed, step = alone, name
+            key += f".{name}"
+        else:
+            step = int(part[1:-1]) if part.startswith("[") else part[1:]
+            key += part
+        steps.append(step)
+        value = value[step]
+    return key.lstrip("."), value
+
+
+def _complains(data: Any, type_: type[Any], message: str) -> bool:
+    try:
+        msgspec.convert(data, type_)
+    except msgspec.ValidationError as error:
+        return str(error) == message
+    return False
+
+
+def _replaced(data: Any, steps: list[Any], value: Any) -> Any:
+    """A copy of nested data with another value at a place."""
+    if not steps:
+        return value
+    copy = data.copy()
+    copy[steps[0]] = _replaced(data[steps[0]], steps[1:], value)
+    return copy
 
 
 def _with_units(value: Any) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -54,6 +56,9 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
             contacts[finger] = Contact(contact.point, contact.normal)
         except InputError as error:
             raise DescriptionError(f"{path}: contacts.{finger}.{error}") from error
+    for key, value in _loose_numbers(entry):
+        if not math.isfinite(value):
+            raise DescriptionError(f"{path}: {key}: found {value}, expected a finite number")
     try:
         return Grasp(
             contacts=contacts,
@@ -65,3 +70,12 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
         )
     except InputError as error:
         raise DescriptionError(f"{path}: {error}") from error
+
+
+def _loose_numbers(entry: GraspFile) -> Iterator[tuple[str, float]]:
+    """The numbers beside the contacts, with their keys."""
+    for name, value in entry.posture.items():
+        yield f"posture.{name}", value
+    if entry.object is not None:
+        yield from (("object.pose.xyz", value) for value in entry.object.pose.xyz)
+        yield from (("object.pose.rpy", value) for value in entry.object.pose.rpy)

@@ -35,6 +35,7 @@ NUMPY_TYPES = {
 }
 """The primitives of ros2msg and how numpy stores them."""
 
+_CONSTANT = re.compile(r"[a-z]+[0-9]*\s+[A-Z][A-Z0-9_]*\s*=")
 _LINE = re.compile(r"(?P<type>[a-z]+[0-9]*)(?P<array>\[\d*\])?\s+(?P<name>[a-z]\w*)\Z")
 
 
@@ -65,7 +66,7 @@ def parse_members(schema: str) -> tuple[Member, ...]:
     for line in schema.splitlines():
         code, _, comment = line.partition("#")
         code = code.strip()
-        if not code or "=" in code:
+        if not code or _CONSTANT.match(code):
             continue
         match = _LINE.match(code)
         if match is None or match["type"] not in (*NUMPY_TYPES, "string"):
@@ -131,17 +132,15 @@ def _write(out: bytearray, member: Member, value: Any) -> None:
         if member.length is not None:
             _write_length(out, member, len(texts))
         for text in texts:
+            if not isinstance(text, str):
+                raise TypeError(f"found {type(text).__name__}")
             data = text.encode() + b"\0"
             out.extend(bytes(-len(out) % 4) + struct.pack("<I", len(data)) + data)
         return
     dtype = np.dtype(NUMPY_TYPES[member.type])
-    array = np.asarray(value)
-    if array.size and array.dtype.kind not in ("biu" if dtype.kind in "biu" else "biuf"):
+    array = _whole_numbers(value, dtype) if dtype.kind in "biu" else np.asarray(value)
+    if array.size and array.dtype.kind not in "biuf":
         raise TypeError(f"found {array.dtype}")
-    if dtype.kind in "iu" and array.size:
-        limits = np.iinfo(dtype)
-        if int(array.min()) < limits.min or int(array.max()) > limits.max:
-            raise OverflowError(f"range is {limits.min} to {limits.max}")
     if member.length is None:
         if array.shape:
             raise ValueError(f"expected a scalar, found shape {array.shape}")
@@ -149,6 +148,18 @@ def _write(out: bytearray, member: Member, value: Any) -> None:
         _write_length(out, member, array.size)
     if array.size:
         out.extend(bytes(-len(out) % dtype.itemsize) + array.astype(dtype).tobytes())
+
+
+def _whole_numbers(value: Any, dtype: np.dtype[Any]) -> np.ndarray:
+    """The value in an integer or boolean type; neither rounds nor wraps."""
+    array = value if isinstance(value, np.ndarray) else np.array(value, dtype=object)
+    numbers = array.ravel().tolist()
+    if not all(isinstance(number, int | np.integer | np.bool_) for number in numbers):
+        raise TypeError("found something that is not a whole number")
+    low, high = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    if numbers and not low <= min(numbers) <= max(numbers) <= high:
+        raise OverflowError(f"range is {low} to {high}")
+    return array.astype(dtype)
 
 
 def _write_length(out: bytearray, member: Member, count: int) -> None:

@@ -41,8 +41,11 @@ class LogClock:
         """Log times of a solve's iterations, (iterations,) uint64 [ns].
 
         Raises:
-            LogError: There are more iterations than the slot has room for.
+            LogError: There are more iterations than the slot has room for, or the solve's number is
+                negative or beyond what 64-bit nanoseconds can tell.
         """
+        if not (solve_id >= 0 and self.start(solve_id + 1) < 2**63):
+            raise LogError(f"solve {solve_id}: the log has no time for a solve of this number")
         if iterations * ITERATION > self.slot:
             raise LogError(
                 f"solve {solve_id}: {iterations} iterations, the log has room for"

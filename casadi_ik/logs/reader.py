@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import struct
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +30,9 @@ from casadi_ik.logs.schema import parse_layout, topic
 from casadi_ik.solvers.recorder import Event, EventKind, SolveSummary
 
 T = TypeVar("T")
+
+_FOOTER = struct.Struct("<QQI")
+"""Summary start, summary offset start, checksum: the contents of the Footer record."""
 
 _UNREADABLE = (
     OSError,
@@ -61,7 +65,7 @@ class LogFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         with self._reading() as stream:
-            self._check_ends(stream)
+            _check_ends(stream)
             reader = SeekingReader(stream, validate_crcs=True)
             summary = reader.get_summary()
             if summary is None or summary.statistics is None:
@@ -147,8 +151,9 @@ class LogFile:
             UnknownNameError: No such method in the log, or none given and there are several.
         """
         channel = self._channel(self._method(method), "iteration")
-        labels = json.loads(channel.metadata.get("labels", "{}"))
-        return {name: tuple(names) for name, names in labels.items()}
+        with self._reading():
+            labels = json.loads(channel.metadata.get("labels", "{}"))
+            return {name: tuple(names) for name, names in labels.items()}
 
     def iterations(self, method: str | None = None, solve_id: int | None = None) -> Iterations:
         """The iterations of a method: all, or those of one solve.
@@ -243,17 +248,25 @@ class LogFile:
                 f"{self.path}: the log is damaged: {error or type(error).__name__}"
             ) from error
 
-    def _check_ends(self, stream: IO[bytes]) -> None:
-        """Both ends of an MCAP file are its magic."""
-        head = stream.read(len(MCAP0_MAGIC))
-        if head != MCAP0_MAGIC:
-            found = f"it begins with {head!r}" if head else "it is empty"
-            raise LogError(f"not an MCAP file: {found}")
-        size = stream.seek(0, os.SEEK_END)
-        stream.seek(max(size - len(MCAP0_MAGIC), len(MCAP0_MAGIC)))
-        if stream.read() != MCAP0_MAGIC:
-            raise LogError(f"the log is truncated: it stops after {size} bytes without a footer")
-        stream.seek(0)
+
+def _check_ends(stream: IO[bytes]) -> None:
+    """Both ends of an MCAP file are its magic; the summary before the last has a checksum."""
+    magic = len(MCAP0_MAGIC)
+    head = stream.read(magic)
+    if head != MCAP0_MAGIC:
+        found = f"it begins with {head!r}" if head else "it is empty"
+        raise LogError(f"not an MCAP file: {found}")
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(max(size - magic, magic))
+    if stream.read() != MCAP0_MAGIC:
+        raise LogError(f"the log is truncated: it stops after {size} bytes without a footer")
+    stream.seek(size - magic - _FOOTER.size)
+    start, _, checksum = _FOOTER.unpack(stream.read(_FOOTER.size))
+    if start and checksum:
+        stream.seek(start)
+        if zlib.crc32(stream.read(size - magic - 4 - start)) != checksum:
+            raise LogError("the log is damaged: the summary does not match its checksum")
+    stream.seek(0)
 
 
 def _parse_metadata(record: Mapping[str, str]) -> dict[str, Any]:

@@ -105,7 +105,9 @@ def iteration_schema(layout: Layout, labels: Mapping[str, tuple[str, ...]] | Non
         names = (labels or {}).get(item.name, ())
         if item.shape == () and item.dtype[0] in "ui" and not item.name.endswith("_mask"):
             lines += [
-                f"{ros_type} {_constant(item.name, name)}={code}" for code, name in enumerate(names)
+                f"{ros_type} {_constant(item.name, name)}={code}"
+                for code, name in enumerate(names)
+                if name
             ]
         length = f"[{item.size}]" if item.shape else ""
         shape = f"({', '.join(map(str, item.shape))}) " if len(item.shape) > 1 else ""

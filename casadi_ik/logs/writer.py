@@ -26,7 +26,8 @@ from casadi_ik.kernels.layout import Layout
 from casadi_ik.logs import schema
 from casadi_ik.logs.cdr import HEADER, Codec
 from casadi_ik.logs.clock import LogClock
-from casadi_ik.logs.events import EventRules, detect_events
+from casadi_ik.logs.event_rules import EventRules
+from casadi_ik.logs.events import detect_events
 from casadi_ik.logs.provenance import METADATA_NAME, log_metadata
 from casadi_ik.solvers.recorder import Event, SolveRecord
 

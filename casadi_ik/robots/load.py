@@ -8,9 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from casadi_ik.errors import DescriptionError
-from casadi_ik.files.reading import Frame, convert, frame_matrix, read_yaml
+from casadi_ik.errors import DescriptionError, UnknownNameError
+from casadi_ik.files.reading import (
+    Frame,
+    T,
+    convert,
+    frame_matrix,
+    read_yaml,
+    refuse_non_finite,
+)
 from casadi_ik.files.shipped import resolve
+from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear
 from casadi_ik.robots.description import Actuator, Array, Finger, Joint, RobotDescription
 from casadi_ik.robots.schema import (
     ActuatorEntry,
@@ -37,33 +45,34 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
         DescriptionError: A file is missing or malformed; the message names file and key.
     """
     path = resolve(name_or_path, "arm_hands")
-    top = convert(read_yaml(path), ArmHandFile, path)
-    hand_path = resolve(top.hand, "hands", beside=path)
-    hand = convert(read_yaml(hand_path), HandFile, hand_path)
+    top = _read(path, ArmHandFile)
+    hand_path, hand = _part(top.hand, "hand", HandFile, path)
     joints: list[Joint] = []
     actuators: list[Actuator] = []
-    sources = {**top.sources, **hand.sources}
+    sources: dict[str, str] = dict(top.sources)
     root = hand.root
     if top.arm is not None:
-        arm_path = resolve(top.arm, "arms", beside=path)
-        arm = convert(read_yaml(arm_path), ArmFile, arm_path)
+        arm_path, arm = _part(top.arm, "arm", ArmFile, path)
         joints += _joints(arm.joints, arm.root, arm.sources, "arm", arm_path)
-        actuators += _actuators(None, joints, "arm", arm_path)
+        actuators += _actuators(None, joints, arm.sources, "arm", arm_path)
         tip = _known_link(arm.tip.link, arm.root, joints, f"{arm_path}: tip.link")
+        _known_source(arm.tip.source, arm.sources, f"{arm_path}: tip.source")
         mount = _pose(arm.tip) @ frame_matrix(top.mount)
         joints.append(_fixed("mount", tip, hand.root, mount))
-        sources.update(arm.sources)
+        sources |= _told_apart(arm.sources, sources, arm.name)
         root = arm.root
     elif top.mount != Frame():
         joints.append(_fixed("mount", "base", hand.root, frame_matrix(top.mount)))
         root = "base"
     hand_joints = _joints(hand.joints, hand.root, hand.sources, "hand", hand_path)
     joints += hand_joints
-    actuators += _actuators(hand.actuators, hand_joints, "hand", hand_path)
+    actuators += _actuators(hand.actuators, hand_joints, hand.sources, "hand", hand_path)
+    sources |= _told_apart(hand.sources, sources, hand.name)
     _unique((a.name for a in actuators), f"{path}: actuators")
     _unique((j.name for j in joints), f"{path}: joints")
     _unique((root, *(j.child for j in joints)), f"{path}: links")
     palm_link = _known_link(hand.palm.link, hand.root, hand_joints, f"{hand_path}: palm.link")
+    _known_source(hand.palm.source, hand.sources, f"{hand_path}: palm.source")
     return RobotDescription(
         name=top.name,
         root=root,
@@ -78,6 +87,26 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
     )
 
 
+def _read(path: Path, type_: type[T]) -> T:
+    data = read_yaml(path)
+    refuse_non_finite(data, path)
+    return convert(data, type_, path)
+
+
+def _part(name_or_path: str, key: str, type_: type[T], beside: Path) -> tuple[Path, T]:
+    """The arm or hand file that an arm-hand file names."""
+    try:
+        path = resolve(name_or_path, f"{key}s", beside=beside)
+    except (UnknownNameError, DescriptionError) as error:
+        raise DescriptionError(f"{beside}: {key}: {error}") from error
+    return path, _read(path, type_)
+
+
+def _told_apart(new: dict[str, str], known: dict[str, str], owner: str) -> dict[str, str]:
+    """Sources whose tag another file uses already get the owner's name before it."""
+    return {f"{owner}.{tag}" if tag in known else tag: text for tag, text in new.items()}
+
+
 def _joints(
     entries: list[JointEntry], root: str, sources: dict[str, str], part: str, path: Path
 ) -> list[Joint]:
@@ -88,15 +117,18 @@ def _joints(
     for entry in entries:
         where = f"{path}: joint {entry.name!r}"
         if entry.type not in JOINT_TYPES:
-            raise DescriptionError(f"{where}: type: found {entry.type!r}, expected {JOINT_TYPES}")
+            raise DescriptionError(
+                f"{where}: type: found {entry.type!r}, expected one of {', '.join(JOINT_TYPES)}"
+            )
         low, high = entry.limits
         if not low <= high:
             raise DescriptionError(f"{where}: limits: lower {low:.6g} is above upper {high:.6g}")
         if not np.linalg.norm(entry.axis) > 1e-9:
             raise DescriptionError(f"{where}: axis: is zero, expected a direction")
-        if entry.velocity is not None and not entry.velocity > 0:
-            raise DescriptionError(f"{where}: velocity: found {entry.velocity}, expected > 0")
+        if entry.velocity is not None:
+            _positive(entry.velocity, f"{where}: velocity")
         _known_source(entry.source, sources, f"{where}: source")
+        _check_numbers(entry.coupling, f"{where}: coupling")
     by_parent: dict[str, list[JointEntry]] = {}
     for entry in entries:
         by_parent.setdefault(entry.parent, []).append(entry)
@@ -155,7 +187,11 @@ def _fixed(name: str, parent: str, child: str, pose: Array) -> Joint:
 
 
 def _actuators(
-    entries: dict[str, ActuatorEntry] | None, joints: list[Joint], part: str, path: Path
+    entries: dict[str, ActuatorEntry] | None,
+    joints: list[Joint],
+    sources: dict[str, str],
+    part: str,
+    path: Path,
 ) -> list[Actuator]:
     """The part's actuators, after checking that every coupling ends at one of them."""
     by_name = {joint.name: joint for joint in joints if joint.type != "fixed"}
@@ -176,23 +212,44 @@ def _actuators(
             raise DescriptionError(
                 f"{where}: limits: lower {low:.6g} is not below upper {high:.6g}"
             )
-        velocity = entry.velocity or (joint.velocity if joint else math.inf)
+        velocity = joint.velocity if joint else math.inf
+        if entry.velocity is not None:
+            velocity = _positive(entry.velocity, f"{where}: velocity")
+        if entry.source or joint is None:
+            _known_source(entry.source, sources, f"{where}: source")
         unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit
         actuators.append(Actuator(name, unit, low, high, velocity, part))
+    units = {joint.name: "m" if joint.type == "prismatic" else "rad" for joint in by_name.values()}
+    units |= {actuator.name: actuator.unit for actuator in actuators}
+    followed = {joint.coupling.of for joint in by_name.values() if joint.coupling is not None}
+    for actuator in actuators:
+        if actuator.name not in by_name and actuator.name not in followed:
+            raise DescriptionError(
+                f"{path}: actuators.{actuator.name}: moves nothing; expected the name of a joint, "
+                "or a coupling that follows it"
+            )
     for joint in by_name.values():
         _check_coupling(joint, by_name, set(entries), path)
+        expected = {LeadScrew: "m", FourBar: "rad"}.get(type(joint.coupling))
+        if expected and joint.coupling and units[joint.coupling.of] != expected:
+            raise DescriptionError(
+                f"{path}: joint {joint.name!r}: coupling.of: {joint.coupling.of!r} is in "
+                f"{units[joint.coupling.of]}, expected something in {expected}"
+            )
     return actuators
 
 
 def _check_coupling(
     joint: Joint, by_name: dict[str, Joint], actuators: set[str], path: Path
 ) -> None:
+    """Follow a joint's couplings down to an actuator."""
     where = f"{path}: joint {joint.name!r}"
     followed, current = [joint.name], joint
     while current.coupling is not None:
         source = current.coupling.of
         if source in followed:
-            raise DescriptionError(f"{where}: coupling: is a cycle {' -> '.join(followed)}")
+            cycle = " -> ".join([*followed, source])
+            raise DescriptionError(f"{where}: coupling.of: is a cycle {cycle}")
         if source in actuators:
             return
         if source not in by_name:
@@ -204,18 +261,32 @@ def _check_coupling(
         current = by_name[source]
     if current.name not in actuators:
         raise DescriptionError(
-            f"{where}: has neither a coupling nor an actuator of its own under 'actuators'"
+            f"{where}: coupling: has neither a coupling nor an actuator of its own under 'actuators'"
         )
+
+
+def _check_numbers(coupling: Coupling | None, where: str) -> None:
+    """Whether a coupling's numbers describe a mechanism."""
+    if isinstance(coupling, Linear):
+        if coupling.ratio == 0:
+            raise DescriptionError(f"{where}.ratio: is zero, so the joint would not move")
+        return
+    if coupling is None:
+        return
+    for length in "bc" if isinstance(coupling, LeadScrew) else "pqgh":
+        _positive(getattr(coupling, length), f"{where}.{length}")
+    if isinstance(coupling, FourBar) and coupling.branch not in (-1, 1):
+        raise DescriptionError(f"{where}.branch: found {coupling.branch}, expected -1 or 1")
 
 
 def _fingers(
     top: ArmHandFile, hand: HandFile, joints: list[Joint], path: Path, hand_path: Path
 ) -> tuple[Finger, ...]:
     _unique(top.fingers, f"{path}: fingers")
-    for name in (*top.fingers, top.thumb):
+    for key, name in (*(("fingers", name) for name in top.fingers), ("thumb", top.thumb)):
         if name not in hand.fingers:
             raise DescriptionError(
-                f"{path}: fingers: {hand_path.name} has no finger {name!r}; it has "
+                f"{path}: {key}: {hand_path.name} has no finger {name!r}; it has "
                 + ", ".join(hand.fingers)
             )
     if top.thumb not in top.fingers:
@@ -231,7 +302,7 @@ def _fingers(
         if not length > 1e-9:
             raise DescriptionError(f"{where}.normal: is zero, expected a direction")
         chain: list[str] = []
-        while link != hand.root:
+        while link not in (hand.root, hand.palm.link):
             if by_child[link].type != "fixed":
                 chain.append(by_child[link].name)
             link = by_child[link].parent
@@ -270,6 +341,12 @@ def _known_link(link: str, root: str, joints: list[Joint], where: str) -> str:
     if link not in links:
         raise DescriptionError(f"{where}: unknown link {link!r}; known: {', '.join(links)}")
     return link
+
+
+def _positive(value: float, where: str) -> float:
+    if not value > 0:
+        raise DescriptionError(f"{where}: found {value:.6g}, expected > 0")
+    return value
 
 
 def _known_source(tags: str, sources: dict[str, str], where: str) -> None:

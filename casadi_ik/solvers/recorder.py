@@ -102,8 +102,8 @@ class SolveRecord:
         layout: Fields of a row of the trace.
         trace: One row per iteration, (iterations,) of `layout.dtype`.
         labels: Names that make a field readable: of the codes 0, 1, ... of an integer scalar
-            ("phase"), of the bits of a field ending in "_mask", of the elements along the first
-            axis of any other field ("q": actuator names).
+            ("phase"; "" for a code not used), of the bits of a field ending in "_mask", of the
+            elements along the first axis of any other field ("q": actuator names).
         events: What the solver itself noticed and the trace does not show.
     """
 

@@ -67,9 +67,7 @@ class Kinematics:
         frame = self.contact_frame(finger)
         return frame.origin, frame.rotate(self.robot.finger(finger).normal)
 
-    def twist_columns(
-        self, joints: Sequence[str], link: str, point: ca.SX
-    ) -> tuple[ca.SX, ca.SX]:
+    def twist_columns(self, joints: Sequence[str], link: str, point: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Geometric Jacobian of a point fixed to a link with respect to some joints.
 
         Args:
@@ -132,9 +130,7 @@ def axis_rotation(axis: NDArray[np.float64], angle: ca.SX) -> ca.SX:
     cross = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
     c, s = ca.cos(angle), ca.sin(angle)
     # Entry by entry: the sum of constant, cosine and sine parts keeps exact zeros and ones.
-    return (
-        ca.SX(_sparse(outer)) + ca.SX(_sparse(np.eye(3) - outer)) * c + ca.SX(_sparse(cross)) * s
-    )
+    return ca.SX(_sparse(outer)) + ca.SX(_sparse(np.eye(3) - outer)) * c + ca.SX(_sparse(cross)) * s
 
 
 def _constants(placement: NDArray[np.float64]) -> tuple[ca.DM, ca.DM]:

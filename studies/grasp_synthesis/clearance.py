@@ -7,11 +7,12 @@ Phalanges are capsules of 9 mm radius around the lines knuckle - distal joint - 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
-from casadi_ik.grasps import GraspObject
 from numpy.typing import NDArray
+
+from casadi_ik.grasps import GraspObject
 
 Array = NDArray[np.float64]
 PHALANX_RADIUS = 0.009  # [m]
@@ -45,9 +46,7 @@ def clearance(item: GraspObject, object_in_palm: Array, lines: Array) -> Clearan
     vertices = item.mesh(96)[0] @ rotation.T + origin
     samples = [_along(line) for line in lines]
     inside = (np.concatenate(samples) - origin) @ rotation
-    gaps = [
-        np.linalg.norm(a[:, None] - b[None], axis=2).min() for a, b in combinations(samples, 2)
-    ]
+    gaps = [np.linalg.norm(a[:, None] - b[None], axis=2).min() for a, b in combinations(samples, 2)]
     return Clearance(
         palm=float(vertices[:, 2].min() - PALM_SURFACE),
         fingers=float(item.signed_distance(inside).min() - PHALANX_RADIUS),
@@ -57,4 +56,4 @@ def clearance(item: GraspObject, object_in_palm: Array, lines: Array) -> Clearan
 
 def _along(line: Array) -> Array:
     t = np.linspace(0, 1, 41)[:, None]
-    return np.concatenate([a + t * (b - a) for a, b in zip(line[:-1], line[1:], strict=True)])
+    return np.concatenate([a + t * (b - a) for a, b in pairwise(line)])

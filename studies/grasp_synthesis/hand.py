@@ -6,15 +6,16 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
+
 from casadi_ik.robots import RobotDescription, load_description
 from casadi_ik.symbolic.kinematics import Kinematics, Pose, forward
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 ROBOT = "kuka_lwr_barrett"
 FINGERS = ("thumb", "finger_2", "finger_3")
 DISTAL_LENGTH = 0.050  # [m] distal joint to {T}, along the link (A3)
-SPREAD_DIRECTION = {"bh_finger_2_spread": "bh_spread", "bh_finger_3_spread": "bh_spread"}
+DRIVEN = {"bh_finger_2_spread": "bh_spread", "bh_finger_3_spread": "bh_spread"}
 
 
 class ArmHand:
@@ -44,9 +45,7 @@ class ArmHand:
         """Joint positions (m, 1) from the actuators; the spread motor drives two joints."""
         values = dict(zip(self.arm_names, ca.vertsplit(arm), strict=True))
         values |= dict(zip(self.hand_names, ca.vertsplit(posture), strict=True))
-        return ca.vertcat(
-            *(values[SPREAD_DIRECTION.get(name, name)] for name in self.robot.joint_names)
-        )
+        return ca.vertcat(*(values[DRIVEN.get(name, name)] for name in self.robot.joint_names))
 
     def kinematics(self, arm: ca.SX, posture: ca.SX) -> Kinematics:
         """Forward kinematics from the actuators."""
@@ -86,7 +85,9 @@ class ArmHand:
             The palm's pose (4, 4), contact points (3, 3), normals (3, 3), finger lines
             (3, 3, 3): per finger knuckle, distal joint and tip; the arm's joints (6, 3).
         """
-        rotation, origin, points, normals, *rest = (np.array(m) for m in self._numeric(arm, posture))
+        rotation, origin, points, normals, *rest = (
+            np.array(m) for m in self._numeric(arm, posture)
+        )
         palm = np.eye(4)
         palm[:3, :3], palm[:3, 3] = rotation, origin[:, 0]
         lines = np.stack([line.T for line in rest[:3]])

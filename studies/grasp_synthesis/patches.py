@@ -1,8 +1,8 @@
 """The patch of an object's surface that a pad may touch, as CasADi graphs.
 
 A patch maps coordinates u to a point [m] and the unit outward normal in the object frame, both
-(3, 1). `start` gives a random u, `mirror` the u of the mirror image: the synthesis keeps thumb
-contacts on the mirror plane and the other two fingers symmetric about it.
+(3, 1). The synthesis keeps the thumb's contact on the hand's mirror plane and the other two fingers
+symmetric about it.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from casadi_ik.grasps import BentCapsule, Box, Cylinder, EllipticCylinder, Shape, Sphere
 from numpy.typing import NDArray
+
+from casadi_ik.grasps import BentCapsule, Box, Cylinder, EllipticCylinder, Shape, Sphere
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from casadi_ik.grasps import GraspObject
 from numpy.typing import NDArray
 
+from casadi_ik.grasps import GraspObject
 from grasp_synthesis.hand import ArmHand
 from grasp_synthesis.posture import OPTIONS, Pinch
 from grasp_synthesis.recipes import Recipe
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 LIMIT_MARGIN = np.deg2rad(10.0)
 ELBOW = np.deg2rad([-105.0, -35.0])  # bent towards the object, never straight
 WRIST_BEND = np.deg2rad(15.0)  # joint 6 keeps away from zero, where joints 5 and 7 align
-REGION_X = {"down": (-0.65, -0.35), "forward": (-0.80, -0.45)}  # [m] where the object may be
+REGION_X = {"down": (-0.65, -0.35), "forward": (-0.82, -0.60)}  # [m] where the object may be
 REGION_Y = (-0.30, 0.30)
 HOUSING = 0.075  # [m] radius of hand housing and wrist above the table
 FINGER = 0.010  # [m] phalanx radius above the table
@@ -73,7 +73,10 @@ def place(
     heights.append(face[2] - HOUSING)
     for name in ("thumb", "finger_2", "finger_3"):
         link = kin.links[f"bh_{name}_link_3"]
-        heights += [link.origin[2] - FINGER, (link.origin + 0.055 * link.rotation[:, 0])[2] - FINGER]
+        heights += [
+            link.origin[2] - FINGER,
+            (link.origin + 0.055 * link.rotation[:, 0])[2] - FINGER,
+        ]
     inequal = ca.vertcat(
         up[2] - 0.5,
         pose.origin[0] - region[0],
@@ -95,9 +98,10 @@ def place(
     jacobian = ca.Function("jacobian", [arm], [ca.vertcat(linear, angular)])
     found = []
     for start in range(12):
-        scale = 0.0 if start == 0 else 0.6
+        guess = home + 0.3 * rng.standard_normal(7)
+        guess[5] *= -0.5 if start % 2 else 1.0  # both bends of the wrist
         result = solver(
-            x0=np.clip(home + scale * rng.standard_normal(7), lower, upper),
+            x0=np.clip(guess, lower, upper),
             lbx=lower,
             ubx=upper,
             lbg=0,

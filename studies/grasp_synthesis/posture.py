@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from casadi_ik.grasps import BentCapsule, Cylinder, GraspObject, Sphere
-from casadi_ik.symbolic.kinematics import Pose
 from numpy.typing import NDArray
 
+from casadi_ik.grasps import BentCapsule, Cylinder, GraspObject, Sphere
+from casadi_ik.symbolic.kinematics import Pose
 from grasp_synthesis.hand import ArmHand, full_posture
 from grasp_synthesis.patches import Patch
 from grasp_synthesis.recipes import Recipe

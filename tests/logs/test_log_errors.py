@@ -18,7 +18,7 @@ from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs import EventRules, LogClock, McapRecorder, open_log
 from casadi_ik.logs.cdr import Codec
-from casadi_ik.solvers.recorder import Event, EventKind, Recorder
+from casadi_ik.solvers.recorder import Event, EventKind, Recorder, SolveRecord
 
 Write = Callable[..., Path]
 
@@ -145,18 +145,24 @@ def test_records_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
     path = tmp_path / "cup.mcap"
     good = make_solve(0)
     other = Layout.record(Field("q", (3,)))
+    wild = make_solve(5).summary
+
+    def of_number(solve_id: int) -> SolveRecord:
+        return dataclasses.replace(good, summary=dataclasses.replace(wild, solve_id=solve_id))
+
     bad = {
         "already in the log": good,
-        "not of its layout": dataclasses.replace(good, layout=other),
+        "not of its layout": dataclasses.replace(make_solve(8), layout=other),
         "layout differs": make_solve(1, layout=other),
         "outside the trace": dataclasses.replace(
             make_solve(2), events=(Event(50, EventKind.RESTART, "", 0.0, 0.0),)
         ),
         "lower_snake_case": make_solve(3, "new", layout=Layout.record(Field("J"))),
         "room for 60000": make_solve(4, rows=60_001, layout=LAYOUT),
-        "'solve_id'": make_solve(5),
+        "no time for a solve": of_number(2**32),
+        "solve -1": of_number(-1),
+        "'seed'": dataclasses.replace(good, summary=dataclasses.replace(wild, seed=2**63)),
     }
-    object.__setattr__(bad["'solve_id'"].summary, "solve_id", 2**32)
     with McapRecorder(path, robot_name="made_up", clock=LogClock(T0)) as recorder:
         recorder.record(good)
         for reason, record in bad.items():

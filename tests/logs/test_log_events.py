@@ -41,6 +41,7 @@ def test_phase_changes_and_restarts() -> None:
         Event(5, EventKind.PHASE_CHANGE, "reach -> refine", 2.0, 0.0),
     )
     assert detect_events(layout, trace)[0].subject == "0 -> 1"
+    assert detect_events(layout, trace, {"phase": ("", "a")})[0].subject == "0 -> a"
 
 
 def test_limits_hit_and_left() -> None:
@@ -52,6 +53,27 @@ def test_limits_hit_and_left() -> None:
         Event(1, EventKind.LIMIT_LEFT, "wrist", 1.9, 2.0),
         Event(2, EventKind.LIMIT_HIT, "elbow", 0.3, 0.3),
     )
+
+
+def test_a_rounding_error_does_not_leave_a_limit() -> None:
+    layout, trace = trace_of(
+        q=np.array([[0.0], [1e-16], [1e-9], [0.0], [0.1], [0.0]]), limit_mask=[1, 0, 0, 1, 0, 1]
+    )
+    events = detect_events(layout, trace)
+    assert [(e.iteration, e.kind) for e in events] == [
+        (0, EventKind.LIMIT_HIT),
+        (4, EventKind.LIMIT_LEFT),
+        (5, EventKind.LIMIT_HIT),
+    ]
+
+
+def test_limits_without_coordinates() -> None:
+    layout, trace = trace_of(limit_mask=[1, 0, 2])
+    assert [(e.iteration, e.kind) for e in detect_events(layout, trace)] == [
+        (0, EventKind.LIMIT_HIT),
+        (1, EventKind.LIMIT_LEFT),
+        (2, EventKind.LIMIT_HIT),
+    ]
 
 
 def test_the_highest_bits_and_wide_masks() -> None:

@@ -51,7 +51,7 @@ def test_a_row_is_its_own_message(layout: Layout, data: st.DataObject) -> None:
         data.draw(st.binary(min_size=layout.dtype.itemsize, max_size=layout.dtype.itemsize)),
         layout.dtype,
     )[0]
-    text = schema.iteration_schema(layout, {name: ("a", "b c") for name in layout.names})
+    text = schema.iteration_schema(layout, dict.fromkeys(layout.names, ("a", "b c")))
     payload = HEADER + row.tobytes()
     ours = Codec(text).decode(payload)
     theirs = generate_dynamic(NAME, text)[NAME](payload)
@@ -177,12 +177,12 @@ def test_the_schema_is_for_people_too() -> None:
         Field("pose", (3, 4), "f8", "m"),
         Field("limit_mask", dtype="u4"),
     )
-    labels = {"phase": ("thumb reaching", "hand-alignment"), "limit_mask": ("a",)}
+    labels = {"phase": ("", "thumb reaching", "hand-alignment"), "limit_mask": ("a",)}
     assert schema.iteration_schema(layout, labels) == (
         "float64[12] pose # (3, 4) [m]\n"
         "uint32 limit_mask # []\n"
-        "uint8 PHASE_THUMB_REACHING=0\n"
-        "uint8 PHASE_HAND_ALIGNMENT=1\n"
+        "uint8 PHASE_THUMB_REACHING=1\n"
+        "uint8 PHASE_HAND_ALIGNMENT=2\n"
         "uint8 phase # [] phase of the method\n"
     )
     assert schema.iteration_name("hand-first", layout, 3) == (

@@ -90,7 +90,7 @@ def test_two_methods_share_a_log(write: Write) -> None:
     assert log.methods == ("enhanced-dls", "hand-first")
     with pytest.raises(UnknownNameError, match="which method"):
         log.iterations()
-    with pytest.raises(UnknownNameError, match="no method 'ipopt'.*enhanced-dls, hand-first"):
+    with pytest.raises(UnknownNameError, match=r"no method 'ipopt'.*enhanced-dls, hand-first"):
         log.iterations("ipopt")
     assert len(log.iterations("hand-first").rows) == 7
     assert [s.method for s in log.solves()] == ["enhanced-dls", "hand-first"]

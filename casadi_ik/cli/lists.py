@@ -1,0 +1,60 @@
+"""`casadi-ik robots`, `methods` and `grasps`: what there is."""
+
+from __future__ import annotations
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from casadi_ik.cli.answer import Answer
+from casadi_ik.cli.report import fields, table
+from casadi_ik.files.reading import convert, read_yaml
+from casadi_ik.files.shipped import resolve, shipped_names
+from casadi_ik.grasps.load import GraspFile
+from casadi_ik.robots import load_description
+from casadi_ik.robots.schema import ArmHandFile
+from casadi_ik.solvers import METHODS, method_summary
+
+
+def robots() -> Answer:
+    """The shipped robots.
+
+    Raises:
+        DescriptionError: A shipped file is damaged.
+    """
+    parts: list[RenderableType] = []
+    for name in shipped_names("arm_hands"):
+        path = resolve(name, "arm_hands")
+        robot = load_description(path)
+        fingers = (f"{f} (placed first)" if f == robot.thumb else f for f in robot.finger_names)
+        pairs = {
+            "fingers": f"{len(robot.fingers)}: {', '.join(fingers)}",
+            "actuators": f"{len(robot.actuators)}: {', '.join(robot.actuator_names)}",
+        }
+        description = convert(read_yaml(path), ArmHandFile, path).description
+        parts += [Text(name, "bold"), Text(f"  {description}"), fields(pairs)]
+    return Answer(Group(*parts))
+
+
+def methods() -> Answer:
+    """The methods, the default first."""
+    rows = table("method", "what it does")
+    for name in METHODS:
+        default = " (default)" if name == METHODS[0] else ""
+        rows.add_row(name, method_summary(name) + default)
+    return Answer(rows)
+
+
+def grasps() -> Answer:
+    """The shipped grasps.
+
+    Raises:
+        DescriptionError: A shipped file is damaged.
+    """
+    rows = table("grasp", "robot", "object", "description")
+    for name in shipped_names("grasps"):
+        path = resolve(name, "grasps")
+        entry = convert(read_yaml(path), GraspFile, path)
+        rows.add_row(
+            name, entry.robot, entry.object.name if entry.object else "", entry.description
+        )
+    return Answer(rows)

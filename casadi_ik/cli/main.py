@@ -1,0 +1,97 @@
+"""Entry point: one command in, an exit code out."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TextIO
+
+from casadi_ik.cli.answer import Exit
+from casadi_ik.cli.outputs import OutputError
+from casadi_ik.cli.parser import PROGRAM, build_parser
+from casadi_ik.errors import CasadiIKError
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: Arguments behind the program's name; None takes those of the process.
+
+    Returns:
+        0 done or solved, 1 a valid problem not solved, 2 bad input (one line on stderr),
+        130 interrupted, 141 the reader of stdout went away. What no one foresaw is raised.
+    """
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            return _run(argv)
+        except CasadiIKError as error:
+            _say("error", str(error))
+            return Exit.BAD_INPUT
+        except KeyboardInterrupt:
+            _say("error", "interrupted")
+            return Exit.INTERRUPTED
+        except BrokenPipeError:
+            _abandon_stdout()
+            return Exit.BROKEN_PIPE
+
+
+def _run(argv: Sequence[str] | None) -> Exit:
+    try:
+        arguments = build_parser().parse_args(argv)
+    except SystemExit:  # --help and --version have been printed
+        sys.stdout.flush()
+        raise
+    answer = arguments.run(arguments)
+    try:
+        _show(answer.report)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _abandon_stdout()
+        raise OutputError(f"<stdout>: cannot be written: {error.strerror}") from error
+    return answer.exit
+
+
+def _show(report: RenderableType) -> None:
+    """Print a report; plain and 80 columns wide where stdout is no terminal."""
+    from rich.console import Console
+
+    class Terminal(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+    console = Terminal(markup=False, emoji=False, highlight=False)
+    console.print(report, crop=False)
+    sys.stdout.flush()
+
+
+def _say(kind: str, text: str) -> None:
+    print(f"{PROGRAM}: {kind}: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    _say("warning", str(message))
+
+
+def _abandon_stdout() -> None:
+    """Point stdout nowhere, so that the interpreter's own flush at exit has nothing to say."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)

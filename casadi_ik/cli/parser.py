@@ -1,0 +1,239 @@
+"""What can be said on the command line. The commands themselves are imported when called."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from casadi_ik.cli.values import file_name, numbers, one_of, positive, whole
+from casadi_ik.errors import InputError
+
+if TYPE_CHECKING:
+    from casadi_ik.cli.answer import Answer
+
+PROGRAM = "casadi-ik"
+PICTURES = (".png", ".pdf", ".svg")
+
+_DESCRIPTION = """\
+Where must every motor of an arm and its hand stand, so that each fingertip touches a given point
+and faces a given way?
+"""
+
+_EXAMPLES = """\
+examples:
+  casadi-ik grasps                                   what is there to be grasped
+  casadi-ik solve cup                                solve a shipped grasp
+  casadi-ik solve my_grasp.yaml --log my_grasp.mcap  your own, with a log of every iteration
+  casadi-ik log info my_grasp.mcap                   what the log holds
+
+exit codes: 0 solved (or done), 1 a valid problem not solved, 2 bad input
+"""
+
+_SOLVE_EXAMPLES = """\
+examples:
+  casadi-ik solve cup
+  casadi-ik solve cup --method enhanced-dls --out cup.json --log cup.mcap --picture cup.png
+  casadi-ik solve my_grasp.yaml --robot my_robot.yaml --tolerance-position 0.002
+
+a grasp file:
+  robot: kuka_lwr_barrett
+  contacts:      # point [m] and outward pad normal, in the robot's base frame
+    thumb:    {point: [0.52, 0.10, 0.60], normal: [0.0, -0.94, 0.34]}
+    finger_2: {point: [0.55, 0.02, 0.60], normal: [0.0, 0.94, 0.34]}
+    finger_3: {point: [0.49, 0.02, 0.60], normal: [0.0, 0.94, 0.34]}
+
+exit codes: 0 solved, 1 not solved (the report says why), 2 bad input
+"""
+
+_BATCH_EXAMPLES = """\
+example:
+  casadi-ik batch targets.npz --robot kuka_lwr_barrett --jobs 4 --out solved.npz
+
+TARGETS.npz holds, for k targets and the f fingers in the robot's order (`casadi-ik robots`):
+  points   (k, f, 3) contact points [m], robot's base frame; NaN marks a free finger
+  normals  (k, f, 3) outward pad normals; NaN marks a free normal
+OUT.npz then holds:
+  q (k, n), success (k,), status (k,), position_error (k, f) [m], angle_error (k, f) [rad],
+  iterations, restarts (k,), time (k,) [s]
+
+exit codes: 0 all solved, 1 not all solved, 2 bad input
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line like all others."""
+
+    def __init__(self, **options: Any) -> None:
+        options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(allow_abbrev=False, **options)
+        # So that `--q0 -1e-3,0.2` reads as numbers and not as an option.
+        self._negative_number_matcher = re.compile(r"-(\d|\.\d|inf|nan)", re.IGNORECASE)
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse the command line.
+
+        Raises:
+            InputError: Always.
+        """
+        raise InputError(f"{message.removeprefix('argument ')} (see {self.prog} --help)")
+
+
+def build_parser() -> Parser:
+    """The parser; the namespace it gives has the command's function as `run`."""
+    parser = Parser(prog=PROGRAM, description=_DESCRIPTION, epilog=_EXAMPLES)
+    parser.add_argument("--version", action="version", version=f"{PROGRAM} {version('casadi-ik')}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, title="commands")
+    _add_solve(commands)
+    _add_batch(commands)
+    for name, run, text in (
+        ("robots", _robots, "list the shipped robots: fingers and actuators"),
+        ("methods", _methods, "list the methods"),
+        ("grasps", _grasps, "list the shipped grasps"),
+    ):
+        commands.add_parser(name, help=text, description=text.capitalize() + ".").set_defaults(
+            run=run
+        )
+    _add_log(commands)
+    return parser
+
+
+def _add_solve(commands: Any) -> None:
+    parser = commands.add_parser(
+        "solve",
+        help="solve one grasp",
+        description="Find the position of every motor for one grasp.",
+        epilog=_SOLVE_EXAMPLES,
+    )
+    parser.add_argument(
+        "grasp", metavar="GRASP", help="a shipped name (`casadi-ik grasps`) or a YAML file"
+    )
+    parser.add_argument(
+        "--robot", metavar="R", help="a shipped name or a YAML file (default: the grasp file's)"
+    )
+    _add_solver_options(parser)
+    parser.add_argument(
+        "--out", metavar="FILE.json", type=file_name(), help="write the solution as JSON"
+    )
+    parser.add_argument(
+        "--picture",
+        metavar="FILE.png",
+        type=file_name(*PICTURES),
+        help="draw the grasp (needs casadi-ik[plots]); .pdf and .svg work too",
+    )
+    parser.set_defaults(run=_solve)
+
+
+def _add_batch(commands: Any) -> None:
+    parser = commands.add_parser(
+        "batch",
+        help="solve many targets of one robot",
+        description="Find the position of every motor for many targets.",
+        epilog=_BATCH_EXAMPLES,
+    )
+    parser.add_argument("targets", metavar="TARGETS.npz", help="points and normals, see below")
+    parser.add_argument("--robot", metavar="R", required=True, help="a shipped name or a YAML file")
+    _add_solver_options(parser)
+    parser.add_argument(
+        "--jobs", metavar="N", type=whole(1), default=1, help="threads (default: 1)"
+    )
+    parser.add_argument(
+        "--out", metavar="OUT.npz", type=file_name(), required=True, help="write the solutions"
+    )
+    parser.set_defaults(run=_batch)
+
+
+def _add_solver_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--method", metavar="M", help="default: the first that `casadi-ik methods` lists"
+    )
+    parser.add_argument(
+        "--q0",
+        metavar="V",
+        type=numbers,
+        nargs="+",
+        help="start: a number per actuator [rad or m], spaces or commas between (default: home)",
+    )
+    parser.add_argument(
+        "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"
+    )
+    parser.add_argument(
+        "--tolerance-position",
+        metavar="METRES",
+        type=positive,
+        help="when a contact point counts as reached (default: 0.005)",
+    )
+    parser.add_argument(
+        "--tolerance-angle",
+        metavar="RADIANS",
+        type=positive,
+        help="when a contact normal counts as reached (default: 0.0524, 3 deg)",
+    )
+    parser.add_argument(
+        "--limits",
+        metavar="enforce|ignore",
+        type=one_of("enforce", "ignore"),
+        default="enforce",
+        help="whether being solved includes the limits (default: enforce); ignore: the paper's way",
+    )
+    parser.add_argument(
+        "--finger-step",
+        metavar="ipopt|closed-form",
+        type=one_of("ipopt", "closed-form"),
+        help="solver of the fingers' own step in the paper's methods (default: ipopt); "
+        "closed-form gives the same answer much faster",
+    )
+    parser.add_argument(
+        "--log", metavar="FILE.mcap", type=file_name(), help="write every iteration to a log"
+    )
+
+
+def _add_log(commands: Any) -> None:
+    log = commands.add_parser(
+        "log", help="look into logs", description="Look into logs that `--log` has written."
+    )
+    actions = log.add_subparsers(metavar="ACTION", required=True, title="actions")
+    info = actions.add_parser(
+        "info",
+        help="what a log holds",
+        description="Methods, solves, iterations, events, size and origin of logs.",
+    )
+    info.add_argument("files", metavar="FILE", nargs="+", help="an MCAP file written by --log")
+    info.set_defaults(run=_log_info)
+
+
+def _solve(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.solve import solve
+
+    return solve(arguments)
+
+
+def _batch(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.batch import batch
+
+    return batch(arguments)
+
+
+def _robots(_: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.lists import robots
+
+    return robots()
+
+
+def _methods(_: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.lists import methods
+
+    return methods()
+
+
+def _grasps(_: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.lists import grasps
+
+    return grasps()
+
+
+def _log_info(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.log import info
+
+    return info(arguments.files)

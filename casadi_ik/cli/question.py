@@ -1,0 +1,94 @@
+"""The words of `solve` and `batch` as the question they ask."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from casadi_ik.api import Solver
+from casadi_ik.arm_hand import ArmHand, load_robot
+from casadi_ik.errors import CasadiIKError, InputError, UnknownNameError, UnsupportedError
+from casadi_ik.files.shipped import resolve
+from casadi_ik.grasps import Grasp, load_grasp
+from casadi_ik.solvers import METHODS, Tolerance
+
+
+@contextlib.contextmanager
+def located(where: str, *kinds: type[CasadiIKError]) -> Iterator[None]:
+    """Put the place in front of an error that does not know it.
+
+    Args:
+        where: A file or an option.
+        kinds: Which errors; names and values unless said.
+    """
+    try:
+        yield
+    except kinds or (InputError, UnknownNameError) as error:
+        raise type(error)(f"{where}: {error}") from error
+
+
+def the_grasp(arguments: argparse.Namespace) -> tuple[Path, Grasp]:
+    """The grasp and the file it is from.
+
+    Raises:
+        UnknownNameError: No shipped grasp has that name.
+        DescriptionError: The file is missing or malformed.
+    """
+    path = resolve(arguments.grasp, "grasps")
+    return path, load_grasp(path)
+
+
+def the_robot(name: str | None, path: Path | None = None, grasp: Grasp | None = None) -> ArmHand:
+    """The robot that was asked for, else the grasp file's, whose path counts from that file.
+
+    Raises:
+        InputError: Neither is given.
+        UnknownNameError: No shipped robot has that name.
+        DescriptionError: Its file is missing or malformed.
+    """
+    if name is not None:
+        with located("--robot"):
+            return load_robot(name)
+    if path is None or grasp is None or not grasp.robot:
+        raise InputError(f"{path}: robot: missing, expected it in the file or --robot")
+    with located(f"{path}: robot"):
+        return load_robot(resolve(grasp.robot, "arm_hands", beside=path))
+
+
+def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:
+    """The solver for a robot.
+
+    Raises:
+        UnknownNameError: No such method.
+        UnsupportedError: The method cannot take the robot.
+    """
+    tolerance = Tolerance()
+    if arguments.tolerance_position is not None:
+        tolerance = replace(tolerance, position=arguments.tolerance_position)
+    if arguments.tolerance_angle is not None:
+        tolerance = replace(tolerance, angle=arguments.tolerance_angle)
+    method = METHODS[0] if arguments.method is None else arguments.method
+    if method not in METHODS:
+        raise UnknownNameError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
+    with located(f"--method {method}", UnsupportedError), located("--finger-step"):
+        return Solver(robot, method, tolerance, arguments.limits, arguments.finger_step)
+
+
+def the_start(arguments: argparse.Namespace, robot: ArmHand) -> list[float] | None:
+    """The start, a number per actuator; None for home.
+
+    Raises:
+        InputError: As many numbers as actuators were expected.
+    """
+    if arguments.q0 is None:
+        return None
+    values = [value for group in arguments.q0 for value in group]
+    if len(values) != len(robot.actuators):
+        raise InputError(
+            f"--q0: found {len(values)} numbers, expected {len(robot.actuators)}: "
+            + ", ".join(robot.actuators)
+        )
+    return values

@@ -1,0 +1,243 @@
+"""Reports on solves: short, in mm and degrees, readable without colour and at 80 columns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from casadi_ik.api import Solver
+from casadi_ik.solvers import BatchSolution, Solution, Status
+
+AT_LIMIT = 1e-6
+"""How near to a limit counts as at it [rad or m]."""
+
+ROWS_SHOWN = 12
+"""How many unsolved rows of a batch are named."""
+
+_SCALE = {"rad": (math.degrees(1.0), "deg"), "m": (1e3, "mm")}
+
+_MEANING = {
+    Status.INVALID: "a number was no longer finite",
+    Status.STALLED: "the method came to a standstill",
+    Status.ITERATION_LIMIT: "the budget of iterations is used up",
+    Status.UNREACHABLE: "the contacts cannot be reached",
+}
+
+
+def fields(pairs: Mapping[str, str] | Iterable[tuple[str, str]]) -> Table:
+    """Names and what they are, one below the other."""
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(no_wrap=True, style="dim")
+    grid.add_column(overflow="fold")
+    for name, value in dict(pairs).items():
+        grid.add_row(f"  {name}", value)
+    return grid
+
+
+def table(*columns: str, right: Sequence[str] = ()) -> Table:
+    """An empty table; what does not fit is wrapped, never cut."""
+    empty = Table(box=SIMPLE_HEAD, pad_edge=True, header_style="bold")
+    for name in columns:
+        empty.add_column(
+            name, justify="right" if name in right else "left", overflow="fold", no_wrap=False
+        )
+    return empty
+
+
+def files(written: Iterable[tuple[str, object]]) -> list[RenderableType]:
+    """Where files went, a line each that is never wrapped, so that it can be copied."""
+    return [Text(f"  {kind:<9}{path}", no_wrap=True, overflow="ignore") for kind, path in written]
+
+
+def headline(success: bool, status: str, rest: str) -> Text:
+    """The verdict first."""
+    return Text.assemble((status, "bold green" if success else "bold red"), f"  {rest}")
+
+
+def solution_report(
+    name: str, solver: Solver, solution: Solution, written: Iterable[tuple[str, object]]
+) -> Group:
+    """The report of `solve`.
+
+    Args:
+        name: What the grasp is called.
+        solver: Who solved.
+        solution: The solution.
+        written: Kind and path of every file that was written.
+    """
+    phases = ", ".join(f"{phase} {count}" for phase, count in solution.phases.items())
+    effort = f"  {solution.iterations} iterations" + (f" ({phases})" if phases else "")
+    if solution.restarts:
+        effort += f", {solution.restarts} restarts"
+    parts: list[RenderableType] = [
+        headline(
+            solution.success,
+            solution.status.name,
+            f"{name}: {solution.method} on {solution.robot}",
+        ),
+        Text(f"{effort}, {duration(solution.time)}"),
+    ]
+    if not solution.success:
+        parts += [Text(f"  {line}", "yellow") for line in reasons(solver, solution)]
+    parts += [_contacts(solver, solution), _actuators(solver, solution)]
+    if solver.limits == "ignore" and not solution.limits_ok:
+        parts.append(Text(f"  limits are ignored; beyond: {', '.join(_beyond(solver, solution))}"))
+    return Group(*parts, *files(written))
+
+
+def reasons(solver: Solver, solution: Solution) -> list[str]:
+    """Why a grasp is not solved: what it missed, and which limits hold it back."""
+    lines = [_MEANING.get(solution.status, "the contacts are not met")]
+    tolerance = solver.tolerance
+    for finger, contact in solution.contacts.items():
+        if contact.ok:
+            continue
+        missed = []
+        if contact.position_error > tolerance.position:
+            missed.append(f"its point by {contact.position_error * 1e3:.3g} mm")
+        if contact.angle_error > tolerance.angle:
+            missed.append(f"its normal by {math.degrees(contact.angle_error):.3g} deg")
+        lines.append(f"{finger} misses {' and '.join(missed)}")
+    if solver.limits == "enforce":
+        beyond = _beyond(solver, solution)
+        if beyond:
+            lines.append(f"beyond a limit: {', '.join(beyond)}")
+    held = [
+        f"{actuator} ({flag})"
+        for actuator, flag in zip(solution.actuators, _flags(solver, solution), strict=True)
+        if flag in ("lower", "upper")
+    ]
+    if held:
+        lines.append(f"at a limit: {', '.join(held)}")
+    return lines
+
+
+def batch_report(
+    name: str, solver: Solver, batch: BatchSolution, written: Iterable[tuple[str, object]]
+) -> Group:
+    """The summary of `batch`; arguments as in `solution_report`."""
+    count, solved = len(batch), int(batch.success.sum())
+    names, counts = np.unique(batch.status_names, return_counts=True)
+    share = f"{solved} of {count} targets ({100 * solved / count:.1f} %)"
+    pairs = {
+        "status": ", ".join(f"{n} {status}" for status, n in zip(names, counts, strict=True)),
+        "iterations": f"mean {batch.iterations.mean():.1f}, most {batch.iterations.max()}",
+        "time": f"mean {duration(float(batch.time.mean()))}, 99th percentile "
+        + duration(float(np.percentile(batch.time, 99))),
+    }
+    if batch.restarts.any():
+        pairs["restarts"] = f"mean {batch.restarts.mean():.2f}, most {batch.restarts.max()}"
+    if solved < count:
+        rows = np.flatnonzero(~batch.success)
+        more = f" and {len(rows) - ROWS_SHOWN} more" if len(rows) > ROWS_SHOWN else ""
+        pairs["not solved"] = f"rows {', '.join(map(str, rows[:ROWS_SHOWN]))}{more} (from 0)"
+    return Group(
+        headline(
+            solved == count,
+            "SOLVED" if solved == count else "NOT ALL SOLVED",
+            f"{share} of {name}: {solver.method} on {solver.robot.name}",
+        ),
+        fields(pairs),
+        *files(written),
+    )
+
+
+def duration(seconds: float) -> str:
+    """A time in the unit that suits it."""
+    if seconds >= 1:
+        return f"{seconds:.2f} s"
+    if seconds >= 1e-3:
+        return f"{seconds * 1e3:.3g} ms"
+    return f"{seconds * 1e6:.3g} us"
+
+
+def _contacts(solver: Solver, solution: Solution) -> Table:
+    tolerance = solver.tolerance
+    rows = table(
+        "contact", "point off by", "normal off by", "", right=("point off by", "normal off by")
+    )
+    for finger, contact in solution.contacts.items():
+        rows.add_row(
+            finger,
+            _number(contact.position_error * 1e3, "mm"),
+            _number(math.degrees(contact.angle_error), "deg"),
+            Text("ok", "green") if contact.ok else Text("missed", "red"),
+        )
+    rows.add_section()
+    rows.add_row(
+        "tolerance",
+        f"{tolerance.position * 1e3:.3f} mm",
+        f"{math.degrees(tolerance.angle):.3f} deg",
+        "",
+        style="dim",
+    )
+    return rows
+
+
+def _number(value: float, unit: str) -> str:
+    return "free" if math.isnan(value) else f"{value:.3f} {unit}"
+
+
+def _actuators(solver: Solver, solution: Solution) -> Table:
+    right = ("position", "lower", "upper")
+    rows = table("actuator", *right, "limit", right=right)
+    robot = solver.robot
+    flags = _flags(solver, solution)
+    for i, actuator in enumerate(robot.description.actuators):
+        scale, unit = _SCALE[actuator.unit]
+        flag = Text(f"at {flags[i]}" if flags[i] in ("lower", "upper") else flags[i], "yellow")
+        rows.add_row(
+            actuator.name,
+            f"{solution.q[i] * scale:.3f} {unit}",
+            f"{actuator.lower * scale:.4g}",
+            f"{actuator.upper * scale:.4g}",
+            flag,
+        )
+    return rows
+
+
+def _flags(solver: Solver, solution: Solution) -> list[str]:
+    """Per actuator "" or "lower" or "upper" (at that limit) or by how much it is beyond."""
+    found = []
+    for actuator, value in zip(solver.robot.description.actuators, solution.q, strict=True):
+        excess = _excess(float(value), actuator.lower, actuator.upper, actuator.unit)
+        if excess:
+            found.append(excess)
+        elif value - actuator.lower <= AT_LIMIT:
+            found.append("lower")
+        elif actuator.upper - value <= AT_LIMIT:
+            found.append("upper")
+        else:
+            found.append("")
+    return found
+
+
+def _excess(value: float, lower: float, upper: float, unit: str) -> str:
+    """By how much a value is beyond its limits, in words; "" if it is not."""
+    scale, name = _SCALE[unit]
+    for side, far in (("below", lower - value), ("above", value - upper)):
+        if far > AT_LIMIT:
+            return f"{far * scale:.3g} {name} {side}"
+    return ""
+
+
+def _beyond(solver: Solver, solution: Solution) -> list[str]:
+    """Actuators, and joints that follow one by a coupling, that are beyond their limits."""
+    description = solver.robot.description
+    found = {
+        actuator.name: _excess(float(value), actuator.lower, actuator.upper, actuator.unit)
+        for actuator, value in zip(description.actuators, solution.q, strict=True)
+    }
+    theta = solver.robot.joints(solution.q)
+    for joint in description.movable:
+        unit = "m" if joint.type == "prismatic" else "rad"
+        excess = _excess(theta[joint.name], joint.lower, joint.upper, unit)
+        if not found.get(joint.name):
+            found[joint.name] = excess
+    return [f"{name} {excess}" for name, excess in found.items() if excess]

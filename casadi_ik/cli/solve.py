@@ -1,0 +1,90 @@
+"""`casadi-ik solve`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.cli.answer import Answer, Exit
+from casadi_ik.cli.outputs import OutputError, check_outputs, write_output
+from casadi_ik.cli.question import located, the_grasp, the_robot, the_solver, the_start
+from casadi_ik.cli.report import solution_report
+from casadi_ik.grasps import Grasp
+from casadi_ik.solvers import Solution
+
+Draw = Callable[[ArmHand, Solution, Grasp, Path], object]
+
+
+def solve(arguments: argparse.Namespace) -> Answer:
+    """Solve one grasp.
+
+    Raises:
+        CasadiIKError: Bad input, or an output that cannot be written.
+    """
+    path, grasp = the_grasp(arguments)
+    robot = the_robot(arguments.robot, path, grasp)
+    q0 = the_start(arguments, robot)
+    with located(str(path)):
+        grasp.arrays(robot.fingers)
+    outputs = {"--log": arguments.log, "--out": arguments.out, "--picture": arguments.picture}
+    check_outputs(outputs.items(), inputs=[path])
+    draw = _drawing() if arguments.picture is not None else None
+    solver = the_solver(arguments, robot)
+    with located(str(path)):
+        solution = solver.solve(grasp, q0, arguments.seed, arguments.log)
+    if arguments.out is not None:
+        text = json.dumps(as_json(solution), indent=2, allow_nan=False) + "\n"
+        write_output(arguments.out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
+    if draw is not None:
+        write_output(
+            arguments.picture, "--picture", lambda part: draw(robot, solution, grasp, part)
+        )
+    written = [(option.lstrip("-"), file) for option, file in outputs.items() if file is not None]
+    report = solution_report(grasp.name or str(path), solver, solution, written)
+    return Answer(report, Exit.DONE if solution.success else Exit.NOT_SOLVED)
+
+
+def as_json(solution: Solution) -> dict[str, Any]:
+    """A solution as JSON holds it; null stands for what is not a finite number (a free finger)."""
+    return {
+        "success": solution.success,
+        "status": solution.status.name,
+        "method": solution.method,
+        "robot": solution.robot,
+        "actuators": list(solution.actuators),
+        "q": [_finite(value) for value in solution.q],
+        "iterations": solution.iterations,
+        "restarts": solution.restarts,
+        "time": _finite(solution.time),
+        "contacts": {
+            finger: {
+                "position_error": _finite(contact.position_error),
+                "angle_error": _finite(contact.angle_error),
+                "ok": contact.ok,
+            }
+            for finger, contact in solution.contacts.items()
+        },
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _drawing() -> Draw:
+    """The function that draws a solution.
+
+    Raises:
+        OutputError: matplotlib is not installed.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise OutputError("--picture: matplotlib is missing; install casadi-ik[plots]")
+    from casadi_ik.views import draw_solution
+
+    return draw_solution

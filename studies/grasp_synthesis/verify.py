@@ -1,0 +1,64 @@
+"""What is wrong with a grasp file, found from the file, the object and the robot alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from casadi_ik.grasps import load_grasp, load_object
+from grasp_synthesis.clearance import clearance
+from grasp_synthesis.closure import friction_needed
+from grasp_synthesis.hand import FINGERS, ArmHand
+
+EXACT = 1e-6  # [m] or [rad]
+PALM_GAP, FINGER_GAP, BETWEEN_GAP = 0.010, 0.0, 0.002  # [m] smallest gaps allowed
+MAX_FRICTION = 1.5
+
+
+def problems(hand: ArmHand, path: Path) -> list[str]:
+    """Everything that a grasp file gets wrong; empty if it is good."""
+    grasp = load_grasp(path)
+    if grasp.object_pose is None or set(grasp.posture) != set(hand.hand_names):
+        return ["it lacks the object or some of the hand's actuators"]
+    item = load_object(grasp.object)
+    points, normals = grasp.arrays(FINGERS)
+    posture = np.array([grasp.posture[name] for name in hand.hand_names])
+    palm, hand_points, hand_normals, lines, _ = hand.evaluate(np.zeros(7), posture)
+    rotation, origin = grasp.object_pose[:3, :3], grasp.object_pose[:3, 3]
+    local, local_normals = (points - origin) @ rotation, normals @ rotation
+    # The rigid motion that carries the posture's contacts onto the file's.
+    motion = _fit(
+        np.concatenate([hand_points, hand_points + 0.05 * hand_normals]),
+        np.concatenate([points, points + 0.05 * normals]),
+    )
+    moved = hand_points @ motion[:3, :3].T + motion[:3, 3]
+    turned = hand_normals @ motion[:3, :3].T
+    in_palm = np.linalg.inv(motion @ palm) @ grasp.object_pose
+    local_lines = (lines - palm[:3, 3]) @ palm[:3, :3]
+    gaps = clearance(item, in_palm, local_lines)
+    friction = friction_needed(points, normals)
+    outside = np.any((posture < hand.lower) | (posture > hand.upper))
+    checks = {
+        "a contact is off the surface": np.abs(item.signed_distance(local)).max() > EXACT,
+        "a pad does not face the surface": np.abs(item.normal(local) + local_normals).max() > EXACT,
+        "the posture is outside the limits": bool(outside),
+        "the posture does not give the points": np.abs(moved - points).max() > EXACT,
+        "the posture does not give the normals": np.abs(turned - normals).max() > EXACT,
+        f"the palm gap is {gaps.palm:.4f} m": gaps.palm < PALM_GAP,
+        f"the phalanges' gap is {gaps.fingers:.4f} m": gaps.fingers < FINGER_GAP,
+        f"the fingers' gap is {gaps.between:.4f} m": gaps.between < BETWEEN_GAP,
+        f"it needs a friction coefficient of {friction:.2f}": friction > MAX_FRICTION,
+    }
+    return [text for text, wrong in checks.items() if wrong]
+
+
+def _fit(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(4, 4) rigid motion that best carries source (k, 3) onto target (k, 3) (Kabsch)."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((source - a).T @ (target - b))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    pose = np.eye(4)
+    pose[:3, :3] = vt.T @ sign @ u.T
+    pose[:3, 3] = b - pose[:3, :3] @ a
+    return pose
