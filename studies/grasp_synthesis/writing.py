@@ -29,6 +29,8 @@ def grasp_text(
         f"the robot {ROBOT}. Rerun it instead of editing.",
         f"Pinched: {recipe.part}.",
         f"Scene: {recipe.scene}; the home configuration of the arm looks to -x, and so does this.",
+        "The place is the first of several drawn at random that enhanced-dls solves from home, if "
+        "any: an example, not a measurement.",
         "Placed with the arm at " + ", ".join(f"{d:.2f}" for d in degrees.round(2) + 0.0) + " deg.",
         f"Friction coefficient needed for the squeeze: {abs(pinch.friction):.3f}. Gaps: palm "
         f"{1e3 * gaps.palm:.1f} mm, phalanges {1e3 * gaps.fingers:.1f} mm, finger to finger "
