@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.logs import McapRecorder
 from casadi_ik.solvers import (
@@ -22,6 +22,8 @@ from casadi_ik.solvers import (
     Problems,
     Recorder,
     Solution,
+    SteppedMethod,
+    Stepper,
     Tolerance,
     build_method,
     target_arrays,
@@ -67,6 +69,10 @@ class Solver:
             InputError: A value that an argument cannot have.
             UnsupportedError: The robot is not of the kind the method needs.
         """
+        if not isinstance(robot, ArmHand):
+            raise InputError(f"robot: found {robot!r}, expected what load_robot returns")
+        if tolerance is not None and not isinstance(tolerance, Tolerance):
+            raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance")
         if limits not in LIMITS:
             raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMITS)}")
         self.robot = robot
@@ -105,7 +111,7 @@ class Solver:
         Args:
             grasp: A contact per finger; its fingers must be the robot's.
             q0: (n,) start [rad or m]; None is `robot.home`.
-            seed: Of all random numbers.
+            seed: Of all random numbers, an integer >= 0.
             log: Path of an MCAP file to write every iteration to.
 
         Returns:
@@ -115,6 +121,8 @@ class Solver:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
             LogError: The log cannot be written.
         """
+        if not isinstance(grasp, Grasp):
+            raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
         points, normals = grasp.arrays(self.robot.fingers)
         batch = self.solve_batch(points[None], normals[None], q0, seed, log=log)
         return batch.solution(
@@ -137,8 +145,8 @@ class Solver:
                 NaN marks a free finger.
             normals: (k, f, 3) outward pad normals, base frame; NaN marks a free normal.
             q0: (n,) or (k, n) start; None is `robot.home`.
-            seed: Of all random numbers.
-            jobs: Threads.
+            seed: Of all random numbers, an integer >= 0.
+            jobs: Threads, at least 1.
             log: Path of an MCAP file to write every iteration to.
 
         Returns:
@@ -152,6 +160,31 @@ class Solver:
         problems = Problems(p, n, self.tolerance, self.limits == "enforce")
         with self._recorder(log, seed) as recorder:
             return self._engine.solve(problems, q0, seed, jobs, recorder)
+
+    def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
+        """Solve one grasp by hand, one iteration at a time.
+
+        Args:
+            grasp: A contact per finger; its fingers must be the robot's.
+            q0: (n,) start [rad or m]; None is `robot.home`.
+
+        Raises:
+            InputError: Bad q0, or a grasp the robot or the method cannot take.
+            UnsupportedError: The method is not one step run to its end.
+        """
+        method = self._engine.method
+        if not isinstance(method, SteppedMethod):
+            raise UnsupportedError(f"method {self.method!r} cannot be stepped by hand")
+        if not isinstance(grasp, Grasp):
+            raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
+        points, normals = grasp.arrays(self.robot.fingers)
+        targets = target_arrays(points[None], normals[None], len(self.robot.fingers))
+        problems = Problems(*targets, self.tolerance, self.limits == "enforce")
+        start = self.robot.configuration(q0, "q0")
+        if start.ndim != 1:
+            raise InputError(f"q0: found shape {start.shape}, expected ({len(start[0])},)")
+        states, parameters = method.start(problems, start[None])
+        return Stepper(method.kernel.step, states[0], parameters[0])
 
     def _recorder(
         self, log: str | PathLike[str] | None, seed: int

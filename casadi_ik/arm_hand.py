@@ -136,14 +136,21 @@ class ArmHand:
         return pose
 
     def links(self, q: ArrayLike) -> dict[str, Array]:
-        """Pose (4, 4) of every link frame in the base frame, for one configuration.
+        """Pose of every link frame in the base frame, by link name.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            By link name (4, 4), or (k, 4, 4) for a batch.
 
         Raises:
             InputError: See `configuration`.
         """
         (poses,) = self._links(self.configuration(q))
-        stacked = poses.reshape(len(self.description.links), 4, 4)
-        return dict(zip(self.description.links, stacked, strict=True))
+        names = self.description.links
+        stacked = poses.reshape(*poses.shape[:-2], len(names), 4, 4)
+        return {name: stacked[..., i, :, :] for i, name in enumerate(names)}
 
     def random(self, rng: np.random.Generator, count: int) -> Array:
         """(count, n) configurations uniform within the limits."""
@@ -184,7 +191,8 @@ class ArmHand:
 
     def _kernel(self, name: str, q: ca.SX, outputs: list[ca.SX]) -> FunctionKernel:
         dense = [ca.densify(output) for output in outputs]
-        return FunctionKernel(ca.Function(f"{self.name}_{name}", [q], dense))
+        # A robot's name may be anything; a function's may not.
+        return FunctionKernel(ca.Function(ca.Function.fix_name(f"{self.name}_{name}"), [q], dense))
 
 
 def load_robot(name_or_path: str | Path) -> ArmHand:

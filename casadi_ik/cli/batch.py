@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import io
+import lzma
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -20,6 +22,19 @@ from casadi_ik.errors import InputError
 from casadi_ik.solvers import BatchSolution, target_arrays
 
 KEYS = ("points", "normals")
+
+_UNREADABLE = (
+    ValueError,
+    EOFError,
+    MemoryError,
+    NotImplementedError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zlib.error,
+    lzma.LZMAError,
+)
+"""What numpy and zipfile were seen to raise on a damaged or encrypted member."""
 
 
 def batch(arguments: argparse.Namespace) -> Answer:
@@ -75,10 +90,10 @@ def _array(data: Any, path: Path, key: str) -> NDArray[Any]:
         raise InputError(f"{path}: {key}: missing, expected {' and '.join(KEYS)}; found {found}")
     try:
         array = data[key]
-    except (ValueError, EOFError, MemoryError, zlib.error) as error:
+    except _UNREADABLE as error:
         raise InputError(f"{path}: {key}: cannot be read: {error}") from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        found = getattr(array, "dtype", "no array")
+        found = f"values of type {array.dtype}" if isinstance(array, np.ndarray) else "no array"
         raise InputError(f"{path}: {key}: found {found}, expected numbers")
     return array
 

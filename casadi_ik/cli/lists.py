@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rich.console import Group, RenderableType
+from rich.table import Table
 from rich.text import Text
 
 from casadi_ik.cli.answer import Answer
@@ -50,11 +51,13 @@ def grasps() -> Answer:
     Raises:
         DescriptionError: A shipped file is damaged.
     """
-    rows = table("grasp", "robot", "object", "description")
+    by_robot: dict[str, Table] = {}
     for name in shipped_names("grasps"):
         path = resolve(name, "grasps")
         entry = convert(read_yaml(path), GraspFile, path)
-        rows.add_row(
-            name, entry.robot, entry.object.name if entry.object else "", entry.description
-        )
-    return Answer(rows)
+        rows = by_robot.setdefault(entry.robot, table("grasp", "object", "description"))
+        rows.add_row(name, entry.object.name if entry.object else "", entry.description)
+    parts: list[RenderableType] = []
+    for robot, rows in by_robot.items():
+        parts += [Text.assemble("robot ", (robot or "any", "bold")), rows]
+    return Answer(Group(*parts))

@@ -31,9 +31,9 @@ def _report(log: LogFile) -> list[RenderableType]:
     about = log.info
     iterations = sum(counts["iteration"] for counts in about.counts.values())
     each = f", {about.size / iterations:.0f} bytes/iteration" if iterations else ""
-    packed = f"{about.compression}, {about.chunks} chunks"
+    packed = f"{about.chunks}, compression {about.compression}"
     if about.compressed:
-        packed += f", {about.uncompressed / about.compressed:.1f} times smaller"
+        packed += f" ({about.uncompressed / about.compressed:.1f} times smaller)"
     attached = (f"{name} ({size(length)})" for name, length in about.attachments.items())
     return [
         Text(str(about.path), "bold", no_wrap=True, overflow="ignore"),
@@ -88,7 +88,7 @@ def _origin(metadata: Mapping[str, Any]) -> dict[str, str]:
 def _flat(value: Any) -> str:
     """JSON on one line, a mapping as "name value, ..."."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_flat(item)}" for key, item in value.items())
+        return ", ".join(f"{key} {_flat(item)}" for key, item in value.items()) or "none"
     return value if isinstance(value, str) else json.dumps(value)
 
 

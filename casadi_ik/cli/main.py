@@ -7,7 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from casadi_ik.cli.answer import Exit
 from casadi_ik.cli.outputs import OutputError
@@ -47,7 +47,8 @@ def _run(argv: Sequence[str] | None) -> Exit:
     try:
         arguments = build_parser().parse_args(argv)
     except SystemExit:  # --help and --version have been printed
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         raise
     answer = arguments.run(arguments)
     try:
@@ -62,6 +63,8 @@ def _run(argv: Sequence[str] | None) -> Exit:
 
 def _show(report: RenderableType) -> None:
     """Print a report; plain and 80 columns wide where stdout is no terminal."""
+    if sys.stdout is None:  # closed by the shell: >&-
+        return
     from rich.console import Console
 
     class Terminal(Console):
@@ -79,14 +82,8 @@ def _say(kind: str, text: str) -> None:
     print(f"{PROGRAM}: {kind}: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
 
 
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """A warning as one line, without the place in the code that Python adds."""
     _say("warning", str(message))
 
 

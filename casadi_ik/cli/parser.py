@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
 
 PROGRAM = "casadi-ik"
-PICTURES = (".png", ".pdf", ".svg")
 
 _DESCRIPTION = """\
 Where must every motor of an arm and its hand stand, so that each fingertip touches a given point
@@ -62,6 +61,9 @@ exit codes: 0 all solved, 1 not all solved, 2 bad input
 """
 
 
+_INVALID_CHOICE = re.compile(r"invalid choice: (.*) \(choose from (.*)\)")
+
+
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line like all others."""
 
@@ -77,7 +79,9 @@ class Parser(argparse.ArgumentParser):
         Raises:
             InputError: Always.
         """
-        raise InputError(f"{message.removeprefix('argument ')} (see {self.prog} --help)")
+        message = message.removeprefix("argument ")
+        message = _INVALID_CHOICE.sub(r"found \1, expected one of \2", message)
+        raise InputError(f"{message} (see {self.prog} --help)")
 
 
 def build_parser() -> Parser:
@@ -119,8 +123,8 @@ def _add_solve(commands: Any) -> None:
     parser.add_argument(
         "--picture",
         metavar="FILE.png",
-        type=file_name(*PICTURES),
-        help="draw the grasp (needs casadi-ik[plots]); .pdf and .svg work too",
+        type=file_name(".png"),
+        help="draw the grasp (needs casadi-ik[plots])",
     )
     parser.set_defaults(run=_solve)
 
@@ -153,7 +157,8 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
         metavar="V",
         type=numbers,
         nargs="+",
-        help="start: a number per actuator [rad or m], spaces or commas between (default: home)",
+        help="start: a number per actuator [rad or m], spaces or commas between; last on the line "
+        "(default: home)",
     )
     parser.add_argument(
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"

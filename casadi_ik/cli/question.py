@@ -10,23 +10,31 @@ from pathlib import Path
 
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
-from casadi_ik.errors import CasadiIKError, InputError, UnknownNameError, UnsupportedError
+from casadi_ik.errors import (
+    CasadiIKError,
+    DescriptionError,
+    InputError,
+    UnknownNameError,
+    UnsupportedError,
+)
 from casadi_ik.files.shipped import resolve
 from casadi_ik.grasps import Grasp, load_grasp
 from casadi_ik.solvers import METHODS, Tolerance
 
 
 @contextlib.contextmanager
-def located(where: str, *kinds: type[CasadiIKError]) -> Iterator[None]:
+def located(
+    where: str, kinds: tuple[type[CasadiIKError], ...] = (InputError, UnknownNameError)
+) -> Iterator[None]:
     """Put the place in front of an error that does not know it.
 
     Args:
         where: A file or an option.
-        kinds: Which errors; names and values unless said.
+        kinds: Which errors.
     """
     try:
         yield
-    except kinds or (InputError, UnknownNameError) as error:
+    except kinds as error:
         raise type(error)(f"{where}: {error}") from error
 
 
@@ -54,8 +62,9 @@ def the_robot(name: str | None, path: Path | None = None, grasp: Grasp | None = 
             return load_robot(name)
     if path is None or grasp is None or not grasp.robot:
         raise InputError(f"{path}: robot: missing, expected it in the file or --robot")
-    with located(f"{path}: robot"):
-        return load_robot(resolve(grasp.robot, "arm_hands", beside=path))
+    with located(f"{path}: robot", (UnknownNameError, DescriptionError)):
+        description = resolve(grasp.robot, "arm_hands", beside=path)
+    return load_robot(description)
 
 
 def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:
@@ -73,7 +82,7 @@ def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:
     method = METHODS[0] if arguments.method is None else arguments.method
     if method not in METHODS:
         raise UnknownNameError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
-    with located(f"--method {method}", UnsupportedError), located("--finger-step"):
+    with located(f"--method {method}", (UnsupportedError,)), located("--finger-step"):
         return Solver(robot, method, tolerance, arguments.limits, arguments.finger_step)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -43,10 +44,9 @@ def fields(pairs: Mapping[str, str] | Iterable[tuple[str, str]]) -> Table:
 def table(*columns: str, right: Sequence[str] = ()) -> Table:
     """An empty table; what does not fit is wrapped, never cut."""
     empty = Table(box=SIMPLE_HEAD, pad_edge=True, header_style="bold")
-    for name in columns:
-        empty.add_column(
-            name, justify="right" if name in right else "left", overflow="fold", no_wrap=False
-        )
+    for i, name in enumerate(columns):
+        justify = "right" if name in right else "left"
+        empty.add_column(name, justify=justify, overflow="fold", no_wrap=i == 0)
     return empty
 
 
@@ -84,10 +84,11 @@ def solution_report(
         Text(f"{effort}, {duration(solution.time)}"),
     ]
     if not solution.success:
-        parts += [Text(f"  {line}", "yellow") for line in reasons(solver, solution)]
+        parts += [_indented(line, "yellow") for line in reasons(solver, solution)]
     parts += [_contacts(solver, solution), _actuators(solver, solution)]
     if solver.limits == "ignore" and not solution.limits_ok:
-        parts.append(Text(f"  limits are ignored; beyond: {', '.join(_beyond(solver, solution))}"))
+        count = len(_beyond(solver, solution))
+        parts.append(_indented(f"limits are ignored; positions beyond them: {count}", "yellow"))
     return Group(*parts, *files(written))
 
 
@@ -100,9 +101,9 @@ def reasons(solver: Solver, solution: Solution) -> list[str]:
             continue
         missed = []
         if contact.position_error > tolerance.position:
-            missed.append(f"its point by {contact.position_error * 1e3:.3g} mm")
+            missed.append(f"its point by {contact.position_error * 1e3:.2f} mm")
         if contact.angle_error > tolerance.angle:
-            missed.append(f"its normal by {math.degrees(contact.angle_error):.3g} deg")
+            missed.append(f"its normal by {math.degrees(contact.angle_error):.2f} deg")
         lines.append(f"{finger} misses {' and '.join(missed)}")
     if solver.limits == "enforce":
         beyond = _beyond(solver, solution)
@@ -148,6 +149,10 @@ def batch_report(
     )
 
 
+def _indented(text: str, style: str = "") -> Padding:
+    return Padding(Text(text, style), (0, 0, 0, 2))
+
+
 def duration(seconds: float) -> str:
     """A time in the unit that suits it."""
     if seconds >= 1:
@@ -158,10 +163,11 @@ def duration(seconds: float) -> str:
 
 
 def _contacts(solver: Solver, solution: Solution) -> Table:
-    tolerance = solver.tolerance
-    rows = table(
-        "contact", "point off by", "normal off by", "", right=("point off by", "normal off by")
+    right = (
+        f"point off by (< {solver.tolerance.position * 1e3:.4g} mm)",
+        f"normal off by (< {math.degrees(solver.tolerance.angle):.4g} deg)",
     )
+    rows = table("contact", *right, "", right=right)
     for finger, contact in solution.contacts.items():
         rows.add_row(
             finger,
@@ -169,14 +175,6 @@ def _contacts(solver: Solver, solution: Solution) -> Table:
             _number(math.degrees(contact.angle_error), "deg"),
             Text("ok", "green") if contact.ok else Text("missed", "red"),
         )
-    rows.add_section()
-    rows.add_row(
-        "tolerance",
-        f"{tolerance.position * 1e3:.3f} mm",
-        f"{math.degrees(tolerance.angle):.3f} deg",
-        "",
-        style="dim",
-    )
     return rows
 
 

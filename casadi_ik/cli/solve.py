@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import math
 from collections.abc import Callable
@@ -12,10 +11,11 @@ from typing import Any
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.cli.answer import Answer, Exit
-from casadi_ik.cli.outputs import OutputError, check_outputs, write_output
+from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import located, the_grasp, the_robot, the_solver, the_start
 from casadi_ik.cli.report import solution_report
-from casadi_ik.grasps import Grasp
+from casadi_ik.errors import MissingExtraError
+from casadi_ik.grasps import Grasp, load_object
 from casadi_ik.solvers import Solution
 
 Draw = Callable[[ArmHand, Solution, Grasp, Path], object]
@@ -32,19 +32,19 @@ def solve(arguments: argparse.Namespace) -> Answer:
     q0 = the_start(arguments, robot)
     with located(str(path)):
         grasp.arrays(robot.fingers)
-    outputs = {"--log": arguments.log, "--out": arguments.out, "--picture": arguments.picture}
+    out: Path | None = arguments.out
+    picture: Path | None = arguments.picture
+    outputs = {"--log": arguments.log, "--out": out, "--picture": picture}
     check_outputs(outputs.items(), inputs=[path])
-    draw = _drawing() if arguments.picture is not None else None
+    draw = _drawing(path, grasp) if picture is not None else None
     solver = the_solver(arguments, robot)
     with located(str(path)):
         solution = solver.solve(grasp, q0, arguments.seed, arguments.log)
-    if arguments.out is not None:
+    if out is not None:
         text = json.dumps(as_json(solution), indent=2, allow_nan=False) + "\n"
-        write_output(arguments.out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
-    if draw is not None:
-        write_output(
-            arguments.picture, "--picture", lambda part: draw(robot, solution, grasp, part)
-        )
+        write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
+    if picture is not None and draw is not None:
+        draw(robot, solution, grasp, picture)
     written = [(option.lstrip("-"), file) for option, file in outputs.items() if file is not None]
     report = solution_report(grasp.name or str(path), solver, solution, written)
     return Answer(report, Exit.DONE if solution.success else Exit.NOT_SOLVED)
@@ -77,14 +77,16 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _drawing() -> Draw:
-    """The function that draws a solution.
+def _drawing(path: Path, grasp: Grasp) -> Draw:
+    """The function that draws a solution, after making sure that it can.
 
     Raises:
-        OutputError: matplotlib is not installed.
+        MissingExtraError: matplotlib is not installed.
+        CasadiIKError: The grasp names an object that there is not, or a malformed one.
     """
-    if importlib.util.find_spec("matplotlib") is None:
-        raise OutputError("--picture: matplotlib is missing; install casadi-ik[plots]")
-    from casadi_ik.views import draw_solution
-
+    with located("--picture", (MissingExtraError,)):
+        from casadi_ik.views import draw_solution
+    if grasp.object:
+        with located(f"{path}: object.name"):
+            load_object(grasp.object)
     return draw_solution

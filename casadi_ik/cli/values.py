@@ -63,13 +63,13 @@ def file_name(*suffixes: str) -> Callable[[str], Path]:
     """A file to be written, with one of the suffixes if any are given."""
 
     def parse(text: str) -> Path:
+        if not text:
+            raise ArgumentTypeError("found '', expected the name of a file")
         path = Path(text)
         if suffixes and path.suffix.lower() not in suffixes:
-            raise ArgumentTypeError(f"found {text!r}, expected a name ending in {_or(suffixes)}")
+            raise ArgumentTypeError(
+                f"found {text!r}, expected a name ending in {', '.join(suffixes)}"
+            )
         return path
 
     return parse
-
-
-def _or(words: tuple[str, ...]) -> str:
-    return " or ".join(words)

@@ -48,6 +48,9 @@ class BufferedFunction:
                 raise KeyboardInterrupt from error
             raise
         except RuntimeError as error:
+            # ... or, if it came while Ipopt was at work, as that.
+            if str(error) == "KeyboardInterrupt":
+                raise KeyboardInterrupt from error
             logger.warning("function %r failed: %s", self._name, error)
             return False
         return self._buffer.ret() == 0

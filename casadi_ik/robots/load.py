@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,14 @@ from casadi_ik.files.reading import (
     refuse_non_finite,
 )
 from casadi_ik.files.shipped import resolve
-from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear
+from casadi_ik.robots.checks import (
+    check_couplings,
+    check_numbers,
+    known_link,
+    known_source,
+    positive,
+    unique,
+)
 from casadi_ik.robots.description import Actuator, Array, Finger, Joint, RobotDescription
 from casadi_ik.robots.schema import (
     ActuatorEntry,
@@ -55,8 +61,8 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
         arm_path, arm = _part(top.arm, "arm", ArmFile, path)
         joints += _joints(arm.joints, arm.root, arm.sources, "arm", arm_path)
         actuators += _actuators(None, joints, arm.sources, "arm", arm_path)
-        tip = _known_link(arm.tip.link, arm.root, joints, f"{arm_path}: tip.link")
-        _known_source(arm.tip.source, arm.sources, f"{arm_path}: tip.source")
+        tip = known_link(arm.tip.link, arm.root, joints, f"{arm_path}: tip.link")
+        known_source(arm.tip.source, arm.sources, f"{arm_path}: tip.source")
         mount = _pose(arm.tip) @ frame_matrix(top.mount)
         joints.append(_fixed("mount", tip, hand.root, mount))
         sources |= _told_apart(arm.sources, sources, arm.name)
@@ -68,11 +74,11 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
     joints += hand_joints
     actuators += _actuators(hand.actuators, hand_joints, hand.sources, "hand", hand_path)
     sources |= _told_apart(hand.sources, sources, hand.name)
-    _unique((a.name for a in actuators), f"{path}: actuators")
-    _unique((j.name for j in joints), f"{path}: joints")
-    _unique((root, *(j.child for j in joints)), f"{path}: links")
-    palm_link = _known_link(hand.palm.link, hand.root, hand_joints, f"{hand_path}: palm.link")
-    _known_source(hand.palm.source, hand.sources, f"{hand_path}: palm.source")
+    unique((a.name for a in actuators), f"{path}: actuators")
+    unique((j.name for j in joints), f"{path}: joints")
+    unique((root, *(j.child for j in joints)), f"{path}: links")
+    palm_link = known_link(hand.palm.link, hand.root, hand_joints, f"{hand_path}: palm.link")
+    known_source(hand.palm.source, hand.sources, f"{hand_path}: palm.source")
     return RobotDescription(
         name=top.name,
         root=root,
@@ -112,8 +118,8 @@ def _joints(
 ) -> list[Joint]:
     """Checked joints, parents before children."""
     names = [entry.name for entry in entries]
-    _unique(names, f"{path}: joints")
-    _unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
+    unique(names, f"{path}: joints")
+    unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
     for entry in entries:
         where = f"{path}: joint {entry.name!r}"
         if entry.type not in JOINT_TYPES:
@@ -126,9 +132,9 @@ def _joints(
         if not np.linalg.norm(entry.axis) > 1e-9:
             raise DescriptionError(f"{where}: axis: is zero, expected a direction")
         if entry.velocity is not None:
-            _positive(entry.velocity, f"{where}: velocity")
-        _known_source(entry.source, sources, f"{where}: source")
-        _check_numbers(entry.coupling, f"{where}: coupling")
+            positive(entry.velocity, f"{where}: velocity")
+        known_source(entry.source, sources, f"{where}: source")
+        check_numbers(entry.coupling, f"{where}: coupling")
     by_parent: dict[str, list[JointEntry]] = {}
     for entry in entries:
         by_parent.setdefault(entry.parent, []).append(entry)
@@ -214,75 +220,19 @@ def _actuators(
             )
         velocity = joint.velocity if joint else math.inf
         if entry.velocity is not None:
-            velocity = _positive(entry.velocity, f"{where}: velocity")
+            velocity = positive(entry.velocity, f"{where}: velocity")
         if entry.source or joint is None:
-            _known_source(entry.source, sources, f"{where}: source")
+            known_source(entry.source, sources, f"{where}: source")
         unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit
         actuators.append(Actuator(name, unit, low, high, velocity, part))
-    units = {joint.name: "m" if joint.type == "prismatic" else "rad" for joint in by_name.values()}
-    units |= {actuator.name: actuator.unit for actuator in actuators}
-    followed = {joint.coupling.of for joint in by_name.values() if joint.coupling is not None}
-    for actuator in actuators:
-        if actuator.name not in by_name and actuator.name not in followed:
-            raise DescriptionError(
-                f"{path}: actuators.{actuator.name}: moves nothing; expected the name of a joint, "
-                "or a coupling that follows it"
-            )
-    for joint in by_name.values():
-        _check_coupling(joint, by_name, set(entries), path)
-        expected = {LeadScrew: "m", FourBar: "rad"}.get(type(joint.coupling))
-        if expected and joint.coupling and units[joint.coupling.of] != expected:
-            raise DescriptionError(
-                f"{path}: joint {joint.name!r}: coupling.of: {joint.coupling.of!r} is in "
-                f"{units[joint.coupling.of]}, expected something in {expected}"
-            )
+    check_couplings(by_name, actuators, path)
     return actuators
-
-
-def _check_coupling(
-    joint: Joint, by_name: dict[str, Joint], actuators: set[str], path: Path
-) -> None:
-    """Follow a joint's couplings down to an actuator."""
-    where = f"{path}: joint {joint.name!r}"
-    followed, current = [joint.name], joint
-    while current.coupling is not None:
-        source = current.coupling.of
-        if source in followed:
-            cycle = " -> ".join([*followed, source])
-            raise DescriptionError(f"{where}: coupling.of: is a cycle {cycle}")
-        if source in actuators:
-            return
-        if source not in by_name:
-            raise DescriptionError(
-                f"{where}: coupling.of: unknown joint or actuator {source!r}; known: "
-                + ", ".join([*by_name, *sorted(actuators - set(by_name))])
-            )
-        followed.append(source)
-        current = by_name[source]
-    if current.name not in actuators:
-        raise DescriptionError(
-            f"{where}: coupling: has neither a coupling nor an actuator of its own under 'actuators'"
-        )
-
-
-def _check_numbers(coupling: Coupling | None, where: str) -> None:
-    """Whether a coupling's numbers describe a mechanism."""
-    if isinstance(coupling, Linear):
-        if coupling.ratio == 0:
-            raise DescriptionError(f"{where}.ratio: is zero, so the joint would not move")
-        return
-    if coupling is None:
-        return
-    for length in "bc" if isinstance(coupling, LeadScrew) else "pqgh":
-        _positive(getattr(coupling, length), f"{where}.{length}")
-    if isinstance(coupling, FourBar) and coupling.branch not in (-1, 1):
-        raise DescriptionError(f"{where}.branch: found {coupling.branch}, expected -1 or 1")
 
 
 def _fingers(
     top: ArmHandFile, hand: HandFile, joints: list[Joint], path: Path, hand_path: Path
 ) -> tuple[Finger, ...]:
-    _unique(top.fingers, f"{path}: fingers")
+    unique(top.fingers, f"{path}: fingers")
     for key, name in (*(("fingers", name) for name in top.fingers), ("thumb", top.thumb)):
         if name not in hand.fingers:
             raise DescriptionError(
@@ -296,8 +246,8 @@ def _fingers(
     for name in top.fingers:
         entry = hand.fingers[name]
         where = f"{hand_path}: fingers.{name}"
-        link = _known_link(entry.link, hand.root, joints, f"{where}.link")
-        _known_source(entry.source, hand.sources, f"{where}.source")
+        link = known_link(entry.link, hand.root, joints, f"{where}.link")
+        known_source(entry.source, hand.sources, f"{where}.source")
         length = float(np.linalg.norm(entry.normal))
         if not length > 1e-9:
             raise DescriptionError(f"{where}.normal: is zero, expected a direction")
@@ -334,35 +284,6 @@ def _home(home: dict[str, float], actuators: list[Actuator], path: Path) -> Arra
 
 def _pose(entry: LinkFrame | ContactEntry) -> Array:
     return frame_matrix(Frame(entry.xyz, entry.rpy))
-
-
-def _known_link(link: str, root: str, joints: list[Joint], where: str) -> str:
-    links = [root, *(joint.child for joint in joints)]
-    if link not in links:
-        raise DescriptionError(f"{where}: unknown link {link!r}; known: {', '.join(links)}")
-    return link
-
-
-def _positive(value: float, where: str) -> float:
-    if not value > 0:
-        raise DescriptionError(f"{where}: found {value:.6g}, expected > 0")
-    return value
-
-
-def _known_source(tags: str, sources: dict[str, str], where: str) -> None:
-    for tag in tags.replace(",", " ").split():
-        if tag not in sources:
-            raise DescriptionError(f"{where}: unknown tag {tag!r}; sources: {', '.join(sources)}")
-    if not tags.strip():
-        raise DescriptionError(f"{where}: is empty; every number needs its source")
-
-
-def _unique(names: Iterable[str], where: str) -> None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise DescriptionError(f"{where}: {name!r} appears twice")
-        seen.add(name)
 
 
 def _freeze(array: Array) -> Array:

@@ -22,7 +22,7 @@ def to_urdf(robot: RobotDescription) -> str:
     Every link gets simple cylinders from its frame to its children, and every finger a fixed
     link ``<finger>_contact`` whose frame is the contact frame. A joint that follows an actuator
     or joint linearly becomes a mimic joint; lead-screw and four-bar couplings have no URDF form
-    and stay independent joints (set them from `Robot.joints`).
+    and stay independent joints (set them from `ArmHand.joints`).
 
     Args:
         robot: The description.
@@ -32,7 +32,7 @@ def to_urdf(robot: RobotDescription) -> str:
         efforts as 0, since URDF demands a number.
     """
     root = ElementTree.Element("robot", name=robot.name)
-    leaders: dict[str, tuple[str, float, float]] = {}
+    mimics = _leaders(robot)
     part = {robot.root: "arm"} | {joint.child: joint.part for joint in robot.joints}
     for link in robot.links:
         element = ElementTree.SubElement(root, "link", name=link)
@@ -54,8 +54,11 @@ def to_urdf(robot: RobotDescription) -> str:
             effort="0",
             velocity=repr(velocity),
         )
-        if isinstance(joint.coupling, Linear):
-            _mimic(element, joint.name, joint.coupling, leaders, robot.joint_names)
+        if joint.name in mimics:
+            leader, ratio, offset = mimics[joint.name]
+            ElementTree.SubElement(
+                element, "mimic", joint=leader, multiplier=repr(ratio), offset=repr(offset)
+            )
     for finger in robot.fingers:
         name = f"{finger.name}_contact"
         ElementTree.SubElement(root, "link", name=name)
@@ -67,26 +70,32 @@ def to_urdf(robot: RobotDescription) -> str:
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _mimic(
-    element: ElementTree.Element,
-    name: str,
-    coupling: Linear,
-    leaders: dict[str, tuple[str, float, float]],
-    joints: tuple[str, ...],
-) -> None:
-    """A mimic tag; the first joint on a shared motor leads the others, as URDF has no motors."""
-    if coupling.of in joints:
-        leader, ratio, offset = coupling.of, coupling.ratio, coupling.offset
-    elif coupling.of in leaders:
-        leader, first_ratio, first_offset = leaders[coupling.of]
-        ratio = coupling.ratio / first_ratio
-        offset = coupling.offset - ratio * first_offset
-    else:
-        leaders[coupling.of] = (name, coupling.ratio, coupling.offset)
-        return
-    ElementTree.SubElement(
-        element, "mimic", joint=leader, multiplier=repr(ratio), offset=repr(offset)
-    )
+def _leaders(robot: RobotDescription) -> dict[str, tuple[str, float, float]]:
+    """Which joint a joint mimics in URDF, with ratio and offset.
+
+    URDF has no motors, so the first joint on a shared motor leads the others; and chains of
+    followers are multiplied out, so that no leader follows anything itself.
+    """
+    joints = {joint.name: joint for joint in robot.movable}
+    first: dict[str, tuple[str, float, float]] = {}
+    mimics: dict[str, tuple[str, float, float]] = {}
+    for joint in robot.movable:
+        ratio, offset, source = 1.0, 0.0, joint
+        while isinstance(coupling := source.coupling, Linear):
+            offset += ratio * coupling.offset
+            ratio *= coupling.ratio
+            if coupling.of not in joints:
+                leader, first_ratio, first_offset = first.setdefault(
+                    coupling.of, (joint.name, ratio, offset)
+                )
+                ratio /= first_ratio
+                offset -= ratio * first_offset
+                source = joints[leader]
+                break
+            source = joints[coupling.of]
+        if source is not joint:
+            mimics[joint.name] = (source.name, ratio, offset)
+    return mimics
 
 
 def _draw(

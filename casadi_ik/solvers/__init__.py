@@ -5,6 +5,7 @@ from casadi_ik.solvers.problem import LIMITS, Problems, Tolerance, target_arrays
 from casadi_ik.solvers.recorder import Recorder
 from casadi_ik.solvers.registry import METHODS, build_method, method_summary
 from casadi_ik.solvers.solution import BatchSolution, ContactVerdict, Solution
+from casadi_ik.solvers.stepper import SteppedMethod, Stepper
 from casadi_ik.steps.status import Phase, Status
 
 __all__ = [
@@ -18,6 +19,8 @@ __all__ = [
     "Recorder",
     "Solution",
     "Status",
+    "SteppedMethod",
+    "Stepper",
     "Tolerance",
     "build_method",
     "method_summary",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,11 +50,12 @@ class Engine:
             recorder: Who keeps the iterations, if anyone.
 
         Raises:
-            InputError: Bad q0 or jobs, or targets the method cannot take.
+            InputError: Bad q0, seed or jobs, or targets the method cannot take.
         """
         starts = self._starts(q0, len(problems))
-        if jobs < 1:
-            raise InputError(f"jobs: found {jobs}, expected at least 1")
+        for name, value, least in (("jobs", jobs, 1), ("seed", seed, 0)):
+            if not isinstance(value, (int, np.integer)) or value < least:
+                raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")
         started = time.time_ns()
         outcome = self._run(problems, starts, seed, jobs, recorder is not None)
         batch = self._judged(problems, outcome)
@@ -66,14 +68,18 @@ class Engine:
         if start.ndim == 1:
             return np.tile(start, (count, 1))
         if len(start) != count:
-            raise InputError(f"q0: found {len(start)} rows, expected 1 or {count}")
+            raise InputError(
+                f"q0: found {len(start)} rows for {count} targets, expected as many, or one (n,)"
+            )
         return start
 
     def _run(self, problems: Problems, starts: Array, seed: int, jobs: int, trace: bool) -> Outcome:
         if jobs == 1 or len(problems) < 2 * jobs:
             return self.method.run(problems, starts, seed, trace)
+        # Built before the threads start: building a graph is no work for several at once.
+        self.method.prepare()
         edges = np.linspace(0, len(problems), jobs + 1).astype(int)
-        parts = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        parts = [slice(a, b) for a, b in pairwise(edges)]
         with ThreadPoolExecutor(jobs) as pool:
             outcomes = list(
                 pool.map(
@@ -85,7 +91,7 @@ class Engine:
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
-        success = verdict.ok.all(axis=1)
+        success = np.all(verdict.ok, axis=1)
         if problems.enforce_limits:
             success &= verdict.limits_ok
         status = np.where(success, int(Status.SOLVED), outcome.status)

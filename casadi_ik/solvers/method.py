@@ -64,6 +64,10 @@ class Method(Protocol):
         """Every number and choice it works with, for the log."""
         ...
 
+    def prepare(self) -> None:
+        """Build and compile what `run` needs; afterwards `run` may be called by several threads."""
+        ...
+
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch.
 

@@ -85,9 +85,9 @@ def target_arrays(points: ArrayLike, normals: ArrayLike, f: int) -> tuple[Array,
         if array.ndim != 3 or array.shape[1:] != (f, 3):
             raise InputError(f"{name}: found shape {array.shape}, expected (k, {f}, 3)")
         free = np.isnan(array)
-        partly = free.any(axis=2) & ~free.all(axis=2)
+        partly = np.any(free, axis=2) & ~np.all(free, axis=2)
         _refuse(partly, f"{name}: is partly NaN, expected three numbers or three NaN")
-        _refuse(np.isinf(array).any(axis=2), f"{name}: is infinite")
+        _refuse(np.any(np.isinf(array), axis=2), f"{name}: is infinite, expected finite numbers")
         arrays.append(array)
     p, n = arrays
     if len(p) != len(n):

@@ -70,8 +70,21 @@ class EnhancedMethod:
         """The parameter record as a plain mapping."""
         return dataclasses.asdict(self.options)
 
-    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
-        """Solve a batch from one start each; see `Method.run`. No random numbers are drawn."""
+    def prepare(self) -> None:
+        """Build and compile the loop."""
+        _ = self.kernel
+
+    def start(self, problems: Problems, q0: Array) -> tuple[Array, Array]:
+        """First states (k, ns) and parameters (k, np) of the step graph for a batch.
+
+        Args:
+            problems: The targets.
+            q0: (k, n) configurations to start from; beyond limits that are enforced, they are
+                moved to them.
+
+        Raises:
+            InputError: A free finger or a free normal.
+        """
         self._check(problems)
         count = len(problems)
         values = parameter_values(
@@ -81,17 +94,28 @@ class EnhancedMethod:
             problems.enforce_limits,
         )
         parameters = np.empty((count, self.step.parameters.size))
-        common = {"points": np.zeros(problems.points.shape[1:]), "normals": None, **values}
-        common["normals"] = common["points"]
-        parameters[:] = self.step.parameters.pack(common)
+        nowhere = np.zeros(problems.points.shape[1:])
+        parameters[:] = self.step.parameters.pack({"points": nowhere, "normals": nowhere, **values})
         points = self.step.parameters.slice("points")
         normals = self.step.parameters.slice("normals")
         parameters[:, points] = problems.points.reshape(count, -1)
         parameters[:, normals] = problems.normals.reshape(count, -1)
         states = np.zeros((count, self.step.state.size))
-        states[:, self.step.state.slice("q")] = q0
+        limits = (self._robot.lower, self._robot.upper)
+        states[:, self.step.state.slice("q")] = (
+            np.clip(q0, *limits) if problems.enforce_limits else q0
+        )
         states[:, self.step.state.slice("phase")] = Phase.THUMB_REACHING
         states[:, self.step.state.slice("best")] = np.finfo(float).max
+        return states, parameters
+
+    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+        """Solve a batch from one start each; see `Method.run`.
+
+        No random numbers are drawn. A start beyond limits that are enforced is moved to them.
+        """
+        states, parameters = self.start(problems, q0)
+        count = len(problems)
         result = self.kernel.run(states, parameters, self.options.max_iterations, trace)
 
         status = result.status.astype(np.int64)

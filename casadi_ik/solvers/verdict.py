@@ -58,4 +58,4 @@ def within_limits(robot: ArmHand, q: Array) -> NDArray[np.bool_]:
     joints_inside = (theta >= description.joint_lower - LIMIT_SLACK) & (
         theta <= description.joint_upper + LIMIT_SLACK
     )
-    return inside.all(axis=1) & joints_inside.all(axis=1)
+    return np.all(inside, axis=1) & np.all(joints_inside, axis=1)

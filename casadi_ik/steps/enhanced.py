@@ -108,7 +108,7 @@ class EnhancedStep:
         in_reaching = state[self.state.slice("phase")] < Phase.HAND_ALIGNMENT
         outputs = choose(in_reaching, state, parameters)
         compilable = self.options.finger_step != "ipopt"
-        name = f"enhanced_dls_{self.robot.name}"
+        name = ca.Function.fix_name(f"enhanced_dls_{self.robot.name}")
         function = ca.Function(name, [state, parameters], list(outputs))
         return StepGraph(name, function, self.state, self.parameters, self.record, compilable)
 
@@ -136,7 +136,7 @@ class EnhancedStep:
         position, normal = thumb_tasks(body, goals[robot.thumb], columns)
         solver = _damped(p["reaching_damping"])
         step = self._spread(hierarchy_step([palm, position, normal], solver), columns)
-        q_next, size = self._moved(s["q"], step, p)
+        q_next = self._moved(s["q"], step, p)
 
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
         thumb = robot.finger_names.index(robot.thumb)
@@ -173,7 +173,7 @@ class EnhancedStep:
             s["q"],
             positions,
             angles,
-            step_size=size,
+            step_size=_largest(q_next - s["q"]),
             status=status,
             phase=Phase.THUMB_REACHING,
             palm_error=safe_norm(palm.error),
@@ -203,14 +203,14 @@ class EnhancedStep:
             J_position,
             weighted_damped_pinv_times(J_orientation, rotation, damping, weights),
         )
-        moved, chain_size = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
+        moved = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
 
         columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
         keep = thumb_tasks(actuated(robot, moved), goals[robot.thumb], columns)
         step = self._spread(hierarchy_step(list(keep), _damped(p["reaching_damping"])), columns)
-        q_next, keep_size = self._moved(moved, step, p)
+        q_next = self._moved(moved, step, p)
 
-        size = ca.mmax(ca.fabs(q_next - s["q"]))
+        size = _largest(q_next - s["q"])
         waited = ca.if_else(size < p["stall_step"], s["waited"] + 1, 0.0)
         status = ca.if_else(
             solved,
@@ -233,7 +233,7 @@ class EnhancedStep:
             closed,
             positions,
             angles,
-            step_size=ca.fmax(chain_size, keep_size),
+            step_size=size,
             status=status,
             phase=Phase.HAND_ALIGNMENT,
             palm_motion=ca.vertcat(safe_norm(translation), safe_norm(rotation)),
@@ -250,12 +250,11 @@ class EnhancedStep:
             full[column] = step[i]
         return full
 
-    def _moved(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
-        """q after a capped step, kept within limits if they are enforced; and the step's size."""
-        size = ca.mmax(ca.fabs(step))
-        q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(size, 1e-12))
+    def _moved(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        """Take a step from q: capped, and kept within limits if they are enforced."""
+        q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(_largest(step), 1e-12))
         kept = ca.fmin(ca.fmax(q_next, _column(self.robot.lower)), _column(self.robot.upper))
-        return ca.if_else(p["enforce_limits"] > 0, kept, q_next), size
+        return ca.if_else(p["enforce_limits"] > 0, kept, q_next)
 
     def _row(
         self,
@@ -287,7 +286,7 @@ class EnhancedStep:
 
 def parameter_values(
     step: EnhancedStep, position_tolerance: float, angle_tolerance: float, enforce_limits: bool
-) -> dict[str, Array | float]:
+) -> dict[str, float | list[float]]:
     """Values of all parameter fields but the targets."""
     options = step.options
     weights = [
@@ -300,7 +299,7 @@ def parameter_values(
         "enforce_limits": float(enforce_limits),
         "reaching_damping": options.reaching_damping,
         "chain_damping": options.chain_damping,
-        "weights": weights,  # type: ignore[dict-item]
+        "weights": weights,
         "reaching_patience": float(options.reaching_patience),
         "reaching_iterations": float(options.reaching_iterations),
         "step_cap": options.step_cap,
@@ -311,6 +310,10 @@ def parameter_values(
 
 def _damped(damping: ca.SX) -> Callable[[ca.SX, ca.SX], ca.SX]:
     return lambda jacobian, error: damped_pinv_times(jacobian, error, damping)
+
+
+def _largest(change: ca.SX) -> ca.SX:
+    return ca.mmax(ca.fabs(change))
 
 
 def _smallest(jacobian: ca.SX) -> ca.SX:

@@ -8,13 +8,16 @@ closed form, since with the sum held the contact runs on a circle.
 What the paper leaves open and how it is read here: fingers that share a spread motor agree on the
 mean of their demands, weighted by the squared length of the demanded normal's part across the
 spread axis (what the normal loses by a wrong spread); a demand outside the limits is moved to the
-nearest attainable normal.
+nearest attainable normal. A normal leaves two spreads half a turn apart; taken is the one at which
+the pad faces the side it faces in the middle of its flexion range (for the Barrett hand: flexion
+sums up to 140 of 188 deg).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 
@@ -23,7 +26,7 @@ from casadi_ik.steps.targets import Target
 from casadi_ik.symbolic.planar_finger import PlanarFinger, planar_finger
 from casadi_ik.symbolic.smooth import Expr
 
-UNDECIDED = 1e-9
+UNDECIDED = 1e-12
 """Weight of the present spread: decides only where no normal demands one."""
 
 IPOPT_OPTIONS = {
@@ -34,6 +37,7 @@ IPOPT_OPTIONS = {
     "ipopt.compl_inf_tol": 1e-12,
     "ipopt.constr_viol_tol": 1e-12,
     "ipopt.dual_inf_tol": 1e-10,
+    "ipopt.mu_init": 1e-6,
     "ipopt.mu_target": 0.0,
     "ipopt.bound_relax_factor": 1e-12,
     "ipopt.honor_original_bounds": "yes",
@@ -101,37 +105,31 @@ def closed_form(demand: Demand) -> tuple[Expr, Expr]:
 
 
 class IpoptFinger:
-    """Eq. (5) by Ipopt on a CasADi graph, for one finger; exact Hessian, lengths in millimetres."""
+    """Eq. (5) by Ipopt on a CasADi graph, for one finger; exact Hessian, lengths in millimetres.
+
+    The far side of the circle is a local minimum as well where it lies within the limits, so Ipopt
+    starts from whichever of the ends and the middle of the range is best.
+    """
 
     def __init__(self, finger: PlanarFinger) -> None:
         """Build the program: variables the two flexions, parameters what `Demand` holds."""
         x = ca.SX.sym("flexion", 2)
         p = ca.SX.sym("p", 3)
         flexion_sum, reach = p[0], p[1:]
-        z0, x0 = float(finger.middle[2]), float(finger.middle[0])
-        c, s = ca.cos(x[0]), ca.sin(x[0])
-        place = ca.vertcat(c * z0 - s * x0, s * z0 + c * x0)
         program = {
             "x": x,
             "p": p,
-            "f": ca.sumsqr((place - reach) * 1e3),
+            "f": _squared_distance(finger, x[0], reach),
             "g": x[0] + x[1] - flexion_sum,
         }
-        self._solver = ca.nlpsol(f"finger_{finger.name}", "ipopt", program, IPOPT_OPTIONS)
+        name = ca.Function.fix_name(f"finger_{finger.name}")
+        self._solver = ca.nlpsol(name, "ipopt", program, IPOPT_OPTIONS)
         self._limits = finger.flexion_limits
 
-    def __call__(self, demand: Demand, start: Expr) -> tuple[Expr, Expr]:
-        """Solve eq. (5).
-
-        Args:
-            demand: What is asked (MX or DM).
-            start: (2, 1) flexions to start from [rad].
-
-        Returns:
-            The two flexions [rad].
-        """
+    def __call__(self, demand: Demand) -> tuple[Expr, Expr]:
+        """Solve eq. (5): the two flexions [rad] for a demand of MX or DM."""
         solution = self._solver(
-            x0=start,
+            x0=_best_start(demand),
             p=ca.vertcat(demand.flexion_sum, demand.reach),
             lbx=self._limits[:, 0],
             ubx=self._limits[:, 1],
@@ -139,6 +137,25 @@ class IpoptFinger:
             ubg=0,
         )
         return solution["x"][0], solution["x"][1]
+
+
+def _squared_distance(finger: PlanarFinger, first: Expr, reach: Expr) -> Expr:
+    """What eq. (5) minimises [mm^2], over the first flexion [rad]."""
+    z, x = float(finger.middle[2]), float(finger.middle[0])
+    c, s = ca.cos(first), ca.sin(first)
+    place = ca.vertcat(c * z - s * x, s * z + c * x)
+    return ca.sumsqr((place - reach) * 1e3)
+
+
+def _best_start(demand: Demand) -> Expr:
+    """The best pair of flexions (2, 1) among the ends and the middle of the first one's range."""
+    lower, upper = demand.first_limits[0], demand.first_limits[1]
+    best, least = lower, _squared_distance(demand.finger, lower, demand.reach)
+    for first in ((lower + upper) / 2, upper):
+        distance = _squared_distance(demand.finger, first, demand.reach)
+        best = ca.if_else(distance < least, first, best)
+        least = ca.fmin(distance, least)
+    return ca.vertcat(best, demand.flexion_sum - best)
 
 
 def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
@@ -156,7 +173,7 @@ def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
         UnsupportedError: A finger is not planar.
     """
     fingers = [planar_finger(robot, name) for name in robot.finger_names if name != robot.thumb]
-    kind = ca.MX if solver == "ipopt" else ca.SX
+    kind: Any = ca.MX if solver == "ipopt" else ca.SX
     q = kind.sym("q", len(robot.actuators))
     points = kind.sym("points", 3, len(fingers))
     normals = kind.sym("normals", 3, len(fingers))
@@ -165,8 +182,7 @@ def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
     for demand in demands(robot, fingers, q, goals):
         finger = demand.finger
         if solver == "ipopt":
-            start = ca.vertcat(q[finger.flexion[0]], q[finger.flexion[1]])
-            first, second = IpoptFinger(finger)(demand, start)
+            first, second = IpoptFinger(finger)(demand)
         else:
             first, second = closed_form(demand)
         entries[finger.flexion[0]], entries[finger.flexion[1]] = first, second
@@ -207,7 +223,7 @@ def _spreads(
     agreed: dict[int, Expr] = {}
     for motor in {finger.spread for finger in fingers if finger.spread is not None}:
         total, weights = UNDECIDED * q[motor], UNDECIDED
-        lower, upper = float(robot.lower[motor]), float(robot.upper[motor])
+        lower, upper = _spread_range(robot, fingers, motor)
         for finger, goal in zip(fingers, local, strict=True):
             if finger.spread == motor:
                 middle = float(finger.spread_limits.mean())
@@ -221,6 +237,18 @@ def _spreads(
         0.0 if finger.spread is None else finger.ratio * agreed[finger.spread] + finger.offset
         for finger in fingers
     ]
+
+
+def _spread_range(
+    robot: RobotDescription, fingers: Sequence[PlanarFinger], motor: int
+) -> tuple[float, float]:
+    """Limits of a spread motor that keep it and every joint on it within theirs."""
+    lower, upper = float(robot.lower[motor]), float(robot.upper[motor])
+    for finger in fingers:
+        if finger.spread == motor:
+            ends = (finger.spread_limits - finger.offset) / finger.ratio
+            lower, upper = max(lower, float(ends.min())), min(upper, float(ends.max()))
+    return lower, upper
 
 
 def _demand(finger: PlanarFinger, goal: Target, spread: Expr) -> Demand:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.targets import Target
-from casadi_ik.symbolic.kinematics import forward
+from casadi_ik.symbolic.kinematics import forward, number
 from casadi_ik.symbolic.smooth import safe_norm
 
 
@@ -53,7 +53,7 @@ def base_axes(robot: RobotDescription) -> NDArray[np.float64]:
         kinematics.palm.inverse_apply(kinematics.links[child[robot.finger(name).joints[0]]].origin)
         for name in thumb_first(robot)
     ]
-    return np.array(ca.evalf(ca.densify(axes_through(origins))))
+    return number(axes_through(origins)).reshape(3, 3)
 
 
 def palm_orientation(robot: RobotDescription, goal: dict[str, Target]) -> ca.SX:

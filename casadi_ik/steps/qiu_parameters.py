@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 
 from casadi_ik.errors import InputError
 
 FINGER_STEPS = ("ipopt", "closed-form")
 PALM_ERRORS = ("euler", "rotation-vector")
 PLATFORMS = ("arm-leg", "palm")
+CHOICES = {"finger_step": FINGER_STEPS, "palm_error": PALM_ERRORS, "platform": PLATFORMS}
+MAY_BE_ZERO = ("borrowed", "stall_step")
 
 
 @dataclass(frozen=True)
@@ -57,20 +59,25 @@ class QiuParameters:
     reaching_patience: int = 10
     reaching_iterations: int = 100
     step_cap: float = 1e9
-    max_iterations: int = field(default=10_000)
+    max_iterations: int = 10_000
     stall_step: float = 1e-10
     stall_patience: int = 5
 
     def __post_init__(self) -> None:
-        for name, known in (
-            ("finger_step", FINGER_STEPS),
-            ("palm_error", PALM_ERRORS),
-            ("platform", PLATFORMS),
-        ):
-            if getattr(self, name) not in known:
-                raise InputError(
-                    f"{name}: found {getattr(self, name)!r}, expected one of {', '.join(known)}"
-                )
-        for name in ("reaching_damping", "chain_damping", "virtual_weight", "joint_weight"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name}: found {getattr(self, name)!r}, expected > 0")
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name in CHOICES:
+                if value not in CHOICES[entry.name]:
+                    known = ", ".join(CHOICES[entry.name])
+                    raise InputError(f"{entry.name}: found {value!r}, expected one of {known}")
+            else:
+                _check_number(entry.name, value, isinstance(entry.default, int))
+
+
+def _check_number(name: str, value: object, whole: bool) -> None:
+    kind, types = ("an integer", (int,)) if whole else ("a number", (int, float))
+    zero = name in MAY_BE_ZERO
+    number = isinstance(value, types) and not isinstance(value, bool)
+    if not (number and (value > 0 or (zero and value == 0))):  # type: ignore[operator]
+        bound = ">= 0" if zero else "> 0"
+        raise InputError(f"{name}: found {value!r}, expected {kind} {bound}")

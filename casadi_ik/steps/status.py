@@ -21,6 +21,11 @@ class Status(IntEnum):
     UNREACHABLE = 4
     """The contacts cannot be reached; the verdict says why."""
 
+    @classmethod
+    def labels(cls) -> tuple[str, ...]:
+        """Names by code from 0 on, for the log."""
+        return tuple(cls(code).name for code in range(max(cls) + 1))
+
 
 class Phase(IntEnum):
     """What an iteration is working on."""
@@ -28,3 +33,17 @@ class Phase(IntEnum):
     THUMB_REACHING = 1
     HAND_ALIGNMENT = 2
     REFINEMENT = 3
+    CANDIDATE = 4
+    HAND_FIT = 5
+    ARM_PLACEMENT = 6
+
+    @property
+    def label(self) -> str:
+        """The name as it is shown."""
+        return self.name.lower().replace("_", "-")
+
+    @classmethod
+    def labels(cls) -> tuple[str, ...]:
+        """Names by code from 0 on ("" where there is no such phase), for the log."""
+        known = {phase.value: phase.label for phase in cls}
+        return tuple(known.get(code, "") for code in range(max(cls) + 1))

@@ -11,7 +11,7 @@ from casadi_ik.kernels.layout import Field
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.directions import angle_between
 from casadi_ik.symbolic.kinematics import Kinematics
-from casadi_ik.symbolic.smooth import safe_norm
+from casadi_ik.symbolic.smooth import Expr, safe_norm
 
 
 def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
@@ -29,8 +29,8 @@ def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
 class Target:
     """One finger's contact: point (3, 1) [m] and unit normal (3, 1), in one common frame."""
 
-    point: ca.SX
-    normal: ca.SX
+    point: Expr
+    normal: Expr
 
 
 def targets(robot: RobotDescription, parameters: dict[str, ca.SX]) -> dict[str, Target]:

@@ -59,7 +59,7 @@ def split(robot: RobotDescription, borrowed: int = 1) -> ChainSplit:
         borrowed: How many of the arm's last joints count to the reversed leg (the paper: 1).
 
     Raises:
-        UnsupportedError: Fewer than six coordinates remain passive, so nothing can be chosen.
+        UnsupportedError: The arm has fewer than six joints, or fewer than are to be borrowed.
     """
     arm = robot.arm_actuators
     thumb = robot.finger_actuators(robot.thumb)
@@ -68,6 +68,11 @@ def split(robot: RobotDescription, borrowed: int = 1) -> ChainSplit:
         raise UnsupportedError(
             f"robot {robot.name!r}: the closed chain of arm ({len(arm)}), thumb ({len(thumb)}) and "
             f"virtual joint has mobility {mobility}; it needs an arm of at least six joints"
+        )
+    if not 0 <= borrowed < len(arm):
+        raise UnsupportedError(
+            f"robot {robot.name!r}: the reversed thumb cannot borrow {borrowed} arm joints; "
+            f"the arm has {len(arm)} and has to keep one"
         )
     reversed_leg = (VIRTUAL, *reversed(thumb), *reversed(arm[len(arm) - borrowed :]))
     preference = (VIRTUAL, *reversed(thumb[1:]), *reversed(arm))

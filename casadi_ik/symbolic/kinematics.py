@@ -79,7 +79,7 @@ class Kinematics:
             linear (3, len(joints)) [m per joint unit] and angular (3, len(joints)).
         """
         carrying = {joint.name: joint for joint in self.robot.chain(link)}
-        linear, angular = [], []
+        linear, angular = [ca.SX.zeros(3, 0)], [ca.SX.zeros(3, 0)]  # the shape without joints
         for name in joints:
             joint = carrying.get(name)
             if joint is None:
@@ -131,6 +131,11 @@ def axis_rotation(axis: NDArray[np.float64], angle: ca.SX) -> ca.SX:
     c, s = ca.cos(angle), ca.sin(angle)
     # Entry by entry: the sum of constant, cosine and sine parts keeps exact zeros and ones.
     return ca.SX(_sparse(outer)) + ca.SX(_sparse(np.eye(3) - outer)) * c + ca.SX(_sparse(cross)) * s
+
+
+def number(value: ca.SX) -> NDArray[np.float64]:
+    """The entries of a constant graph, row by row (rows * columns,)."""
+    return np.array(ca.evalf(ca.densify(value))).ravel()
 
 
 def _constants(placement: NDArray[np.float64]) -> tuple[ca.DM, ca.DM]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.robots.couplings import Linear
 from casadi_ik.robots.description import Joint, RobotDescription
-from casadi_ik.symbolic.kinematics import forward
+from casadi_ik.symbolic.kinematics import forward, number
 
 Array = NDArray[np.float64]
 ALIGNED = 1e-9
@@ -141,13 +141,9 @@ def _reference(
     point, normal = kinematics.contact(name)
     points = [kinematics.links[joint.child].origin for joint in chain] + [point]
     directions = [kinematics.axes[joint.name] for joint in chain] + [normal]
-    turned = [_number(palm.rotation.T @ direction) for direction in directions]
-    moved = [_number(palm.inverse_apply(p)) for p in points]
+    turned = [number(palm.rotation.T @ direction) for direction in directions]
+    moved = [number(palm.inverse_apply(p)) for p in points]
     return moved[:-1], turned[:-1], moved[-1], turned[-1]
-
-
-def _number(value: ca.SX) -> Array:
-    return np.array(ca.evalf(ca.densify(value))).ravel()
 
 
 def _across(normal: Array, y: Array) -> Array:

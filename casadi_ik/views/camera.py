@@ -43,22 +43,27 @@ class Camera:
 
 
 def camera_at(
-    azimuth: float, elevation: float, points: ArrayLike, pixels: tuple[int, int], margin: float
+    azimuth: float,
+    elevation: float,
+    points: ArrayLike,
+    pixels: tuple[int, int],
+    margin: tuple[float, float] = (0.0, 0.0),
 ) -> Camera:
     """A camera that shows given points.
 
     Args:
         azimuth: Where the viewer stands, about z from x [rad].
         elevation: How high above the horizon [rad].
-        points: (k, 3) what must be in the image.
+        points: (k, 3) what must be in the image [m].
         pixels: Width and height of the image.
-        margin: Space around the points [m].
+        margin: What is left free on either side, as parts of width and height.
     """
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     up = np.cos(elevation) * np.array([0, 0, 1.0]) - np.sin(elevation) * level
-    seen = np.asarray(points, dtype=float) @ np.stack([right, up, np.cross(right, up)]).T
+    axes = np.stack([right, up, np.cross(right, up)])
+    seen = np.asarray(points, dtype=float) @ axes.T
     low, high = seen.min(axis=0), seen.max(axis=0)
-    center = (low + high) / 2 @ np.stack([right, up, np.cross(right, up)])
-    width, height = (high - low)[:2] + 2 * margin
-    return Camera(right, up, center, max(height, width * pixels[1] / pixels[0]), pixels)
+    width, height = (high - low)[:2] / (1 - 2 * np.array(margin))
+    visible = max(height, width * pixels[1] / pixels[0])
+    return Camera(right, up, (low + high) / 2 @ axes, visible, pixels)

@@ -1,1 +1,247 @@
-def draw_convergence(): ...
+"""How a solve converges: errors, step sizes and singular values over the iterations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator, NullFormatter
+from numpy.typing import NDArray
+
+from casadi_ik.errors import InputError
+from casadi_ik.logs import Iterations
+from casadi_ik.solvers import Tolerance
+from casadi_ik.views.picture import DPI, FAINT, INK, new_figure, save_picture
+
+Array = NDArray[np.float64]
+
+COLORS = ("#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6", "#c2334d", "#0f8b8d")
+"""Of the lines of a panel."""
+
+PHASE_COLORS = ("#f3f1ec", "#fbecd9", "#deebf7", "#e3f2e1")
+"""By the code of the phase."""
+
+LIMIT_COLOR = "#c2334d"
+
+FIELDS = {
+    "position_error": ("distance to the contact [mm]", 1e3, 1e-6),
+    "angle_error": ("angle to the normal [deg]", float(np.rad2deg(1.0)), 1e-6),
+    "cost": ("cost", 1.0, 1e-16),
+    "step_size": ("largest motor change [rad or m]", 1.0, 1e-10),
+}
+"""What is drawn if the method records it: label, factor to the unit drawn, and the value below
+which nothing is told apart (zero, above all, would need all the height of a logarithm)."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One diagram.
+
+    Attributes:
+        label: What it shows.
+        lines: Values (k,) by name; NaN where not computed.
+        bound: What has to be fallen below, if anything.
+    """
+
+    label: str
+    lines: dict[str, Array]
+    bound: float | None = None
+
+
+def draw_convergence(
+    iterations: Iterations,
+    path: str | PathLike[str] | None = None,
+    *,
+    tolerance: Tolerance | None = None,
+    title: str = "",
+    dpi: float = DPI,
+) -> Figure:
+    """Draw one solve.
+
+    Args:
+        iterations: Of one solve, e.g. ``open_log(path).iterations(method, solve_id)``.
+        path: PNG file to write, if any.
+        tolerance: What counts as reached; `Tolerance()` unless said.
+        title: Above the picture; method, number of iterations and ending unless said.
+        dpi: Dots per inch.
+
+    Returns:
+        The figure, which belongs to no pyplot window.
+
+    Raises:
+        InputError: No iterations, or those of several solves.
+        PictureError: The file cannot be written.
+    """
+    if len(iterations.rows) == 0:
+        raise InputError("iterations: none to draw")
+    if len(np.unique(iterations.solve_id)) > 1:
+        raise InputError("iterations: of several solves, expected one (give a solve_id)")
+    panels = _panels(iterations, tolerance or Tolerance())
+    limits = _at_limits(iterations)
+    heights = [1.0] * len(panels) + ([0.12 + 0.11 * len(limits)] if limits else [])
+    figure = new_figure(9.0, 1.0 + 1.7 * sum(heights), dpi)
+    grid = figure.subplots(
+        len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
+    )[:, 0]
+    for axes in grid:
+        _dress(axes, iterations)
+    for axes, panel in zip(grid, panels, strict=False):
+        _draw(axes, panel)
+    if limits:
+        _draw_limits(grid[-1], limits)
+    grid[-1].set_xlabel("iteration", color=INK)
+    grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    grid[-1].set_xlim(-0.5, len(iterations.rows) - 0.5)
+    _head(figure, iterations, title)
+    inches = float(figure.get_size_inches()[1])
+    figure.tight_layout(rect=(0.0, 0.0, 1.0, 1 - 0.55 / inches), h_pad=0.6)
+    if path is not None:
+        save_picture(figure, path)
+    return figure
+
+
+def _panels(iterations: Iterations, tolerance: Tolerance) -> list[Panel]:
+    names = iterations.layout.names
+    bounds = {
+        "position_error": 1e3 * tolerance.position,
+        "angle_error": float(np.rad2deg(tolerance.angle)),
+    }
+    panels = [
+        Panel(label, _lines(iterations, name, factor, smallest), bounds.get(name))
+        for name, (label, factor, smallest) in FIELDS.items()
+        if name in names
+    ]
+    sigmas: dict[str, Array] = {}
+    for name in names:
+        if name.startswith("sigma_"):
+            sigmas |= _lines(iterations, name, 1.0, 1e-9)
+    if sigmas:
+        panels.append(Panel("smallest singular value", sigmas))
+    return [panel for panel in panels if panel.lines]
+
+
+def _lines(iterations: Iterations, name: str, factor: float, smallest: float) -> dict[str, Array]:
+    """The columns of a field by name, without those that never are a number."""
+    values = iterations.rows[name].reshape(len(iterations.rows), -1).astype(float) * factor
+    labels = iterations.labels.get(name, ())
+    lines = {}
+    for column in range(values.shape[1]):
+        plain = name.removeprefix("sigma_").replace("_", " ")
+        label = labels[column] if column < len(labels) else plain
+        if np.isfinite(values[:, column]).any():
+            lines[label] = np.maximum(values[:, column], smallest)
+    return lines
+
+
+def _at_limits(iterations: Iterations) -> dict[str, NDArray[np.bool_]]:
+    """(k,) whether it is at a limit, for every actuator that ever is."""
+    if "limit_mask" not in iterations.layout.names:
+        return {}
+    mask = iterations.rows["limit_mask"].astype(np.uint64)
+    names = iterations.labels.get("limit_mask", ())
+    bits = {name: (mask >> np.uint64(bit)) & np.uint64(1) > 0 for bit, name in enumerate(names)}
+    return {name: hit for name, hit in bits.items() if hit.any()}
+
+
+def _runs(values: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """First and last index of every run of equal values."""
+    edges = np.flatnonzero(np.diff(values)) + 1
+    return list(zip([0, *edges.tolist()], [*(edges - 1).tolist(), len(values) - 1], strict=True))
+
+
+def _draw(axes: Axes, panel: Panel) -> None:
+    marker = "." if len(next(iter(panel.lines.values()))) <= 60 else ""
+    for i, (label, values) in enumerate(panel.lines.items()):
+        axes.semilogy(
+            values,
+            color=COLORS[i % len(COLORS)],
+            lw=max(2.8 - 0.7 * i, 1.2),  # so that equal lines do not hide one another
+            marker=marker,
+            markersize=5,
+            label=label.replace("_", " "),
+        )
+    if panel.bound is not None:
+        axes.axhline(panel.bound, color=INK, lw=1.0, ls=(0, (4, 3)), label="tolerance")
+    _show_decades(axes)
+    axes.set_title(panel.label, loc="left", size=10, color=INK, pad=4)
+    if len(panel.lines) == 1 and panel.bound is None:
+        return
+    axes.legend(
+        loc="center left",
+        bbox_to_anchor=(1.005, 0.5),
+        frameon=False,
+        fontsize=9,
+        labelcolor=INK,
+        handlelength=1.6,
+    )
+
+
+def _show_decades(axes: Axes) -> None:
+    """At least one whole decade, so that its ends are marked."""
+    low, high = axes.get_ylim()
+    if high < 20 * low:
+        low, high = 10 ** np.floor(np.log10(low)), 10 ** np.ceil(np.log10(high))
+        axes.set_ylim(float(low), float(high))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _draw_limits(axes: Axes, limits: dict[str, NDArray[np.bool_]]) -> None:
+    for row, hit in enumerate(limits.values()):
+        runs = _runs(hit.astype(np.int64))
+        bars = [(first - 0.5, last - first + 1) for first, last in runs if hit[first]]
+        axes.broken_barh(bars, (row - 0.32, 0.64), facecolor=LIMIT_COLOR, lw=0)
+    axes.set_ylim(len(limits) - 0.5, -0.5)
+    axes.yaxis.set_ticks_position("right")
+    axes.set_yticks(range(len(limits)), [name.replace("_", " ") for name in limits], fontsize=9)
+    axes.tick_params(axis="y", length=0, colors=INK)
+    axes.grid(visible=False, axis="y")
+    axes.set_title("at a limit", loc="left", size=10, color=INK, pad=4)
+
+
+def _dress(axes: Axes, iterations: Iterations) -> None:
+    """Phases as shades, a faint grid, no box."""
+    if "phase" in iterations.layout.names:
+        codes = iterations.rows["phase"].astype(np.int64)
+        for first, last in _runs(codes):
+            color = PHASE_COLORS[codes[first] % len(PHASE_COLORS)]
+            axes.axvspan(first - 0.5, last + 0.5, color=color, lw=0, zorder=0)
+    axes.grid(visible=True, color="white", lw=0.9)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=FAINT, labelsize=9, which="both", length=2)
+    for side in axes.spines.values():
+        side.set_visible(False)
+
+
+def _head(figure: Figure, iterations: Iterations, title: str) -> None:
+    rows, labels = iterations.rows, iterations.labels
+    if not title:
+        title = f"{iterations.method} · {len(rows)} iterations"
+        status = int(rows["status"][-1]) if "status" in iterations.layout.names else 0
+        known = labels.get("status", ())
+        if 0 < status < len(known):
+            title += f" · {known[status]}"
+    top = 1 - 0.3 / float(figure.get_size_inches()[1])
+    figure.text(0.015, top, title, size=13, weight="bold", color=INK, va="center")
+    if "phase" not in iterations.layout.names:
+        return
+    names = labels.get("phase", ())
+    handles = [
+        Patch(
+            color=PHASE_COLORS[code % len(PHASE_COLORS)],
+            label=(names[code] if code < len(names) else f"phase {code}").replace("-", " "),
+        )
+        for code in np.unique(rows["phase"]).astype(int).tolist()
+    ]
+    figure.legend(
+        handles=handles,
+        loc="center right",
+        bbox_to_anchor=(0.995, top),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=10,
+        labelcolor=INK,
+    )

@@ -39,6 +39,9 @@ def floor_image(camera: Camera, solids: Sequence[Solid], height: float) -> Array
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = 0.35 + float(np.linalg.norm(vertices - middle, axis=1).max())
     fade = np.clip(1.6 * (1 - np.linalg.norm(points - middle, axis=-1) / radius), 0.0, 1.0)
+    # ... and before the picture ends, so that it has no edge.
+    fade *= np.clip((0.5 - np.abs(x) / (width * scale)) / 0.12, 0.0, 1.0)[None]
+    fade *= np.clip((0.5 - np.abs(y) / (rows * scale)) / 0.12, 0.0, 1.0)[:, None]
     off_line = np.abs((points / GRID + 0.5) % 1.0 - 0.5).min(axis=-1) * GRID
     line = np.clip(1.5 - off_line / (0.0012 + 0.4 * scale), 0.0, 1.0)
     return shadow * (1 - fade * (0.035 + 0.10 * line))
@@ -49,7 +52,7 @@ def _shadow(camera: Camera, solids: Sequence[Solid], floor: float) -> Array:
     corners = np.concatenate([solid.vertices[solid.faces] for solid in solids])
     corners = corners[corners[..., 2].min(axis=1) >= floor - 1e-6].copy()
     corners[..., 2] = floor
-    face, _, _ = rasterize(camera.project(corners), camera.pixels)
+    face, _ = rasterize(camera.project(corners), camera.pixels)
     shade = (face >= 0).astype(float)
     radius = max(1, int(0.008 * camera.pixels[1]))
     for axis in (0, 1, 0, 1):

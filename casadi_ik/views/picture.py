@@ -1,4 +1,4 @@
-"""Figures without pyplot: they work headless and in threads, and are written whole or not at all."""
+"""Figures without pyplot: they work headless and in threads, and are written whole or not."""
 
 from __future__ import annotations
 

@@ -11,9 +11,13 @@ FRAGMENTS = 3_000_000
 """How many pixels of triangles are worked on at a time, which bounds the memory."""
 
 
+FLAT = 1e-9
+"""Doubled area below which a triangle is seen edge on [pixels^2]."""
+
+
 def rasterize(
     corners: Array, pixels: tuple[int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], Array]:
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Which triangle is nearest at every pixel.
 
     Args:
@@ -21,52 +25,73 @@ def rasterize(
         pixels: Width and height of the image.
 
     Returns:
-        Index of the triangle (h, w), -1 where there is none; weights of its corners (h, w, 3);
-        depth (h, w), infinite where there is none.
+        Index of the triangle (h, w), -1 where there is none, and depth (h, w), infinite there.
     """
     width, height = pixels
     face = np.full(width * height, -1)
-    weights = np.zeros((width * height, 3))
     depth = np.full(width * height, np.inf)
     flat = corners[..., :2]
-    area = _cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
-    edges = _edges(flat, area)
+    area, edges = _edges(flat)
+    # Depth of a triangle's plane as a x + b y + c.
+    planes = np.einsum("tcx,tc->tx", edges, corners[..., 2])
     top = np.clip(np.ceil(flat[..., 1].min(axis=1) - 0.5), 0, height).astype(int)
     bottom = np.clip(np.ceil(flat[..., 1].max(axis=1) - 0.5), 0, height).astype(int)
-    rows = np.where(np.abs(area) > 1e-9, bottom - top, 0)
+    rows = np.where(np.abs(area) > FLAT, bottom - top, 0)
 
     # A line is one triangle in one row of pixels, a fragment one of its pixels.
     owner, y = _expanded(top, rows)
-    first, count = _covered(edges[owner], y + 0.5, width)
+    first, count = _covered(edges[owner], y, width)
+    slope = planes[owner, 0]
+    offset = planes[owner, 1] * (y + 0.5) + planes[owner, 2] + 0.5 * slope
     parts = np.searchsorted(np.cumsum(count), np.arange(0, count.sum(), FRAGMENTS)[1:])
     for lines in np.split(np.arange(len(owner)), parts):
         line, x = _expanded(first[lines], count[lines])
         line = lines[line]
-        triangle = owner[line]
-        here = np.stack([x + 0.5, y[line] + 0.5, np.ones(len(x))], axis=1)
-        share = np.einsum("pcx,px->pc", edges[triangle], here)
-        distance = np.einsum("pc,pc->p", share, corners[triangle, :, 2])
+        distance = slope[line] * x + offset[line]
         pixel = y[line] * width + x
         np.minimum.at(depth, pixel, distance)
         won = np.flatnonzero(distance <= depth[pixel])
-        face[pixel[won]] = triangle[won]
-        weights[pixel[won]] = share[won]
-    shape = (height, width)
-    return face.reshape(shape), weights.reshape(*shape, 3), depth.reshape(shape)
+        face[pixel[won]] = owner[line[won]]
+    return face.reshape(height, width), depth.reshape(height, width)
 
 
-def _edges(flat: Array, area: Array) -> Array:
-    """(t, 3, 3) rows (a, b, c): the weight of a corner is a x + b y + c, 0 on the edge opposite."""
+def corner_weights(
+    corners: Array,
+    face: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+) -> Array:
+    """(k, 3) how much of each corner there is at pixels of triangles.
+
+    Args:
+        corners: (t, 3, 3) triangles as pixel coordinates and depth.
+        face: (k,) the triangle at each pixel.
+        rows: (k,) of the pixels.
+        columns: (k,) of the pixels.
+    """
+    _, edges = _edges(corners[..., :2])
+    x, y = columns + 0.5, rows + 0.5
+    weights = [
+        edges[:, i, 0][face] * x + edges[:, i, 1][face] * y + edges[:, i, 2][face] for i in range(3)
+    ]
+    return np.stack(weights, axis=1)
+
+
+def _edges(flat: Array) -> tuple[Array, Array]:
+    """Doubled areas (t,), and (t, 3, 3) rows (a, b, c): a corner's weight is a x + b y + c."""
+    area = _cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
     start, end = np.roll(flat, -1, axis=1), np.roll(flat, -2, axis=1)
     side = end - start
     offset = side[..., 1] * start[..., 0] - side[..., 0] * start[..., 1]
     edges = np.stack([-side[..., 1], side[..., 0], offset], axis=-1)
-    return edges / np.where(np.abs(area) > 1e-9, area, 1.0)[:, None, None]
+    return area, edges / np.where(np.abs(area) > FLAT, area, 1.0)[:, None, None]
 
 
-def _covered(edges: Array, y: Array, width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First pixel and number of pixels whose centres are inside, on the line at height y."""
-    slope, offset = edges[..., 0], edges[..., 1] * y[:, None] + edges[..., 2]
+def _covered(
+    edges: Array, y: NDArray[np.int64], width: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First pixel and number of pixels whose centres are inside, in the row y."""
+    slope, offset = edges[..., 0], edges[..., 1] * (y + 0.5)[:, None] + edges[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = -offset / slope
     low = np.where(slope > 0, crossing, -np.inf).max(axis=1)

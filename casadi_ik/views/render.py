@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.views.camera import Camera
 from casadi_ik.views.floor import floor_image
-from casadi_ik.views.rasterizer import rasterize
+from casadi_ik.views.rasterizer import corner_weights, rasterize
 from casadi_ik.views.solids import Solid
 
 Array = NDArray[np.float64]
@@ -29,6 +29,7 @@ CREASE = np.cos(np.deg2rad(35.0))
 LIGHT = np.array([-0.45, 0.70, 0.60])
 """Towards the lamp: right, up and towards the viewer."""
 
+
 @dataclass(frozen=True, eq=False)
 class Layer:
     """Solids that are opaque to one another.
@@ -37,11 +38,13 @@ class Layer:
         solids: The solids.
         opacity: Of this layer over what lies behind it.
         ghost: Its opacity where an earlier layer hides it.
+        fading: Whether it fades out towards the edges of the image.
     """
 
     solids: Sequence[Solid]
     opacity: float = 1.0
     ghost: float = 0.0
+    fading: bool = False
 
 
 def render(camera: Camera, layers: Sequence[Layer], floor: float | None = None) -> Array:
@@ -57,16 +60,20 @@ def render(camera: Camera, layers: Sequence[Layer], floor: float | None = None) 
     image = np.ones((height * SAMPLES, width * SAMPLES, 3))
     nearest = np.full(image.shape[:2], np.inf)
     if floor is not None and layers:
-        image *= floor_image(fine, layers[0].solids, floor)[..., None]
+        coarse = floor_image(camera, layers[0].solids, floor)
+        image *= coarse.repeat(SAMPLES, axis=0).repeat(SAMPLES, axis=1)[..., None]
     for layer in layers:
         if not layer.solids:
             continue
         seen, color, depth = _surface(fine, layer.solids)
         opacity = np.where(depth < nearest[seen], layer.opacity, layer.ghost)
+        if layer.fading:
+            opacity *= _inwards(seen, nearest.shape)
         image[seen] += opacity[:, None] * (color - image[seen])
         if layer.opacity == 1.0:
             nearest[seen] = np.minimum(nearest[seen], depth)
-    return image.reshape(height, SAMPLES, width, SAMPLES, 3).mean(axis=(1, 3))
+    steps = [(i, j) for i in range(SAMPLES) for j in range(SAMPLES)]
+    return np.mean([image[i::SAMPLES, j::SAMPLES] for i, j in steps], axis=0)
 
 
 def _surface(
@@ -80,16 +87,27 @@ def _surface(
     owner = np.repeat(np.arange(len(solids)), count)
 
     front = np.flatnonzero(_face_normals(corners) @ camera.towards > 0)
-    face, weights, depth = rasterize(camera.project(corners[front]), camera.pixels)
+    screen = camera.project(corners[front])
+    face, depth = rasterize(screen, camera.pixels)
     seen = np.nonzero(face >= 0)
+    weights = corner_weights(screen, face[seen], *seen)
     found = front[face[seen]]
-    normal = np.einsum("pc,pcx->px", weights[seen], normals[found])
+    normal = sum(weights[:, i, None] * normals[found, i] for i in range(3))
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     color = _shaded(camera, colors[found], normal)
     parts = np.full(face.shape, -1)
     parts[seen] = owner[found]
-    color *= 1 - 0.35 * _outline(parts, depth, 0.004 * camera.height)[seen][:, None]
-    return seen, color, depth[seen]
+    line = _outline(parts, depth, 0.004 * camera.height)[seen]
+    return seen, color * (1 - 0.35 * line[:, None]), depth[seen]
+
+
+def _inwards(seen: tuple[NDArray[np.int64], ...], shape: tuple[int, ...]) -> Array:
+    """(k,) 0 at the edges of the image, 1 further in."""
+    parts = [
+        np.clip(np.minimum(index, size - 1 - index) / (0.15 * size), 0.0, 1.0)
+        for index, size in zip(seen, shape, strict=True)
+    ]
+    return parts[0] * parts[1]
 
 
 def _shaded(camera: Camera, color: Array, normal: Array) -> Array:

@@ -122,6 +122,9 @@ def _frame(axis: ArrayLike) -> Array:
     """(3, 3) rotation whose z is along an axis."""
     z = np.asarray(axis, dtype=float)
     z = z / np.linalg.norm(z)
-    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
+    frame = np.empty((3, 3))
+    frame[:, 2] = z
+    frame[:, 0] = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    frame[:, 0] /= np.linalg.norm(frame[:, 0])
+    frame[:, 1] = np.cross(z, frame[:, 0])
+    return frame

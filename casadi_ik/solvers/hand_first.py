@@ -1,0 +1,186 @@
+"""The hand-first method: lookup of postures, then one compiled loop over all stages."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.kernels import LoopKernel
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.solvers.method import Outcome, TraceFormat
+from casadi_ik.solvers.posture_table import PostureTable
+from casadi_ik.solvers.problem import Array, Problems
+from casadi_ik.steps.hand_first import HandFirstStep
+from casadi_ik.steps.hand_first_parameters import HandFirstParameters
+from casadi_ik.steps.hand_first_state import STAGES
+from casadi_ik.steps.status import Phase, Status
+from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
+
+UNBOUNDED = 1e3
+"""Bounds [rad or m] where limits are ignored."""
+
+MAX_ITERATIONS = 100_000
+"""Far above what the stages' own budgets allow: the loop always ends by a status."""
+
+
+class HandFirstMethod:
+    """`hand-first`: contacts fix palm and hand, the arm follows in closed form.
+
+    Attributes:
+        name: Name of the method.
+        options: Its numbers.
+    """
+
+    name = "hand-first"
+
+    def __init__(
+        self, robot: RobotDescription, options: HandFirstParameters, compiled: bool = True
+    ) -> None:
+        """Recognise the arm and lay out the step."""
+        self.options = options
+        self._robot = robot
+        self._compiled = compiled
+        self.step = HandFirstStep(robot, _closed_form(robot), options.candidates)
+
+    @cached_property
+    def kernel(self) -> LoopKernel:
+        """The compiled loop."""
+        return LoopKernel(self.step.graph(), self._compiled)
+
+    @cached_property
+    def table(self) -> PostureTable:
+        """The hand postures that targets are compared with."""
+        return PostureTable(ArmHand(self._robot), self.step.layouts.hand, self.options.table)
+
+    def prepare(self) -> None:
+        """Build and compile the loop, and fill the table."""
+        _ = self.kernel, self.table
+
+    @property
+    def trace_format(self) -> TraceFormat:
+        """How its traces are to be read."""
+        robot = self._robot
+        labels = {
+            "q": robot.actuator_names,
+            "position_error": robot.finger_names,
+            "angle_error": robot.finger_names,
+            "limit_mask": robot.actuator_names,
+            "phase": Phase.labels(),
+            "status": Status.labels(),
+        }
+        return TraceFormat(self.step.layouts.record, labels)
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """The parameter record as a plain mapping."""
+        return dataclasses.asdict(self.options)
+
+    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+        """Solve a batch; see `Method.run`. No random numbers are drawn."""
+        begin = time.perf_counter()
+        options, layouts = self.options, self.step.layouts
+        count, rounds = len(problems), options.rounds
+        lookup = self.table.nearest(problems.points, problems.normals, options.candidates * rounds)
+        parameters = self._parameters(problems, q0)
+        shared = (time.perf_counter() - begin) / max(count, 1)
+
+        outcome = _Collected(count, len(self._robot.actuators), shared)
+        waiting = np.arange(count)
+        traces: list[list[NDArray[Any]]] = [[] for _ in range(count)]
+        postures = layouts.parameters.slice("postures")
+        for number in range(rounds):
+            part = slice(number * options.candidates, (number + 1) * options.candidates)
+            parameters[waiting, postures] = lookup[waiting, part].reshape(len(waiting), -1)
+            result = self.kernel.run(
+                self._states(q0[waiting]), parameters[waiting], MAX_ITERATIONS, trace
+            )
+            outcome.take(layouts, waiting, result, number * options.candidates)
+            for row, rows in zip(waiting, result.trace, strict=False):
+                traces[row].append(rows)
+            waiting = waiting[result.status != Status.SOLVED]
+            if not len(waiting):
+                break
+        return Outcome(
+            q=outcome.q,
+            status=outcome.status,
+            iterations=outcome.counts.sum(axis=1),
+            restarts=outcome.restarts,
+            time=outcome.time,
+            phases={stage.label: outcome.counts[:, i] for i, stage in enumerate(STAGES)},
+            trace=tuple(np.concatenate(rows) for rows in traces) if trace else (),
+        )
+
+    def _parameters(self, problems: Problems, q0: Array) -> Array:
+        layout = self.step.layouts.parameters
+        robot, count = self._robot, len(problems)
+        bound = np.full(len(robot.actuators), UNBOUNDED)
+        values: dict[str, Any] = {
+            "points": np.nan_to_num(problems.points),
+            "normals": np.nan_to_num(problems.normals),
+            "weights": np.stack(
+                [~np.isnan(problems.points[..., 0]), ~np.isnan(problems.normals[..., 0])], axis=2
+            ),
+            "position_tolerance": problems.tolerance.position,
+            "angle_tolerance": problems.tolerance.angle,
+            "lower": robot.lower if problems.enforce_limits else -bound,
+            "upper": robot.upper if problems.enforce_limits else bound,
+            "start": np.clip(q0, robot.lower, robot.upper) if problems.enforce_limits else q0,
+        }
+        parameters = np.zeros((count, layout.size))
+        for name, value in values.items():
+            array = np.asarray(value, dtype=float)
+            parameters[:, layout.slice(name)] = (
+                array.reshape(count, -1) if array.ndim > 1 and len(array) == count else array
+            )
+        return parameters
+
+    def _states(self, q0: Array) -> Array:
+        layout = self.step.layouts.state
+        states = np.zeros((len(q0), layout.size))
+        states[:, layout.slice("q")] = q0
+        states[:, layout.slice("best_q")] = q0
+        states[:, layout.slice("phase")] = Phase.CANDIDATE
+        states[:, layout.slice("best_cost")] = np.finfo(float).max
+        return states
+
+
+class _Collected:
+    """Results of a batch whose rows may take several rounds; the best of a row is kept."""
+
+    def __init__(self, count: int, n: int, shared: float) -> None:
+        self.q = np.zeros((count, n))
+        self.status = np.full(count, int(Status.STALLED), dtype=np.int64)
+        self.restarts = np.zeros(count, dtype=np.int64)
+        self.counts = np.zeros((count, len(STAGES)), dtype=np.int64)
+        self.time = np.full(count, shared)
+        self._cost = np.full(count, np.inf)
+
+    def take(self, layouts: Any, rows: NDArray[np.intp], result: Any, before: int) -> None:
+        """Take the results of some rows; `before` candidates were tried in earlier rounds."""
+        state = layouts.state
+        solved = result.status == Status.SOLVED
+        cost = result.states[:, state.slice("best_cost")][:, 0]
+        better = solved | (cost < self._cost[rows])
+        kept = rows[better]
+        self.q[kept] = result.states[better][:, state.slice("q")]
+        self._cost[kept] = cost[better]
+        self.status[rows] = np.where(result.status < 0, int(Status.INVALID), result.status)
+        candidate = result.states[:, state.slice("candidate")][:, 0].astype(np.int64)
+        self.restarts[rows] = before + np.minimum(candidate, layouts.candidates - 1)
+        self.counts[rows] += result.states[:, state.slice("counts")].astype(np.int64)
+        self.time[rows] += result.time
+
+
+def _closed_form(robot: RobotDescription) -> SrsArm | None:
+    try:
+        return srs_arm(robot)
+    except UnsupportedError:
+        return None

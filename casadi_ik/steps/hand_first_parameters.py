@@ -1,0 +1,33 @@
+"""Numbers of the hand-first method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from casadi_ik.errors import InputError
+
+
+@dataclass(frozen=True)
+class HandFirstParameters:
+    """Parameters of the method.
+
+    Attributes:
+        table: Hand postures the targets' shapes are compared with.
+        candidates: Of those, how many a round of the compiled loop may start from.
+        rounds: Rounds before a target is given up; each takes the next best candidates.
+    """
+
+    table: int = 1024
+    candidates: int = 8
+    rounds: int = 6
+
+    def __post_init__(self) -> None:
+        for name in ("table", "candidates", "rounds"):
+            value = getattr(self, name)
+            if not (isinstance(value, int) and value >= 1):
+                raise InputError(f"{name}: found {value!r}, expected a whole number >= 1")
+        if self.candidates * self.rounds > self.table:
+            raise InputError(
+                f"table: found {self.table}, expected at least candidates x rounds = "
+                f"{self.candidates * self.rounds}"
+            )

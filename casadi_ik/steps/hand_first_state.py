@@ -1,0 +1,129 @@
+"""State, parameters and record of the hand-first method, shared by its stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.steps.contact_fit import LENGTH, Bounded
+from casadi_ik.steps.status import Phase
+from casadi_ik.symbolic.smooth import Expr
+
+STAGES = (Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT)
+"""The stages in the order of their codes."""
+
+EXACT = 1e-8
+"""Root of the cost at which contacts count as met exactly (0.1 nm per 100 mm, or rad)."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandFirstLayouts:
+    """The three layouts for one robot.
+
+    Attributes:
+        robot: The description.
+        candidates: How many hand postures the stages may start from.
+        hand: Positions in q of the hand's actuators.
+    """
+
+    robot: RobotDescription
+    candidates: int
+
+    @property
+    def hand(self) -> tuple[int, ...]:
+        """Positions in q of the hand's actuators."""
+        arm = set(self.robot.arm_actuators)
+        return tuple(i for i in range(len(self.robot.actuators)) if i not in arm)
+
+    @property
+    def state(self) -> Layout:
+        """What an iteration hands to the next."""
+        n = len(self.robot.actuators)
+        return Layout(
+            (
+                Field("q", (n,), doc="arm and hand; while the hand is fitted only the hand's part"),
+                Field("palm_rotation", (3, 3)),
+                Field("palm_origin", (3,), unit="m"),
+                Field("phase"),
+                Field("candidate", doc="index of the hand posture started from"),
+                Field("damping"),
+                Field("cost", doc="cost at q (or at palm and hand)"),
+                Field("fits", doc="1 if palm and hand meet the contacts"),
+                Field("waited", doc="evaluations in a row that gained little"),
+                Field("spent", doc="evaluations in this phase"),
+                Field("margin", doc="best margin of the arm so far, negative: a violation"),
+                Field("arm", (len(self.robot.arm_actuators),), doc="arm with the best margin"),
+                Field("best_cost", doc="smallest cost of a whole configuration so far"),
+                Field("best_q", (n,), doc="the configuration it belongs to"),
+                Field("counts", (len(STAGES),), doc="iterations by stage, in the order of STAGES"),
+            )
+        )
+
+    @property
+    def parameters(self) -> Layout:
+        """The problem and the numbers of the method."""
+        n, f = len(self.robot.actuators), len(self.robot.fingers)
+        return Layout(
+            (
+                Field("points", (f, 3), unit="m", doc="contact points, base frame; 0 if free"),
+                Field("normals", (f, 3), doc="outward pad normals, base frame; 0 if free"),
+                Field("weights", (f, 2), doc="1 where point, normal count, 0 where free"),
+                Field("position_tolerance", (f,), unit="m"),
+                Field("angle_tolerance", (f,), unit="rad"),
+                Field("lower", (n,), doc="lower bounds of q"),
+                Field("upper", (n,), doc="upper bounds of q"),
+                Field("start", (n,), doc="where a stage that needs a start begins"),
+                Field("postures", (self.candidates, len(self.hand)), doc="hand postures to try"),
+            )
+        )
+
+    @property
+    def record(self) -> Layout:
+        """What is logged of an iteration."""
+        n, f = len(self.robot.actuators), len(self.robot.fingers)
+        return Layout.record(
+            Field("q", (n,), "f8", "rad or m", "actuator positions before the step"),
+            Field("cost", (), "f8", "", "squared residual before the step"),
+            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
+            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
+            Field("damping", (), "f4", "", "Levenberg-Marquardt damping of the step"),
+            Field("step_size", (), "f4", "rad or m", "largest motor change of the step tried"),
+            Field("margin", (), "f4", "", "best arm margin found (arm placement)"),
+            Field("limit_mask", (), "u4", "", "bit i: actuator i at a limit"),
+            Field("candidate", (), "u1", "", "hand posture started from"),
+            Field("accepted", (), "u1", "", "1 if the step lowered the cost"),
+            Field("phase", (), "u1"),
+            Field("status", (), "u1", "", "0 running, else the final status"),
+        )
+
+    def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> Bounded:
+        """Bounds of the hand's actuators."""
+        rows = list(self.hand)
+        return Bounded(q[rows], p["lower"][rows], p["upper"][rows], first)
+
+
+def within_tolerance(positions: Expr, normals: Expr, p: dict[str, Expr]) -> Expr:
+    """Whether every contact is met.
+
+    Args:
+        positions: (f, 1) distances [m], zero where free.
+        normals: (f, 1) lengths of the difference of the unit normals, zero where free.
+        p: Parameters.
+
+    Returns:
+        Boolean; an angle is compared through the chord 2 sin(angle / 2).
+    """
+    chord = 2 * ca.sin(p["angle_tolerance"] / 2)
+    return ca.logic_and(
+        ca.mmax(positions - p["position_tolerance"]) <= 0, ca.mmax(normals - chord) <= 0
+    )
+
+
+def errors(residual: Expr, f: int) -> tuple[Expr, Expr]:
+    """Distances [m] and chords of a residual of `weighted_residual`, each (f, 1)."""
+    positions = [ca.norm_2(residual[3 * i : 3 * i + 3]) * LENGTH for i in range(f)]
+    chords = [ca.norm_2(residual[3 * (f + i) : 3 * (f + i) + 3]) for i in range(f)]
+    return ca.vertcat(*positions), ca.vertcat(*chords)

@@ -1,0 +1,36 @@
+"""What the tests of the command line share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+FAST = ("--method", "enhanced-dls", "--finger-step", "closed-form")
+POSTURE = np.r_[
+    [0.3, 0.6, -0.2, -1.5, 0.2, 0.9, 0.4], np.deg2rad([10.0, 80.0, 12.0, 78.0, 12.0, 78.0, 12.0])
+]
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a command ended."""
+
+    exit: int
+    out: str
+    err: str
+
+    @property
+    def error(self) -> str:
+        """The one line of a refusal, behind the program's name."""
+        assert self.exit == 2, self
+        assert self.out == ""
+        assert self.err.count("\n") == 1, self.err
+        assert self.err.endswith("\n")
+        start = "casadi-ik: error: "
+        assert self.err.startswith(start), self.err
+        return self.err.removeprefix(start).rstrip("\n")
+
+
+Command = Callable[..., Run]

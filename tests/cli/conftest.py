@@ -1,0 +1,95 @@
+"""A grasp and targets that can be solved, and the command line to be called on them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import POSTURE, Command, Run
+
+import casadi_ik as ik
+from casadi_ik.cli.main import main
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Calls the command line in this process."""
+
+    def call(*words: object) -> Run:
+        code = main([str(word) for word in words])
+        seen = capsys.readouterr()
+        return Run(code, seen.out, seen.err)
+
+    return call
+
+
+@pytest.fixture
+def run_process(tmp_path: Path) -> Command:
+    """Calls the command line in a process of its own."""
+
+    def call(*words: object, **options: Any) -> Run:
+        done = subprocess.run(
+            [sys.executable, "-m", "casadi_ik", *map(str, words)],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            timeout=120,
+            **options,
+        )
+        return Run(done.returncode, done.stdout, done.stderr)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def contacts(robot: ik.ArmHand) -> dict[str, dict[str, list[float]]]:
+    """Contacts of the robot in a posture it can reach, as a grasp file has them."""
+    points, normals = robot.contacts(POSTURE)
+    return {
+        name: {"point": points[i].tolist(), "normal": normals[i].tolist()}
+        for i, name in enumerate(robot.fingers)
+    }
+
+
+@pytest.fixture
+def grasp_file(tmp_path: Path, contacts: dict[str, Any]) -> Callable[..., Path]:
+    """Writes a grasp file; keyword arguments replace top-level keys, None takes one away."""
+
+    def write(name: str = "pinch.yaml", **changes: Any) -> Path:
+        data = {"robot": "kuka_lwr_barrett", "contacts": contacts} | changes
+        path = tmp_path / name
+        path.write_text(yaml.safe_dump({k: v for k, v in data.items() if v is not None}))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def far_away(grasp_file: Callable[..., Path], contacts: dict[str, Any]) -> Path:
+    """A valid grasp file that no one can reach."""
+    moved = {
+        name: {"point": [x + 5.0 for x in contact["point"]], "normal": contact["normal"]}
+        for name, contact in contacts.items()
+    }
+    return grasp_file("far_away.yaml", contacts=moved)
+
+
+@pytest.fixture
+def target_file(tmp_path: Path, robot: ik.ArmHand) -> Callable[..., Path]:
+    """Writes three targets that can be reached; keyword arguments replace arrays."""
+
+    def write(name: str = "targets.npz", count: int = 3, **changes: Any) -> Path:
+        points, normals = robot.contacts(np.tile(POSTURE, (count, 1)))
+        arrays: dict[str, Any] = {"points": points, "normals": normals} | changes
+        path = tmp_path / name
+        with path.open("wb") as stream:
+            np.savez(stream, **{k: v for k, v in arrays.items() if v is not None})
+        return path
+
+    return write

@@ -1,0 +1,48 @@
+"""What all tests share: the shipped robot, a robot with every kind of coupling, an oracle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from pinocchio_oracle import PinocchioRobot
+from toy_robots import copy_shipped_robot, write_coupled_robot
+
+
+@pytest.fixture(scope="session")
+def robot() -> ik.ArmHand:
+    """The shipped KUKA LWR 4+ with the Barrett hand."""
+    return ik.load_robot("kuka_lwr_barrett")
+
+
+@pytest.fixture(scope="session")
+def coupled_robot(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
+    """A small robot in which every kind of coupling and joint occurs."""
+    return ik.load_robot(write_coupled_robot(tmp_path_factory.mktemp("coupled")))
+
+
+@pytest.fixture(scope="session")
+def oracle(robot: ik.ArmHand) -> PinocchioRobot:
+    """The shipped robot as pinocchio reads it from the written URDF."""
+    return PinocchioRobot(robot)
+
+
+@pytest.fixture(scope="session")
+def coupled_oracle(coupled_robot: ik.ArmHand) -> PinocchioRobot:
+    """The coupled robot as pinocchio reads it from the written URDF."""
+    return PinocchioRobot(coupled_robot)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Random numbers, the same in every run."""
+    return np.random.default_rng(20211121)
+
+
+@pytest.fixture
+def own_robot(tmp_path: Path) -> Path:
+    """A copy of the shipped descriptions, for tests that break them."""
+    return copy_shipped_robot(tmp_path)

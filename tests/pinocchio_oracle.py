@@ -1,0 +1,62 @@
+"""The independent oracle: pinocchio on the URDF that a robot writes of itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+import casadi_ik as ik
+
+
+class PinocchioRobot:
+    """A robot in pinocchio; every joint is free, whatever it is coupled to."""
+
+    def __init__(self, robot: ik.ArmHand) -> None:
+        self.robot = robot
+        self.model = pin.buildModelFromXML(robot.urdf())
+        self.data = self.model.createData()
+
+    def configuration(self, q) -> np.ndarray:
+        """pinocchio's own vector for our actuators."""
+        values = np.zeros(self.model.nq)
+        for name, value in self.robot.joints(q).items():
+            values[self.model.joints[self.model.getJointId(name)].idx_q] = value
+        return values
+
+    def frames(self, q) -> dict[str, np.ndarray]:
+        """Pose (4, 4) of every link, the contact links included."""
+        pin.framesForwardKinematics(self.model, self.data, self.configuration(q))
+        return {
+            frame.name: self.data.oMf[i].homogeneous
+            for i, frame in enumerate(self.model.frames)
+            if frame.type == pin.FrameType.BODY
+        }
+
+    def contacts(self, q) -> tuple[np.ndarray, np.ndarray]:
+        """Points and normals as `ArmHand.contacts`."""
+        frames = self.frames(q)
+        fingers = self.robot.description.fingers
+        poses = [frames[f"{finger.name}_contact"] for finger in fingers]
+        points = np.array([pose[:3, 3] for pose in poses])
+        normals = [
+            pose[:3, :3] @ finger.normal for pose, finger in zip(poses, fingers, strict=True)
+        ]
+        return points, np.array(normals)
+
+    def jacobian(self, q, frame: str, reference: pin.ReferenceFrame) -> np.ndarray:
+        """(6, m) twist [v; w] of a frame per movable joint, in our order of joints."""
+        pin.computeJointJacobians(self.model, self.data, self.configuration(q))
+        pin.updateFramePlacements(self.model, self.data)
+        found = pin.getFrameJacobian(
+            self.model, self.data, self.model.getFrameId(frame, pin.FrameType.BODY), reference
+        )
+        ids = [self.model.getJointId(name) for name in self.robot.description.joint_names]
+        return found[:, [self.model.joints[i].idx_v for i in ids]]
+
+
+def verdict(oracle: PinocchioRobot, q, points, normals) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [m] and angles [rad] of one configuration from (f, 3) targets."""
+    p, n = oracle.contacts(q)
+    cosine = np.einsum("ij,ij->i", n, normals)
+    sine = np.linalg.norm(np.cross(n, normals), axis=1)
+    return np.linalg.norm(p - points, axis=1), np.arctan2(sine, cosine)

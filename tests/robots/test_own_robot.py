@@ -1,0 +1,148 @@
+"""A user's own descriptions: relative paths, couplings as data, a hand without an arm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from toy_robots import copy_shipped_robot, replace, write_coupled_robot
+
+import casadi_ik as ik
+
+
+def test_copy_with_relative_paths_is_the_same_robot(own_robot, robot, rng, monkeypatch):
+    q = robot.random(rng, 5)
+    expected = robot.contacts(q)
+    for path in (own_robot, str(own_robot)):
+        np.testing.assert_array_equal(ik.load_robot(path).contacts(q), expected)
+    monkeypatch.chdir(own_robot.parent)
+    np.testing.assert_array_equal(ik.load_robot("robot.yaml").contacts(q), expected)
+
+
+def test_mount_turns_and_shifts_the_hand(own_robot, robot, rng):
+    replace(own_robot, "mount: {xyz: [0, 0, 0], rpy: [0, 0, 0]}", "mount: {xyz: [0, 0, 1 cm]}")
+    own = ik.load_robot(own_robot)
+    q = robot.random(rng, 3)
+    shift = robot.palm(q)[:, :3, 2] * 0.01
+    np.testing.assert_allclose(
+        own.contacts(q)[0], robot.contacts(q)[0] + shift[:, None], atol=1e-15
+    )
+
+
+def test_joints_may_stand_in_any_order(tmp_path, rng):
+    path = copy_shipped_robot(tmp_path)
+    hand = tmp_path / "hand.yaml"
+    lines = hand.read_text().split("joints:\n")
+    body, rest = lines[1].split("\npalm:")
+    entries = ["  - " + entry for entry in body.split("  - ")[1:]]
+    hand.write_text(lines[0] + "joints:\n" + "\n".join(reversed(entries)) + "\npalm:" + rest)
+    own, shipped = ik.load_robot(path), ik.load_robot("kuka_lwr_barrett")
+    q = shipped.random(rng, 3)
+    assert own.actuators == shipped.actuators
+    np.testing.assert_allclose(own.contacts(q), shipped.contacts(q), atol=1e-15)
+
+
+def test_couplings_follow_their_closed_formulas(coupled_robot, rng):
+    q = coupled_robot.random(rng, 200)
+    assert coupled_robot.actuators == (
+        "spread", "screw_1", "screw_2", "thumb_turn", "thumb_slide", "thumb_bend",
+    )  # fmt: skip
+    assert [a.unit for a in coupled_robot.description.actuators] == [
+        "rad", "m", "m", "rad", "m", "rad",
+    ]  # fmt: skip
+    spread, s_1, s_2, turn, slide, bend = q.T
+
+    def triangle(s, b, c):
+        return np.arccos((b * b + c * c - s * s) / (2 * b * c))
+
+    left_2 = triangle(s_2, 0.0498, 0.014) - 0.81437063
+    # Chandra, eq. (9), the branch as printed, lengths in cm.
+    p, bar_q, g, h = 2.97, 3.47, 0.84, 0.72
+    phi = 3.32939008 + left_2
+    a, b = 2 * p * bar_q * np.cos(phi) - 2 * g * bar_q, 2 * p * bar_q * np.sin(phi)
+    c = g * g + p * p + bar_q * bar_q - h * h - 2 * p * g * np.cos(phi)
+    psi = np.arctan2(b, a) - np.arccos(c / np.hypot(a, b))
+    theta_3 = (
+        np.arctan2(bar_q * np.sin(psi) - p * np.sin(phi), g + bar_q * np.cos(psi) - p * np.cos(phi))
+        - phi
+    )
+    left_3 = (theta_3 - 4.1110 + np.pi) % (2 * np.pi) - np.pi
+    expected = {
+        "left_spread": 0.8 * spread + 0.1,
+        "left_1": triangle(s_1, 0.0522, 0.013) - 0.58,
+        "left_2": left_2,
+        "left_3": left_3,
+        "left_4": -0.5 * left_3 + 0.05,
+        "right_spread": 1.2 * spread - 0.1,
+        "right_1": 2 * (-0.5 * left_3 + 0.05) + 0.3,
+        "thumb_turn": turn,
+        "thumb_slide": slide,
+        "thumb_bend": bend,
+    }
+    joints = coupled_robot.joints(q)
+    assert set(joints) == set(expected)
+    for name, values in expected.items():
+        np.testing.assert_allclose(joints[name], values, atol=2e-13, err_msg=name)
+        assert np.ptp(values) > 1e-3
+
+
+def test_published_end_of_the_four_bar(coupled_robot):
+    """Facts, section 3: q3 runs from 0 to 0.606 while q2 runs from 0 to 1.225."""
+    q = np.tile(coupled_robot.home, (2, 1))
+    q[:, 2] = [0.0415, 0.0575]
+    joints = coupled_robot.joints(q)
+    np.testing.assert_allclose(joints["left_2"], [0.0, 1.225], atol=5e-3)
+    np.testing.assert_allclose(joints["left_3"], [0.0, 0.606], atol=2e-3)
+
+
+def test_actuators_of_a_finger_see_through_the_couplings(coupled_robot):
+    description = coupled_robot.description
+    assert description.finger_actuators("left") == (0, 1, 2)
+    assert description.finger_actuators("right") == (0, 2)
+    assert description.finger_actuators("thumb") == (3, 4, 5)
+    assert description.arm_actuators == ()
+    assert [finger.name for finger in description.fingers] == ["right", "thumb", "left"]
+    assert description.finger("right").joints == ("right_spread", "right_1")
+
+
+def test_home_defaults_to_the_nearest_attainable_zero(coupled_robot):
+    np.testing.assert_array_equal(coupled_robot.home, [0.2, 0.042, 0.0415, 0, 0, 0.1])
+
+
+def test_finger_begins_at_the_palm(tmp_path):
+    """Joints between the hand's root and the palm belong to no finger."""
+    path = write_coupled_robot(tmp_path)
+    replace(tmp_path / "parts" / "hand.yaml", "palm: {link: hand", "palm: {link: thumb_0")
+    finger = ik.load_robot(path).description.finger("thumb")
+    assert finger.joints == ("thumb_slide", "thumb_bend")
+
+
+def test_sources_of_the_same_tag_are_told_apart(own_robot):
+    arm = own_robot.with_name("arm.yaml")
+    replace(arm, "  centro:", "  mdh: of the arm\n  centro:")
+    sources = ik.load_robot(own_robot).description.sources
+    assert sources["mdh"] == "of the arm"
+    assert "Craig" in sources["barrett_bh8_280.mdh"]
+
+
+def test_any_name_of_robot_and_fingers_will_do(tmp_path, rng):
+    path = copy_shipped_robot(tmp_path)
+    replace(path, "name: kuka_lwr_barrett", 'name: "7 dwarfs & a hand-1"')
+    replace(path, "[thumb, finger_2", "[thumb, ring-finger")
+    replace(tmp_path / "hand.yaml", "  finger_2:", "  ring-finger:")
+    own = ik.load_robot(path)
+    points, normals = own.contacts(own.home)
+    for finger_step in ("closed-form", "ipopt"):
+        solver = ik.Solver(
+            own,
+            "enhanced-dls",
+            finger_step=finger_step,
+            compiled=False,
+            options={"max_iterations": 3},
+        )
+        assert solver.solve_batch(points[None], normals[None]).success.all()
+    assert 'name="7 dwarfs &amp; a hand-1"' in own.urdf()
+
+
+def test_load_robot_says_what_is_wrong():
+    with pytest.raises(ik.CasadiIKError, match="no shipped arm-hand is called 'kuka'"):
+        ik.load_robot("kuka")

@@ -1,0 +1,241 @@
+"""The shipped robot against the published tables, computed here a second time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+import casadi_ik as ik
+from casadi_ik.files.shipped import models_folder
+from casadi_ik.robots import load_description
+
+DEG = np.pi / 180
+
+
+def rot(axis: int, angle: float) -> np.ndarray:
+    pose = np.eye(4)
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    pose[i, i] = pose[j, j] = np.cos(angle)
+    pose[i, j], pose[j, i] = -np.sin(angle), np.sin(angle)
+    return pose
+
+
+def shift(axis: int, length: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[axis, 3] = length
+    return pose
+
+
+def lwr(theta: np.ndarray) -> np.ndarray:
+    """Flange pose by standard DH: Rz(theta) Tz(d) Tx(0) Rx(alpha)."""
+    pose = np.eye(4)
+    table = [(0.3105, 90), (0, -90), (0.4, -90), (0, 90), (0.39, 90), (0, -90), (0.078, 0)]
+    for angle, (d, alpha) in zip(theta, table, strict=True):
+        pose = pose @ rot(2, angle) @ shift(2, d) @ rot(0, alpha * DEG)
+    return pose
+
+
+R_SIGN, J_SIGN = {1: -1, 2: 1, 3: 0}, {1: 1, 2: 1, 3: -1}
+NUMBER = {"thumb": 3, "finger_2": 2, "finger_3": 1}
+
+
+def barrett(k: int, spread: float, proximal: float, distal: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frames {3} and {T} of finger k in frame W by modified DH (manual, Table 9)."""
+    r, j = R_SIGN[k], J_SIGN[k]
+    phi_2, phi_3 = 2.456 * DEG, 37.544 * DEG
+    rows = [
+        (r * 0.025, 0.0, 0.0754, r * spread - np.pi / 2 * j),
+        (0.050, np.pi / 2, 0.0, proximal + phi_2),
+        (0.070, 0.0, 0.0, distal + phi_3),
+        (0.050, -np.pi / 2, 0.0095, 0.0),
+    ]
+    frames, pose = [], np.eye(4)
+    for a, alpha, d, theta in rows:
+        pose = pose @ shift(0, a) @ rot(0, alpha) @ rot(2, theta) @ shift(2, d)
+        frames.append(pose)
+    return frames[2], frames[3]
+
+
+def test_contacts_by_denavit_hartenberg(robot, rng):
+    q = rng.uniform(-np.pi, np.pi, (60, 14))
+    q[:30] = robot.random(rng, 30)
+    points, normals = robot.contacts(q)
+    for row, theta in enumerate(q):
+        flange = lwr(theta[:7])
+        for column, (name, k) in enumerate(NUMBER.items()):
+            assert robot.fingers[column] == name
+            proximal, distal = theta[8 + 2 * column : 10 + 2 * column]
+            third, tip = barrett(k, theta[7], proximal, distal)
+            expected = flange @ tip
+            np.testing.assert_allclose(points[row, column], expected[:3, 3], atol=1e-12)
+            np.testing.assert_allclose(normals[row, column], (flange @ third)[:3, 1], atol=1e-12)
+            np.testing.assert_allclose(normals[row, column], expected[:3, 2], atol=1e-12)
+
+
+def test_palm_is_frame_w_on_the_flange(robot, rng):
+    for q in robot.random(rng, 10):
+        np.testing.assert_allclose(robot.palm(q), lwr(q[:7]), atol=1e-12)
+        np.testing.assert_allclose(robot.links(q)["lwr_flange"], lwr(q[:7]), atol=1e-12)
+    np.testing.assert_allclose(robot.palm(np.zeros(14))[:3, 3], [0, 0, 1.1785], atol=1e-15)
+
+
+@pytest.mark.parametrize(("finger", "sign"), [("finger_2", 1.0), ("finger_3", -1.0), ("thumb", 0)])
+def test_normal_formula_of_qiu(robot, rng, finger, sign):
+    """[-s1 s23, c1 s23, c23] with theta_1 = +spread, -spread and pi (facts, section 2)."""
+    column = robot.fingers.index(finger)
+    for q in robot.random(rng, 20):
+        _, normals = robot.contacts(q)
+        theta_1 = sign * q[7] if sign else np.pi
+        theta_23 = q[8 + 2 * column] + q[9 + 2 * column] + 40 * DEG
+        expected = [
+            -np.sin(theta_1) * np.sin(theta_23),
+            np.cos(theta_1) * np.sin(theta_23),
+            np.cos(theta_23),
+        ]
+        palm = robot.palm(q)[:3, :3]
+        np.testing.assert_allclose(palm.T @ normals[column], expected, atol=1e-12)
+
+
+def test_published_tips_of_the_open_hand(robot):
+    """Facts, section 2: tips and normals at spread 0, proximal 0."""
+    palm = robot.palm(np.zeros(14))
+    points, normals = robot.contacts(np.zeros(14))
+    local = (points - palm[:3, 3]) @ palm[:3, :3]
+    expected = [[0, 0.1521, 0.1178], [0.025, -0.1521, 0.1178], [-0.025, -0.1521, 0.1178]]
+    np.testing.assert_allclose(local, expected, atol=5e-5)
+    np.testing.assert_allclose(
+        normals @ palm[:3, :3],
+        [[0, -0.643, 0.766], [0, 0.643, 0.766], [0, 0.643, 0.766]],
+        atol=5e-4,
+    )
+
+
+def test_names_and_order(robot):
+    assert robot.name == "kuka_lwr_barrett"
+    assert robot.fingers == ("thumb", "finger_2", "finger_3")
+    assert robot.thumb == "thumb"
+    assert robot.actuators == (
+        *(f"lwr_joint_{i}" for i in range(1, 8)),
+        "bh_spread",
+        "bh_thumb_proximal",
+        "bh_thumb_distal",
+        "bh_finger_2_proximal",
+        "bh_finger_2_distal",
+        "bh_finger_3_proximal",
+        "bh_finger_3_distal",
+    )
+
+
+def test_limits_and_home(robot):
+    upper = [170, 120, 170, 120, 170, 120, 170, 180, 140, 48, 140, 48, 140, 48]
+    lower = [-x for x in upper[:7]] + [0] * 7
+    home = [0, 30, 0, -90, 0, 60, 0, 30, 90, 10, 90, 10, 90, 10]
+    np.testing.assert_allclose(robot.upper, np.radians(upper), rtol=1e-15)
+    np.testing.assert_allclose(robot.lower, np.radians(lower), rtol=1e-15)
+    np.testing.assert_allclose(robot.home, np.radians(home), rtol=1e-15)
+    velocity = [actuator.velocity for actuator in robot.description.actuators]
+    np.testing.assert_allclose(np.degrees(velocity[:7]), [110, 110, 128, 128, 204, 184, 184])
+    assert velocity[7:] == [2.0] * 7
+    for joint in robot.description.movable:
+        if joint.name in robot.actuators:
+            i = robot.actuators.index(joint.name)
+            assert (joint.lower, joint.upper) == (robot.lower[i], robot.upper[i])
+
+
+def test_arrays_are_read_only(robot):
+    for array in (robot.lower, robot.upper, robot.home, robot.description.palm_placement):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
+def test_one_motor_spreads_two_fingers_mirrored(robot):
+    q = robot.home.copy()
+    q[7] = 0.7
+    joints = robot.joints(q)
+    assert set(joints) == set(robot.actuators) - {"bh_spread"} | {
+        "bh_finger_2_spread",
+        "bh_finger_3_spread",
+    }
+    assert joints["bh_finger_2_spread"] == joints["bh_finger_3_spread"] == 0.7
+    points, _ = robot.contacts(q)
+    palm = robot.palm(q)
+    local = (points - palm[:3, 3]) @ palm[:3, :3]
+    np.testing.assert_allclose(local[1] * [-1, 1, 1], local[2], atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["arms", "hands"])
+def test_every_number_has_a_source(kind):
+    for path in (models_folder() / kind).glob("*.yaml"):
+        text = yaml.safe_load(path.read_text())
+        entries = [*text["joints"], *text.get("fingers", {}).values()]
+        entries += [text[key] for key in ("tip", "palm") if key in text]
+        entries += [a for a in (text.get("actuators") or {}).values() if "limits" in a]
+        assert len(entries) > 7
+        for entry in entries:
+            tags = entry["source"].split()
+            assert tags, entry
+            assert set(tags) <= set(text["sources"]), entry
+
+
+@pytest.mark.parametrize("name", ik.shipped_names("arm_hands"))
+def test_every_shipped_robot_loads(name):
+    robot = ik.load_robot(name)
+    assert robot.name == name
+    assert robot.thumb in robot.fingers
+    assert np.all(robot.lower < robot.upper)
+    assert robot.home.shape == (len(robot.actuators),)
+    assert load_description(name).sources
+    points, normals = robot.contacts(robot.home)
+    assert points.shape == (len(robot.fingers), 3)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, rtol=1e-14)
+
+
+def test_batches_equal_singles(robot, rng):
+    q = robot.random(rng, 5)
+    points, normals = robot.contacts(q)
+    joints, links, palms = robot.joints(q), robot.links(q), robot.palm(q)
+    for i in range(5):
+        single = robot.contacts(q[i])
+        np.testing.assert_array_equal(points[i], single[0])
+        np.testing.assert_array_equal(normals[i], single[1])
+        np.testing.assert_array_equal(palms[i], robot.palm(q[i]))
+        assert robot.joints(q[i]) == {name: values[i] for name, values in joints.items()}
+        for name, pose in robot.links(q[i]).items():
+            np.testing.assert_array_equal(links[name][i], pose)
+    empty_points, _ = robot.contacts(np.empty((0, 14)))
+    assert empty_points.shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("q", "says"),
+    [
+        (np.zeros(13), r"q: found shape \(13,\), expected \(14,\) or \(k, 14\)"),
+        (np.zeros((2, 2, 14)), r"found shape \(2, 2, 14\)"),
+        (np.full(14, np.nan), "NaN"),
+        (np.full(14, np.inf), "finite"),
+        (["a"] * 14, "expected numbers"),
+        ([[1.0], [1.0, 2.0]], "expected numbers"),
+        (1.0, r"found shape \(\)"),
+    ],
+)
+def test_bad_configurations(robot, q, says):
+    for ask in (robot.contacts, robot.joints, robot.palm, robot.links):
+        with pytest.raises(ik.CasadiIKError, match=says):
+            ask(q)
+
+
+def test_random_configurations_lie_within_limits(robot):
+    q = robot.random(np.random.default_rng(1), 500)
+    assert np.all((q >= robot.lower) & (q <= robot.upper))
+    assert np.all(np.ptp(q, axis=0) > 0.9 * (robot.upper - robot.lower))
+    np.testing.assert_array_equal(q, robot.random(np.random.default_rng(1), 500))
+
+
+def test_unknown_names_list_the_known(robot):
+    with pytest.raises(ik.CasadiIKError, match="no finger 'pinky'; its fingers: thumb, finger_2"):
+        robot.description.finger("pinky")
+    with pytest.raises(ik.CasadiIKError, match="no actuator 'x'; its actuators: lwr_joint_1"):
+        robot.description.actuator_index("x")
+    with pytest.raises(ik.CasadiIKError, match="no link 'x'"):
+        robot.description.chain("x")

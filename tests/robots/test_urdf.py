@@ -1,0 +1,64 @@
+"""The written URDF, read by pinocchio."""
+
+from __future__ import annotations
+
+import math
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+
+@pytest.fixture(params=["shipped", "coupled"])
+def pair(request, robot, oracle, coupled_robot, coupled_oracle):
+    return (robot, oracle) if request.param == "shipped" else (coupled_robot, coupled_oracle)
+
+
+def test_frames_and_contacts(pair, rng):
+    robot, oracle = pair
+    for q in robot.random(rng, 40):
+        frames, links = oracle.frames(q), robot.links(q)
+        assert set(frames) == set(links) | {f"{finger}_contact" for finger in robot.fingers}
+        for name, pose in links.items():
+            np.testing.assert_allclose(pose, frames[name], atol=1e-12, err_msg=name)
+        points, normals = robot.contacts(q)
+        expected_points, expected_normals = oracle.contacts(q)
+        np.testing.assert_allclose(points, expected_points, atol=1e-12)
+        np.testing.assert_allclose(normals, expected_normals, atol=1e-12)
+
+
+def test_limits_and_velocities(pair):
+    robot, oracle = pair
+    for joint in robot.description.movable:
+        entry = oracle.model.joints[oracle.model.getJointId(joint.name)]
+        assert oracle.model.lowerPositionLimit[entry.idx_q] == joint.lower
+        assert oracle.model.upperPositionLimit[entry.idx_q] == joint.upper
+        expected = joint.velocity if math.isfinite(joint.velocity) else 10.0
+        assert oracle.model.velocityLimit[entry.idx_v] == expected
+
+
+def test_mimic_joints_stand_for_the_linear_couplings(pair, rng):
+    """With mimic joints on, only what they leave free has to be set."""
+    robot, _ = pair
+    model = pin.buildModelFromXML(robot.urdf(), mimic=True)
+    data = model.createData()
+    shared = {"left_4", "right_1", "right_spread", "bh_finger_3_spread"}
+    followers = shared & set(robot.description.joint_names)
+    assert model.nq == len(robot.description.joint_names) - len(followers)
+    for q in robot.random(rng, 20):
+        values = np.zeros(model.nq)
+        for name, value in robot.joints(q).items():
+            if name not in followers:
+                values[model.joints[model.getJointId(name)].idx_q] = value
+        pin.framesForwardKinematics(model, data, values)
+        for name, pose in robot.links(q).items():
+            found = data.oMf[model.getFrameId(name, pin.FrameType.BODY)].homogeneous
+            np.testing.assert_allclose(pose, found, atol=1e-12, err_msg=name)
+
+
+def test_something_is_drawn_of_every_part(robot):
+    tree = ElementTree.fromstring(robot.urdf())
+    lengths = [float(node.get("length")) for node in tree.iter("cylinder")]
+    assert len(lengths) > 15
+    assert all(0.005 < length < 0.5 for length in lengths)

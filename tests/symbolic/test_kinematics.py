@@ -1,0 +1,193 @@
+"""Forward kinematics and Jacobians over the motors, against pinocchio and central differences."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.couplings import joint_positions
+from casadi_ik.symbolic.kinematics import axis_rotation, forward
+from casadi_ik.symbolic.so3 import euler_zyx
+
+
+@pytest.fixture(params=["shipped", "coupled"])
+def pair(request, robot, oracle, coupled_robot, coupled_oracle):
+    return (robot, oracle) if request.param == "shipped" else (coupled_robot, coupled_oracle)
+
+
+def inner(robot, rng, count):
+    """Configurations far enough from the limits for central differences of sliders."""
+    margin = 0.02 * (robot.upper - robot.lower)
+    return rng.uniform(robot.lower + margin, robot.upper - margin, (count, len(robot.actuators)))
+
+
+def over_q(robot, build) -> ca.Function:
+    """Function of q of what `build` makes of the actuated kinematics."""
+    q = ca.SX.sym("q", len(robot.actuators))
+    outputs = build(actuated(robot.description, q))
+    outputs = outputs if isinstance(outputs, (tuple, list)) else [outputs]
+    return ca.Function("f", [q], [ca.densify(output) for output in outputs])
+
+
+def numbers(f: ca.Function, q) -> list[np.ndarray]:
+    return [np.array(value) for value in f.call([ca.DM(q)])]
+
+
+def difference(f, q, step=1e-6) -> np.ndarray:
+    """Central differences of an array-valued f, last axis over q."""
+    columns = []
+    for i in range(len(q)):
+        h = np.zeros(len(q))
+        h[i] = step
+        columns.append((f(q + h) - f(q - h)) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+def spin(pose_of, q, step=1e-6) -> np.ndarray:
+    """Angular velocity (3, n) in the base frame of a rotation-valued function."""
+    R = pose_of(q)
+    rate = difference(pose_of, q, step)
+    hat = np.einsum("ijn,kj->ikn", rate, R)
+    return np.array([hat[2, 1] - hat[1, 2], hat[0, 2] - hat[2, 0], hat[1, 0] - hat[0, 1]]) / 2
+
+
+def test_links_and_axes(pair, rng):
+    robot, oracle = pair
+    q = ca.SX.sym("q", len(robot.actuators))
+    kinematics = forward(robot.description, joint_positions(robot.description, q))
+    poses = [ca.horzcat(pose.rotation, pose.origin) for pose in kinematics.links.values()]
+    f = ca.Function("f", [q], [ca.densify(pose) for pose in poses])
+    axes = ca.Function("a", [q], [ca.densify(a) for a in kinematics.axes.values()])
+    for row in robot.random(rng, 20):
+        frames = oracle.frames(row)
+        for name, pose in zip(kinematics.links, numbers(f, row), strict=True):
+            np.testing.assert_allclose(pose, frames[name][:3], atol=1e-12)
+        for name, axis in zip(kinematics.axes, numbers(axes, row), strict=True):
+            joint = next(j for j in robot.description.joints if j.name == name)
+            np.testing.assert_allclose(
+                axis.ravel(), frames[joint.child][:3, :3] @ joint.axis, atol=1e-12
+            )
+
+
+def test_contact_jacobians(pair, rng):
+    robot, oracle = pair
+    everything = range(len(robot.actuators))
+    for i, finger in enumerate(robot.fingers):
+        f = over_q(robot, lambda body, finger=finger: body.contact_jacobian(finger, everything))
+        coupling = over_q(robot, lambda body: body.coupling)
+        for q in inner(robot, rng, 5):
+            linear, angular = numbers(f, q)
+            expected = oracle.jacobian(q, f"{finger}_contact", pin.LOCAL_WORLD_ALIGNED)
+            expected = expected @ numbers(coupling, q)[0]
+            np.testing.assert_allclose(np.vstack([linear, angular]), expected, atol=1e-11)
+            slope = difference(lambda x, i=i: robot.contacts(x)[0][i], q)
+            scale = max(1.0, np.abs(linear).max())
+            np.testing.assert_allclose(linear, slope, atol=1e-8 * scale)
+            turned = difference(lambda x, i=i: robot.contacts(x)[1][i], q)
+            normal = robot.contacts(q)[1][i]
+            scale = max(1.0, np.abs(angular).max())
+            np.testing.assert_allclose(np.cross(angular.T, normal).T, turned, atol=1e-8 * scale)
+
+
+def test_palm_jacobians(pair, rng):
+    robot, oracle = pair
+    everything = list(range(len(robot.actuators)))
+    f = over_q(
+        robot,
+        lambda body: [
+            *body.palm_jacobian(everything),
+            body.palm_body_jacobian(everything),
+            body.palm_euler_jacobian(everything),
+            euler_zyx(body.kinematics.palm.rotation),
+            body.coupling,
+        ],
+    )
+    link, placement = robot.description.palm_link, pin.SE3(robot.description.palm_placement)
+    for q in inner(robot, rng, 5):
+        linear, angular, body, euler, angles, coupling = numbers(f, q)
+        local = placement.toActionMatrixInverse() @ oracle.jacobian(q, link, pin.LOCAL) @ coupling
+        np.testing.assert_allclose(body, local, atol=1e-12)
+        aligned = np.vstack([linear, angular])
+        np.testing.assert_allclose(linear, difference(lambda x: robot.palm(x)[:3, 3], q), atol=1e-8)
+        np.testing.assert_allclose(angular, spin(lambda x: robot.palm(x)[:3, :3], q), atol=1e-8)
+        rotation = robot.palm(q)[:3, :3]
+        np.testing.assert_allclose(np.kron(np.eye(2), rotation) @ body, aligned, atol=1e-12)
+        slope = difference(lambda x: numbers(f, x)[4].ravel(), q)
+        assert abs(np.cos(angles[1])) > 1e-2
+        np.testing.assert_allclose(euler, slope, atol=1e-6)
+
+
+def test_columns_can_be_chosen(robot, rng):
+    q = robot.random(rng, 1)[0]
+    everything = range(14)
+    chosen = [9, 3, 0]
+    full, part = (
+        numbers(over_q(robot, lambda body, c=c: body.contact_jacobian("thumb", c)), q)
+        for c in (everything, chosen)
+    )
+    for whole, columns in zip(full, part, strict=True):
+        np.testing.assert_array_equal(whole[:, chosen], columns)
+
+
+def test_a_joint_that_does_not_carry_the_link_does_not_move_it(robot, rng):
+    linear, angular = numbers(
+        over_q(robot, lambda body: body.contact_jacobian("thumb", range(14))),
+        robot.random(rng, 1)[0],
+    )
+    strangers = [7, 10, 11, 12, 13]
+    assert not linear[:, strangers].any()
+    assert not angular[:, strangers].any()
+    assert np.all(np.abs(angular[:, [0, 6, 8, 9]]).max(axis=0) > 0.1)
+
+
+def test_coupling_jacobian(coupled_robot, rng):
+    f = over_q(coupled_robot, lambda body: [body.coupling, body.kinematics.theta])
+    names = coupled_robot.description.joint_names
+    for q in inner(coupled_robot, rng, 20):
+        coupling, theta = numbers(f, q)
+        assert coupling.shape == (10, 6)
+        np.testing.assert_allclose(
+            theta.ravel(), list(coupled_robot.joints(q).values()), atol=1e-14
+        )
+        slope = difference(lambda x: np.array(list(coupled_robot.joints(x).values())), q, 1e-7)
+        np.testing.assert_allclose(coupling, slope, atol=1e-4, rtol=1e-6)
+    # Facts, section 3: a slider turns its joint by 72 to 138 rad/m.
+    assert 60 < coupling[names.index("left_1"), 1] < 150
+    assert coupling[names.index("right_1"), 2] == pytest.approx(
+        -coupling[names.index("left_3"), 2], rel=1e-12
+    )
+
+
+def test_expressions_of_q_may_be_given(coupled_robot, rng):
+    x = ca.SX.sym("x")
+    body = actuated(coupled_robot.description, x * ca.DM(coupled_robot.home))
+    f = ca.Function("f", [x], [ca.densify(body.coupling)])
+    expected = over_q(coupled_robot, lambda b: b.coupling)
+    q = 1.01 * coupled_robot.home
+    np.testing.assert_allclose(numbers(f, 1.01)[0], numbers(expected, q)[0], rtol=1e-13)
+
+
+def test_axis_rotation(rng):
+    for axis in [*np.eye(3), -np.eye(3)[1], np.array([1.0, 2.0, 3.0]) / np.sqrt(14)]:
+        angle = rng.uniform(-4, 4)
+        x = ca.SX.sym("x")
+        f = ca.Function("f", [x], [ca.densify(axis_rotation(axis, x))])
+        np.testing.assert_allclose(
+            numbers(f, angle)[0], pin.AngleAxis(angle, axis).toRotationMatrix(), atol=1e-15
+        )
+
+
+def test_rounded_constants_cost_nothing(robot, monkeypatch):
+    """Zeros and ones that come out of cosines as 1e-17 and 1 - 1e-16 leave no operations."""
+
+    def instructions() -> int:
+        q = ca.SX.sym("q", 14)
+        points = [actuated(robot.description, q).kinematics.contact(f)[0] for f in robot.fingers]
+        return ca.Function("f", [q], points).n_instructions()
+
+    cleaned = instructions()
+    monkeypatch.setattr("casadi_ik.symbolic.kinematics.ROUNDING", 0.0)
+    assert cleaned < 0.95 * instructions()

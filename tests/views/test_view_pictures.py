@@ -1,0 +1,212 @@
+"""The pictures: what is written on them, what is in them, and how they get into a file."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import matplotlib.colors as mcolors
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError, PictureError
+from casadi_ik.views import draw_convergence, draw_solution
+from casadi_ik.views.captions import MET_COLOR, MISSED_COLOR, OBJECT_COLOR, TARGET_COLOR
+from casadi_ik.views.picture import new_figure, save_picture
+
+COARSE = 40  # dots per inch
+
+
+def words(figure: Figure) -> str:
+    texts = [text.get_text() for text in figure.texts]
+    texts += [text.get_text() for axes in figure.axes for text in axes.texts]
+    texts += [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    return "\n".join(texts)
+
+
+def count(figure: Figure, color: str) -> int:
+    """Pixels of about this colour in the two views."""
+    hue = mcolors.rgb_to_hsv(mcolors.to_rgb(color))
+    pixels = 0
+    for axes in figure.axes:
+        hsv = mcolors.rgb_to_hsv(np.clip(axes.images[0].get_array(), 0, 1))
+        alike = np.abs(hsv[..., 0] - hue[0]) < 0.03
+        pixels += int((alike & (hsv[..., 1] > 0.25) & (hsv[..., 2] > 0.6 * hue[2])).sum())
+    return pixels
+
+
+def test_the_picture_says_how_it_ended(robot, solution, grasp) -> None:
+    figure = draw_solution(robot, solution, grasp, dpi=COARSE)
+    text = words(figure)
+    worst = max(contact.position_error for contact in solution.contacts.values())
+    for part in ("cup", robot.name, "SOLVED", "enhanced-dls", f"{1e3 * worst:.2f} mm", "°"):
+        assert part in text
+    for finger in robot.fingers:
+        assert finger in text
+    assert len(figure.axes) == 2
+
+
+def test_the_picture_shows_object_target_and_contacts(robot, solution, grasp) -> None:
+    figure = draw_solution(robot, solution, grasp, dpi=COARSE)
+    for color in (OBJECT_COLOR, TARGET_COLOR, MET_COLOR):
+        assert count(figure, color) > 20
+    assert count(figure, MISSED_COLOR) == 0
+    without = dataclasses.replace(grasp, object="")
+    assert count(draw_solution(robot, solution, without, dpi=COARSE), OBJECT_COLOR) == 0
+
+
+def test_a_missed_grasp_is_red(robot, grasp) -> None:
+    solver = ik.Solver(
+        robot, "enhanced-dls", finger_step="closed-form", options={"max_iterations": 2}
+    )
+    solution = solver.solve(grasp)
+    figure = draw_solution(robot, solution, grasp, dpi=COARSE)
+    assert "ITERATION_LIMIT" in words(figure)
+    assert "out of tolerance" in words(figure)
+    assert count(figure, MISSED_COLOR) > 20
+    assert count(figure, MET_COLOR) == 0
+
+
+def test_free_fingers_and_normals_are_left_out(robot, solution, grasp) -> None:
+    point = grasp.contacts["thumb"].point
+    part = ik.Grasp({"thumb": ik.Contact(point)}, name="a point", object="no such thing")
+    verdicts = {
+        name: ik.ContactVerdict(np.nan, np.nan, True) for name in robot.fingers if name != "thumb"
+    } | {"thumb": ik.ContactVerdict(1e-3, np.nan, True)}
+    answer = dataclasses.replace(solution, contacts=verdicts)
+    text = words(draw_solution(robot, answer, part, dpi=COARSE))
+    assert "1.00 mm" in text
+    assert "nan" not in text
+    assert "finger_2" not in text
+
+
+def test_a_target_far_away_does_not_shrink_the_close_up(robot, solution, grasp) -> None:
+    contacts = {
+        name: ik.Contact(contact.point + np.array([5.0, 0, 0]), contact.normal)
+        for name, contact in grasp.contacts.items()
+    }
+    missed = {name: ik.ContactVerdict(5.0, 0.0, False) for name in robot.fingers}
+    far = draw_solution(
+        robot,
+        dataclasses.replace(solution, contacts=missed),
+        dataclasses.replace(grasp, contacts=contacts, object_pose=None),
+        dpi=COARSE,
+    )
+    image = far.axes[1].images[0].get_array()
+    assert (image.min(axis=2) < 0.9).mean() > 0.1
+
+
+def test_a_finger_the_robot_has_not_is_refused(robot, solution) -> None:
+    with pytest.raises(InputError, match=r"contacts\.toe"):
+        draw_solution(robot, solution, ik.Grasp({"toe": ik.Contact([0, 0, 1])}), dpi=COARSE)
+
+
+def test_pictures_are_written_whole_at_their_size(robot, solution, grasp, log, tmp_path) -> None:
+    jobs = [
+        lambda: draw_solution(robot, solution, grasp, tmp_path / "grasp.png", dpi=COARSE),
+        lambda: draw_convergence(log.iterations(), tmp_path / "convergence.png", dpi=COARSE),
+    ]
+    with ThreadPoolExecutor(2) as pool:
+        for future in [pool.submit(job) for job in jobs]:
+            future.result()
+    assert imread(tmp_path / "grasp.png").shape[:2] == (264, 480)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["convergence.png", "grasp.png"]
+
+
+def test_what_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    figure = new_figure(1, 1, COARSE)
+    missing = tmp_path / "no" / "such" / "folder.png"
+    with pytest.raises(PictureError, match=r"folder\.png: cannot write the picture: No such file"):
+        save_picture(figure, missing)
+    with pytest.raises(PictureError, match="not a regular file"):
+        save_picture(figure, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_keeps_the_picture_that_was_there(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "old.png"
+    path.write_bytes(b"old")
+
+    def full(self: Path, data: bytes) -> int:
+        with self.open("wb") as stream:
+            stream.write(data[:10])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(PictureError, match=r"old\.png: .*No space left"):
+        save_picture(new_figure(1, 1, COARSE), path)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_convergence_draws_the_errors_in_millimetres_and_degrees(robot, log) -> None:
+    iterations = log.iterations()
+    figure = draw_convergence(iterations, dpi=COARSE)
+    by_title = {axes.get_title(loc="left"): axes for axes in figure.axes}
+    for title, field, factor in (
+        ("distance to the contact [mm]", "position_error", 1e3),
+        ("angle to the normal [deg]", "angle_error", np.rad2deg(1)),
+    ):
+        lines = {line.get_label(): line for line in by_title[title].lines}
+        for column, finger in enumerate(robot.fingers):
+            values = lines[finger.replace("_", " ")].get_ydata()
+            expected = np.maximum(iterations.rows[field][:, column] * factor, 1e-6)
+            np.testing.assert_allclose(values, expected, rtol=1e-6)
+    bounds = [
+        line.get_ydata()[0]
+        for axes in by_title.values()
+        for line in axes.lines
+        if line.get_label() == "tolerance"
+    ]
+    np.testing.assert_allclose(bounds, [5.0, 3.0])
+    assert "smallest singular value" in by_title
+    assert "thumb reaching" in words(figure)
+    assert "SOLVED" in words(figure)
+    ever = np.bitwise_or.reduce(iterations.rows["limit_mask"])
+    named = [label.get_text() for label in by_title["at a limit"].get_yticklabels()]
+    assert named == [
+        name.replace("_", " ") for bit, name in enumerate(robot.actuators) if ever >> bit & 1
+    ]
+
+
+def test_convergence_takes_a_tolerance_and_a_title(log) -> None:
+    tolerance = ik.Tolerance(position=1e-3)
+    figure = draw_convergence(log.iterations(), tolerance=tolerance, title="mine", dpi=COARSE)
+    assert 1.0 in [line.get_ydata()[0] for line in figure.axes[0].lines]
+    assert "mine" in words(figure)
+
+
+def test_convergence_wants_one_solve(log) -> None:
+    one = log.iterations()
+    none = dataclasses.replace(
+        one, rows=one.rows[:0], solve_id=one.solve_id[:0], iteration=one.iteration[:0]
+    )
+    with pytest.raises(InputError, match="none to draw"):
+        draw_convergence(none)
+    two = dataclasses.replace(one, solve_id=np.arange(len(one.rows)) % 2)
+    with pytest.raises(InputError, match="several solves"):
+        draw_convergence(two)
+
+
+def test_pyplot_is_never_touched() -> None:
+    code = "import casadi_ik.views, sys; sys.exit('matplotlib.pyplot' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_without_matplotlib_the_error_says_what_to_install() -> None:
+    code = (
+        "import sys; sys.modules['matplotlib'] = None\n"
+        "import casadi_ik\n"
+        "try: import casadi_ik.views\n"
+        "except casadi_ik.CasadiIKError as error: print(type(error).__name__, error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.startswith("MissingExtraError")
+    assert "pip install casadi-ik[plots]" in done.stdout
+    assert done.stdout.count("\n") == 1
