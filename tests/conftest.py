@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-import casadi_ik as ik
 from pinocchio_oracle import PinocchioRobot
 from toy_robots import copy_shipped_robot, write_coupled_robot
+
+import casadi_ik as ik
 
 
 @pytest.fixture(scope="session")

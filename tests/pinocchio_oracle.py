@@ -17,7 +17,7 @@ class PinocchioRobot:
         self.data = self.model.createData()
 
     def configuration(self, q) -> np.ndarray:
-        """pinocchio's own vector for our actuators."""
+        """Pinocchio's own vector for our actuators."""
         values = np.zeros(self.model.nq)
         for name, value in self.robot.joints(q).items():
             values[self.model.joints[self.model.getJointId(name)].idx_q] = value

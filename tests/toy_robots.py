@@ -35,9 +35,9 @@ joints:
      origin: {xyz: [0, 0, 0.01]},
      coupling: {kind: linear, of: left_3, ratio: -0.5, offset: 0.05}}
   - {name: stem, parent: hand, child: stem, type: fixed, axis: [0, 0, 1], limits: [0, 0],
-     origin: {xyz: [0, 0, 0.01], rpy: [0, 0.4, 0]}, source: toy}
-  - {name: right_spread, parent: stem, child: right_0, axis: [0, 0, -1], limits: [-1, 1], source: toy,
-     coupling: {kind: linear, of: spread, ratio: 1.2, offset: -0.1}}
+     origin: {xyz: [0, 0, 0.01], rpy: [0.3, 90 deg, 0.2]}, source: toy}
+  - {name: right_spread, parent: stem, child: right_0, axis: [0, 0, -1], limits: [-1, 1],
+     source: toy, coupling: {kind: linear, of: spread, ratio: 1.2, offset: -0.1}}
   - {name: right_1, parent: right_0, child: right_a, axis: [1, 0, 0], limits: [-2, 2], source: toy,
      origin: {xyz: [0, 0, 0.03]},
      coupling: {kind: linear, of: left_4, ratio: 2, offset: 0.3}}

@@ -98,8 +98,8 @@ class EnhancedMethod:
         parameters[:] = self.step.parameters.pack({"points": nowhere, "normals": nowhere, **values})
         points = self.step.parameters.slice("points")
         normals = self.step.parameters.slice("normals")
-        parameters[:, points] = problems.points.reshape(count, -1)
-        parameters[:, normals] = problems.normals.reshape(count, -1)
+        parameters[:, points] = problems.points.reshape(count, points.stop - points.start)
+        parameters[:, normals] = problems.normals.reshape(count, normals.stop - normals.start)
         states = np.zeros((count, self.step.state.size))
         limits = (self._robot.lower, self._robot.upper)
         states[:, self.step.state.slice("q")] = (
@@ -109,7 +109,7 @@ class EnhancedMethod:
         states[:, self.step.state.slice("best")] = np.finfo(float).max
         return states, parameters
 
-    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:  # noqa: ARG002
         """Solve a batch from one start each; see `Method.run`.
 
         No random numbers are drawn. A start beyond limits that are enforced is moved to them.

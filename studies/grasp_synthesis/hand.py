@@ -13,6 +13,7 @@ from casadi_ik.symbolic.kinematics import Kinematics, Pose, forward
 
 Array = NDArray[np.float64]
 ROBOT = "kuka_lwr_barrett"
+FRAME_W = "bh_base"  # on the mounting face; the palm surface is 80 mm above it
 FINGERS = ("thumb", "finger_2", "finger_3")
 DISTAL_LENGTH = 0.050  # [m] distal joint to {T}, along the link (A3)
 DRIVEN = {"bh_finger_2_spread": "bh_spread", "bh_finger_3_spread": "bh_spread"}
@@ -54,7 +55,7 @@ class ArmHand:
     def contacts_in_palm(self, posture: ca.SX) -> dict[str, Pose]:
         """Contact frame of each finger in palm frame W: x along it, y the outward pad normal."""
         kin = self.kinematics(ca.SX.zeros(7), posture)
-        palm = kin.palm
+        palm = kin.links[FRAME_W]
         frames = {name: kin.contact_frame(name) for name in FINGERS}
         return {
             name: Pose(palm.rotation.T @ frame.rotation, palm.inverse_apply(frame.origin))
@@ -75,7 +76,7 @@ class ArmHand:
             end = distal.origin + distal.rotation[:, 0] * DISTAL_LENGTH
             joints.append(ca.horzcat(knuckle, distal.origin, end))
         arm_links = [kin.links[f"lwr_link_{i}"].origin for i in range(1, 7)]
-        outputs = [kin.palm.rotation, kin.palm.origin, points, normals, *joints]
+        outputs = [kin.links[FRAME_W].rotation, kin.links[FRAME_W].origin, points, normals, *joints]
         return ca.Function("arm_hand", [arm, posture], [*outputs, ca.horzcat(*arm_links)])
 
     def evaluate(self, arm: Array, posture: Array) -> tuple[Array, Array, Array, Array, Array]:

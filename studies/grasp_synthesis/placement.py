@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.grasps import GraspObject
-from grasp_synthesis.hand import ArmHand
+from grasp_synthesis.hand import FRAME_W, ArmHand
 from grasp_synthesis.posture import OPTIONS, Pinch
 from grasp_synthesis.recipes import Recipe
 
@@ -61,7 +61,8 @@ def place(
     wished = rng.uniform(region[::2], region[1::2])
     arm = ca.SX.sym("arm", 7)
     kin = hand.kinematics(arm, ca.SX(pinch.posture))
-    palm, pose = kin.palm, kin.palm.at(pinch.object_in_palm)
+    palm = kin.links[FRAME_W]
+    pose = palm.at(pinch.object_in_palm)
     if recipe.up is None:
         up, height = -palm.rotation[:, 2], -item.mesh(64)[0][:, 2].min()
     else:

@@ -93,3 +93,17 @@ def target_file(tmp_path: Path, robot: ik.ArmHand) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture
+def refused(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """Calls `solve` or `batch` with outputs and gives the refusal; nothing may be left."""
+
+    def call(command: str, subject: object, *words: object) -> str:
+        before = sorted(tmp_path.rglob("*"))
+        outputs = ("--out", tmp_path / "new.out", "--log", tmp_path / "new.mcap")
+        error = run(command, subject, *outputs, *words).error
+        assert sorted(tmp_path.rglob("*")) == before
+        return error
+
+    return call

@@ -2,33 +2,15 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from command_line import Command
 
-import casadi_ik as ik
-
 NAN, INF = float("nan"), float("inf")
 METHOD = ("--method", "enhanced-dls")
-
-
-@pytest.fixture
-def refused(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
-    """Calls the command line with all outputs and gives the refusal; nothing may be left."""
-
-    def call(command: str, subject: object, *words: object) -> str:
-        before = sorted(tmp_path.rglob("*"))
-        outputs = ("--out", tmp_path / "new.out", "--log", tmp_path / "new.mcap")
-        error = run(command, subject, *outputs, *words).error
-        assert sorted(tmp_path.rglob("*")) == before
-        return error
-
-    return call
 
 
 FILES: dict[str, tuple[bytes, str]] = {
@@ -222,102 +204,3 @@ def test_no_log(content: bytes, run: Command, tmp_path: Path) -> None:
     path = tmp_path / "bad.mcap"
     path.write_bytes(content)
     assert run("log", "info", path).error.startswith(f"{path}: ")
-
-
-def _changed(array: np.ndarray, where: Any, value: float) -> np.ndarray:
-    changed = array.copy()
-    changed[where] = value
-    return changed
-
-
-ARRAYS: dict[str, tuple[Callable[[Any, Any], dict[str, Any]], str]] = {
-    "no points": (lambda p, n: {"points": None}, "points: missing, expected"),
-    "no normals": (lambda p, n: {"normals": None}, "normals: missing, expected"),
-    "flat": (lambda p, n: {"points": p[0], "normals": n[0]}, "points: found shape (3, 3)"),
-    "scalar": (lambda p, n: {"points": 1.0}, "points: found shape ()"),
-    "two fingers": (lambda p, n: {"points": p[:, :2]}, "points: found shape (3, 2, 3)"),
-    "rows": (lambda p, n: {"normals": n[:2]}, "found 3 and 2 rows"),
-    "no rows": (lambda p, n: {"points": p[:0], "normals": n[:0]}, "points: found no targets"),
-    "objects": (lambda p, n: {"points": np.array([{}], dtype=object)}, "points: cannot be read"),
-    "text": (lambda p, n: {"points": p.astype(str)}, "points: found values of type <U32"),
-    "complex": (lambda p, n: {"normals": n + 1j}, "normals: found values of type complex128"),
-    "truth": (lambda p, n: {"normals": n > 0}, "normals: found values of type bool"),
-    "infinite": (lambda p, n: {"points": _changed(p, (2, 0, 1), INF)}, "points: row 2"),
-    "partly NaN": (lambda p, n: {"points": _changed(p, (1, 1, 0), NAN)}, "points: row 1"),
-    "zero normal": (lambda p, n: {"normals": _changed(n, (2, 1), 0)}, "normals: row 2"),
-    "no point": (lambda p, n: {"points": _changed(p, (2, 1), NAN)}, "normals: row 2"),
-    "no contact": (
-        lambda p, n: {"points": _changed(p, 1, NAN), "normals": _changed(n, 1, NAN)},
-        "points: row 1",
-    ),
-    "free normal": (lambda p, n: {"normals": _changed(n, (2, 1), NAN)}, "finger_2"),
-}
-
-
-@pytest.mark.parametrize("name", ARRAYS)
-def test_bad_targets(
-    name: str, refused: Callable[..., str], target_file: Callable[..., Path], robot: ik.ArmHand
-) -> None:
-    change, fragment = ARRAYS[name]
-    with np.load(target_file()) as data:
-        changes = change(data["points"], data["normals"])
-    path = target_file(**changes)
-    error = refused("batch", path, "--robot", "kuka_lwr_barrett", *METHOD)
-    assert error.startswith(f"{path}: ")
-    assert fragment in error
-
-
-def _zipped(path: Path, members: dict[str, bytes]) -> None:
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-
-
-HEAD = b"\x93NUMPY\x01\x00\x10\x00"
-CONTENTS: dict[str, bytes | dict[str, bytes]] = {
-    "empty": b"",
-    "text": b"hello",
-    "pickle": b"\x80\x04}\x94.",
-    "no arrays": {"points": b"hello", "normals": b"hello"},
-    "bad header": {"points.npy": HEAD + b"{'descr': 'zz'  \n", "normals.npy": HEAD},
-    "not a literal": {"points.npy": HEAD + b"import os; 1   \n", "normals.npy": HEAD},
-    "cut off": {"points.npy": HEAD[:7], "normals.npy": HEAD[:7]},
-}
-
-
-@pytest.mark.parametrize("name", CONTENTS)
-def test_no_targets(name: str, refused: Callable[..., str], tmp_path: Path) -> None:
-    path, content = tmp_path / "bad.npz", CONTENTS[name]
-    if isinstance(content, dict):
-        _zipped(path, content)
-    else:
-        path.write_bytes(content)
-    error = refused("batch", path, "--robot", "kuka_lwr_barrett")
-    assert error.startswith(f"{path}: ")
-
-
-def test_damaged_targets(
-    run: Command, target_file: Callable[..., Path], rng: np.random.Generator, tmp_path: Path
-) -> None:
-    path, out = target_file(), tmp_path / "new.npz"
-    whole = path.read_bytes()
-    refusals = 0
-    for _ in range(60):
-        damaged = bytearray(whole)
-        start = int(rng.integers(0, len(whole) - 20))
-        damaged[start : start + 20] = rng.bytes(20)
-        path.write_bytes(damaged)
-        done = run("batch", path, "--robot", "kuka_lwr_barrett", *METHOD, "--out", out)
-        if done.exit == 2:
-            assert done.error.startswith(f"{path}: ")
-            assert list(tmp_path.iterdir()) == [path]
-            refusals += 1
-        else:  # bytes that nobody reads
-            out.unlink()
-    assert refusals > 40
-
-
-@pytest.mark.parametrize("name", ["nowhere.npz", "."])
-def test_missing_targets(name: str, refused: Callable[..., str], tmp_path: Path) -> None:
-    error = refused("batch", tmp_path / name, "--robot", "kuka_lwr_barrett")
-    assert "cannot be read" in error

@@ -23,6 +23,8 @@ from casadi_ik.files.shipped import models_folder, resolve, shipped_names
 
 
 class Entry(Struct, frozen=True):
+    """A file with something of everything."""
+
     number: float = 0.0
     text: str = ""
     named: dict[str, float] = {}  # noqa: RUF012
@@ -141,7 +143,7 @@ def test_shipped_names_and_paths(tmp_path):
     (tmp_path / "part.yaml").write_text("")
     assert resolve("part.yaml", "arms", beside=tmp_path / "robot.yaml") == tmp_path / "part.yaml"
     assert resolve(tmp_path / "part.yaml", "arms") == tmp_path / "part.yaml"
-    with pytest.raises(UnknownNameError, match="no shipped arm-hand is called 'kuka'; shipped: .*"):
+    with pytest.raises(UnknownNameError, match="no shipped arm-hand is called 'kuka'; shipped: "):
         resolve("kuka", "arm_hands")
     with pytest.raises(DescriptionError, match=r"nowhere\.yaml: no such file"):
         resolve(str(tmp_path / "nowhere.yaml"), "arms")

@@ -30,12 +30,12 @@ def robot() -> RobotDescription:
 
 @pytest.fixture(scope="module")
 def in_palm(robot: RobotDescription) -> ca.Function:
-    """Contact points and normals (3, 3) each, in the palm frame, from theta."""
+    """Contact points and normals (3, 3) each, in Barrett frame W, from theta."""
     theta = ca.SX.sym("theta", len(robot.joint_names))
     kin = forward(robot, theta)
     contacts = [kin.contact(name) for name in FINGERS]
-    points = ca.horzcat(*(kin.palm.inverse_apply(point) for point, _ in contacts))
-    normals = ca.horzcat(*(kin.palm.rotation.T @ normal for _, normal in contacts))
+    points = ca.horzcat(*(kin.links["bh_base"].inverse_apply(point) for point, _ in contacts))
+    normals = ca.horzcat(*(kin.links["bh_base"].rotation.T @ normal for _, normal in contacts))
     return ca.Function("in_palm", [theta], [points, normals])
 
 

@@ -82,5 +82,5 @@ def test_points_on_a_line_give_finite_numbers():
 
 def test_two_fingers_are_too_few(own_robot):
     replace(own_robot, "[thumb, finger_2, finger_3]", "[thumb, finger_2]")
-    with pytest.raises(UnsupportedError, match="has 2 fingers; .* at least three"):
+    with pytest.raises(UnsupportedError, match=r"has 2 fingers; .* at least three"):
         base_axes(ik.load_robot(own_robot).description)

@@ -17,7 +17,7 @@ COLUMNS = (0, 1, 2, 3, 4, 5, 6, 8, 9)
 
 @pytest.fixture(scope="module")
 def tasks(robot):
-    """(q, R desired, point, normal) -> Jacobian and error of palm (euler, vector), point, normal."""
+    """(q, R desired, point, normal) -> Jacobian and error of palm (both ways), point, normal."""
     q, R = ca.SX.sym("q", 14), ca.SX.sym("R", 3, 3)
     point, normal = ca.SX.sym("point", 3), ca.SX.sym("normal", 3)
     body = actuated(robot.description, q)
@@ -64,7 +64,7 @@ def test_jacobians_predict_how_the_errors_fall(robot, tasks, rng):
 
 def test_position_is_in_millimetres(robot, tasks):
     R, point, normal = own_pose(robot, robot.home)
-    _, error = tasks(robot.home, R, point + [0.003, 0, 0], normal)[2]
+    _, error = tasks(robot.home, R, point + np.array([0.003, 0, 0]), normal)[2]
     np.testing.assert_allclose(error, [3, 0, 0], atol=1e-9)
 
 
