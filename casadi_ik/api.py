@@ -15,6 +15,7 @@ from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.logs import McapRecorder
 from casadi_ik.solvers import (
+    FINGER_STEPS,
     LIMITS,
     METHODS,
     BatchSolution,
@@ -26,6 +27,7 @@ from casadi_ik.solvers import (
     Stepper,
     Tolerance,
     build_method,
+    method_options,
     target_arrays,
 )
 
@@ -60,7 +62,7 @@ class Solver:
             limits: "enforce": being solved includes that every actuator and joint is within its
                 limits. "ignore": only the contacts decide (the paper's reading).
             finger_step: "ipopt" (the default of the paper's methods) or "closed-form", the same
-                answer, much faster.
+                answer, much faster. Methods without a finger step take no notice.
             options: Other fields of the method's parameter record (`QiuParameters`).
             compiled: False keeps to CasADi's virtual machine: the same iterates, slower.
 
@@ -80,7 +82,11 @@ class Solver:
         self.tolerance = tolerance or Tolerance()
         self.limits = limits
         self.options = dict(options or {})
-        if finger_step is not None:
+        if finger_step is not None and finger_step not in FINGER_STEPS:
+            raise InputError(
+                f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
+            )
+        if finger_step is not None and "finger_step" in method_options(method):
             self.options["finger_step"] = finger_step
         self._engine = Engine(
             robot, build_method(method, robot.description, self.options, compiled)

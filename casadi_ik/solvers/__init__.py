@@ -3,12 +3,14 @@
 from casadi_ik.solvers.engine import Engine
 from casadi_ik.solvers.problem import LIMITS, Problems, Tolerance, target_arrays
 from casadi_ik.solvers.recorder import Recorder
-from casadi_ik.solvers.registry import METHODS, build_method, method_summary
+from casadi_ik.solvers.registry import METHODS, build_method, method_options, method_summary
 from casadi_ik.solvers.solution import BatchSolution, ContactVerdict, Solution
 from casadi_ik.solvers.stepper import SteppedMethod, Stepper
+from casadi_ik.steps.qiu_parameters import FINGER_STEPS
 from casadi_ik.steps.status import Phase, Status
 
 __all__ = [
+    "FINGER_STEPS",
     "LIMITS",
     "METHODS",
     "BatchSolution",
@@ -23,6 +25,7 @@ __all__ = [
     "Stepper",
     "Tolerance",
     "build_method",
+    "method_options",
     "method_summary",
     "target_arrays",
 ]

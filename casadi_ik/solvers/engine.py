@@ -83,7 +83,7 @@ class Engine:
         with ThreadPoolExecutor(jobs) as pool:
             outcomes = list(
                 pool.map(
-                    lambda part: self.method.run(problems.part(part), starts[part], seed, trace),
+                    lambda part: self.method.run(problems.rows(part), starts[part], seed, trace),
                     parts,
                 )
             )

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.kernels import LoopKernel
+from casadi_ik.kernels import LoopKernel, LoopResult
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.method import Outcome, TraceFormat
 from casadi_ik.solvers.posture_table import PostureTable
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.hand_first import HandFirstStep
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
-from casadi_ik.steps.hand_first_state import STAGES
+from casadi_ik.steps.hand_first_state import STAGES, HandFirstLayouts
 from casadi_ik.steps.status import Phase, Status
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
@@ -85,26 +85,20 @@ class HandFirstMethod:
 
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch; see `Method.run`. No random numbers are drawn."""
-        begin = time.perf_counter()
+        del seed
         options, layouts = self.options, self.step.layouts
-        count, rounds = len(problems), options.rounds
-        lookup = self.table.nearest(problems.points, problems.normals, options.candidates * rounds)
-        parameters = self._parameters(problems, q0)
-        shared = (time.perf_counter() - begin) / max(count, 1)
-
-        outcome = _Collected(count, len(self._robot.actuators), shared)
+        count = len(problems)
+        outcome = _Collected(count, len(self._robot.actuators), trace)
         waiting = np.arange(count)
-        traces: list[list[NDArray[Any]]] = [[] for _ in range(count)]
-        postures = layouts.parameters.slice("postures")
-        for number in range(rounds):
-            part = slice(number * options.candidates, (number + 1) * options.candidates)
-            parameters[waiting, postures] = lookup[waiting, part].reshape(len(waiting), -1)
-            result = self.kernel.run(
-                self._states(q0[waiting]), parameters[waiting], MAX_ITERATIONS, trace
-            )
-            outcome.take(layouts, waiting, result, number * options.candidates)
-            for row, rows in zip(waiting, result.trace, strict=False):
-                traces[row].append(rows)
+        for number in range(options.rounds if count else 0):
+            begin = time.perf_counter()
+            first, last = number * options.candidates, (number + 1) * options.candidates
+            chosen = problems.rows(waiting)
+            lookup = self.table.nearest(chosen.points, chosen.normals, last)[:, first:]
+            parameters = self._parameters(chosen, q0[waiting], lookup)
+            outcome.time[waiting] += (time.perf_counter() - begin) / max(len(waiting), 1)
+            result = self.kernel.run(self._states(q0[waiting]), parameters, MAX_ITERATIONS, trace)
+            outcome.take(layouts, waiting, result, first)
             waiting = waiting[result.status != Status.SOLVED]
             if not len(waiting):
                 break
@@ -115,10 +109,10 @@ class HandFirstMethod:
             restarts=outcome.restarts,
             time=outcome.time,
             phases={stage.label: outcome.counts[:, i] for i, stage in enumerate(STAGES)},
-            trace=tuple(np.concatenate(rows) for rows in traces) if trace else (),
+            trace=tuple(np.concatenate(rows) for rows in outcome.traces),
         )
 
-    def _parameters(self, problems: Problems, q0: Array) -> Array:
+    def _parameters(self, problems: Problems, q0: Array, postures: Array) -> Array:
         layout = self.step.layouts.parameters
         robot, count = self._robot, len(problems)
         bound = np.full(len(robot.actuators), UNBOUNDED)
@@ -132,6 +126,7 @@ class HandFirstMethod:
             "angle_tolerance": problems.tolerance.angle,
             "lower": robot.lower if problems.enforce_limits else -bound,
             "upper": robot.upper if problems.enforce_limits else bound,
+            "postures": postures,
             "start": np.clip(q0, robot.lower, robot.upper) if problems.enforce_limits else q0,
         }
         parameters = np.zeros((count, layout.size))
@@ -155,15 +150,18 @@ class HandFirstMethod:
 class _Collected:
     """Results of a batch whose rows may take several rounds; the best of a row is kept."""
 
-    def __init__(self, count: int, n: int, shared: float) -> None:
+    def __init__(self, count: int, n: int, trace: bool) -> None:
         self.q = np.zeros((count, n))
         self.status = np.full(count, int(Status.STALLED), dtype=np.int64)
         self.restarts = np.zeros(count, dtype=np.int64)
         self.counts = np.zeros((count, len(STAGES)), dtype=np.int64)
-        self.time = np.full(count, shared)
+        self.time = np.zeros(count)
+        self.traces: list[list[NDArray[Any]]] = [[] for _ in range(count if trace else 0)]
         self._cost = np.full(count, np.inf)
 
-    def take(self, layouts: Any, rows: NDArray[np.intp], result: Any, before: int) -> None:
+    def take(
+        self, layouts: HandFirstLayouts, rows: NDArray[np.intp], result: LoopResult, before: int
+    ) -> None:
         """Take the results of some rows; `before` candidates were tried in earlier rounds."""
         state = layouts.state
         solved = result.status == Status.SOLVED
@@ -177,6 +175,8 @@ class _Collected:
         self.restarts[rows] = before + np.minimum(candidate, layouts.candidates - 1)
         self.counts[rows] += result.states[:, state.slice("counts")].astype(np.int64)
         self.time[rows] += result.time
+        for row, records in zip(rows, result.trace, strict=False):
+            self.traces[row].append(records)
 
 
 def _closed_form(robot: RobotDescription) -> SrsArm | None:

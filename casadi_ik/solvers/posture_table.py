@@ -1,4 +1,4 @@
-"""Which hand postures look like a grasp: a table of postures, ranked by the shape of their contacts.
+"""Which hand postures look like a grasp: a table of them, ranked by the shape of their contacts.
 
 Distances between contact points and angles of the normals do not change when the hand is moved as
 a whole. These invariants of a target are compared with those of many postures, so that the hand
@@ -90,9 +90,9 @@ def shape(points: Array, normals: Array) -> tuple[Array, NDArray[np.bool_]]:
     for i, j in permutations(range(f), 2):
         line = (points[:, j] - points[:, i]) / LENGTH
         columns.append(np.einsum("ki,ki->k", line, normals[:, i]))
-    for i, j, l in combinations(range(f), 3):
-        across = np.cross(points[:, j] - points[:, i], points[:, l] - points[:, i]) / LENGTH**2
-        columns += [np.einsum("ki,ki->k", across, normals[:, m]) for m in (i, j, l)]
+    for i, j, m in combinations(range(f), 3):
+        across = np.cross(points[:, j] - points[:, i], points[:, m] - points[:, i]) / LENGTH**2
+        columns += [np.einsum("ki,ki->k", across, normals[:, k]) for k in (i, j, m)]
     if not columns:
         return np.zeros((len(points), 1)), np.zeros((len(points), 1), dtype=bool)
     values = np.stack(columns, axis=1)

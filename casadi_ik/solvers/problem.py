@@ -56,7 +56,7 @@ class Problems:
     def __len__(self) -> int:
         return len(self.points)
 
-    def part(self, rows: slice) -> Problems:
+    def rows(self, rows: slice | NDArray[np.intp]) -> Problems:
         """Some of the targets."""
         return Problems(self.points[rows], self.normals[rows], self.tolerance, self.enforce_limits)
 

@@ -14,36 +14,34 @@ from casadi_ik.kernels import LoopKernel
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.method import Outcome, TraceFormat
 from casadi_ik.solvers.problem import Array, Problems
-from casadi_ik.steps.enhanced import EnhancedStep, parameter_values
-from casadi_ik.steps.qiu_parameters import QiuParameters
+from casadi_ik.steps.enhanced import EnhancedStep
+from casadi_ik.steps.original import OriginalStep
+from casadi_ik.steps.qiu_parameters import OriginalParameters, QiuParameters
 from casadi_ik.steps.status import Phase, Status
 
 
-class EnhancedMethod:
-    """`enhanced-dls`: thumb first, then the arm-thumb closed chain.
+class QiuMethod:
+    """A method of the paper: one step graph, one start, run to its end.
 
     Attributes:
         name: Name of the method.
-        options: Every choice and number, the paper's by default.
+        step: Its step for this robot.
     """
 
-    def __init__(
-        self,
-        robot: RobotDescription,
-        options: QiuParameters,
-        name: str = "enhanced-dls",
-        compiled: bool = True,
-    ) -> None:
-        """Build the step graph.
-
-        Raises:
-            UnsupportedError: The robot's thumb or fingers are not of the kind the paper needs.
-        """
+    def __init__(self, name: str, step: EnhancedStep | OriginalStep, compiled: bool = True) -> None:
+        """Take a step; its graph is built and compiled when first needed."""
         self.name = name
-        self.options = options
-        self._robot = robot
+        self.step = step
         self._compiled = compiled
-        self.step = EnhancedStep(robot, options)
+
+    @property
+    def options(self) -> QiuParameters | OriginalParameters:
+        """Every choice and number, the paper's by default."""
+        return self.step.options
+
+    @property
+    def _robot(self) -> RobotDescription:
+        return self.step.robot
 
     @cached_property
     def kernel(self) -> LoopKernel:
@@ -54,14 +52,13 @@ class EnhancedMethod:
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
         robot = self._robot
-        phases = {phase.value: phase.name.lower().replace("_", "-") for phase in Phase}
         labels = {
             "q": robot.actuator_names,
             "position_error": robot.finger_names,
             "angle_error": robot.finger_names,
             "limit_mask": robot.actuator_names,
-            "phase": tuple(phases.get(code, "") for code in range(max(phases) + 1)),
-            "status": tuple(Status(code).name for code in range(max(Status) + 1)),
+            "phase": Phase.labels(),
+            "status": Status.labels(),
         }
         return TraceFormat(self.step.record, labels)
 
@@ -87,11 +84,8 @@ class EnhancedMethod:
         """
         self._check(problems)
         count = len(problems)
-        values = parameter_values(
-            self.step,
-            problems.tolerance.position,
-            problems.tolerance.angle,
-            problems.enforce_limits,
+        values = self.step.parameter_values(
+            problems.tolerance.position, problems.tolerance.angle, problems.enforce_limits
         )
         parameters = np.empty((count, self.step.parameters.size))
         nowhere = np.zeros(problems.points.shape[1:])
@@ -100,13 +94,11 @@ class EnhancedMethod:
         normals = self.step.parameters.slice("normals")
         parameters[:, points] = problems.points.reshape(count, points.stop - points.start)
         parameters[:, normals] = problems.normals.reshape(count, normals.stop - normals.start)
-        states = np.zeros((count, self.step.state.size))
         limits = (self._robot.lower, self._robot.upper)
-        states[:, self.step.state.slice("q")] = (
-            np.clip(q0, *limits) if problems.enforce_limits else q0
-        )
-        states[:, self.step.state.slice("phase")] = Phase.THUMB_REACHING
-        states[:, self.step.state.slice("best")] = np.finfo(float).max
+        starts = np.clip(q0, *limits) if problems.enforce_limits else q0
+        first = {"q": np.zeros(q0.shape[1]), **self.step.first_state()}
+        states = np.tile(self.step.state.pack(first), (count, 1))
+        states[:, self.step.state.slice("q")] = starts
         return states, parameters
 
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:  # noqa: ARG002
@@ -121,14 +113,18 @@ class EnhancedMethod:
         status = result.status.astype(np.int64)
         status[result.status == Status.RUNNING] = Status.ITERATION_LIMIT
         status[result.status < 0] = Status.INVALID
-        reached = result.states[:, self.step.state.slice("reached")][:, 0].astype(np.int64)
         return Outcome(
             q=result.states[:, self.step.state.slice("q")],
             status=status,
             iterations=result.iterations,
             restarts=np.zeros(count, dtype=np.int64),
             time=result.time,
-            phases={"thumb-reaching": reached, "hand-alignment": result.iterations - reached},
+            phases={
+                phase.label: counts
+                for phase, counts in self.step.phase_counts(
+                    result.states, result.iterations
+                ).items()
+            },
             trace=result.trace,
         )
 

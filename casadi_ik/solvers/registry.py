@@ -2,36 +2,114 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.solvers.hand_first import HandFirstMethod
 from casadi_ik.solvers.method import Method
-from casadi_ik.solvers.qiu import EnhancedMethod
-from casadi_ik.steps.qiu_parameters import QiuParameters
-
-Builder = Callable[[RobotDescription, dict[str, Any], bool], Method]
-
-
-def _enhanced_dls(robot: RobotDescription, options: dict[str, Any], compiled: bool) -> Method:
-    return EnhancedMethod(robot, _parameters(QiuParameters, options), compiled=compiled)
+from casadi_ik.solvers.qiu import QiuMethod
+from casadi_ik.steps.enhanced import EnhancedStep
+from casadi_ik.steps.hand_first_parameters import HandFirstParameters
+from casadi_ik.steps.original import OriginalStep
+from casadi_ik.steps.qiu_parameters import OriginalParameters, QiuParameters
 
 
-_BUILDERS: dict[str, tuple[Builder, str]] = {
-    "enhanced-dls": (
-        _enhanced_dls,
-        "thumb first, then the arm-thumb closed chain; DLS steps (Qiu & Kermani 2021)",
+@dataclass(frozen=True)
+class _Entry:
+    """How a method is built.
+
+    Attributes:
+        summary: What it does, in one line.
+        record: Its parameter record.
+        fixed: Fields of the record that make the method what its name says.
+        build: Makes it from robot, record and whether to compile.
+    """
+
+    summary: str
+    record: type[Any]
+    fixed: Mapping[str, Any]
+    build: Callable[[str, RobotDescription, Any, bool], Method]
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Fields of the record that can be chosen."""
+        return tuple(entry.name for entry in fields(self.record) if entry.name not in self.fixed)
+
+
+def _hand_first(
+    name: str, robot: RobotDescription, record: HandFirstParameters, compiled: bool
+) -> Method:
+    del name
+    return HandFirstMethod(robot, record, compiled)
+
+
+def _enhanced(name: str, robot: RobotDescription, record: QiuParameters, compiled: bool) -> Method:
+    return QiuMethod(name, EnhancedStep(robot, record), compiled)
+
+
+def _original(
+    name: str, robot: RobotDescription, record: OriginalParameters, compiled: bool
+) -> Method:
+    return QiuMethod(name, OriginalStep(robot, record), compiled)
+
+
+_PAPER = "(Qiu & Kermani 2021)"
+_ENTRIES: dict[str, _Entry] = {
+    "hand-first": _Entry(
+        "palm and hand are fitted to the contacts, the arm follows in closed form (ours)",
+        HandFirstParameters,
+        {},
+        _hand_first,
+    ),
+    "enhanced-dls": _Entry(
+        f"thumb first, then the arm-thumb closed chain; damped least squares {_PAPER}",
+        QiuParameters,
+        {"steps": "dls"},
+        _enhanced,
+    ),
+    "enhanced-sdls": _Entry(
+        f"the same with selectively damped least squares {_PAPER}",
+        QiuParameters,
+        {"steps": "sdls"},
+        _enhanced,
+    ),
+    "original-dls": _Entry(
+        f"all contacts in one hierarchy, what the paper compares with; DLS {_PAPER}",
+        OriginalParameters,
+        {"steps": "dls"},
+        _original,
+    ),
+    "original-sdls": _Entry(
+        f"the same with selectively damped least squares {_PAPER}",
+        OriginalParameters,
+        {"steps": "sdls"},
+        _original,
     ),
 }
 
-METHODS: tuple[str, ...] = tuple(_BUILDERS)
+METHODS: tuple[str, ...] = tuple(_ENTRIES)
 """Names of the methods, the default first."""
 
 
 def method_summary(name: str) -> str:
-    """What a method does, in one line."""
-    return _BUILDERS[name][1]
+    """What a method does, in one line.
+
+    Raises:
+        UnknownNameError: No such method.
+    """
+    return _entry(name).summary
+
+
+def method_options(name: str) -> tuple[str, ...]:
+    """What can be set of a method: the fields of its parameter record.
+
+    Raises:
+        UnknownNameError: No such method.
+    """
+    return _entry(name).options
 
 
 def build_method(
@@ -50,17 +128,24 @@ def build_method(
         InputError: An option has a value it cannot have.
         UnsupportedError: The robot is not of the kind the method needs.
     """
-    if name not in _BUILDERS:
-        raise UnknownNameError(f"method {name!r} does not exist; methods: {', '.join(METHODS)}")
-    return _BUILDERS[name][0](robot, options, compiled)
-
-
-def _parameters(record: type[QiuParameters], options: dict[str, Any]) -> QiuParameters:
-    known = record.__dataclass_fields__
+    entry = _entry(name)
     for option in options:
-        if option not in known:
-            raise UnknownNameError(f"option {option!r} does not exist; options: {', '.join(known)}")
+        if option not in entry.options:
+            raise UnknownNameError(
+                f"option {option!r} does not exist for method {name!r}; options: "
+                + ", ".join(entry.options)
+            )
     try:
-        return record(**options)
+        record = entry.record(**options, **entry.fixed)
     except TypeError as error:
         raise InputError(f"options: {error}") from error
+    return entry.build(name, robot, record, compiled)
+
+
+def _entry(name: str) -> _Entry:
+    try:
+        return _ENTRIES[name]
+    except (KeyError, TypeError):
+        raise UnknownNameError(
+            f"method {name!r} does not exist; methods: {', '.join(METHODS)}"
+        ) from None

@@ -20,6 +20,7 @@ from casadi_ik.symbolic.srs_arm import (
     limit_roots,
     swivel,
 )
+from casadi_ik.symbolic.subexpressions import shared
 
 SAMPLES = 6
 """Swivels tried first, for each sign of the elbow."""
@@ -68,7 +69,7 @@ def _sampled(arm: SrsArm) -> ca.Function:
     angles = ca.DM((2 * np.pi * (np.arange(SAMPLES) + 0.5) / SAMPLES).tolist())
     results = [_best(arm, palm, sign, angles, lower, upper) for sign in (1.0, -1.0)]
     q, margin = _better(*results)
-    return ca.Function("sampled", inputs, ca.cse([q, margin]))
+    return ca.Function("sampled", inputs, shared(q, margin))
 
 
 def _at_limits(arm: SrsArm) -> ca.Function:
@@ -89,7 +90,7 @@ def _at_limits(arm: SrsArm) -> ca.Function:
         ca.SX.zeros(BLOCK, 1),
     )
     q, margin = _best(arm, palm, sign, chosen, lower, upper)
-    return ca.Function("at_limits", inputs, ca.cse([q, margin]))
+    return ca.Function("at_limits", inputs, shared(q, margin))
 
 
 def _best(

@@ -9,36 +9,41 @@ starts from, in phase 2 the one after the fingers' step, which is where the meth
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.robots.description import Array, RobotDescription
 from casadi_ik.steps.finger_step import finger_step_function
+from casadi_ik.steps.hierarchy import combine
+from casadi_ik.steps.limits import kept_within, limit_mask
 from casadi_ik.steps.palm_estimate import palm_orientation
 from casadi_ik.steps.palm_motion import palm_motion
 from casadi_ik.steps.qiu_parameters import QiuParameters
 from casadi_ik.steps.status import Phase, Status
 from casadi_ik.steps.targets import contact_errors, target_fields, targets
-from casadi_ik.steps.thumb_reaching import (
+from casadi_ik.steps.tasks import (
     MILLIMETRE,
-    hierarchy_step,
+    Task,
+    TaskSolver,
+    contact_tasks,
+    damped,
     palm_orientation_task,
-    thumb_tasks,
+    selective,
+    weighted,
+    weighted_damped,
 )
 from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated
 from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
-from casadi_ik.symbolic.linear_algebra import (
-    damped_pinv_times,
-    project_to_null_space,
-    weighted_damped_pinv_times,
-)
 from casadi_ik.symbolic.measures import condition_number, singular_values
 from casadi_ik.symbolic.smooth import Expr, safe_norm
+from casadi_ik.symbolic.subexpressions import shared
 
 NOT_MEASURED = float("nan")
+
+Counts = NDArray[np.int64]
 
 
 class EnhancedStep:
@@ -70,6 +75,10 @@ class EnhancedStep:
                 Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not"),
                 Field("reaching_damping"),
                 Field("chain_damping"),
+                Field("reaching_gamma"),
+                Field("chain_gamma"),
+                Field("longest_error", unit="mm"),
+                Field("widest_error", unit="rad"),
                 Field("weights", (len(self.chain.active),)),
                 Field("reaching_patience"),
                 Field("reaching_iterations"),
@@ -108,9 +117,50 @@ class EnhancedStep:
         in_reaching = state[self.state.slice("phase")] < Phase.HAND_ALIGNMENT
         outputs = choose(in_reaching, state, parameters)
         compilable = self.options.finger_step != "ipopt"
-        name = ca.Function.fix_name(f"enhanced_dls_{self.robot.name}")
+        name = ca.Function.fix_name(f"enhanced_{self.options.steps}_{self.robot.name}")
         function = ca.Function(name, [state, parameters], list(outputs))
         return StepGraph(name, function, self.state, self.parameters, self.record, compilable)
+
+    def parameter_values(
+        self, position_tolerance: float, angle_tolerance: float, enforce_limits: bool
+    ) -> dict[str, float | list[float]]:
+        """Values of all parameter fields but the targets."""
+        options = self.options
+        weights = [
+            options.virtual_weight if column == VIRTUAL else options.joint_weight
+            for column in self.chain.active
+        ]
+        return {
+            "position_tolerance": position_tolerance,
+            "angle_tolerance": angle_tolerance,
+            "enforce_limits": float(enforce_limits),
+            "reaching_damping": options.reaching_damping,
+            "chain_damping": options.chain_damping,
+            "reaching_gamma": options.reaching_gamma,
+            "chain_gamma": options.chain_gamma,
+            "longest_error": options.longest_error,
+            "widest_error": options.widest_error,
+            "weights": weights,
+            "reaching_patience": float(options.reaching_patience),
+            "reaching_iterations": float(options.reaching_iterations),
+            "step_cap": options.step_cap,
+            "stall_step": options.stall_step,
+            "stall_patience": float(options.stall_patience),
+        }
+
+    def first_state(self) -> dict[str, float]:
+        """Values of all state fields but q."""
+        return {
+            "phase": float(Phase.THUMB_REACHING),
+            "best": float(np.finfo(float).max),
+            "waited": 0.0,
+            "reached": 0.0,
+        }
+
+    def phase_counts(self, states: Array, iterations: Counts) -> dict[Phase, Counts]:
+        """Iterations by phase (k,) from the last states (k, ns) and all iterations (k,)."""
+        reached = states[:, self.state.slice("reached")][:, 0].astype(np.int64)
+        return {Phase.THUMB_REACHING: reached, Phase.HAND_ALIGNMENT: iterations - reached}
 
     def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
@@ -133,9 +183,9 @@ class EnhancedStep:
         palm = palm_orientation_task(
             body, palm_orientation(robot, goals), columns, self.options.palm_error == "euler"
         )
-        position, normal = thumb_tasks(body, goals[robot.thumb], columns)
-        solver = _damped(p["reaching_damping"])
-        step = self._spread(hierarchy_step([palm, position, normal], solver), columns)
+        position, normal = contact_tasks(body, robot.thumb, goals[robot.thumb], columns)
+        tasks = [palm, position, normal]
+        step = self._spread(combine(tasks, self._reaching(p), "successive"), columns)
         q_next = self._moved(s["q"], step, p)
 
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
@@ -180,7 +230,7 @@ class EnhancedStep:
             sigma_thumb=_smallest(position.jacobian) * MILLIMETRE,
             sigma_palm=_smallest(palm.jacobian[:, : len(robot.arm_actuators)]),
         )
-        return ca.Function("reach", [state, parameters], [after, record, status])
+        return ca.Function("reach", [state, parameters], shared(after, record, status))
 
     def _align(self) -> ca.Function:
         """One iteration of hand alignment (section II-C), after the fingers' own step."""
@@ -195,19 +245,16 @@ class EnhancedStep:
         others = {name: goal for name, goal in goals.items() if name != robot.thumb}
         translation, rotation = palm_motion(body, others)
         chain = closed_chain(body, self.chain, MILLIMETRE, self.options.platform)
-        J_position, J_orientation = chain.J_cc[:3, :], chain.J_cc[3:, :]
-        damping, weights = p["chain_damping"], p["weights"]
-        active = weighted_damped_pinv_times(
-            J_position, translation, damping, weights
-        ) + project_to_null_space(
-            J_position,
-            weighted_damped_pinv_times(J_orientation, rotation, damping, weights),
-        )
+        motion = [
+            Task(chain.J_cc[:3, :], translation, is_position=True),
+            Task(chain.J_cc[3:, :], rotation, is_position=False),
+        ]
+        active = combine(motion, self._chain_solver(p), "successive")
         moved = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
 
         columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
-        keep = thumb_tasks(actuated(robot, moved), goals[robot.thumb], columns)
-        step = self._spread(hierarchy_step(list(keep), _damped(p["reaching_damping"])), columns)
+        keep = contact_tasks(actuated(robot, moved), robot.thumb, goals[robot.thumb], columns)
+        step = self._spread(combine(keep, self._reaching(p), "successive"), columns)
         q_next = self._moved(moved, step, p)
 
         size = _largest(q_next - s["q"])
@@ -241,7 +288,20 @@ class EnhancedStep:
             sigma_closed_chain=ca.mmin(spectrum),
             condition_closed_chain=condition_number(spectrum),
         )
-        return ca.Function("align_rest", [state, parameters, closed], [after, record, status])
+        return ca.Function("align_rest", [state, parameters, closed], shared(after, record, status))
+
+    def _reaching(self, p: dict[str, ca.SX]) -> TaskSolver:
+        """Solves the tasks of the serial chain."""
+        if self.options.steps == "dls":
+            return damped(p["reaching_damping"])
+        return selective(p["reaching_gamma"], p["longest_error"], p["widest_error"])
+
+    def _chain_solver(self, p: dict[str, ca.SX]) -> TaskSolver:
+        """Solves the tasks of the closed chain, weighted."""
+        if self.options.steps == "dls":
+            return weighted_damped(p["chain_damping"], p["weights"])
+        solver = selective(p["chain_gamma"], p["longest_error"], p["widest_error"])
+        return weighted(solver, p["weights"])
 
     def _spread(self, step: ca.SX, columns: tuple[int, ...]) -> ca.SX:
         """A step of some actuators as a step of all (n, 1)."""
@@ -253,8 +313,7 @@ class EnhancedStep:
     def _moved(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
         """Take a step from q: capped, and kept within limits if they are enforced."""
         q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(_largest(step), 1e-12))
-        kept = ca.fmin(ca.fmax(q_next, _column(self.robot.lower)), _column(self.robot.upper))
-        return ca.if_else(p["enforce_limits"] > 0, kept, q_next)
+        return kept_within(self.robot, q_next, p["enforce_limits"])
 
     def _row(
         self,
@@ -266,9 +325,6 @@ class EnhancedStep:
         phase: Phase,
         **measured: Expr,
     ) -> ca.SX:
-        robot = body.robot
-        at_limit = ca.logic_or(q <= _column(robot.lower), q >= _column(robot.upper))
-        bits = ca.DM([2.0**i for i in range(len(robot.actuators))])
         values: dict[str, Expr] = {
             "q": q,
             "position_error": positions,
@@ -278,47 +334,16 @@ class EnhancedStep:
             "sigma_palm": NOT_MEASURED,
             "sigma_closed_chain": NOT_MEASURED,
             "condition_closed_chain": NOT_MEASURED,
-            "limit_mask": ca.dot(at_limit, bits),
+            "limit_mask": limit_mask(body.robot, q),
             "phase": float(phase),
         }
         return self.record.pack(values | measured)
-
-
-def parameter_values(
-    step: EnhancedStep, position_tolerance: float, angle_tolerance: float, enforce_limits: bool
-) -> dict[str, float | list[float]]:
-    """Values of all parameter fields but the targets."""
-    options = step.options
-    weights = [
-        options.virtual_weight if column == VIRTUAL else options.joint_weight
-        for column in step.chain.active
-    ]
-    return {
-        "position_tolerance": position_tolerance,
-        "angle_tolerance": angle_tolerance,
-        "enforce_limits": float(enforce_limits),
-        "reaching_damping": options.reaching_damping,
-        "chain_damping": options.chain_damping,
-        "weights": weights,
-        "reaching_patience": float(options.reaching_patience),
-        "reaching_iterations": float(options.reaching_iterations),
-        "step_cap": options.step_cap,
-        "stall_step": options.stall_step,
-        "stall_patience": float(options.stall_patience),
-    }
-
-
-def _damped(damping: ca.SX) -> Callable[[ca.SX, ca.SX], ca.SX]:
-    return lambda jacobian, error: damped_pinv_times(jacobian, error, damping)
-
-
-def _largest(change: ca.SX) -> ca.SX:
-    return ca.mmax(ca.fabs(change))
 
 
 def _smallest(jacobian: ca.SX) -> ca.SX:
     return ca.mmin(singular_values(jacobian))
 
 
-def _column(values: Array) -> ca.DM:
-    return ca.DM(values.tolist())
+def _largest(step: ca.SX) -> ca.SX:
+    """Largest change of any motor."""
+    return ca.mmax(ca.fabs(step))

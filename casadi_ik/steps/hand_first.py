@@ -38,6 +38,7 @@ from casadi_ik.steps.whole_fit import whole_step
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.srs_arm import SrsArm
+from casadi_ik.symbolic.subexpressions import shared
 
 SLOW = 0.9
 """A step that leaves more than this part of the cost gained little."""
@@ -140,7 +141,7 @@ class HandFirstStep:
         )
         status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
         record = self._row(s, p, q, Phase.CANDIDATE, status)
-        return ca.Function("candidate", [state, parameters], ca.cse([after, record, status]))
+        return ca.Function("candidate", [state, parameters], shared(after, record, status))
 
     @property
     def _after_candidate(self) -> Phase:
@@ -181,7 +182,7 @@ class HandFirstStep:
         )
         status = ca.SX(float(Status.RUNNING))
         record = self._row(s, p, s["q"], Phase.HAND_FIT, status, before, judged)
-        return ca.Function("hand_fit", [state, parameters], ca.cse([after, record, status]))
+        return ca.Function("hand_fit", [state, parameters], shared(after, record, status))
 
     def _placement(self) -> ca.Function:
         state = ca.MX.sym("state", self.layouts.state.size)
@@ -230,9 +231,7 @@ class HandFirstStep:
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
         record = self._row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
-        return ca.Function(
-            "place", [state, parameters, arm, margin], ca.cse([after, record, status])
-        )
+        return ca.Function("place", [state, parameters, arm, margin], shared(after, record, status))
 
     def _refinement(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
@@ -258,7 +257,7 @@ class HandFirstStep:
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
         record = self._row(s, p, s["q"], Phase.REFINEMENT, status, before, judged)
-        return ca.Function("refinement", [state, parameters], ca.cse([after, record, status]))
+        return ca.Function("refinement", [state, parameters], shared(after, record, status))
 
     def _judge(
         self,

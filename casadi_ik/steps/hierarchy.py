@@ -7,7 +7,7 @@ disturbing the higher ones (Qiu & Kermani 2021, section I).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache
 
 import casadi as ca
 
@@ -57,7 +57,7 @@ def narrowed(projector: Expr, task: Task) -> Expr:
     return _narrowed(*task.jacobian.shape)(projector, task.jacobian * scale)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _narrowed(m: int, k: int) -> ca.Function:
     """P' = P N(J P): a function of its own, since it is called once per level."""
     P, J = ca.SX.sym("P", k, k), ca.SX.sym("J", m, k)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from casadi_ik.steps.targets import Target
-from casadi_ik.steps.thumb_reaching import MILLIMETRE
+from casadi_ik.steps.tasks import MILLIMETRE
 from casadi_ik.symbolic.actuated import ActuatedKinematics
 from casadi_ik.symbolic.directions import rotation_between
 from casadi_ik.symbolic.se3 import log_se3

@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 from casadi_ik.errors import InputError
+from casadi_ik.steps.hierarchy import PROJECTIONS
+
+ORDERS = ("per-finger", "points-first")
+"""Order of the tasks of the original methods: finger by finger, or all points, then all normals."""
 
 FINGER_STEPS = ("ipopt", "closed-form")
 PALM_ERRORS = ("euler", "rotation-vector")
 PLATFORMS = ("arm-leg", "palm")
-CHOICES = {"finger_step": FINGER_STEPS, "palm_error": PALM_ERRORS, "platform": PLATFORMS}
+STEPS = ("dls", "sdls")
+CHOICES = {
+    "steps": STEPS,
+    "finger_step": FINGER_STEPS,
+    "palm_error": PALM_ERRORS,
+    "platform": PLATFORMS,
+    "projection": PROJECTIONS,
+    "order": ORDERS,
+}
 MAY_BE_ZERO = ("borrowed", "stall_step")
 
 
@@ -22,10 +35,16 @@ class QiuParameters:
     "considerably large").
 
     Attributes:
+        steps: How a task is solved: "dls" (Wampler 1986) or "sdls" (Buss & Kim 2005).
         reaching_damping: lambda of thumb reaching (paper: 1), squared in the normal matrix.
             [mm] in the position task, [rad/rad] in the orientation tasks.
         chain_damping: lambda of the closed chain (paper: 150), squared in the normal matrix.
             Read as 150 rather than 150^2 in the matrix, the success falls by 20 points.
+        reaching_gamma: SDLS: largest joint change in one step of thumb reaching (paper: pi/9)
+            [rad].
+        chain_gamma: SDLS: the same for the closed chain (paper: pi/500) [rad].
+        longest_error: SDLS: position errors are shortened to this (paper: 200) [mm].
+        widest_error: SDLS: orientation errors are shortened to this (paper: pi/6) [rad].
         virtual_weight: Weight of the virtual joint in the closed chain (paper: 10).
         joint_weight: Weight of the other active joints (paper: 1).
         palm_error: "euler": differences of Euler angles as the paper writes; it names no
@@ -48,8 +67,13 @@ class QiuParameters:
         stall_patience: See `stall_step`.
     """
 
+    steps: str = "dls"
     reaching_damping: float = 1.0
     chain_damping: float = 150.0
+    reaching_gamma: float = math.pi / 9
+    chain_gamma: float = math.pi / 500
+    longest_error: float = 200.0
+    widest_error: float = math.pi / 6
     virtual_weight: float = 10.0
     joint_weight: float = 1.0
     palm_error: str = "euler"
@@ -64,14 +88,22 @@ class QiuParameters:
     stall_patience: int = 5
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if entry.name in CHOICES:
-                if value not in CHOICES[entry.name]:
-                    known = ", ".join(CHOICES[entry.name])
-                    raise InputError(f"{entry.name}: found {value!r}, expected one of {known}")
-            else:
-                _check_number(entry.name, value, isinstance(entry.default, int))
+        _check_fields(self)
+
+
+def _check_fields(record: QiuParameters | OriginalParameters) -> None:
+    """Raise unless every field has a value it can have."""
+    for entry in fields(record):
+        value = getattr(record, entry.name)
+        if entry.name in CHOICES:
+            if value not in CHOICES[entry.name]:
+                known = ", ".join(CHOICES[entry.name])
+                raise InputError(f"{entry.name}: found {value!r}, expected one of {known}")
+        elif isinstance(entry.default, bool):
+            if not isinstance(value, bool):
+                raise InputError(f"{entry.name}: found {value!r}, expected true or false")
+        else:
+            _check_number(entry.name, value, isinstance(entry.default, int))
 
 
 def _check_number(name: str, value: object, whole: bool) -> None:
@@ -81,3 +113,42 @@ def _check_number(name: str, value: object, whole: bool) -> None:
     if not (number and (value > 0 or (zero and value == 0))):  # type: ignore[operator]
         bound = ">= 0" if zero else "> 0"
         raise InputError(f"{name}: found {value!r}, expected {kind} {bound}")
+
+
+@dataclass(frozen=True)
+class OriginalParameters:
+    """Parameters of the methods the paper compares with: one hierarchy over all motors.
+
+    The paper says only "the methods without the enhancement of the proposed approach". What is
+    left open is read as follows; the study `table_one` reports the other readings.
+
+    Attributes:
+        steps: How a task is solved: "dls" or "sdls".
+        palm_task: Whether the palm's estimated orientation is the first task.
+        order: Order of the contact tasks, see `ORDERS`; the thumb is the first finger.
+        projection: How a lower task is kept from disturbing the higher ones, see `hierarchy`.
+        damping: lambda (paper: 1) [mm; rad/rad].
+        gamma: SDLS: largest joint change in one step (paper: pi/9) [rad].
+        longest_error: SDLS: position errors are shortened to this (paper: 200) [mm].
+        widest_error: SDLS: orientation errors are shortened to this (paper: pi/6) [rad].
+        palm_error: See `QiuParameters`.
+        max_iterations: Budget of a solve (paper: 10,000).
+        stall_step: See `QiuParameters`.
+        stall_patience: See `QiuParameters`.
+    """
+
+    steps: str = "dls"
+    palm_task: bool = True
+    order: str = "points-first"
+    projection: str = "successive"
+    damping: float = 1.0
+    gamma: float = math.pi / 9
+    longest_error: float = 200.0
+    widest_error: float = math.pi / 6
+    palm_error: str = "euler"
+    max_iterations: int = 10_000
+    stall_step: float = 1e-10
+    stall_patience: int = 5
+
+    def __post_init__(self) -> None:
+        _check_fields(self)

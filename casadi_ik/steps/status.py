@@ -36,6 +36,7 @@ class Phase(IntEnum):
     CANDIDATE = 4
     HAND_FIT = 5
     ARM_PLACEMENT = 6
+    HIERARCHY = 7
 
     @property
     def label(self) -> str:

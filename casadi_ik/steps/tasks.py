@@ -11,7 +11,7 @@ from casadi_ik.steps.selectively_damped import selectively_damped
 from casadi_ik.steps.targets import Target
 from casadi_ik.symbolic.actuated import ActuatedKinematics
 from casadi_ik.symbolic.directions import normal_error
-from casadi_ik.symbolic.linear_algebra import damped_pinv_times
+from casadi_ik.symbolic.linear_algebra import damped_pinv_times, weighted_damped_pinv_times
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 from casadi_ik.symbolic.so3 import euler_zyx, log_so3
 
@@ -86,6 +86,22 @@ def selective(gamma_max: Expr, longest: Expr, widest: Expr) -> TaskSolver:
     def solve(task: Task) -> Expr:
         limit = longest if task.is_position else widest
         return selectively_damped(task.jacobian, clamped(task.error, limit), gamma_max)
+
+    return solve
+
+
+def weighted_damped(damping: Expr, weights: Expr) -> TaskSolver:
+    """Weighted damped least squares (Chan & Dubey 1995); a heavy actuator (k, 1) moves little."""
+    return lambda task: weighted_damped_pinv_times(task.jacobian, task.error, damping, weights)
+
+
+def weighted(solver: TaskSolver, weights: Expr) -> TaskSolver:
+    """Any solver in the weighted coordinates sqrt(w_i) q_i, as weighted damping does it."""
+    scale = 1 / ca.sqrt(weights)
+
+    def solve(task: Task) -> Expr:
+        scaled = task.jacobian * ca.repmat(scale.T, task.jacobian.shape[0], 1)
+        return scale * solver(Task(scaled, task.error, task.is_position))
 
     return solve
 

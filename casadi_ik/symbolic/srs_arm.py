@@ -143,7 +143,7 @@ def srs_arm(robot: RobotDescription) -> SrsArm:
     )
 
 
-def swivel(arm: SrsArm, palm: Pose, elbow_sign: float) -> Swivel:
+def swivel(arm: SrsArm, palm: Pose, elbow_sign: Expr) -> Swivel:
     """Everything but the swivel.
 
     Args:
@@ -251,7 +251,7 @@ def _meeting_point(points: list[Array], axes: list[Array], where: str) -> Array:
     right = sum(
         ((np.eye(3) - np.outer(a, a)) @ p for p, a in zip(points, axes, strict=True)), np.zeros(3)
     )
-    point = np.linalg.lstsq(normal, right, rcond=None)[0]
+    point: Array = np.linalg.lstsq(normal, right, rcond=None)[0].astype(float)
     for p, a in zip(points, axes, strict=True):
         if np.linalg.norm(np.cross(point - p, a)) > MEETING:
             raise UnsupportedError(f"{where} do not meet in one point")

@@ -11,7 +11,7 @@ from casadi_ik.robots import load_description
 THUMB_ORIGIN = "origin: {xyz: [0, 50 mm, 75.4 mm], rpy: [90 deg, -2.456 deg, 90 deg]}"
 COUPLED = "coupling: {kind: linear, of: bh_spread}"
 ARM_TIP = "tip: {link: lwr_flange, source: centro}"
-PALM = "palm: {link: bh_base, source: mdh}"
+PALM = "palm: {link: bh_base, xyz: [0, 0, 80 mm], source: palm}"
 
 SHIPPED = {
     # name: (file, text, its replacement, the key, what is said)

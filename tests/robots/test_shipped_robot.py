@@ -73,11 +73,15 @@ def test_contacts_by_denavit_hartenberg(robot, rng):
             np.testing.assert_allclose(normals[row, column], expected[:3, 2], atol=1e-12)
 
 
-def test_palm_is_frame_w_on_the_flange(robot, rng):
+def test_palm_stands_on_frame_w_on_the_flange(robot, rng):
+    """Frame W is the flange's; the palm frame is parallel to it, on the palm's surface."""
     for q in robot.random(rng, 10):
-        np.testing.assert_allclose(robot.palm(q), lwr(q[:7]), atol=1e-12)
-        np.testing.assert_allclose(robot.links(q)["lwr_flange"], lwr(q[:7]), atol=1e-12)
-    np.testing.assert_allclose(robot.palm(np.zeros(14))[:3, 3], [0, 0, 1.1785], atol=1e-15)
+        flange, surface = lwr(q[:7]), np.eye(4)
+        surface[2, 3] = 0.080
+        np.testing.assert_allclose(robot.links(q)["bh_base"], flange, atol=1e-12)
+        np.testing.assert_allclose(robot.links(q)["lwr_flange"], flange, atol=1e-12)
+        np.testing.assert_allclose(robot.palm(q), flange @ surface, atol=1e-12)
+    np.testing.assert_allclose(robot.palm(np.zeros(14))[:3, 3], [0, 0, 1.2585], atol=1e-15)
 
 
 @pytest.mark.parametrize(("finger", "sign"), [("finger_2", 1.0), ("finger_3", -1.0), ("thumb", 0)])
@@ -99,7 +103,7 @@ def test_normal_formula_of_qiu(robot, rng, finger, sign):
 
 def test_published_tips_of_the_open_hand(robot):
     """Facts, section 2: tips and normals at spread 0, proximal 0."""
-    palm = robot.palm(np.zeros(14))
+    palm = robot.links(np.zeros(14))["bh_base"]
     points, normals = robot.contacts(np.zeros(14))
     local = (points - palm[:3, 3]) @ palm[:3, :3]
     expected = [[0, 0.1521, 0.1178], [0.025, -0.1521, 0.1178], [-0.025, -0.1521, 0.1178]]

@@ -281,7 +281,7 @@ def test_parameters_say_everything(case):
         (
             {"method": "enhanced-dls", "options": {"speed": 3}},
             UnknownNameError,
-            "option 'speed' does not exist; options: reaching_damping",
+            "option 'speed' does not exist for method 'enhanced-dls'; options: reaching_damping",
         ),
         (
             {"method": "enhanced-dls", "finger_step": "fmincon"},

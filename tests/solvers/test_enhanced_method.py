@@ -8,7 +8,8 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.solvers.problem import Problems, Tolerance
-from casadi_ik.solvers.qiu import EnhancedMethod
+from casadi_ik.solvers.qiu import QiuMethod
+from casadi_ik.steps.enhanced import EnhancedStep
 from casadi_ik.steps.qiu_parameters import QiuParameters
 from casadi_ik.steps.status import Phase, Status
 
@@ -33,7 +34,8 @@ def pinch_targets(robot, count, seed=0):
 
 def method(robot, compiled=True, **options):
     options = {"finger_step": "closed-form"} | options
-    return EnhancedMethod(robot.description, QiuParameters(**options), compiled=compiled)
+    step = EnhancedStep(robot.description, QiuParameters(**options))
+    return QiuMethod("enhanced-dls", step, compiled)
 
 
 def run(built, robot, points, normals, enforce=False, q0=None):

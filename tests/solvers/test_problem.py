@@ -77,9 +77,9 @@ def test_default_tolerance_is_the_papers():
     assert Tolerance() == Tolerance(position=0.005, angle=np.deg2rad(3))
 
 
-def test_part_of_a_batch():
+def test_rows_of_a_batch():
     problems = Problems(*arrays(k=4), Tolerance(), True)
-    part = problems.part(slice(1, 3))
+    part = problems.rows(slice(1, 3))
     assert len(problems) == 4
     assert len(part) == 2
     np.testing.assert_array_equal(part.points, problems.points[1:3])

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.steps.enhanced import EnhancedStep, parameter_values
+from casadi_ik.steps.enhanced import EnhancedStep
 from casadi_ik.steps.finger_step import finger_step_function
 from casadi_ik.steps.qiu_parameters import QiuParameters
 from casadi_ik.steps.status import Phase, Status
@@ -27,7 +27,7 @@ class Stepper:
         )
 
     def parameters(self, points, normals, enforce_limits=False):
-        values = parameter_values(self.step, 5e-3, np.radians(3), enforce_limits)
+        values = self.step.parameter_values(5e-3, np.radians(3), enforce_limits)
         return self.step.parameters.pack({"points": points, "normals": normals, **values})
 
     def __call__(self, state, parameters):

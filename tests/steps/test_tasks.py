@@ -1,4 +1,4 @@
-"""Thumb reaching: the tasks, and the hierarchy they are solved in."""
+"""The tasks, and the hierarchy they are solved in."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from casadi_ik.steps.hierarchy import combine
 from casadi_ik.steps.targets import Target
-from casadi_ik.steps.thumb_reaching import hierarchy_step, palm_orientation_task, thumb_tasks
+from casadi_ik.steps.tasks import Task, contact_tasks, damped, palm_orientation_task
 from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.linear_algebra import damped_pinv_times
 
 COLUMNS = (0, 1, 2, 3, 4, 5, 6, 8, 9)
 
@@ -22,7 +22,7 @@ def tasks(robot):
     point, normal = ca.SX.sym("point", 3), ca.SX.sym("normal", 3)
     body = actuated(robot.description, q)
     parts = [palm_orientation_task(body, R, COLUMNS, euler) for euler in (True, False)]
-    parts += thumb_tasks(body, Target(point, normal), COLUMNS)
+    parts += contact_tasks(body, "thumb", Target(point, normal), COLUMNS)
     outputs = [ca.densify(x) for part in parts for x in (part.jacobian, part.error)]
     f = ca.Function("f", [q, R, point, normal], outputs)
 
@@ -83,12 +83,8 @@ def step_function(count, damping):
     J = [ca.SX.sym(f"J{i}", 3, 9) for i in range(count)]
     e = [ca.SX.sym(f"e{i}", 3) for i in range(count)]
 
-    class Pair:
-        def __init__(self, jacobian, error):
-            self.jacobian, self.error = jacobian, error
-
-    tasks = [Pair(a, b) for a, b in zip(J, e, strict=True)]
-    total = hierarchy_step(tasks, lambda a, b: damped_pinv_times(a, b, damping))
+    tasks = [Task(a, b, is_position=False) for a, b in zip(J, e, strict=True)]
+    total = combine(tasks, damped(damping), "successive")
     return ca.Function("f", [*J, *e], [total])
 
 

@@ -1,0 +1,21 @@
+"""Joint limits inside a step: kept or ignored, and what stands at them."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.smooth import Expr
+
+
+def kept_within(robot: RobotDescription, q: Expr, enforce: Expr) -> Expr:
+    """Move q (n, 1) into the limits where `enforce` is 1; leave it as it is where it is 0."""
+    lower, upper = ca.DM(robot.lower.tolist()), ca.DM(robot.upper.tolist())
+    return ca.if_else(enforce > 0, ca.fmin(ca.fmax(q, lower), upper), q)
+
+
+def limit_mask(robot: RobotDescription, q: Expr) -> Expr:
+    """Bit i is set where actuator i stands at or beyond a limit."""
+    lower, upper = ca.DM(robot.lower.tolist()), ca.DM(robot.upper.tolist())
+    bits = ca.DM([2.0**i for i in range(len(robot.actuators))])
+    return ca.dot(ca.logic_or(q <= lower, q >= upper), bits)
