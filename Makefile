@@ -48,7 +48,7 @@ bench: $(VENV)/demo.stamp
 	$(BIN)/python studies/bench.py
 
 notebooks: $(VENV)/dev.stamp
-	$(BIN)/python -m jupyter nbconvert --to notebook --execute --inplace notebooks/*.ipynb
+	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
 clean:
 	rm -rf $(VENV) out
