@@ -42,7 +42,7 @@ def random_arm_targets(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the study and print its table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Success on random arm configurations.")
     parser.add_argument("--count", type=int, default=100, help="arm configurations per grasp")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--method", default="enhanced-dls", choices=ik.METHODS)

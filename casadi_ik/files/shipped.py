@@ -44,7 +44,8 @@ def resolve(name_or_path: str | Path, kind: str, beside: Path | None = None) -> 
         if beside is not None and not path.is_absolute():
             path = beside.parent / path
         if not path.is_file():
-            raise DescriptionError(f"{path}: no such file")
+            problem = "is a folder, expected a YAML file" if path.is_dir() else "no such file"
+            raise DescriptionError(f"{path}: {problem}")
         return path
     path = models_folder() / kind / f"{text}.yaml"
     if text not in shipped_names(kind):

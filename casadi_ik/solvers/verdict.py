@@ -43,10 +43,9 @@ def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
         np.linalg.norm(normals + problems.normals, axis=2),
     )
     slack = 1 + TOLERANCE_SLACK
-    # What is free is NaN and compares as not greater, hence as met.
-    ok = ~(position > problems.tolerance.position * slack) & ~(
-        angle > problems.tolerance.angle * slack
-    )
+    # Free is what the target leaves out; an error that is NaN for another reason is no success.
+    met = (position <= problems.tolerance.position * slack) | np.isnan(problems.points[..., 0])
+    ok = met & ((angle <= problems.tolerance.angle * slack) | np.isnan(problems.normals[..., 0]))
     return Verdict(position, angle, ok, within_limits(robot, q))
 
 

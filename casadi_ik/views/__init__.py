@@ -1,15 +1,16 @@
-"""Pictures of grasps and of convergence; needs matplotlib, the extra `plots`."""
+"""Pictures of grasps and of convergence; needs the extra `plots`: matplotlib and PyVista."""
 
 from casadi_ik.errors import MissingExtraError
 
 try:
     import matplotlib as _  # noqa: F401
+    import pyvista as _pyvista  # noqa: F401
 except ImportError as error:
     raise MissingExtraError(
-        "pictures need matplotlib, which is not installed: pip install casadi-ik[plots]"
+        f"pictures need {error.name}, which is not installed: pip install casadi-ik[plots]"
     ) from error
 
 from casadi_ik.views.convergence import draw_convergence
-from casadi_ik.views.scene import draw_solution
+from casadi_ik.views.scene import draw_solution, show
 
-__all__ = ["draw_convergence", "draw_solution"]
+__all__ = ["draw_convergence", "draw_solution", "show"]

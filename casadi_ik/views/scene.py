@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from collections.abc import Mapping
+from contextlib import closing
 from os import PathLike
 
 import numpy as np
+import pyvista as pv
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.grasps import Grasp, load_object
 from casadi_ik.solvers import Solution
-from casadi_ik.views.camera import Camera, camera_at
 from casadi_ik.views.captions import (
     MET_COLOR,
     MISSED_COLOR,
@@ -24,10 +26,10 @@ from casadi_ik.views.captions import (
     add_title,
     label_fingers,
 )
-from casadi_ik.views.picture import DPI, new_figure, save_picture
-from casadi_ik.views.render import Layer, render
-from casadi_ik.views.robot_body import RobotBody, robot_body
-from casadi_ik.views.solids import Solid, arrow, ball, capsule
+from casadi_ik.views.picture import DPI, INK, new_figure, save_picture
+from casadi_ik.views.robot_body import robot_body
+from casadi_ik.views.shapes import Solid, arrow, capsule, with_edges
+from casadi_ik.views.stage import Image, Stage, over
 from casadi_ik.views.viewpoint import View, close_view, whole_view
 
 Array = NDArray[np.float64]
@@ -39,32 +41,19 @@ WHOLE = (0.0, 0.06, 0.40, 0.82)
 CLOSE = (0.40, 0.06, 0.60, 0.82)
 """Left, bottom, width and height of the panels, as parts of the picture."""
 
-WRIST = 0.10
+WINDOW = (1200, 900)
+"""Of `show` [pixels]."""
+
+OBJECT, GHOST, WRIST = 0.5, 0.45, 0.3
+"""Opacity of the object, of contacts that something hides, and of the arm in the close-up."""
+
+WRIST_LENGTH = 0.10
 """Of the arm, the close-up shows what is no further than this from the palm [m]."""
 
 NEAR = 0.35
-"""An object or a contact further than this from the palm is not in the close-up [m]."""
+"""What reaches further than this from the palm need not be in the close-up [m]."""
 
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What there is to see.
-
-    Attributes:
-        body: The robot.
-        things: The object, if any.
-        marks: The contacts.
-        palm: (3,) where the palm is [m].
-        target: (3,) middle of the contacts asked for [m].
-        floor: Height of the robot's foot [m].
-    """
-
-    body: RobotBody
-    things: list[Solid]
-    marks: list[Solid]
-    palm: Array
-    target: Array
-    floor: float
+_one_at_a_time = threading.Lock()
 
 
 def draw_solution(
@@ -91,68 +80,89 @@ def draw_solution(
         The figure, which belongs to no pyplot window.
 
     Raises:
-        PictureError: The file cannot be written.
+        PictureError: The file cannot be written, or there is no OpenGL to draw with.
         DescriptionError: The description of the object is malformed.
         InputError: The grasp has a finger that the robot has not.
     """
     figure = new_figure(*SIZE, dpi)
-    scene = _scene(robot, solution, grasp)
-    close = view or close_view(robot, solution.q)
-    _draw_whole(figure, scene, whole_view(scene.target, close))
-    axes, camera = _draw_close(figure, scene, close)
-    label_fingers(axes, camera, robot, solution, grasp)
+    colors = {
+        finger: MET_COLOR if verdict.ok else MISSED_COLOR
+        for finger, verdict in solution.contacts.items()
+    }
+    with _one_at_a_time, closing(Stage()) as stage:
+        solids = _fill(stage, robot, solution.q, grasp, colors)
+        view = view or close_view(robot, solution.q)
+        target = np.nanmean(grasp.arrays(robot.fingers)[0], axis=0)
+        pixels = _pixels(figure, WHOLE)
+        stage.aim(whole_view(target, view), _points(*solids.values()), pixels, (0.03, 0.10))
+        image = over(1.0, stage.shoot("floor"), _inwards(pixels))
+        image = over(image, stage.shoot("arm", "wrist", "hand", "object", "marks"))
+        _panel(figure, WHOLE, over(image, stage.shoot("marks"), GHOST))
+
+        palm = robot.palm(solution.q)[:3, 3]
+        there = solids["object"] + solids["marks"]
+        near = [solid for solid in there if _distances(solid, palm).max() < NEAR]
+        pixels = _pixels(figure, CLOSE)
+        stage.aim(view, _points(solids["hand"], near), pixels, (0.17, 0.02))
+        # The arm is pale: it may stand in the way.
+        image = over(1.0, stage.shoot("wrist"), WRIST * _inwards(pixels))
+        image = over(image, stage.shoot("hand", "object", "marks"))
+        axes = _panel(figure, CLOSE, over(image, stage.shoot("marks"), GHOST))
+        seen = stage.project(robot.contacts(solution.q)[0])
+    label_fingers(axes, dict(zip(robot.fingers, seen, strict=True)), solution, grasp)
     add_title(figure, solution, grasp)
-    add_legend(figure, solution, bool(scene.things))
+    add_legend(figure, solution, bool(solids["object"]))
     if path is not None:
         save_picture(figure, path)
     return figure
 
 
-def _scene(robot: ArmHand, solution: Solution, grasp: Grasp) -> Scene:
-    root = robot.links(solution.q)[robot.description.root]
-    asked, _ = grasp.arrays(robot.fingers)
-    return Scene(
-        body=robot_body(robot, solution.q),
-        things=_object(grasp),
-        marks=_marks(robot, solution, grasp),
-        palm=robot.palm(solution.q)[:3, 3],
-        target=np.nanmean(asked, axis=0),
-        floor=float(root[2, 3]),
-    )
+def show(
+    robot: ArmHand, q: ArrayLike, grasp: Grasp | None = None, *, window: bool = True
+) -> pv.Plotter:
+    """Open a window in which a robot can be looked at from all sides.
+
+    Args:
+        robot: The robot.
+        q: (n,) actuator positions [rad or m].
+        grasp: Contacts and object to be shown too.
+        window: Whether to open it, until it is closed; else only the plotter is made.
+
+    Returns:
+        The plotter, e.g. for its `export_gltf`.
+
+    Raises:
+        PictureError: There is no OpenGL to draw with.
+        InputError: Bad q, or the grasp has a finger that the robot has not.
+    """
+    with _one_at_a_time:
+        stage = Stage(off_screen=not window)
+        solids = _fill(stage, robot, q, grasp, dict.fromkeys(robot.fingers, INK))
+        target = robot.contacts(q)[0].mean(axis=0)
+        view = whole_view(target, close_view(robot, q))
+        stage.aim(view, _points(*solids.values()), WINDOW, (0.05, 0.05))
+    if window:
+        stage.plotter.show(auto_close=False)
+    return stage.plotter
 
 
-def _draw_whole(figure: Figure, scene: Scene, view: View) -> None:
-    body, pixels = scene.body, _pixels(figure, WHOLE)
-    solids = [*body.arm, *body.hand, *scene.things, *scene.marks]
-    camera = camera_at(*view, _vertices(solids), pixels, (0.03, 0.10))
-    robot = Layer([*body.arm, *body.hand])
-    layers = [robot, Layer(scene.things, 0.5), Layer(scene.marks, 1.0, 0.45)]
-    _panel(figure, WHOLE, camera).imshow(render(camera, layers, scene.floor))
-
-
-def _draw_close(figure: Figure, scene: Scene, view: View) -> tuple[Axes, Camera]:
-    body, pixels = scene.body, _pixels(figure, CLOSE)
-    near = [
-        solid
-        for solid in (*scene.things, *scene.marks)
-        if np.linalg.norm(solid.vertices.mean(axis=0) - scene.palm) < NEAR
-    ]
-    camera = camera_at(*view, _vertices([*body.hand, *near]), pixels, (0.17, 0.02))
-    wrist = [
-        solid
-        for solid in body.arm
-        if np.linalg.norm(solid.vertices - scene.palm, axis=1).min() < WRIST
-    ]
-    # The arm is pale: it may stand in the way.
-    layers = [
-        Layer(wrist, 0.3, fading=True),
-        Layer(body.hand),
-        Layer(scene.things, 0.5),
-        Layer(scene.marks, 1.0, 0.45),
-    ]
-    axes = _panel(figure, CLOSE, camera)
-    axes.imshow(render(camera, layers))
-    return axes, camera
+def _fill(
+    stage: Stage, robot: ArmHand, q: ArrayLike, grasp: Grasp | None, colors: Mapping[str, str]
+) -> dict[str, list[Solid]]:
+    """Put all there is to see on the stage, and give it back by group."""
+    arm, hand = robot_body(robot, q)
+    palm = robot.palm(q)[:3, 3]
+    solids: dict[str, list[Solid]] = {"arm": [], "wrist": [], "hand": hand}
+    for solid in arm:
+        solids["wrist" if _distances(solid, palm).min() < WRIST_LENGTH else "arm"].append(solid)
+    for group, members in solids.items():
+        stage.add(group, members)
+    stage.add_floor(float(robot.links(q)[robot.description.root][2, 3]), arm + hand)
+    solids["object"] = _object(grasp) if grasp else []
+    solids["marks"] = _marks(robot, q, grasp, colors) if grasp else []
+    stage.add("object", solids["object"], OBJECT)
+    stage.add("marks", solids["marks"])
+    return solids
 
 
 def _object(grasp: Grasp) -> list[Solid]:
@@ -164,32 +174,43 @@ def _object(grasp: Grasp) -> list[Solid]:
         vertices, faces = load_object(grasp.object).mesh(64)
     except UnknownNameError:
         return []
-    return [Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, OBJECT_COLOR)]
+    mesh = pv.PolyData.from_regular_faces(vertices @ pose[:3, :3].T + pose[:3, 3], faces)
+    return [(with_edges(mesh), OBJECT_COLOR)]
 
 
-def _marks(robot: ArmHand, solution: Solution, grasp: Grasp) -> list[Solid]:
+def _marks(robot: ArmHand, q: ArrayLike, grasp: Grasp, colors: Mapping[str, str]) -> list[Solid]:
     """Arrows of the contacts: asked for thick and short, reached thin and long."""
-    asked_points, asked_normals = grasp.arrays(robot.fingers)
-    points, normals = robot.contacts(solution.q)
-    marks = []
-    for row, finger in enumerate(robot.fingers):
-        if np.isnan(asked_points[row, 0]):
+    marks: list[Solid] = []
+    contacts = zip(*grasp.arrays(robot.fingers), *robot.contacts(q), strict=True)
+    for finger, (asked, asked_normal, point, normal) in zip(robot.fingers, contacts, strict=True):
+        if np.isnan(asked[0]):
             continue
-        color = MET_COLOR if solution.contacts[finger].ok else MISSED_COLOR
+        color = colors[finger]
         marks += [
-            ball(asked_points[row], 0.0036, TARGET_COLOR),
-            ball(points[row], 0.0042, color),
-            arrow(points[row], normals[row], 0.046, 0.0022, color),
+            (pv.Sphere(radius=0.0036, center=asked), TARGET_COLOR),
+            (pv.Sphere(radius=0.0042, center=point), color),
+            (arrow(point, normal, 0.046, 0.0022), color),
         ]
-        if not solution.contacts[finger].ok:
-            marks.append(capsule(points[row], asked_points[row], 0.0006, color))
-        if not np.isnan(asked_normals[row, 0]):
-            marks.append(arrow(asked_points[row], asked_normals[row], 0.030, 0.0048, TARGET_COLOR))
+        if color == MISSED_COLOR:
+            marks.append((capsule(point, asked, 0.0006), color))
+        if not np.isnan(asked_normal[0]):
+            marks.append((arrow(asked, asked_normal, 0.030, 0.0048), TARGET_COLOR))
     return marks
 
 
-def _vertices(solids: list[Solid]) -> Array:
-    return np.concatenate([solid.vertices for solid in solids])
+def _points(*groups: list[Solid]) -> Array:
+    return np.concatenate([mesh.points for group in groups for mesh, _ in group])
+
+
+def _distances(solid: Solid, place: Array) -> Array:
+    return np.linalg.norm(solid[0].points - place, axis=1)
+
+
+def _inwards(pixels: tuple[int, int]) -> Image:
+    """(h, w, 1) 0 at the edges of an image, 1 further in."""
+    x, y = (np.linspace(0, 1, size, dtype=np.float32) for size in pixels)
+    x, y = (np.clip(np.minimum(v, 1 - v) / 0.15, 0, 1) for v in (x, y))
+    return y[:, None, None] * x[:, None]
 
 
 def _pixels(figure: Figure, box: tuple[float, float, float, float]) -> tuple[int, int]:
@@ -197,9 +218,8 @@ def _pixels(figure: Figure, box: tuple[float, float, float, float]) -> tuple[int
     return round(width * box[2]), round(height * box[3])
 
 
-def _panel(figure: Figure, box: tuple[float, float, float, float], camera: Camera) -> Axes:
+def _panel(figure: Figure, box: tuple[float, float, float, float], image: Image) -> Axes:
     axes = figure.add_axes(box)
     axes.set_axis_off()
-    axes.set_xlim(0, camera.pixels[0])
-    axes.set_ylim(camera.pixels[1], 0)
+    axes.imshow(np.clip(image, 0.0, 1.0))
     return axes

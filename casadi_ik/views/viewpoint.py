@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.views.camera import camera_at
 
 Array = NDArray[np.float64]
 
 View = tuple[float, float]
-"""Azimuth about z from x, and elevation above the horizon [rad]."""
+"""Azimuth about z from x, and elevation above the horizon, of the viewer [rad]."""
 
-AZIMUTHS = np.deg2rad(np.arange(0, 360, 10))
-ELEVATIONS = np.deg2rad([5, 15, 25, 35])
+AZIMUTHS = np.deg2rad(np.arange(0, 360, 10)).tolist()
+ELEVATIONS = np.deg2rad([5, 15, 25, 35]).tolist()
+
+
+def axes_of(view: View) -> Array:
+    """(3, 3) unit rows: to the right, up, and towards the viewer."""
+    (c, s), (ce, se) = ((np.cos(angle), np.sin(angle)) for angle in view)
+    return np.array([[-s, c, 0.0], [-se * c, -se * s, ce], [ce * c, ce * s, se]])
 
 
 def close_view(robot: ArmHand, q: ArrayLike) -> View:
@@ -25,27 +32,21 @@ def close_view(robot: ArmHand, q: ArrayLike) -> View:
         q: (n,) actuator positions [rad or m].
     """
     points, normals = robot.contacts(q)
-    links = robot.links(q)
-    palm = robot.palm(q)[:3, 3]
-    # What may hide the hand: the arm.
-    arm = np.array(
-        [links[joint.parent][:3, 3] for joint in robot.description.joints if joint.part != "hand"]
-        or [palm]
-    )
+    links, palm = robot.links(q), robot.palm(q)[:3, 3]
+    joints = [joint for joint in robot.description.joints if joint.part != "hand"]
+    arm = np.mean([links[joint.parent][:3, 3] for joint in joints] or [palm], axis=0)
     spots = np.concatenate([points, palm[None]])
-    best, chosen = -np.inf, (0.0, 0.0)
-    for azimuth in AZIMUTHS.tolist():
-        for elevation in ELEVATIONS.tolist():
-            camera = camera_at(azimuth, elevation, spots, (100, 100))
-            flat = spots @ np.stack([camera.right, camera.up], axis=1)
-            gaps = np.linalg.norm(flat[:, None] - flat[None], axis=2)
-            gap = gaps[np.triu_indices(len(spots), 1)].min()
-            side = 1 - np.abs(normals @ camera.towards).max()
-            hidden = max(0.0, float((arm.mean(axis=0) - palm) @ camera.towards))
-            score = gap + 0.03 * side - 0.05 * hidden - 0.01 * abs(elevation - 0.35)
-            if score > best:
-                best, chosen = float(score), (azimuth, elevation)
-    return chosen
+
+    def score(view: View) -> float:
+        axes = axes_of(view)
+        flat = spots @ axes[:2].T
+        gaps = np.linalg.norm(flat[:, None] - flat[None], axis=2)
+        gap = gaps[np.triu_indices(len(spots), 1)].min()
+        side = 1 - np.abs(normals @ axes[2]).max()
+        hidden = max(0.0, float((arm - palm) @ axes[2]))  # behind the arm
+        return float(gap + 0.03 * side - 0.05 * hidden - 0.01 * abs(view[1] - 0.35))
+
+    return max(product(AZIMUTHS, ELEVATIONS), key=score)
 
 
 def whole_view(target: Array, close: View) -> View:

@@ -1,0 +1,176 @@
+"""What is drawn: closed surfaces; a body that follows the robot; a camera that shows it."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+from casadi_ik.errors import InputError, PictureError
+from casadi_ik.views import show
+from casadi_ik.views.robot_body import robot_body
+from casadi_ik.views.shapes import arrow, capsule, drum, stretched
+from casadi_ik.views.stage import Stage, over
+from casadi_ik.views.viewpoint import axes_of, close_view, whole_view
+
+AXIS = np.array([0.3, -0.5, 0.8])
+ORIGIN = np.zeros(3)
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+SHAPES = {
+    "capsule": (
+        capsule(ORIGIN, AXIS, 0.1),
+        np.pi * 1e-2 * np.linalg.norm(AXIS) + 4 / 3 * np.pi * 1e-3,
+    ),
+    "ball": (capsule(ORIGIN, ORIGIN, 0.1), 4 / 3 * np.pi * 1e-3),
+    "drum": (drum(CORNERS[1], AXIS, 0.1, 0.5), np.pi * 1e-2 * 0.5),
+    "prism": (
+        stretched(drum(ORIGIN, np.array([0, 0, 1.0]), 0.1, 1.0), CORNERS),
+        0.5 + 0.1 * (2 + np.sqrt(2)) + np.pi * 0.01,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_shapes_are_closed_and_of_their_size(name: str) -> None:
+    mesh, expected = SHAPES[name]
+    whole = pv.PolyData(mesh.points, mesh.faces).clean()
+    assert whole.n_open_edges == 0
+    assert whole.volume == pytest.approx(expected, rel=0.05)
+    assert np.linalg.norm(mesh.point_data["Normals"], axis=1) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_drum_lies_along_its_axis() -> None:
+    mesh = drum(CORNERS[1], AXIS, 0.1, 0.5)
+    axis = AXIS / np.linalg.norm(AXIS)
+    along = (mesh.points - CORNERS[1]) @ axis
+    across = np.linalg.norm(mesh.points - CORNERS[1] - along[:, None] * axis, axis=1)
+    assert (along.min(), along.max(), across.max()) == pytest.approx((-0.25, 0.25, 0.1), abs=1e-3)
+
+
+def test_an_arrow_ends_at_its_length() -> None:
+    mesh = arrow(CORNERS[1], AXIS, 0.5, 0.02)
+    tip = CORNERS[1] + 0.5 * AXIS / np.linalg.norm(AXIS)
+    assert np.linalg.norm(mesh.points - tip, axis=1).min() < 1e-6
+
+
+def test_fingertips_of_the_body_touch_their_contacts(robot) -> None:
+    for q in robot.random(np.random.default_rng(1), 5):
+        points, normals = robot.contacts(q)
+        _, hand = robot_body(robot, q)
+        for (mesh, _), point, normal in zip(hand[-len(points) :], points, normals, strict=True):
+            assert np.linalg.norm(mesh.points - point, axis=1).min() < 1.5e-3
+            assert ((mesh.points - point) @ normal).max() < 1e-3  # nothing beyond the pad
+
+
+def test_the_body_stands_on_the_floor(robot) -> None:
+    arm, _ = robot_body(robot, robot.home)
+    assert min(mesh.points[:, 2].min() for mesh, _ in arm) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.fixture
+def stage():
+    with closing(Stage()) as made:
+        yield made
+
+
+def test_the_camera_shows_all_points_within_its_margins(stage) -> None:
+    points = np.random.default_rng(2).normal(size=(30, 3))
+    stage.aim((0.7, 0.3), points, (200, 120), (0.1, 0.05))
+    seen = stage.project(points)
+    assert seen[:, 0].min() >= 20 - 1e-6
+    assert seen[:, 0].max() <= 180 + 1e-6
+    assert seen[:, 1].min() >= 6 - 1e-6
+    assert seen[:, 1].max() <= 114 + 1e-6
+    right, up, towards = axes_of((0.7, 0.3))
+    assert towards @ [np.cos(0.7), np.sin(0.7), 0] == pytest.approx(np.cos(0.3))
+    np.testing.assert_allclose(stage.project(points + towards), seen, atol=1e-6)
+    moved = stage.project(points + 0.1 * right + 0.1 * up) - seen
+    assert (moved * [1, -1] > 1).all()
+
+
+def test_what_is_drawn_is_where_it_is_projected_to(stage) -> None:
+    points = np.array([[0.0, 0.2, 0.3], [0.1, -0.4, 0.2]])
+    stage.add("ball", [(pv.Sphere(radius=0.02, center=points[0]), "#ff0000")])
+    stage.aim((0.3, 0.4), points, (121, 81), (0.2, 0.2))
+    image = stage.shoot()
+    rows, columns = np.nonzero(image[..., 3] > 0.5)
+    x, y = stage.project(points)[0]
+    assert (columns.mean() + 0.5, rows.mean() + 0.5) == pytest.approx((x, y), abs=0.6)
+
+
+def test_the_nearer_solid_hides_the_other_and_groups_can_be_left_out(stage) -> None:
+    stage.add("near", [(pv.Sphere(radius=0.2, center=(1, 0, 0)), "#ff0000")])
+    stage.add("far", [(pv.Sphere(radius=0.2, center=(-1, 0, 0)), "#0000ff")])
+    stage.aim((0.0, 0.0), [[0, 0.3, 0.3], [0, -0.3, -0.3]], (41, 41))
+    red, _, blue, alpha = stage.shoot()[20, 20]
+    assert red > 2 * blue
+    assert alpha == 1.0
+    red, _, blue, _ = stage.shoot("far")[20, 20]
+    assert blue > 2 * red
+    assert stage.shoot("neither")[20, 20].tolist() == [1, 1, 1, 0]
+
+
+def test_layers_blend() -> None:
+    layer = np.array([[[1.0, 0.0, 0.0, 1.0], [1.0, 1.0, 1.0, 0.0], [1.0, 0.5, 0.5, 0.5]]])
+    blended = over(np.full((1, 3, 3), 0.5), layer)
+    np.testing.assert_allclose(blended, [[[1, 0, 0], [0.5, 0.5, 0.5], [0.75, 0.25, 0.25]]])
+    np.testing.assert_allclose(over(1.0, layer, 0.2)[0, 0], [1, 0.8, 0.8])
+
+
+def test_the_floor_has_the_shadow_below_the_body(stage) -> None:
+    thing = [(pv.Sphere(radius=0.1, center=(0.2, 0.3, 0.5)), "#ff0000")]
+    stage.add_floor(0.0, thing)
+    stage.aim((0.4, 0.8), [[-0.5, 0, 0], [0.5, 0, 0], [0, -0.5, 0], [0, 0.5, 0]], (80, 80))
+    image = stage.shoot("floor")
+    dark = 1 - image[..., 0]
+    x, y = stage.project([[0.2, 0.3, 0.0]])[0]
+    assert dark[int(y), int(x)] > 0.2
+    x, y = stage.project([[0.2, -0.08, 0.0]])[0]
+    assert 0.0 < dark[int(y), int(x)] < 0.12
+
+
+def test_the_close_view_sets_the_fingertips_apart(robot, solution) -> None:
+    points, _ = robot.contacts(solution.q)
+    flat = (points @ axes_of(close_view(robot, solution.q))[:2].T)[:, None]
+    gaps = np.linalg.norm(flat - flat.swapaxes(0, 1), axis=2)[np.triu_indices(3, 1)]
+    assert gaps.min() > 0.015
+
+
+def test_the_whole_view_is_on_the_side_of_the_close_one() -> None:
+    target = np.array([-0.8, 0.1, 0.4])
+    for azimuth in np.linspace(0, 2 * np.pi, 9).tolist():
+        view = whole_view(target, (azimuth, 0.1))
+        assert np.cos(view[0] - azimuth) > -0.5
+    assert whole_view(np.array([0, 0, 1.0]), (0.3, 0.1))[0] == 0.3
+
+
+def test_show_gives_a_plotter_to_export(robot, grasp, tmp_path) -> None:
+    plotter = show(robot, robot.home, grasp, window=False)
+    plotter.export_gltf(str(tmp_path / "robot.gltf"))
+    plotter.close()
+    assert (tmp_path / "robot.gltf").stat().st_size > 100_000
+    show(robot, robot.home, window=False).close()
+    with pytest.raises(InputError):
+        show(robot, np.zeros(3), window=False)
+
+
+def test_without_opengl_there_is_an_error_and_no_crash(monkeypatch) -> None:
+    monkeypatch.setattr("pyvista.Plotter", NoOpenGL)
+    with pytest.raises(PictureError, match="no OpenGL"):
+        Stage()
+
+
+class NoOpenGL:
+    """A plotter as it is where neither X nor EGL nor OSMesa is installed."""
+
+    def __init__(self, **_) -> None:
+        self.render_window = self
+
+    def Initialize(self) -> None:
+        pass
+
+    def IsCurrent(self) -> bool:
+        return False
