@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -46,3 +49,17 @@ def rng() -> np.random.Generator:
 def own_robot(tmp_path: Path) -> Path:
     """A copy of the shipped descriptions, for tests that break them."""
     return copy_shipped_robot(tmp_path)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Without OpenGL nothing can be drawn; CI has it, and there the tests must run."""
+    drawing = [item for item in items if item.get_closest_marker("opengl")]
+    if drawing and "CI" not in os.environ and not _has_opengl():
+        for item in drawing:
+            item.add_marker(pytest.mark.skip(reason="no OpenGL (on Linux: install libegl1)"))
+
+
+def _has_opengl() -> bool:
+    """Tried in a process of its own, since VTK may end it."""
+    program = "from casadi_ik.views.stage import Stage; Stage().close()"
+    return subprocess.run([sys.executable, "-c", program], capture_output=True).returncode == 0

@@ -136,6 +136,7 @@ def test_long_paths_are_not_broken(run: Command, grasp_file: GraspFile, tmp_path
     assert str(out) in run("solve", grasp_file(), *FAST, "--out", out).out
 
 
+@pytest.mark.opengl
 def test_picture_is_drawn(run: Command, grasp_file: GraspFile, tmp_path: Path) -> None:
     picture = tmp_path / "pinch.png"
     done = run("solve", grasp_file(), *FAST, "--picture", picture)

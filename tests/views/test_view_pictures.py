@@ -21,6 +21,8 @@ from casadi_ik.views import draw_convergence, draw_solution
 from casadi_ik.views.captions import MET_COLOR, MISSED_COLOR, OBJECT_COLOR, TARGET_COLOR
 from casadi_ik.views.picture import new_figure, save_picture
 
+pytestmark = pytest.mark.opengl
+
 COARSE = 40  # dots per inch
 
 

@@ -15,6 +15,8 @@ from casadi_ik.views.shapes import arrow, capsule, drum, stretched
 from casadi_ik.views.stage import Stage, over
 from casadi_ik.views.viewpoint import axes_of, close_view, whole_view
 
+pytestmark = pytest.mark.opengl
+
 AXIS = np.array([0.3, -0.5, 0.8])
 ORIGIN = np.zeros(3)
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
