@@ -89,7 +89,7 @@ class Solver:
         if finger_step is not None and "finger_step" in method_options(method):
             self.options["finger_step"] = finger_step
         self._engine = Engine(
-            robot, build_method(method, robot.description, self.options, compiled)
+            robot, build_method(method, robot.description, self.options, compiled), compiled
         )
 
     def __repr__(self) -> str:
@@ -111,6 +111,7 @@ class Solver:
         q0: ArrayLike | None = None,
         seed: int = 0,
         log: str | PathLike[str] | None = None,
+        diagnose: bool = True,
     ) -> Solution:
         """Solve one grasp.
 
@@ -119,6 +120,7 @@ class Solver:
             q0: (n,) start [rad or m]; None is `robot.home`.
             seed: Of all random numbers, an integer >= 0.
             log: Path of an MCAP file to write every iteration to.
+            diagnose: Whether to find out why, if it is not solved (`Solution.diagnosis`).
 
         Returns:
             The solution; not converging is its status, never an exception.
@@ -130,7 +132,7 @@ class Solver:
         if not isinstance(grasp, Grasp):
             raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
         points, normals = grasp.arrays(self.robot.fingers)
-        batch = self.solve_batch(points[None], normals[None], q0, seed, log=log)
+        batch = self.solve_batch(points[None], normals[None], q0, seed, log=log, diagnose=diagnose)
         return batch.solution(
             0, self.method, self.robot.name, self.robot.actuators, self.robot.fingers
         )
@@ -143,6 +145,7 @@ class Solver:
         seed: int = 0,
         jobs: int = 1,
         log: str | PathLike[str] | None = None,
+        diagnose: bool = False,
     ) -> BatchSolution:
         """Solve k targets.
 
@@ -154,6 +157,8 @@ class Solver:
             seed: Of all random numbers, an integer >= 0.
             jobs: Threads, at least 1.
             log: Path of an MCAP file to write every iteration to.
+            diagnose: Whether to find out why, for every target that is not solved
+                (`BatchSolution.diagnoses`).
 
         Returns:
             The same fields as a `Solution`, as arrays.
@@ -165,7 +170,7 @@ class Solver:
         p, n = target_arrays(points, normals, len(self.robot.fingers))
         problems = Problems(p, n, self.tolerance, self.limits == "enforce")
         with self._recorder(log, seed) as recorder:
-            return self._engine.solve(problems, q0, seed, jobs, recorder)
+            return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
 
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
         """Solve one grasp by hand, one iteration at a time.

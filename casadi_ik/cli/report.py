@@ -93,7 +93,7 @@ def solution_report(
 
 
 def reasons(solver: Solver, solution: Solution) -> list[str]:
-    """Why a grasp is not solved: what it missed, and which limits hold it back."""
+    """Why a grasp is not solved: what it missed, what is at a limit, and the diagnosis."""
     lines = [_MEANING.get(solution.status, "the contacts are not met")]
     tolerance = solver.tolerance
     for finger, contact in solution.contacts.items():
@@ -116,6 +116,8 @@ def reasons(solver: Solver, solution: Solution) -> list[str]:
     ]
     if held:
         lines.append(f"at a limit: {', '.join(held)}")
+    if solution.diagnosis is not None:
+        lines += solution.diagnosis.lines
     return lines
 
 

@@ -6,8 +6,11 @@ import argparse
 import json
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.cli.answer import Answer, Exit
@@ -16,7 +19,7 @@ from casadi_ik.cli.question import located, the_grasp, the_robot, the_solver, th
 from casadi_ik.cli.report import solution_report
 from casadi_ik.errors import MissingExtraError
 from casadi_ik.grasps import Grasp, load_object
-from casadi_ik.solvers import Solution
+from casadi_ik.solvers import Diagnosis, Solution
 
 Draw = Callable[[ArmHand, Solution, Grasp, Path], object]
 
@@ -70,7 +73,24 @@ def as_json(solution: Solution) -> dict[str, Any]:
             }
             for finger, contact in solution.contacts.items()
         },
+        "diagnosis": None if solution.diagnosis is None else _diagnosis(solution.diagnosis),
     }
+
+
+def _diagnosis(diagnosis: Diagnosis) -> dict[str, Any]:
+    plain = _plain(asdict(diagnosis))
+    return plain | {"reason": diagnosis.reason.name, "lines": list(diagnosis.lines)}
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: arrays and tuples as lists, null for what is not finite."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    return _finite(value) if isinstance(value, float) else value
 
 
 def _finite(value: float) -> float | None:

@@ -1,10 +1,12 @@
 """Loops, phases, status and verdicts."""
 
+from casadi_ik.solvers.contact_verdict import ContactVerdict
+from casadi_ik.solvers.diagnosis import Diagnosis, Reason
 from casadi_ik.solvers.engine import Engine
 from casadi_ik.solvers.problem import LIMITS, Problems, Tolerance, target_arrays
 from casadi_ik.solvers.recorder import Recorder
 from casadi_ik.solvers.registry import METHODS, build_method, method_options, method_summary
-from casadi_ik.solvers.solution import BatchSolution, ContactVerdict, Solution
+from casadi_ik.solvers.solution import BatchSolution, Solution
 from casadi_ik.solvers.stepper import SteppedMethod, Stepper
 from casadi_ik.steps.qiu_parameters import FINGER_STEPS
 from casadi_ik.steps.status import Phase, Status
@@ -15,9 +17,11 @@ __all__ = [
     "METHODS",
     "BatchSolution",
     "ContactVerdict",
+    "Diagnosis",
     "Engine",
     "Phase",
     "Problems",
+    "Reason",
     "Recorder",
     "Solution",
     "Status",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -12,11 +13,15 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError
+from casadi_ik.solvers.diagnosis import Diagnosis, Reason
+from casadi_ik.solvers.diagnostician import Diagnostician
+from casadi_ik.solvers.hand_first import HandFirstMethod
 from casadi_ik.solvers.method import Method, Outcome
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.recorder import Recorder, SolveRecord, SolveSummary
 from casadi_ik.solvers.solution import BatchSolution
 from casadi_ik.solvers.verdict import judge
+from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.status import Status
 
 
@@ -27,10 +32,20 @@ class Engine:
     Attributes:
         robot: The robot.
         method: The method, built for this robot.
+        compiled: Whether what a diagnosis needs besides runs in compiled code.
     """
 
     robot: ArmHand
     method: Method
+    compiled: bool = True
+
+    @cached_property
+    def diagnostician(self) -> Diagnostician:
+        """Who says why a target was not solved; asks hand-first, whichever the method is."""
+        method = self.method
+        if not isinstance(method, HandFirstMethod):
+            method = HandFirstMethod(self.robot.description, HandFirstParameters(), self.compiled)
+        return Diagnostician(self.robot, method)
 
     def solve(
         self,
@@ -39,6 +54,7 @@ class Engine:
         seed: int,
         jobs: int = 1,
         recorder: Recorder | None = None,
+        diagnose: bool = False,
     ) -> BatchSolution:
         """Solve a batch of k targets.
 
@@ -48,6 +64,7 @@ class Engine:
             seed: Of all random numbers.
             jobs: Threads; compiled loops run side by side.
             recorder: Who keeps the iterations, if anyone.
+            diagnose: Whether to find out why what is not solved is not.
 
         Raises:
             InputError: Bad q0, seed or jobs, or targets the method cannot take.
@@ -59,6 +76,8 @@ class Engine:
         started = time.time_ns()
         outcome = self._run(problems, starts, seed, jobs, recorder is not None)
         batch = self._judged(problems, outcome)
+        if diagnose:
+            batch = self._diagnosed(problems, starts, outcome, batch)
         if recorder is not None:
             self._record(recorder, problems, batch, outcome, seed, started)
         return batch
@@ -110,6 +129,29 @@ class Engine:
             limits_ok=verdict.limits_ok,
             phases=outcome.phases,
         )
+
+    def _diagnosed(
+        self, problems: Problems, starts: Array, outcome: Outcome, batch: BatchSolution
+    ) -> BatchSolution:
+        """Say why; where hand-first's own diagnosis comes upon a solution, that is the answer."""
+        own = isinstance(self.method, HandFirstMethod)
+        found: dict[int, Diagnosis] = {}
+        q, seconds = outcome.q.copy(), outcome.time.copy()
+        for row in map(int, np.flatnonzero(~batch.success)):
+            nearest = outcome.q[row] if own else None
+            one = problems.rows(slice(row, row + 1))
+            found[row] = self.diagnostician.diagnose(one, starts[row], nearest)
+            if own and found[row].reason is Reason.REACHABLE:
+                q[row] = found[row].q
+                seconds[row] += found[row].time
+        batch = self._judged(problems, replace(outcome, q=q, time=seconds))
+        diagnoses = tuple(
+            None if solved else found[row] for row, solved in enumerate(batch.success)
+        )
+        status = batch.status.copy()
+        unreachable = [why is not None and why.established for why in diagnoses]
+        status[unreachable] = Status.UNREACHABLE
+        return replace(batch, status=status, diagnoses=diagnoses)
 
     def _record(
         self,

@@ -27,6 +27,9 @@ from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
 
+AT_LIMITS = 0.5
+"""Part of the range that the wide table moves to the limits."""
+
 MAX_ITERATIONS = 100_000
 """Far above what the stages' own budgets allow: the loop always ends by a status."""
 
@@ -60,9 +63,15 @@ class HandFirstMethod:
         """The hand postures that targets are compared with."""
         return PostureTable(ArmHand(self._robot), self.step.layouts.hand, self.options.table)
 
+    @cached_property
+    def wide_table(self) -> PostureTable:
+        """Many more postures, a good part of them at limits, for targets the first round misses."""
+        robot, options = ArmHand(self._robot), self.options
+        return PostureTable(robot, self.step.layouts.hand, options.wide_table, AT_LIMITS)
+
     def prepare(self) -> None:
-        """Build and compile the loop, and fill the table."""
-        _ = self.kernel, self.table
+        """Build and compile the loop, and fill the tables."""
+        _ = self.kernel, self.table, self.wide_table
 
     @property
     def trace_format(self) -> TraceFormat:
@@ -92,9 +101,9 @@ class HandFirstMethod:
         waiting = np.arange(count)
         for number in range(options.rounds if count else 0):
             begin = time.perf_counter()
-            first, last = number * options.candidates, (number + 1) * options.candidates
+            first = number * options.candidates
             chosen = problems.rows(waiting)
-            lookup = self.table.nearest(chosen.points, chosen.normals, last)[:, first:]
+            lookup = self._postures(chosen, number)
             parameters = self._parameters(chosen, q0[waiting], lookup)
             outcome.time[waiting] += (time.perf_counter() - begin) / max(len(waiting), 1)
             result = self.kernel.run(self._states(q0[waiting]), parameters, MAX_ITERATIONS, trace)
@@ -112,10 +121,28 @@ class HandFirstMethod:
             trace=tuple(np.concatenate(rows) for rows in outcome.traces),
         )
 
+    def rows(self, problems: Problems, q0: Array, number: int = 0) -> tuple[Array, Array]:
+        """States and parameters of a round, a row per target, to be changed before `run_rows`."""
+        lookup = self._postures(problems, number)
+        return self._states(q0), self._parameters(problems, q0, lookup)
+
+    def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
+        """Run the compiled loop on rows as made by `rows`."""
+        return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
+
+    def _postures(self, problems: Problems, number: int) -> Array:
+        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one."""
+        count = self.options.candidates
+        if number == 0:
+            return self.table.nearest(problems.points, problems.normals, count)
+        found = self.wide_table.nearest(problems.points, problems.normals, number * count)
+        return found[:, -count:]
+
     def _parameters(self, problems: Problems, q0: Array, postures: Array) -> Array:
         layout = self.step.layouts.parameters
-        robot, count = self._robot, len(problems)
-        bound = np.full(len(robot.actuators), UNBOUNDED)
+        count = len(problems)
+        lower, upper = problems.bounds(self._robot.lower, self._robot.upper, UNBOUNDED)
+        hand = list(self.step.layouts.hand)
         values: dict[str, Any] = {
             "points": np.nan_to_num(problems.points),
             "normals": np.nan_to_num(problems.normals),
@@ -124,10 +151,11 @@ class HandFirstMethod:
             ),
             "position_tolerance": problems.tolerance.position,
             "angle_tolerance": problems.tolerance.angle,
-            "lower": robot.lower if problems.enforce_limits else -bound,
-            "upper": robot.upper if problems.enforce_limits else bound,
-            "postures": postures,
-            "start": np.clip(q0, robot.lower, robot.upper) if problems.enforce_limits else q0,
+            "lower": lower,
+            "upper": upper,
+            "postures": np.clip(postures, lower[hand], upper[hand]),
+            "reach": 1.0,
+            "start": np.clip(q0, lower, upper),
         }
         parameters = np.zeros((count, layout.size))
         for name, value in values.items():
@@ -176,6 +204,7 @@ class _Collected:
         self.counts[rows] += result.states[:, state.slice("counts")].astype(np.int64)
         self.time[rows] += result.time
         for row, records in zip(rows, result.trace, strict=False):
+            records["candidate"] += before
             self.traces[row].append(records)
 
 

@@ -14,12 +14,20 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.solvers.problem import Array
+from casadi_ik.steps.even_spread import evenly
 
 LENGTH = 0.1
 """Distances are divided by this [m], so that they weigh like the cosines."""
 
-CHUNK = 2048
-"""Targets compared at once."""
+CHUNK = 256
+"""Targets compared at once: what fits into the cache."""
+
+STEPS = 64
+"""Values are compared in steps of 1 / STEPS. The products then have no rounding errors in single
+precision, so that a target finds the same postures alone and in a batch."""
+
+SEARCHES = 16
+"""Up to so many smallest entries are searched for one by one."""
 
 
 class PostureTable:
@@ -29,22 +37,29 @@ class PostureTable:
         postures: (t, k) positions of the hand's actuators.
     """
 
-    def __init__(self, robot: ArmHand, hand: tuple[int, ...], size: int) -> None:
+    def __init__(
+        self, robot: ArmHand, hand: tuple[int, ...], size: int, at_limits: float = 0.0
+    ) -> None:
         """Spread the postures and note the shape of their contacts.
 
         Args:
             robot: The robot.
             hand: Positions in q of the hand's actuators.
             size: Number of postures.
+            at_limits: Part of the range [0, 1) that is moved to the limits, half to either: hands
+                stand at their limits more often than an even spread would.
         """
         columns = list(hand)
         q = np.tile(robot.home, (size, 1))
-        spread = evenly(size, len(columns))
+        spread = (evenly(size, len(columns)) - 0.5) / (1 - at_limits) + 0.5
+        spread = np.clip(spread, 0.0, 1.0)
         q[:, columns] = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
         self.postures = q[:, columns]
         values, _ = shape(*robot.contacts(q))
-        self._values = values.astype(np.float32)
-        self._squares = (values**2).astype(np.float32)
+        rounded = _rounded(values)
+        # Squares last: one product gives |table - wanted|^2 without the part all postures share.
+        self._columns = np.hstack([rounded, rounded**2]).T.copy()
+        self._complete = np.hstack([rounded, (rounded**2).sum(axis=1, keepdims=True)]).T.copy()
 
     def nearest(self, points: Array, normals: Array, count: int) -> Array:
         """The postures whose contacts are shaped most like the targets, best first.
@@ -61,10 +76,12 @@ class PostureTable:
         for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
             values, known = shape(points[part], normals[part])
-            wanted = values.astype(np.float32)
-            # |known * (table - wanted)|^2 without the part that all rows share.
-            distance = known.astype(np.float32) @ self._squares.T
-            distance -= 2 * (wanted @ self._values.T)
+            wanted = -2 * _rounded(values)
+            if known.all():
+                ones = np.ones((len(wanted), 1), dtype=np.float32)
+                distance = np.hstack([wanted, ones]) @ self._complete
+            else:
+                distance = np.hstack([wanted, known.astype(np.float32)]) @ self._columns
             rows[part] = _smallest(distance, count)
         return self.postures[rows]
 
@@ -100,25 +117,17 @@ def shape(points: Array, normals: Array) -> tuple[Array, NDArray[np.bool_]]:
     return np.where(known, values, 0.0), known
 
 
-def evenly(count: int, dimensions: int) -> Array:
-    """(count, dimensions) points of an additive recurrence, evenly spread over the unit cube.
-
-    Roberts' generalised golden ratio: the root of x^(d+1) = x + 1 gives the increments.
-    """
-    ratio = 2.0
-    for _ in range(64):
-        ratio = (1 + ratio) ** (1 / (dimensions + 1))
-    steps = ratio ** -np.arange(1.0, dimensions + 1)
-    return (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
+def _rounded(values: Array) -> NDArray[np.float32]:
+    return np.rint(values * STEPS).clip(-8 * STEPS, 8 * STEPS).astype(np.float32)
 
 
 def _smallest(distance: NDArray[np.float32], count: int) -> NDArray[np.intp]:
-    """Columns of the smallest entries of each row, in order."""
-    if count == 1:
-        return distance.argmin(axis=1)[:, None]
-    if count < distance.shape[1]:
-        rows = np.argpartition(distance, count - 1, axis=1)[:, :count]
-    else:
-        rows = np.tile(np.arange(count), (len(distance), 1))
-    order = np.take_along_axis(distance, rows, axis=1).argsort(axis=1, kind="stable")
-    return np.take_along_axis(rows, order, axis=1)
+    """Columns of the smallest entries of each row, in order; `distance` is used up."""
+    if count > SEARCHES:
+        return distance.argsort(axis=1, kind="stable")[:, :count]
+    found = np.empty((len(distance), count), dtype=np.intp)
+    every = np.arange(len(distance))
+    for i in range(count):
+        found[:, i] = distance.argmin(axis=1)
+        distance[every, found[:, i]] = np.inf
+    return found

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, UnknownNameError
 
 Array = NDArray[np.float64]
 
@@ -46,19 +47,88 @@ class Problems:
         normals: (k, f, 3) unit outward pad normals, base frame; NaN marks a free normal.
         tolerance: When a contact counts as reached.
         enforce_limits: Whether limits are part of being solved.
+        first_row: Number of the first target in the whole batch; with the seed it decides the
+            random numbers of a target, so that a part of a batch gets those of the whole.
+        fixed: (n,) positions of locked actuators, NaN where one may move; None: all may.
     """
 
     points: Array
     normals: Array
     tolerance: Tolerance
     enforce_limits: bool
+    first_row: int = 0
+    fixed: Array | None = None
 
     def __len__(self) -> int:
         return len(self.points)
 
     def rows(self, rows: slice | NDArray[np.intp]) -> Problems:
-        """Some of the targets."""
-        return Problems(self.points[rows], self.normals[rows], self.tolerance, self.enforce_limits)
+        """Some of the targets.
+
+        Args:
+            rows: A slice without a step keeps the targets' numbers; rows picked one by one are
+                numbered anew from 0.
+        """
+        first_row = 0
+        if isinstance(rows, slice):
+            first_row = self.first_row + rows.indices(len(self))[0]
+        return Problems(
+            self.points[rows],
+            self.normals[rows],
+            self.tolerance,
+            self.enforce_limits,
+            first_row,
+            self.fixed,
+        )
+
+    def bounds(self, lower: Array, upper: Array, unbounded: float) -> tuple[Array, Array]:
+        """Bounds (n,) that a method has to keep to.
+
+        Args:
+            lower: (n,) limits of the robot's actuators.
+            upper: (n,).
+            unbounded: What stands for no limit [rad or m].
+        """
+        if not self.enforce_limits:
+            lower, upper = np.full_like(lower, -unbounded), np.full_like(upper, unbounded)
+        if self.fixed is None:
+            return lower, upper
+        free = np.isnan(self.fixed)
+        return np.where(free, lower, self.fixed), np.where(free, upper, self.fixed)
+
+
+def fixed_array(
+    fixed: Mapping[str, float], actuators: Sequence[str], lower: Array, upper: Array
+) -> Array | None:
+    """Locked actuators as an array for `Problems.fixed`.
+
+    Args:
+        fixed: Position by name of the actuator [rad or m].
+        actuators: Names of all actuators, in the order of q.
+        lower: (n,) limits.
+        upper: (n,).
+
+    Raises:
+        UnknownNameError: No such actuator.
+        InputError: Not a number within the actuator's limits.
+    """
+    if not fixed:
+        return None
+    values = np.full(len(actuators), np.nan)
+    for name, value in fixed.items():
+        if name not in actuators:
+            raise UnknownNameError(
+                f"fixed: no actuator {name!r}, expected one of {', '.join(actuators)}"
+            )
+        i = list(actuators).index(name)
+        number = isinstance(value, (int, float, np.integer, np.floating))
+        if not (number and lower[i] <= value <= upper[i]):
+            raise InputError(
+                f"fixed.{name}: found {value!r}, expected a number from {lower[i]:g} to "
+                f"{upper[i]:g}"
+            )
+        values[i] = value
+    return values
 
 
 def target_arrays(points: ArrayLike, normals: ArrayLike, f: int) -> tuple[Array, Array]:

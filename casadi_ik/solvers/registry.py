@@ -10,9 +10,11 @@ from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.hand_first import HandFirstMethod
 from casadi_ik.solvers.method import Method
+from casadi_ik.solvers.nlp import IpoptMethod
 from casadi_ik.solvers.qiu import QiuMethod
 from casadi_ik.steps.enhanced import EnhancedStep
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
+from casadi_ik.steps.ipopt_parameters import IpoptParameters
 from casadi_ik.steps.original import OriginalStep
 from casadi_ik.steps.qiu_parameters import OriginalParameters, QiuParameters
 
@@ -56,6 +58,11 @@ def _original(
     return QiuMethod(name, OriginalStep(robot, record), compiled)
 
 
+def _ipopt(name: str, robot: RobotDescription, record: IpoptParameters, compiled: bool) -> Method:
+    del name, compiled  # Ipopt calls its graphs in the virtual machine
+    return IpoptMethod(robot, record)
+
+
 _PAPER = "(Qiu & Kermani 2021)"
 _ENTRIES: dict[str, _Entry] = {
     "hand-first": _Entry(
@@ -87,6 +94,12 @@ _ENTRIES: dict[str, _Entry] = {
         OriginalParameters,
         {"steps": "sdls"},
         _original,
+    ),
+    "ipopt": _Entry(
+        "the whole arm-hand as one nonlinear program, with restarts: slow, to compare with",
+        IpoptParameters,
+        {},
+        _ipopt,
     ),
 }
 

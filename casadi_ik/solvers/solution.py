@@ -8,23 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.solvers.contact_verdict import ContactVerdict
+from casadi_ik.solvers.diagnosis import Diagnosis
 from casadi_ik.solvers.problem import Array
 from casadi_ik.steps.status import Status
-
-
-@dataclass(frozen=True)
-class ContactVerdict:
-    """How well one finger meets its contact.
-
-    Attributes:
-        position_error: Distance from the contact point [m]; NaN if the finger is free.
-        angle_error: Angle from the normal [rad]; NaN if it is free.
-        ok: Within tolerance (what is free is).
-    """
-
-    position_error: float
-    angle_error: float
-    ok: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +32,7 @@ class Solution:
         method: Name of the method.
         robot: Name of the robot.
         actuators: Names of the entries of q.
+        diagnosis: Why it is not solved; None if it is, or if no diagnosis was asked for.
     """
 
     success: bool
@@ -59,6 +47,7 @@ class Solution:
     method: str
     robot: str
     actuators: tuple[str, ...]
+    diagnosis: Diagnosis | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +66,7 @@ class BatchSolution:
         ok: (k, f) bool.
         limits_ok: (k,) bool.
         phases: (k,) iterations by phase name.
+        diagnoses: Why each target is not solved (None if it is); empty if not asked for.
     """
 
     success: NDArray[np.bool_]
@@ -90,6 +80,7 @@ class BatchSolution:
     ok: NDArray[np.bool_]
     limits_ok: NDArray[np.bool_]
     phases: Mapping[str, NDArray[np.int64]]
+    diagnoses: tuple[Diagnosis | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.q)
@@ -129,4 +120,5 @@ class BatchSolution:
             method=method,
             robot=robot,
             actuators=actuators,
+            diagnosis=self.diagnoses[row] if self.diagnoses else None,
         )

@@ -1,87 +1,128 @@
-"""Contacts as a least-squares problem with simple bounds, and one damped step of it.
+"""Contacts as a least-squares problem, and when a fit of them is at its end.
 
-The step is Levenberg-Marquardt on the free coordinates: one at a bound whose gradient points
-outwards is left where it is. What a step leads to is clipped to the bounds and judged by its cost
-there, so the iterates never leave them.
+A step is judged by what it made of the cost. The damping follows the ratio of what was gained to
+what the linear model promised (Nielsen 1999: Damping parameter in Marquardt's method).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 
-from casadi_ik.symbolic.linear_algebra import solve_spd
+from casadi_ik.steps.hand_first_state import LENGTH, errors, within_tolerance
 from casadi_ik.symbolic.smooth import Expr
 
-LENGTH = 0.1
-"""Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
-
 DAMPING_START = 1e-3
-DAMPING_DOWN = 1 / 8
-DAMPING_UP = 8.0
-DAMPING_FLOOR = 1e-9
+DAMPING_FLOOR = 1e-12
 """Damping [-] of the normal matrix; the rows are of order one per radian and 0.1 m."""
+
+DAMPING_CEILING = 1e4
+"""Damping at which a step that gains nothing shows that nothing is to be gained."""
+
+DAMPING_DOWN = 1 / 8
+"""Smallest factor of the damping after a step that gained."""
+
+GROWTH_START = 4.0
+"""Factor of the damping after a step that gained nothing; it doubles with every such step."""
+
+SLOW = 0.9
+"""A step that leaves more than this part of the cost gained little."""
+
+QUADRATIC = 0.1
+"""A step that leaves less than this part is converging fast: worth another one."""
+
+PATIENCE, BUDGET = 3, 15
+"""Evaluations with little gain, and evaluations in all, before a fit is given up."""
+
+PROMISING = 1e-3
+"""Cost below which a fit is close enough to be worth `PERSISTENCE` times as much."""
+
+PERSISTENCE = 10
+
+EXACT = 1e-8
+"""Root of the cost at which contacts count as met exactly (0.1 nm per 100 mm, or rad)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Bounded:
-    """Bounds of some of the coordinates: value, lower and upper (k, 1); and where they start."""
+class Tried:
+    """A damped step that was tried.
 
-    value: Expr
-    lower: Expr
-    upper: Expr
-    first: int
+    Attributes:
+        reached: Where it leads: whatever the stage's unknowns are.
+        before: Residual before.
+        there: Residual there.
+        promised: By how much the linear model says the cost falls.
+        size: Largest change of a motor.
+    """
 
-    @property
-    def slack(self) -> Expr:
-        """How close to a bound counts as standing there (k, 1)."""
-        return 1e-9 * (1 + ca.fabs(self.value))
+    reached: Any
+    before: Expr
+    there: Expr
+    promised: Expr
+    size: Expr
 
 
-def damped_step(jacobian: Expr, residual: Expr, damping: Expr, bounded: Bounded) -> Expr:
-    """Levenberg-Marquardt step for ``|residual + jacobian step|^2`` within the bounds (n, 1).
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A damped step after it was judged by its cost; `fit` goes into the state."""
 
-    Two passes of an active set: what the free step carries beyond a bound is held at that bound,
-    and the others are solved for again.
+    accepted: Expr
+    within: Expr
+    settled: Expr
+    cost: Expr
+    fit: dict[str, Expr]
+
+
+def judge_contacts(s: dict[str, Expr], p: dict[str, Expr], tried: Tried, f: int) -> Judged:
+    """Judge a step by the contacts of f fingers; see `judge`."""
+    residual = ca.if_else(gains(tried), tried.there, tried.before)
+    return judge(s, tried, within_tolerance(*errors(residual, f), p))
+
+
+def gains(tried: Tried) -> Expr:
+    """Whether the step lowers the cost."""
+    return ca.sumsqr(tried.there) < ca.sumsqr(tried.before)
+
+
+def judge(s: dict[str, Expr], tried: Tried, within: Expr) -> Judged:
+    """Accept a step that lowers the cost, and decide whether the fit is at its end.
 
     Args:
-        jacobian: (m, n), structurally sparse if possible.
-        residual: (m, 1).
-        damping: Scalar added to the diagonal of J'J.
-        bounded: The bounded coordinates, from column `bounded.first` on.
+        s: State.
+        tried: The step.
+        within: Whether what is left of the residual after it is good enough to stop at.
     """
-    n, first = jacobian.shape[1], bounded.first
-    gradient = ca.densify(jacobian.T @ residual)
-    normal = ca.densify(jacobian.T @ jacobian + damping * ca.DM.eye(n))
-    nowhere = ca.SX.zeros(n, 1)
-    held = ca.vertcat(ca.SX.zeros(first, 1), blocked(gradient[first:], bounded))
-    step = _step_with(normal, gradient, held, nowhere)
-    inside = clip(bounded.value + step[first:], bounded) - bounded.value
-    beyond = ca.fabs(inside - step[first:]) > 0
-    again = ca.vertcat(ca.SX.zeros(first, 1), ca.logic_or(held[first:], beyond))
-    return _step_with(normal, gradient, again, ca.vertcat(ca.SX.zeros(first, 1), inside))
+    cost_before, cost_there = ca.sumsqr(tried.before), ca.sumsqr(tried.there)
+    accepted = gains(tried)
+    cost = ca.if_else(accepted, cost_there, cost_before)
+    left = cost / ca.fmax(cost_before, 1e-300)
+    waited = ca.if_else(left > SLOW, s["waited"] + 1, 0.0)
+    spent = s["spent"] + 1
+    worth = ca.if_else(cost < PROMISING, float(PERSISTENCE), 1.0)
+    over = ca.logic_or(waited >= PATIENCE * worth, spent >= BUDGET * worth)
+    stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > DAMPING_CEILING)
+    over = ca.logic_or(over, stuck)
+    slowing = ca.logic_and(within, left > QUADRATIC)
+    kept = (cost_before - cost_there) / ca.fmax(tried.promised, 1e-300)
+    bent = 2 * kept - 1
+    factor = ca.if_else(accepted, ca.fmax(DAMPING_DOWN, 1 - bent * bent * bent), s["growth"])
+    settled = ca.logic_or(cost < EXACT * EXACT, ca.logic_or(over, slowing))
+    fit = fresh_fit() | {
+        "damping": ca.fmax(s["damping"] * factor, DAMPING_FLOOR),
+        "growth": ca.if_else(accepted, GROWTH_START, 2 * s["growth"]),
+        "waited": waited,
+        "spent": spent,
+    }
+    fit = {name: ca.if_else(settled, fresh_fit()[name], fit[name]) for name in fit}
+    return Judged(accepted, within, settled, cost, fit | {"cost": cost})
 
 
-def _step_with(normal: Expr, gradient: Expr, held: Expr, values: Expr) -> Expr:
-    """Minimiser of the quadratic with some coordinates held at given steps."""
-    free, fixed = 1 - held, held * values
-    masked = normal * (free @ free.T) + ca.diag(held)
-    right = -free * (gradient + normal @ fixed)
-    return solve_spd(ca.densify(masked), ca.densify(right)) * free + fixed
-
-
-def blocked(gradient: Expr, bounded: Bounded) -> Expr:
-    """1 for every bounded coordinate at a bound whose descent points outwards (k, 1)."""
-    at_lower = ca.logic_and(bounded.value <= bounded.lower + bounded.slack, gradient > 0)
-    at_upper = ca.logic_and(bounded.value >= bounded.upper - bounded.slack, gradient < 0)
-    return ca.logic_or(at_lower, at_upper)
-
-
-def clip(value: Expr, bounded: Bounded) -> Expr:
-    """Value moved into the bounds."""
-    return ca.fmin(ca.fmax(value, bounded.lower), bounded.upper)
+def fresh_fit() -> dict[str, float]:
+    """Counters and damping of a fit that begins."""
+    return {"damping": DAMPING_START, "growth": GROWTH_START, "waited": 0.0, "spent": 0.0}
 
 
 def weighted_residual(position: Sequence[Expr], normal: Sequence[Expr], weights: Expr) -> Expr:

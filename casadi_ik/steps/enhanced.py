@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.robots.description import Array, RobotDescription
-from casadi_ik.steps.finger_step import finger_step_function
+from casadi_ik.steps.finger_step import finger_step_function, planar_fingers
 from casadi_ik.steps.hierarchy import combine
 from casadi_ik.steps.limits import kept_within, limit_mask
 from casadi_ik.steps.palm_estimate import palm_orientation
@@ -55,11 +55,15 @@ class EnhancedStep:
         Args:
             robot: The description.
             options: The structural choices; numbers are parameters of the graph.
+
+        Raises:
+            UnsupportedError: The robot is not of the kind the method needs.
         """
         n, f = len(robot.actuators), len(robot.fingers)
         self.robot = robot
         self.options = options
         self.chain = split(robot, options.borrowed)
+        planar_fingers(robot)  # refused now rather than when the graph is built
         self.state = Layout(
             (
                 Field("q", (n,)),

@@ -158,6 +158,15 @@ def _best_start(demand: Demand) -> Expr:
     return ca.vertcat(best, demand.flexion_sum - best)
 
 
+def planar_fingers(robot: RobotDescription) -> list[PlanarFinger]:
+    """The fingers that the step closes: all but the thumb.
+
+    Raises:
+        UnsupportedError: One of them is not planar; the message says how.
+    """
+    return [planar_finger(robot, name) for name in robot.finger_names if name != robot.thumb]
+
+
 def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
     """The whole finger step as a Function, to be called inside a step graph.
 
@@ -172,7 +181,7 @@ def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
     Raises:
         UnsupportedError: A finger is not planar.
     """
-    fingers = [planar_finger(robot, name) for name in robot.finger_names if name != robot.thumb]
+    fingers = planar_fingers(robot)
     kind: Any = ca.MX if solver == "ipopt" else ca.SX
     q = kind.sym("q", len(robot.actuators))
     points = kind.sym("points", 3, len(fingers))

@@ -12,27 +12,17 @@ refinement  one damped step of all motors, from the least violating arm, where t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import casadi as ca
 
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.arm_placement import ALLOWED, ITERATIONS, place_arm
-from casadi_ik.steps.contact_fit import (
-    DAMPING_DOWN,
-    DAMPING_FLOOR,
-    DAMPING_START,
-    DAMPING_UP,
-)
-from casadi_ik.steps.hand_first_state import (
-    EXACT,
-    STAGES,
-    HandFirstLayouts,
-    errors,
-    within_tolerance,
-)
+from casadi_ik.steps.contact_fit import EXACT, Judged, Tried, fresh_fit, judge, judge_contacts
+from casadi_ik.steps.hand_first_state import STAGES, HandFirstLayouts, errors
 from casadi_ik.steps.hand_fit import PalmAndHand, best_palm, fit_step, hand_contacts
+from casadi_ik.steps.numeric_arm import STARTS, nearest_start, pose_step
 from casadi_ik.steps.status import Phase, Status
 from casadi_ik.steps.whole_fit import whole_step
 from casadi_ik.symbolic.kinematics import Pose
@@ -40,35 +30,7 @@ from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
 
-SLOW = 0.9
-"""A step that leaves more than this part of the cost gained little."""
-
-QUADRATIC = 0.1
-"""A step that leaves less than this part is converging fast: worth another one."""
-
-PATIENCE, BUDGET = 3, 15
-"""Evaluations with little gain, and evaluations in all, before a fit is given up."""
-
-PROMISING = 1e-3
-"""Cost below which a fit is close enough to be worth `PERSISTENCE` times as much."""
-
-PERSISTENCE = 3
 NOTHING = float("nan")
-
-
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """A damped step after it was judged by its cost."""
-
-    accepted: Expr
-    cost: Expr
-    damping: Expr
-    waited: Expr
-    spent: Expr
-    within: Expr
-    settled: Expr
-    before: Expr
-    step_size: Expr
 
 
 class HandFirstStep:
@@ -98,7 +60,7 @@ class HandFirstStep:
         stages = {
             Phase.CANDIDATE: self._candidate(),
             Phase.HAND_FIT: self._hand_fit(),
-            Phase.ARM_PLACEMENT: self._placement(),
+            Phase.ARM_PLACEMENT: self._placement() if self.arm else self._numeric_placement(),
             Phase.REFINEMENT: self._refinement(),
         }
         cases = [stages[phase] for phase in STAGES]
@@ -137,12 +99,11 @@ class HandFirstStep:
                 "palm_rotation": rotation,
                 "palm_origin": origin,
                 "phase": float(self._after_candidate),
-                "damping": DAMPING_START,
                 "cost": 0.0,
-                "waited": 0.0,
-                "spent": 0.0,
                 "margin": -1e9,
+                "starts": 0.0,
             }
+            | fresh_fit()
         )
         status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
         record = self._row(s, p, q, Phase.CANDIDATE, status)
@@ -157,14 +118,13 @@ class HandFirstStep:
         state, parameters, s, p = self._inputs()
         columns = list(self.layouts.hand)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
-        reached, before, there = fit_step(self.layouts, x, s["damping"], p, s["q"])
-        judged = self._judge(s, p, before, there, reached.hand - x.hand)
-        keep = judged.accepted
+        tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
+        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        keep, reached = judged.accepted, tried.reached
         # The last candidate goes on to the arm even if it does not fit: its arm and hand are the
         # nearest there is, and refinement starts from them.
         last = s["candidate"] + 1 >= self.layouts.candidates
         onwards = ca.logic_or(judged.within, last)
-        following = Phase.ARM_PLACEMENT if self.arm else Phase.REFINEMENT
         after = self.layouts.state.pack(
             self._counted(s, Phase.HAND_FIT)
             | {
@@ -173,41 +133,80 @@ class HandFirstStep:
                 "palm_origin": ca.if_else(keep, reached.origin, x.origin),
                 "phase": ca.if_else(
                     judged.settled,
-                    ca.if_else(onwards, float(following), float(Phase.CANDIDATE)),
+                    ca.if_else(onwards, float(Phase.ARM_PLACEMENT), float(Phase.CANDIDATE)),
                     float(Phase.HAND_FIT),
                 ),
                 "candidate": s["candidate"]
                 + ca.if_else(ca.logic_and(judged.settled, ca.logic_not(onwards)), 1.0, 0.0),
-                "damping": ca.if_else(judged.settled, DAMPING_START, judged.damping),
-                "cost": judged.cost,
                 "fits": judged.within,
-                "waited": ca.if_else(judged.settled, 0.0, judged.waited),
-                "spent": ca.if_else(judged.settled, 0.0, judged.spent),
             }
+            | judged.fit
         )
         status = ca.SX(float(Status.RUNNING))
-        record = self._row(s, p, s["q"], Phase.HAND_FIT, status, before, judged)
+        record = self._row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged)
         return ca.Function("hand_fit", [state, parameters], shared(after, record, status))
 
     def _placement(self) -> ca.Function:
         state = ca.MX.sym("state", self.layouts.state.size)
         parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
-        place, decide = self._swivels(), self._place()
-        outputs = decide(state, parameters, *place(state, parameters))
-        return ca.Function("placement", [state, parameters], list(outputs))
-
-    def _swivels(self) -> ca.Function:
-        """The arm's part of an iteration, one of two graphs by the number of the trial."""
-        state = ca.MX.sym("state", self.layouts.state.size)
-        parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
-        if self.arm is None:
-            n = len(self.robot.arm_actuators)
-            return ca.Function("swivels", [state, parameters], [ca.MX.zeros(n, 1), ca.MX(0.0)])
         s, p = self.layouts.state.unpack(state), self.layouts.parameters.unpack(parameters)
         arm = list(self.robot.arm_actuators)
+        assert self.arm is not None
         palm = Pose(s["palm_rotation"], s["palm_origin"])
         found = place_arm(self.arm, palm, p["lower"][arm], p["upper"][arm], s["spent"])
-        return ca.Function("swivels", [state, parameters], list(found))
+        outputs = self._place()(state, parameters, *found)
+        return ca.Function("placement", [state, parameters], list(outputs))
+
+    def _numeric_placement(self) -> ca.Function:
+        """A step towards the palm pose; the first of a start begins at a row of the table."""
+        state = ca.MX.sym("state", self.layouts.state.size)
+        parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
+        s = self.layouts.state.unpack(state)
+        begin = nearest_start(self.robot)
+        arm = ca.MX.sym("arm", len(self.robot.arm_actuators))
+        inputs = [ca.MX.sym("rotation", 3, 3), ca.MX.sym("origin", 3), ca.MX.sym("passed"), arm]
+        fresh = ca.Function("fresh", inputs, list(begin(*inputs[:3])))
+        same = ca.Function("same", inputs, [arm, inputs[2]])
+        now = s["q"][list(self.robot.arm_actuators)]
+        palm = (s["palm_rotation"], s["palm_origin"])
+        chosen = ca.Function.if_else("start", fresh, same)(s["spent"] < 1, *palm, s["passed"], now)
+        outputs = self._pose_step()(state, parameters, *chosen)
+        return ca.Function("placement", [state, parameters], list(outputs))
+
+    def _pose_step(self) -> ca.Function:
+        state, parameters, s, p = self._inputs()
+        rows = list(self.robot.arm_actuators)
+        arm, passed = ca.SX.sym("arm", len(rows)), ca.SX.sym("passed")
+        inside = ca.fmin(ca.fmax(arm, p["lower"][rows]), p["upper"][rows])
+        palm = Pose(s["palm_rotation"], s["palm_origin"])
+        tried = pose_step(self.robot, inside, palm, s["damping"], p)
+        judged = judge(s, tried, ca.sumsqr(tried.there) < EXACT * EXACT)
+        now = ca.if_else(judged.accepted, tried.reached, inside)
+        margin = -ca.sqrt(judged.cost)
+        better = margin > s["margin"]
+        best, best_margin = ca.if_else(better, now, s["arm"]), ca.fmax(margin, s["margin"])
+        exact = judged.cost < EXACT * EXACT
+        starts = s["starts"] + judged.settled
+        leave = ca.logic_or(exact, starts >= STARTS)
+        q = self._with_arm(s["q"], ca.if_else(leave, best, now))
+        after = self.layouts.state.pack(
+            self._counted(s, Phase.ARM_PLACEMENT)
+            | judged.fit
+            | {
+                "q": q,
+                "cost": s["cost"],
+                "phase": ca.if_else(leave, float(Phase.REFINEMENT), float(Phase.ARM_PLACEMENT)),
+                "margin": best_margin,
+                "arm": best,
+                "starts": starts,
+                "passed": passed,
+            }
+        )
+        solved = ca.logic_and(exact, s["fits"] > 0)
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        record = self._row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
+        inputs = [state, parameters, arm, passed]
+        return ca.Function("pose_step", inputs, shared(after, record, status))
 
     def _place(self) -> ca.Function:
         """Keep the best arm so far; take it if it is within limits."""
@@ -240,9 +239,9 @@ class HandFirstStep:
 
     def _refinement(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
-        reached, before, there = whole_step(self.robot, s["q"], s["damping"], p)
-        judged = self._judge(s, p, before, there, reached - s["q"])
-        q = ca.if_else(judged.accepted, reached, s["q"])
+        tried = whole_step(self.robot, s["q"], s["damping"], p)
+        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        q = ca.if_else(judged.accepted, tried.reached, s["q"])
         solved = ca.logic_and(judged.settled, judged.within)
         failed = ca.logic_and(judged.settled, ca.logic_not(judged.within))
         better = judged.cost < s["best_cost"]
@@ -252,52 +251,14 @@ class HandFirstStep:
                 "q": q,
                 "phase": ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.REFINEMENT)),
                 "candidate": s["candidate"] + ca.if_else(failed, 1.0, 0.0),
-                "damping": judged.damping,
-                "cost": judged.cost,
-                "waited": judged.waited,
-                "spent": judged.spent,
                 "best_cost": ca.if_else(better, judged.cost, s["best_cost"]),
                 "best_q": ca.if_else(better, q, s["best_q"]),
             }
+            | judged.fit
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self._row(s, p, s["q"], Phase.REFINEMENT, status, before, judged)
+        record = self._row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged)
         return ca.Function("refinement", [state, parameters], shared(after, record, status))
-
-    def _judge(
-        self,
-        s: dict[str, Expr],
-        p: dict[str, Expr],
-        before: Expr,
-        there: Expr,
-        step: Expr,
-    ) -> Judged:
-        """Accept a step that lowers the cost, and decide whether the stage is at its end."""
-        f = len(self.robot.fingers)
-        cost_before, cost_there = ca.sumsqr(before), ca.sumsqr(there)
-        accepted = cost_there < cost_before
-        cost = ca.if_else(accepted, cost_there, cost_before)
-        positions, chords = errors(ca.if_else(accepted, there, before), f)
-        within = within_tolerance(positions, chords, p)
-        ratio = cost / ca.fmax(cost_before, 1e-300)
-        waited = ca.if_else(ratio > SLOW, s["waited"] + 1, 0.0)
-        spent = s["spent"] + 1
-        exact = cost < EXACT * EXACT
-        worth = ca.if_else(cost < PROMISING, float(PERSISTENCE), 1.0)
-        over = ca.logic_or(waited >= PATIENCE * worth, spent >= BUDGET * worth)
-        slowing = ca.logic_and(within, ratio > QUADRATIC)
-        damping = s["damping"] * ca.if_else(accepted, DAMPING_DOWN, DAMPING_UP)
-        return Judged(
-            accepted=accepted,
-            cost=cost,
-            damping=ca.fmax(damping, DAMPING_FLOOR),
-            waited=waited,
-            spent=spent,
-            within=within,
-            settled=ca.logic_or(exact, ca.logic_or(over, slowing)),
-            before=before,
-            step_size=ca.mmax(ca.fabs(step)),
-        )
 
     def _counted(self, s: dict[str, Expr], stage: Phase) -> dict[str, Expr]:
         """The state with one more iteration spent in a stage."""
@@ -305,12 +266,10 @@ class HandFirstStep:
         return s | {"counts": s["counts"] + one}
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
-        rows = list(self.layouts.hand)
-        return ca.vertcat(*(hand[rows.index(i)] if i in rows else q[i] for i in range(q.numel())))
+        return _with(q, self.layouts.hand, hand)
 
     def _with_arm(self, q: Expr, arm: Expr) -> Expr:
-        rows = list(self.robot.arm_actuators)
-        return ca.vertcat(*(arm[rows.index(i)] if i in rows else q[i] for i in range(q.numel())))
+        return _with(q, self.robot.arm_actuators, arm)
 
     def _row(
         self,
@@ -319,26 +278,26 @@ class HandFirstStep:
         q: Expr,
         phase: Phase,
         status: Expr,
-        residual: Expr | None = None,
+        tried: Tried | None = None,
         judged: Judged | None = None,
         margin: Expr = NOTHING,
     ) -> Expr:
         f = len(self.robot.fingers)
         positions: Expr = [NOTHING] * f
         angles: Expr = [NOTHING] * f
-        if residual is not None:
-            positions, chords = errors(residual, f)
+        if tried is not None:
+            positions, chords = errors(tried.before, f)
             angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
         at_limit = ca.logic_or(q <= p["lower"], q >= p["upper"])
         bits = ca.DM([2.0**i for i in range(q.numel())])
         return self.layouts.record.pack(
             {
                 "q": q,
-                "cost": ca.sumsqr(residual) if residual is not None else NOTHING,
+                "cost": ca.sumsqr(tried.before) if tried else NOTHING,
                 "position_error": positions,
                 "angle_error": angles,
                 "damping": s["damping"],
-                "step_size": judged.step_size if judged else NOTHING,
+                "step_size": tried.size if tried else NOTHING,
                 "margin": margin,
                 "limit_mask": ca.dot(at_limit, bits),
                 "candidate": s["candidate"],
@@ -347,3 +306,9 @@ class HandFirstStep:
                 "status": status,
             }
         )
+
+
+def _with(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
+    """Replace some of the entries of q."""
+    places = {row: i for i, row in enumerate(rows)}
+    return ca.vertcat(*(values[places[i]] if i in places else q[i] for i in range(q.numel())))

@@ -14,15 +14,17 @@ class HandFirstParameters:
     Attributes:
         table: Hand postures the targets' shapes are compared with.
         candidates: Of those, how many a round of the compiled loop may start from.
+        wide_table: The same for the rounds after the first.
         rounds: Rounds before a target is given up; each takes the next best candidates.
     """
 
     table: int = 1024
     candidates: int = 8
+    wide_table: int = 8192
     rounds: int = 6
 
     def __post_init__(self) -> None:
-        for name in ("table", "candidates", "rounds"):
+        for name in ("table", "candidates", "wide_table", "rounds"):
             value = getattr(self, name)
             if not (isinstance(value, int) and value >= 1):
                 raise InputError(f"{name}: found {value!r}, expected a whole number >= 1")

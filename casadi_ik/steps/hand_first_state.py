@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.steps.contact_fit import LENGTH, Bounded
+from casadi_ik.steps.bounded_step import Bounded
 from casadi_ik.steps.status import Phase
 from casadi_ik.symbolic.smooth import Expr
 
 STAGES = (Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT)
 """The stages in the order of their codes."""
 
-EXACT = 1e-8
-"""Root of the cost at which contacts count as met exactly (0.1 nm per 100 mm, or rad)."""
+LENGTH = 0.1
+"""Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +33,13 @@ class HandFirstLayouts:
     robot: RobotDescription
     candidates: int
 
-    @property
+    @cached_property
     def hand(self) -> tuple[int, ...]:
         """Positions in q of the hand's actuators."""
         arm = set(self.robot.arm_actuators)
         return tuple(i for i in range(len(self.robot.actuators)) if i not in arm)
 
-    @property
+    @cached_property
     def state(self) -> Layout:
         """What an iteration hands to the next."""
         n = len(self.robot.actuators)
@@ -50,19 +51,22 @@ class HandFirstLayouts:
                 Field("phase"),
                 Field("candidate", doc="index of the hand posture started from"),
                 Field("damping"),
+                Field("growth", doc="factor of the damping if the next step gains nothing"),
                 Field("cost", doc="cost at q (or at palm and hand)"),
                 Field("fits", doc="1 if palm and hand meet the contacts"),
                 Field("waited", doc="evaluations in a row that gained little"),
                 Field("spent", doc="evaluations in this phase"),
                 Field("margin", doc="best margin of the arm so far, negative: a violation"),
                 Field("arm", (len(self.robot.arm_actuators),), doc="arm with the best margin"),
+                Field("starts", doc="starts of the numeric arm stage so far"),
+                Field("passed", doc="how far the palm of the last start was from the one wanted"),
                 Field("best_cost", doc="smallest cost of a whole configuration so far"),
                 Field("best_q", (n,), doc="the configuration it belongs to"),
                 Field("counts", (len(STAGES),), doc="iterations by stage, in the order of STAGES"),
             )
         )
 
-    @property
+    @cached_property
     def parameters(self) -> Layout:
         """The problem and the numbers of the method."""
         n, f = len(self.robot.actuators), len(self.robot.fingers)
@@ -75,12 +79,13 @@ class HandFirstLayouts:
                 Field("angle_tolerance", (f,), unit="rad"),
                 Field("lower", (n,), doc="lower bounds of q"),
                 Field("upper", (n,), doc="upper bounds of q"),
+                Field("reach", doc="weight of the arm's reach while the hand is fitted"),
                 Field("start", (n,), doc="where a stage that needs a start begins"),
                 Field("postures", (self.candidates, len(self.hand)), doc="hand postures to try"),
             )
         )
 
-    @property
+    @cached_property
     def record(self) -> Layout:
         """What is logged of an iteration."""
         n, f = len(self.robot.actuators), len(self.robot.fingers)

@@ -6,17 +6,24 @@ fifteen equations. The palm's coordinates are its pose; a step turns and shifts 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.steps.contact_fit import LENGTH, clip, damped_step, weighted_residual
-from casadi_ik.steps.hand_first_state import HandFirstLayouts
+from casadi_ik.steps.bounded_step import clip, damped_step
+from casadi_ik.steps.contact_fit import Tried, weighted_residual
+from casadi_ik.steps.hand_first_state import LENGTH, HandFirstLayouts
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.alignment import align
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.so3 import exp_so3, skew
+from casadi_ik.symbolic.se3 import compose, exp_se3
+from casadi_ik.symbolic.smooth import Expr, safe_norm
+from casadi_ik.symbolic.so3 import skew
+from casadi_ik.symbolic.srs_arm import SrsArm, reach
+
+PASSES = 2
+"""Corrections of the active set in a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,23 +116,64 @@ def fit_jacobian(contacts: HandContacts, x: PalmAndHand, p: dict[str, Expr]) -> 
     return weighted_residual(positions, normals, p["weights"])
 
 
-def fit_step(
-    layouts: HandFirstLayouts, x: PalmAndHand, damping: Expr, p: dict[str, Expr], q: Expr
-) -> tuple[PalmAndHand, Expr, Expr]:
-    """One damped step.
+def reach_row(
+    arm: SrsArm, columns: Sequence[int], x: PalmAndHand, p: dict[str, Expr]
+) -> tuple[Expr, Expr]:
+    """How far the wrist is out of the arm's reach, by `LENGTH`, and its slope (1, 6).
 
-    Returns:
-        Where it leads, the residual before, and the residual there.
+    Where contacts leave the hand a freedom (three parallel fingers), it is spent on bringing the
+    wrist where the elbow can follow. Zero, with slope zero, within reach.
     """
-    robot, columns = layouts.robot, layouts.hand
-    contacts = hand_contacts(robot, x.hand, columns)
-    residual = fit_residual(contacts, x, p)
+    near, far = reach(arm, p["lower"][columns[3]], p["upper"][columns[3]])
+    wrist = ca.DM(arm.wrist_in_palm)
+    line = x.origin + x.rotation @ wrist - ca.DM(arm.shoulder)
+    distance = safe_norm(line)
+    beyond = distance - ca.fmin(ca.fmax(distance, near), far)
+    along = x.rotation.T @ line / distance
+    slope = ca.horzcat(along.T, ca.cross(wrist, along).T) * (ca.fabs(beyond) > 0)
+    return p["reach"] * beyond / LENGTH, p["reach"] * slope / LENGTH
+
+
+def fit_step(
+    layouts: HandFirstLayouts,
+    arm: SrsArm | None,
+    x: PalmAndHand,
+    damping: Expr,
+    p: dict[str, Expr],
+    q: Expr,
+) -> Tried:
+    """One damped step; it turns and shifts the palm along one screw.
+
+    With the palm on a screw, a palm that turns about the common axis of several joints while they
+    turn back leaves the contacts exactly alone: the long valleys of nearly singular hands are
+    straight.
+
+    Args:
+        layouts: Of the robot.
+        arm: An arm whose reach is to be kept to, if known.
+        x: Where the step begins.
+        damping: Scalar.
+        p: Parameters.
+        q: (n, 1) with the hand's part at `x.hand`.
+    """
+    before, jacobian = _rows(layouts, arm, x, p)
     bounds = layouts.hand_bounds(q, p, first=6)
-    step = damped_step(fit_jacobian(contacts, x, p), residual, damping, bounds)
-    reached = PalmAndHand(
-        x.rotation @ exp_so3(step[3:6]),
-        x.origin + x.rotation @ step[:3],
-        clip(x.hand + step[6:], bounds),
-    )
-    there = fit_residual(hand_contacts(robot, reached.hand, columns), reached, p)
-    return reached, residual, there
+    damped = damped_step(jacobian, before, damping, bounds, PASSES)
+    rotation, origin = compose((x.rotation, x.origin), exp_se3(damped.step[:6]))
+    reached = PalmAndHand(rotation, origin, clip(x.hand + damped.step[6:], bounds))
+    there, _ = _rows(layouts, arm, reached, p)
+    size = ca.mmax(ca.fabs(reached.hand - x.hand))
+    return Tried(reached, before, there, damped.promised, size)
+
+
+def _rows(
+    layouts: HandFirstLayouts, arm: SrsArm | None, x: PalmAndHand, p: dict[str, Expr]
+) -> tuple[Expr, Expr]:
+    """Residual and Jacobian of contacts and reach."""
+    contacts = hand_contacts(layouts.robot, x.hand, layouts.hand)
+    residual, jacobian = fit_residual(contacts, x, p), fit_jacobian(contacts, x, p)
+    if arm is None:
+        return residual, jacobian
+    beyond, slope = reach_row(arm, layouts.robot.arm_actuators, x, p)
+    slope = ca.horzcat(slope, ca.SX(1, len(layouts.hand)))
+    return ca.vertcat(residual, beyond), ca.vertcat(jacobian, slope)

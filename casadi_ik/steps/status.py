@@ -37,6 +37,7 @@ class Phase(IntEnum):
     HAND_FIT = 5
     ARM_PLACEMENT = 6
     HIERARCHY = 7
+    WHOLE_SYSTEM = 8
 
     @property
     def label(self) -> str:

@@ -5,10 +5,14 @@ from __future__ import annotations
 import casadi as ca
 
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.steps.contact_fit import Bounded, clip, damped_step, weighted_residual
+from casadi_ik.steps.bounded_step import Bounded, clip, damped_step
+from casadi_ik.steps.contact_fit import Tried, weighted_residual
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.so3 import skew
+
+PASSES = 2
+"""Corrections of the active set in a step."""
 
 
 def whole_residual(robot: RobotDescription, q: Expr, p: dict[str, Expr]) -> Expr:
@@ -35,15 +39,11 @@ def whole_jacobian(robot: RobotDescription, q: Expr, p: dict[str, Expr]) -> Expr
     return weighted_residual(positions, normals, p["weights"])
 
 
-def whole_step(
-    robot: RobotDescription, q: Expr, damping: Expr, p: dict[str, Expr]
-) -> tuple[Expr, Expr, Expr]:
-    """One damped step.
-
-    Returns:
-        q it leads to (n, 1), the residual before, and the residual there.
-    """
+def whole_step(robot: RobotDescription, q: Expr, damping: Expr, p: dict[str, Expr]) -> Tried:
+    """One damped step from q (n, 1)."""
     bounds = Bounded(q, p["lower"], p["upper"], first=0)
     residual = whole_residual(robot, q, p)
-    reached = clip(q + damped_step(whole_jacobian(robot, q, p), residual, damping, bounds), bounds)
-    return reached, residual, whole_residual(robot, reached, p)
+    damped = damped_step(whole_jacobian(robot, q, p), residual, damping, bounds, PASSES)
+    reached = clip(q + damped.step, bounds)
+    there = whole_residual(robot, reached, p)
+    return Tried(reached, residual, there, damped.promised, ca.mmax(ca.fabs(reached - q)))

@@ -81,6 +81,12 @@ class SrsArm:
     palm_rotation: Array
     wrist_in_palm: Array
 
+    @property
+    def bent(self) -> float:
+        """Angle between upper arm and forearm at q = 0 about the elbow's axis [rad]."""
+        across = np.cross(self.upper_arm, self.forearm) @ self.elbow_axis
+        return float(np.arctan2(across, self.upper_arm @ self.forearm))
+
 
 @dataclass(frozen=True, eq=False)
 class Swivel:
@@ -152,14 +158,11 @@ def swivel(arm: SrsArm, palm: Pose, elbow_sign: Expr) -> Swivel:
         elbow_sign: +1 or -1.
     """
     a, b = float(np.linalg.norm(arm.upper_arm)), float(np.linalg.norm(arm.forearm))
-    bent = np.arctan2(
-        np.cross(arm.upper_arm, arm.forearm) @ arm.elbow_axis, arm.upper_arm @ arm.forearm
-    )
     to_wrist = palm.origin + palm.rotation @ ca.DM(arm.wrist_in_palm) - ca.DM(arm.shoulder)
     cosine = (ca.sumsqr(to_wrist) - a * a - b * b) / (2 * a * b)
     slack = 1 - cosine * cosine
     inner = ca.sqrt(ca.fmax(slack, STRAIGHTEST))
-    elbow = elbow_sign * ca.atan2(inner, cosine) - float(bent)
+    elbow = elbow_sign * ca.atan2(inner, cosine) - arm.bent
     B = axis_rotation(arm.elbow_axis, elbow)
     stretched = ca.DM(arm.upper_arm) + B @ ca.DM(arm.forearm)
     line = to_wrist / ca.fmax(safe_norm(to_wrist), 1e-12)
@@ -176,6 +179,18 @@ def swivel(arm: SrsArm, palm: Pose, elbow_sign: Expr) -> Swivel:
     return Swivel(
         elbow, slack, (shoulder[0], shoulder[1], shoulder[2]), (wrist[0], wrist[1], wrist[2])
     )
+
+
+def reach(arm: SrsArm, lower: Expr, upper: Expr) -> tuple[Expr, Expr]:
+    """Smallest and largest distance S-W [m] that the elbow's bounds [rad] allow."""
+    a, b = float(np.linalg.norm(arm.upper_arm)), float(np.linalg.norm(arm.forearm))
+    low, high = lower + arm.bent, upper + arm.bent
+    most = ca.fmin(ca.fmax(ca.fabs(low), ca.fabs(high)), np.pi)
+    least = ca.fmin(ca.fmax(ca.fmax(low, -high), 0.0), np.pi)
+    near, far = (
+        ca.sqrt(ca.fmax(a * a + b * b + 2 * a * b * ca.cos(bend), 0.0)) for bend in (most, least)
+    )
+    return near, far
 
 
 def at_angle(parts: tuple[Expr, Expr, Expr], psi: Expr) -> Expr:

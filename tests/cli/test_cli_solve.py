@@ -45,7 +45,7 @@ def test_json_follows_the_contract(
     found = json.loads(out.read_text())
     assert list(found) == [
         *("success", "status", "method", "robot", "actuators", "q", "iterations", "restarts"),
-        *("time", "contacts"),
+        *("time", "contacts", "diagnosis"),
     ]
     assert found["success"] is True
     assert found["status"] == "SOLVED"

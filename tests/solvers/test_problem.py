@@ -84,3 +84,14 @@ def test_rows_of_a_batch():
     assert len(part) == 2
     np.testing.assert_array_equal(part.points, problems.points[1:3])
     assert part.enforce_limits
+
+
+def test_parts_of_a_batch_keep_the_numbers_of_their_targets():
+    points = np.zeros((10, 3, 3))
+    problems = Problems(points, points, Tolerance(), True, first_row=100)
+    assert problems.rows(slice(4, 8)).first_row == 104
+    assert problems.rows(slice(4, 8)).rows(slice(1, None)).first_row == 105
+    assert problems.rows(slice(-2, None)).first_row == 108
+    assert problems.rows(slice(0, 0)).first_row == 100
+    assert len(problems.rows(np.array([7, 2]))) == 2
+    assert problems.rows(np.array([7, 2])).first_row == 0

@@ -1,0 +1,18 @@
+"""Points spread evenly over a cube, the same every time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def evenly(count: int, dimensions: int) -> NDArray[np.float64]:
+    """(count, dimensions) points of an additive recurrence, evenly spread over the unit cube.
+
+    Roberts' generalised golden ratio: the root of x^(d+1) = x + 1 gives the increments.
+    """
+    ratio = 2.0
+    for _ in range(64):
+        ratio = (1 + ratio) ** (1 / (dimensions + 1))
+    steps = ratio ** -np.arange(1.0, dimensions + 1)
+    return (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
