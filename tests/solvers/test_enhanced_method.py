@@ -210,9 +210,7 @@ def test_free_fingers_are_refused_by_name(robot):
 
 
 def test_robots_the_paper_has_no_answer_for(coupled_robot):
-    with pytest.raises(
-        UnsupportedError, match=r"not a planar finger|needs an arm of at least six joints"
-    ):
+    with pytest.raises(UnsupportedError, match="needs an arm of at least six joints"):
         ik.Solver(coupled_robot, "enhanced-dls")
 
 
