@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hand_first_targets import shipped_hands
@@ -88,7 +90,7 @@ def test_trace_of_a_solve(robot, method, rng):
         distances = np.linalg.norm(points - asked.points[row], axis=2)
         np.testing.assert_allclose(trace["position_error"], distances, rtol=1e-5, atol=1e-9)
         assert ((trace["q"] >= robot.lower) & (trace["q"] <= robot.upper)).all()
-        for before, after in zip(trace[:-1], trace[1:], strict=True):
+        for before, after in pairwise(trace):
             if after["phase"] != Phase.HAND_ALIGNMENT:
                 assert after["start"] == before["start"] + 1
                 continue
@@ -104,7 +106,7 @@ def test_trace_of_a_solve(robot, method, rng):
 
 def test_out_of_reach_the_best_is_kept(robot, method, rng):
     asked = problems(robot, robot.random(rng, 10))
-    far = Problems(asked.points + [3.0, 0, 0], asked.normals, PAPER, True)
+    far = Problems(asked.points + np.array([3.0, 0, 0]), asked.normals, PAPER, True)
     batch = solve(robot, method, far)
     assert not batch.success.any()
     assert (batch.status == Status.STALLED).all()
