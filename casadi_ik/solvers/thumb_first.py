@@ -104,8 +104,8 @@ class ThumbFirstMethod:
             "points": np.nan_to_num(problems.points),
             "normals": np.nan_to_num(problems.normals),
             "weights": np.stack(known, axis=2),
-            "position_tolerance": problems.tolerance.position,
-            "angle_tolerance": problems.tolerance.angle,
+            "position_tolerance": problems.position_tolerance,
+            "angle_tolerance": problems.angle_tolerance,
             "lower": lower,
             "upper": upper,
             "postures": np.clip(postures, lower[hand], upper[hand]),
@@ -115,7 +115,8 @@ class ThumbFirstMethod:
         parameters = np.empty((count, layout.size))
         for name, value in values.items():
             rows = np.asarray(value, dtype=float)
-            parameters[:, layout.slice(name)] = rows.reshape(count, -1) if rows.ndim > 1 else rows
+            target = parameters[:, layout.slice(name)]
+            target[:] = rows.reshape(target.shape) if rows.ndim > 1 else rows
         states = np.zeros((count, self.step.state.size))
         first = {
             "q": q0,

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from hand_first_targets import shipped_hands
-from robot_variants import derived_robot
+from robot_variants import derived_robot, thumb_of
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError
@@ -195,3 +195,12 @@ def test_proxqp_solves_as_well(robot, once, rng):
 def test_parameters_are_checked(robot, options, says):
     with pytest.raises(InputError, match=says):
         ik.Solver(robot, "thumb-first", options=options)
+
+
+@pytest.mark.parametrize("joints", [1, 3, 4])
+def test_thumbs_of_any_number_of_joints(tmp_path, rng, joints):
+    robot = thumb_of(tmp_path, joints)
+    method = ThumbFirstMethod(robot.description, ThumbFirstParameters(starts=8), compiled=False)
+    batch = solve(robot, method, problems(robot, robot.random(rng, 20)))
+    assert batch.success.mean() >= 0.9
+    assert batch.limits_ok.all()
