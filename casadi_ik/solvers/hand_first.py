@@ -99,6 +99,8 @@ class HandFirstMethod:
         count = len(problems)
         outcome = _Collected(count, len(self._robot.actuators), trace)
         waiting = np.arange(count)
+        states = self._states(q0)
+        passed = layouts.state.slice("passed")
         for number in range(options.rounds if count else 0):
             begin = time.perf_counter()
             first = number * options.candidates
@@ -106,8 +108,10 @@ class HandFirstMethod:
             lookup = self._postures(chosen, number)
             parameters = self._parameters(chosen, q0[waiting], lookup)
             outcome.time[waiting] += (time.perf_counter() - begin) / max(len(waiting), 1)
-            result = self.kernel.run(self._states(q0[waiting]), parameters, MAX_ITERATIONS, trace)
+            result = self.kernel.run(states[waiting], parameters, MAX_ITERATIONS, trace)
             outcome.take(layouts, waiting, result, first)
+            # The next round goes on where this one stopped in the numeric arm's list of starts.
+            states[waiting, passed] = result.states[:, passed]
             waiting = waiting[result.status != Status.SOLVED]
             if not len(waiting):
                 break
