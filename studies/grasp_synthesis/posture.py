@@ -125,7 +125,8 @@ class PinchProblem:
             )
             if not self.solver.stats()["success"]:
                 continue
-            x = self._polish(np.array(result["x"])[:, 0])
+            end = np.array(result["x"])[:, 0]
+            x = polish(end, self.low, self.high, self.residual, self.jacobian)
             rotation, origin = self.pose(x)
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = np.array(rotation), np.array(origin)[:, 0]
@@ -140,15 +141,26 @@ class PinchProblem:
             )
         return sorted(found, key=lambda pinch: pinch.measure)
 
-    def _polish(self, x: Array) -> Array:
-        """Newton on the contacts alone, by least squares, to rounding; fixed unknowns stay."""
-        free = (self.high - self.low > 0) & (x - self.low > 1e-6) & (self.high - x > 1e-6)
-        for _ in range(4):
-            jacobian = np.array(self.jacobian(x))[:, free]
-            step = np.linalg.lstsq(jacobian, np.array(self.residual(x))[:, 0], rcond=1e-9)[0]
-            x = x.copy()
-            x[free] -= step
-        return x
+
+def polish(
+    x: Array, low: Array, high: Array, residual: ca.Function, jacobian: ca.Function
+) -> Array:
+    """Newton on the contacts alone, by least squares, to rounding; fixed unknowns stay.
+
+    Args:
+        x: Where a programme ended.
+        low: Bounds of its unknowns.
+        high: Bounds of its unknowns.
+        residual: ``x -> r``, zero where all contacts are exact.
+        jacobian: ``x -> dr/dx``.
+    """
+    free = (high - low > 0) & (x - low > 1e-6) & (high - x > 1e-6)
+    for _ in range(4):
+        columns = np.array(jacobian(x))[:, free]
+        step = np.linalg.lstsq(columns, np.array(residual(x))[:, 0], rcond=1e-9)[0]
+        x = x.copy()
+        x[free] -= step
+    return x
 
 
 def _cones(contacts: dict[str, Pose], squeeze: ca.SX) -> list[ca.SX]:
