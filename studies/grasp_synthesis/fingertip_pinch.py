@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 from casadi_ik.grasps import GraspObject, Sphere
 from casadi_ik.robots import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.so3 import exp_so3
 from grasp_synthesis.patches import Patch
-from grasp_synthesis.posture import OPTIONS, polish
+from grasp_synthesis.programme import Programme
 
 Array = NDArray[np.float64]
 LENGTH = 0.1  # [m] unit of positions in the programme
@@ -125,41 +124,24 @@ class TipPinchProblem:
         inequalities = ca.vertcat(*cones, *facing)
         cost = friction**2 + 0.02 * ca.sumsqr(motors**2)
         x = ca.vertcat(motors, place, turn, ca.vec(surface), squeeze, friction)
-        # The force of thumb on the first finger sets the scale.
-        problem = {"x": x, "f": cost, "g": ca.vertcat(equalities, inequalities)}
-        self.solver = ca.nlpsol("pinch", "ipopt", problem, OPTIONS)
-        self.residual = ca.Function("residual", [x], [equalities])
-        self.jacobian = ca.Function("jacobian", [x], [ca.jacobian(equalities, x)])
         self.found = ca.Function("found", [x], [q, rotation, place * LENGTH])
-        self.count, self.slack = equalities.numel(), inequalities.numel()
         turning = 0.0 if isinstance(item.shape, Sphere) else TURN
         bounds = np.array([patch.bounds() for patch in patches])
         low = [np.full(k, -RANGE), [-1.5, 0.2, 0.3], np.full(3, -turning), bounds[:, 0].ravel()]
         high = [np.full(k, RANGE), [1.0, 1.5, 2.5], np.full(3, turning), bounds[:, 1].ravel()]
-        self.low = np.concatenate([*low, [1.0], np.full(len(pairs) - 1, -4.0), [0.0]])
-        self.high = np.concatenate([*high, [1.0], np.full(len(pairs) - 1, 4.0), [2.0]])
+        # The first tension, between the first two fingers, sets the scale of the others.
+        lower = np.concatenate([*low, [1.0], np.full(len(pairs) - 1, -4.0), [0.0]])
+        upper = np.concatenate([*high, [1.0], np.full(len(pairs) - 1, 4.0), [2.0]])
+        self.programme = Programme(x, cost, equalities, inequalities, lower, upper)
 
     def solve(self, rng: np.random.Generator, starts: int) -> list[TipPinch]:
         """Every local minimum found from random starts, best first."""
         pinches: list[TipPinch] = []
-        for _ in range(starts):
-            result = self.solver(
-                x0=rng.uniform(self.low, self.high),
-                lbx=self.low,
-                ubx=self.high,
-                lbg=np.zeros(self.count + self.slack),
-                ubg=np.concatenate([np.zeros(self.count), np.full(self.slack, np.inf)]),
-            )
-            if not self.solver.stats()["success"]:
-                continue
-            x = polish(
-                np.array(result["x"])[:, 0], self.low, self.high, self.residual, self.jacobian
-            )
+        for x, measure, residual in self.programme.minima(rng, starts):
             q, rotation, origin = (np.array(part) for part in self.found(x))
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = rotation, origin[:, 0]
-            residual = float(np.abs(np.array(self.residual(x))).max())
-            pinches.append(TipPinch(q[:, 0], pose, float(x[-1]), float(result["f"]), residual))
+            pinches.append(TipPinch(q[:, 0], pose, float(x[-1]), measure, residual))
         return sorted(pinches, key=lambda pinch: pinch.measure)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from casadi_ik.robots import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
 from grasp_synthesis.fingertip_pinch import TipPinch
-from grasp_synthesis.posture import OPTIONS
+from grasp_synthesis.programme import OPTIONS
 
 Array = NDArray[np.float64]
 LIMIT_MARGIN = np.deg2rad(10.0)

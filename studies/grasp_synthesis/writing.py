@@ -37,7 +37,9 @@ def barrett_text(
         f"  {name}: {_number(value)}  # {np.rad2deg(value):.3f} deg"
         for name, value in zip(hand.hand_names, pinch.posture, strict=True)
     ]
-    contacts = dict(zip(FINGERS, zip(points, normals, strict=True), strict=True))
+    contacts: dict[str, tuple[Array, Array]] = {
+        finger: (points[i], normals[i]) for i, finger in enumerate(FINGERS)
+    }
     pose = palm @ pinch.object_in_palm
     return grasp_text(header, ROBOT, recipe.name, recipe.scene, pose, posture, contacts)
 
