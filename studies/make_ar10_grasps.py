@@ -119,8 +119,8 @@ def make(
 
 
 def idle(robot: ik.ArmHand) -> Array:
-    """(n,) the arm at zero, the hand open."""
-    q = robot.lower.copy()
+    """(n,) the arm at zero, the hand at home (open): there a solve leaves fingers that are free."""
+    q = robot.home.copy()
     q[list(robot.description.arm_actuators)] = 0.0
     return q
 

@@ -145,8 +145,11 @@ class HandFirstMethod:
     def _parameters(self, problems: Problems, q0: Array, postures: Array) -> Array:
         layout = self.step.layouts.parameters
         count = len(problems)
-        lower, upper = problems.bounds(self._robot.lower, self._robot.upper, UNBOUNDED)
+        lower, upper = problems.bounds(self._robot, UNBOUNDED)
         hand = list(self.step.layouts.hand)
+        # What moves free fingers only stays where it is.
+        needed = ~np.isnan(problems.points[..., 0]) @ self._moves
+        postures = np.where(needed[:, None], postures, q0[:, None, hand])
         values: dict[str, Any] = {
             "points": np.nan_to_num(problems.points),
             "normals": np.nan_to_num(problems.normals),
@@ -168,6 +171,12 @@ class HandFirstMethod:
                 array.reshape(count, -1) if array.ndim > 1 and len(array) == count else array
             )
         return parameters
+
+    @cached_property
+    def _moves(self) -> NDArray[np.bool_]:
+        """(f, hand) whether a motor of the hand moves a finger."""
+        robot, hand = self._robot, self.step.layouts.hand
+        return np.array([np.isin(hand, robot.finger_actuators(f)) for f in robot.finger_names])
 
     def _states(self, q0: Array) -> Array:
         layout = self.step.layouts.state
