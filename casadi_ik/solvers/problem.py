@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.robots.description import RobotDescription
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Tolerance
+from casadi_ik.robots.description import RobotDescription
 
 Array = NDArray[np.float64]
 
