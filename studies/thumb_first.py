@@ -10,11 +10,10 @@ same step, from one start each, and all starts; hand-first in the same run sets 
 from __future__ import annotations
 
 import platform
+from importlib.metadata import version
 from typing import Any
 
-import casadi as ca
 import numpy as np
-import proxsuite
 from closed_chain.report import OURS, PAPER, figure, options, title, write
 from numpy.typing import NDArray
 from random_arms import random_arm_targets
@@ -91,8 +90,8 @@ def main() -> None:
 `{robot.name}`, 5 mm / 3 deg, limits enforced, start at home. *grasps*: hands of the {len(grasps)}
 shipped grasps; *bent*: the same with distal joints from 25 to 45 deg; arms uniform within limits.
 The time is that of an iteration as a ratio to hand-first's on the same targets in the same run, the
-lookup of the start included. Python {platform.python_version()}, CasADi {ca.__version__}, proxsuite
-{proxsuite.__version__}, {platform.machine()}.
+lookup of the start included. Python {platform.python_version()}, CasADi {version("casadi")},
+proxsuite {version("proxsuite")}, {platform.machine()}.
 
 | | grasps: solved % | iterations | 99 % | time | bent: solved % | iterations | 99 % | time |
 |---|---|---|---|---|---|---|---|---|

@@ -12,7 +12,7 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.kernels import LoopKernel
+from casadi_ik.kernels import LoopKernel, LoopResult
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.method import Outcome, TraceFormat
 from casadi_ik.solvers.posture_table import PostureTable
@@ -86,19 +86,23 @@ class ThumbFirstMethod:
         """The parameter record as a plain mapping."""
         return dataclasses.asdict(self.options)
 
-    def start(self, problems: Problems, q0: Array) -> tuple[Array, Array]:
+    def start(
+        self, problems: Problems, q0: Array, starts: int | None = None
+    ) -> tuple[Array, Array]:
         """First states (k, ns) and parameters (k, np) of the step graph for a batch.
 
         Args:
             problems: The targets.
             q0: (k, n); of hands whose contacts look alike, the one nearest to it is tried first.
+            starts: Palm estimates to look up; None: all there may be.
         """
+        starts = starts or self.options.starts
         count, layout = len(problems), self.step.parameters
-        lower, upper = problems.bounds(self._robot.lower, self._robot.upper, UNBOUNDED)
+        lower, upper = problems.bounds(self._robot, UNBOUNDED)
         hand = list(self.step.hand)
-        postures = self.table.nearest(
-            problems.points, problems.normals, self.options.starts, q0[:, hand]
-        )
+        found = self.table.nearest(problems.points, problems.normals, starts, q0[:, hand])
+        postures = np.zeros((count, self.options.starts, len(hand)))
+        postures[:, :starts] = found
         known = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
         values: dict[str, Any] = {
             "points": np.nan_to_num(problems.points),
@@ -109,6 +113,7 @@ class ThumbFirstMethod:
             "lower": lower,
             "upper": upper,
             "postures": np.clip(postures, lower[hand], upper[hand]),
+            "given": float(starts),
             "first_damping": self.options.damping,
             "step_cap": self.options.step_cap,
         }
@@ -130,24 +135,45 @@ class ThumbFirstMethod:
         return states, parameters
 
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
-        """Solve a batch; see `Method.run`. No random numbers are drawn."""
+        """Solve a batch; see `Method.run`. No random numbers are drawn.
+
+        Nearly all targets need one start only, so the others are looked up for those left over.
+        """
         del seed
-        count, layout = len(problems), self.step.state
-        began = time.perf_counter()
-        states, parameters = self.start(problems, q0)
-        lookup = (time.perf_counter() - began) / max(count, 1)
-        result = self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
-        last = {name: result.states[:, layout.slice(name)] for name in ("q", "start", "counts")}
+        result, seconds = self._round(problems, q0, 1, None, trace)
+        states, status, traces = result.states, result.status.astype(np.int64), list(result.trace)
+        left = np.flatnonzero(status != Status.SOLVED)
+        if len(left) and self.options.starts > 1:
+            some = problems.rows(left)
+            again, more = self._round(some, q0[left], self.options.starts, states[left], trace)
+            states[left], status[left] = again.states, again.status
+            seconds[left] += more
+            for row, rows in zip(left, again.trace, strict=False):
+                traces[row] = np.concatenate([traces[row], rows])
+        last = {name: states[:, self.step.state.slice(name)] for name in ("q", "start", "counts")}
         counts = last["counts"].astype(np.int64)
         return Outcome(
             q=last["q"],
-            status=np.where(result.status < 0, int(Status.INVALID), result.status).astype(np.int64),
+            status=np.where(status < 0, int(Status.INVALID), status),
             iterations=counts.sum(axis=1),
             restarts=np.minimum(last["start"][:, 0], self.options.starts - 1).astype(np.int64),
-            time=result.time + lookup,
+            time=seconds,
             phases={stage.label: counts[:, i] for i, stage in enumerate(STAGES)},
-            trace=result.trace,
+            trace=tuple(traces),
         )
+
+    def _round(
+        self, problems: Problems, q0: Array, starts: int, after: Array | None, trace: bool
+    ) -> tuple[LoopResult, Array]:
+        """Run the loop with so many starts, on from given states if any; and seconds (k,)."""
+        began = time.perf_counter()
+        states, parameters = self.start(problems, q0, starts)
+        if after is not None:
+            states = after.copy()
+            states[:, self.step.state.slice("phase")] = Phase.CANDIDATE
+        lookup = (time.perf_counter() - began) / max(len(problems), 1)
+        result = self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
+        return result, result.time + lookup
 
 
 def _closed_form(robot: RobotDescription) -> SrsArm | None:

@@ -27,7 +27,7 @@ from casadi_ik.steps.closed_chain_step import (
     linearised,
     motor_scales,
 )
-from casadi_ik.steps.contact_fit import DAMPING_START, EXACT, fresh_fit, judge
+from casadi_ik.steps.contact_fit import DAMPING_START, fresh_fit, judge
 from casadi_ik.steps.hand_first_state import LENGTH
 from casadi_ik.steps.hand_fit import best_palm, hand_contacts
 from casadi_ik.steps.numeric_arm import nearest_start, pose_step
@@ -138,7 +138,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         started[list(self.hand)] = hand
         started[list(self.robot.arm_actuators)] = arm
         started = ca.fmin(ca.fmax(started, p["lower"]), p["upper"])
-        exhausted = s["start"] >= self.options.starts
+        exhausted = s["start"] >= p["given"]
         q = ca.if_else(exhausted, s["best_q"], started)
         numeric = self.arm is None and self.robot.arm_actuators
         after = self._next(
@@ -163,7 +163,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         columns = list(self.robot.arm_actuators)
         palm = Pose(s["palm_rotation"], s["palm_origin"])
         tried = pose_step(self.robot, s["q"][columns], palm, s["damping"], p)
-        judged = judge(s, tried, ca.sumsqr(tried.there) < EXACT * EXACT)
+        judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
         q = ca.SX(s["q"])
         q[columns] = ca.if_else(judged.accepted, tried.reached, s["q"][columns])
         after = self._next(

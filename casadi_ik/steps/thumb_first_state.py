@@ -69,6 +69,7 @@ class ThumbFirstLayouts:
                 Field("lower", (n,), doc="lower bounds of q"),
                 Field("upper", (n,), doc="upper bounds of q"),
                 Field("postures", (self.options.starts, len(self.hand)), doc="hands to begin with"),
+                Field("given", doc="how many of them are there"),
                 Field("first_damping"),
                 Field("step_cap"),
             )

@@ -92,7 +92,9 @@ def test_trace_of_a_solve(robot, method, rng):
         assert ((trace["q"] >= robot.lower) & (trace["q"] <= robot.upper)).all()
         for before, after in pairwise(trace):
             if after["phase"] != Phase.HAND_ALIGNMENT:
-                assert after["start"] == before["start"] + 1
+                # The first start is a round of its own, which says so if it ends in vain.
+                vain = before["status"] == Status.STALLED
+                assert after["start"] == before["start"] + (0 if vain else 1)
                 continue
             assert after["start"] == before["start"]
             assert after["manipulability"] >= 0
