@@ -33,7 +33,7 @@ VARIANTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 
 def bent_targets(robot: ik.ArmHand, count: int, rng: np.random.Generator) -> Targets:
     """The shipped grasps' hands with distal joints from 25 to 45 deg, on random arms."""
-    names = ik.shipped_names("grasps")
+    names = ik.shipped_grasps(robot.name)
     q = robot.random(rng, count * len(names))
     for i, name in enumerate(names):
         for actuator, value in ik.load_grasp(name).posture.items():
@@ -48,7 +48,7 @@ def main() -> None:
     given = options("Success, iterations and time of thumb-first.", 250)
     rng = np.random.default_rng(given.seed)
     robot = ik.load_robot("kuka_lwr_barrett")
-    grasps = ik.shipped_names("grasps")
+    grasps = ik.shipped_grasps(robot.name)
     sets = {
         "grasps": random_arm_targets(robot, grasps, given.count, rng),
         "bent": bent_targets(robot, given.count, rng),
