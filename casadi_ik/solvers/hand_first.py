@@ -153,26 +153,23 @@ class HandFirstMethod:
         count = len(problems)
         lower, upper = problems.bounds(self._robot, UNBOUNDED)
         hand = list(self.step.layouts.hand)
+        free_points, free_normals = np.isnan(problems.points), np.isnan(problems.normals)
+        counted = ~np.stack([free_points[..., 0], free_normals[..., 0]], axis=2)
         values: dict[str, Any] = {
-            "points": np.nan_to_num(problems.points),
-            "normals": np.nan_to_num(problems.normals),
-            "weights": np.stack(
-                [~np.isnan(problems.points[..., 0]), ~np.isnan(problems.normals[..., 0])], axis=2
-            ),
+            "points": np.where(free_points, 0.0, problems.points).reshape(count, -1),
+            "normals": np.where(free_normals, 0.0, problems.normals).reshape(count, -1),
+            "weights": counted.reshape(count, -1),
             "position_tolerance": problems.position_tolerance,
             "angle_tolerance": problems.angle_tolerance,
             "lower": lower,
             "upper": upper,
-            "postures": np.clip(postures, lower[hand], upper[hand]),
+            "postures": np.clip(postures, lower[hand], upper[hand]).reshape(count, -1),
             "reach": 1.0,
             "start": np.clip(q0, lower, upper),
         }
-        parameters = np.zeros((count, layout.size))
+        parameters = np.empty((count, layout.size))
         for name, value in values.items():
-            array = np.asarray(value, dtype=float)
-            parameters[:, layout.slice(name)] = (
-                array.reshape(count, -1) if array.ndim > 1 and len(array) == count else array
-            )
+            parameters[:, layout.slice(name)] = value
         return parameters
 
     @cached_property
