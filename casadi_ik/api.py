@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
 from typing import Any
@@ -23,8 +23,10 @@ from casadi_ik.solvers import (
     Problems,
     Recorder,
     Solution,
+    SolvedBlock,
     SteppedMethod,
     Stepper,
+    Stream,
     Tolerance,
     build_method,
     method_options,
@@ -171,6 +173,42 @@ class Solver:
         problems = Problems(p, n, self.tolerance, self.limits == "enforce")
         with self._recorder(log, seed) as recorder:
             return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
+
+    def solve_blocks(
+        self,
+        blocks: Iterable[tuple[ArrayLike, ArrayLike]],
+        q0: ArrayLike | None = None,
+        seed: int = 0,
+        jobs: int = 1,
+        log: str | PathLike[str] | None = None,
+        diagnose: bool = False,
+    ) -> Generator[SolvedBlock, None, None]:
+        """Solve targets that come block by block, in the memory that one block takes.
+
+        A target's answer does not depend on how the targets are cut into blocks. A malformed
+        target does not stop the others: it is among the faults of its block.
+
+        Args:
+            blocks: Points and normals of some targets each, as for `solve_batch`.
+            q0: (n,) start of all; None is `robot.home`.
+            seed: Of all random numbers, an integer >= 0.
+            jobs: Threads, at least 1; a few thousand targets a block keep them busy.
+            log: Path of an MCAP file to write every iteration to; complete after the last block,
+                and given up if the iterator is closed before.
+            diagnose: Whether to find out why, for every target that is not solved.
+
+        Yields:
+            The blocks, solved.
+
+        Raises:
+            InputError: Bad q0, seed or jobs, or a block of the wrong shape.
+            LogError: The log cannot be written.
+        """
+        enforce = self.limits == "enforce"
+        with self._recorder(log, seed) as recorder:
+            yield from Stream(
+                self._engine, self.tolerance, enforce, q0, seed, jobs, recorder, diagnose
+            ).solve(blocks)
 
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
         """Solve one grasp by hand, one iteration at a time.
