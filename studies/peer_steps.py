@@ -88,7 +88,11 @@ class PinContacts:
         self.pin.computeJointJacobians(self.model, data, self.theta(q))
         self.pin.updateFramePlacements(self.model, data)
         placed = [data.oMf[frame] for frame in self.frames]
-        return data, np.array([m.translation for m in placed]), np.array([m.rotation for m in placed])
+        return (
+            data,
+            np.array([m.translation for m in placed]),
+            np.array([m.rotation for m in placed]),
+        )
 
     def rows_of(self, data: Any, normals: Array) -> Array:
         """(6 f, joints) derivative of points / LENGTH and normals, in pinocchio's order."""
@@ -154,8 +158,8 @@ class Pink:
 
     def __init__(self, robot: ik.ArmHand, damping: float) -> None:
         """Set it up; `damping` is the task's Levenberg-Marquardt damping."""
-        import pinocchio as pin
         import pink
+        import pinocchio as pin
         import qpsolvers
         from pink.tasks import JointCouplingTask, Task
 

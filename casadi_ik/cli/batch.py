@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.batch_totals import BatchTotals
 from casadi_ik.cli.outputs import check_outputs
-from casadi_ik.cli.question import the_robot, the_solver, the_start
+from casadi_ik.cli.question import the_fixed, the_robot, the_solver, the_start
 from casadi_ik.cli.report import batch_report
 from casadi_ik.cli.say import say
 from casadi_ik.cli.solution_file import columns, growing_npz
@@ -33,6 +33,7 @@ def batch(arguments: argparse.Namespace) -> Answer:
     path = Path(arguments.targets)
     robot = the_robot(arguments.robot)
     q0 = the_start(arguments, robot)
+    fixed = the_fixed(arguments, robot)
     targets = TargetFile(path, len(robot.fingers))
     count = targets.check(BLOCK)
     outputs = {"--log": arguments.log, "--out": arguments.out}
@@ -45,6 +46,7 @@ def batch(arguments: argparse.Namespace) -> Answer:
         arguments.jobs,
         arguments.log,
         arguments.diagnose,
+        fixed,
     )
     totals = BatchTotals()
     npz = growing_npz(arguments.out, "--out", count)

@@ -24,6 +24,8 @@ def joined(parts: Sequence[Rows]) -> Rows:
 
     def column(name: str) -> Any:
         values = [getattr(part, name) for part in parts]
+        if name == "tolerances":  # of the fingers, the same for every row
+            return values[0]
         if isinstance(values[0], tuple):
             return tuple(chain(*values))
         if isinstance(values[0], Mapping):

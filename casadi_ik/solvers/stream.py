@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.errors import InputError, RowError
+from casadi_ik.grasps import Tolerance
 from casadi_ik.solvers.engine import Engine
 from casadi_ik.solvers.joining import joined
-from casadi_ik.solvers.problem import Problems, Tolerance, target_arrays
+from casadi_ik.solvers.problem import Problems
 from casadi_ik.solvers.recorder import Recorder
 from casadi_ik.solvers.solution import BatchSolution
 
@@ -40,8 +41,8 @@ class Stream:
 
     Attributes:
         engine: Who solves.
-        tolerance: When a contact counts as reached.
-        enforce_limits: Whether limits are part of being solved.
+        ask: Points, normals and the number of the first target as a checked question.
+        tolerances: When a contact counts as reached, by finger.
         q0: (n,) start; None is the robot's home.
         seed: Of all random numbers.
         jobs: Threads.
@@ -50,8 +51,8 @@ class Stream:
     """
 
     engine: Engine
-    tolerance: Tolerance
-    enforce_limits: bool
+    ask: Callable[[np.ndarray, np.ndarray, int], Problems]
+    tolerances: tuple[Tolerance, ...]
     q0: ArrayLike | None
     seed: int
     jobs: int
@@ -79,7 +80,7 @@ class Stream:
                 f"points and normals: found {len(points)} and {len(normals)} rows, expected as many"
             )
         engine = self.engine
-        n, f = len(engine.robot.actuators), len(engine.robot.fingers)
+        n = len(engine.robot.actuators)
         parts: dict[int, BatchSolution] = {}
         faults: dict[int, str] = {}
         waiting = [(0, len(points))]
@@ -91,14 +92,13 @@ class Stream:
             except RowError as error:
                 row = error.row - first_row
                 faults[error.row] = str(error)
-                parts[row] = BatchSolution.invalid(1, n, f, self.diagnose)
+                parts[row] = BatchSolution.invalid(1, n, self.tolerances, self.diagnose)
                 waiting += [part for part in ((row + 1, stop), (start, row)) if part[0] < part[1]]
         solution = joined([parts[start] for start in sorted(parts)])
         return SolvedBlock(first_row, solution, dict(sorted(faults.items())))
 
     def _solved(self, points: np.ndarray, normals: np.ndarray, first_row: int) -> BatchSolution:
-        targets = target_arrays(points, normals, len(self.engine.robot.fingers), first_row)
-        problems = Problems(*targets, self.tolerance, self.enforce_limits, first_row)
+        problems = self.ask(points, normals, first_row)
         return self.engine.solve(
             problems, self.q0, self.seed, self.jobs, self.recorder, self.diagnose
         )
