@@ -8,6 +8,7 @@ keep the limits in every step and move no motor by more than `CAP` at once.
 from __future__ import annotations
 
 import tempfile
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -67,11 +68,11 @@ class Joints:
 class PinContacts:
     """Contacts and their Jacobian by pinocchio, in our motors."""
 
-    def __init__(self, robot: ik.ArmHand, model: Any) -> None:
-        """Look the contact frames up."""
-        import pinocchio as pin
-
-        self.pin, self.model, self.joints = pin, model, Joints(robot)
+    def __init__(self, robot: ik.ArmHand) -> None:
+        """Load the robot and look the contact frames up."""
+        self.pin: Any = import_module("pinocchio")
+        self.model = model = self.pin.buildModelFromXML(robot.urdf())
+        self.joints = Joints(robot)
         self.frames = [model.getFrameId(f"{name}_contact") for name in robot.fingers]
         place = self.joints.order([n for n in model.names if n != "universe"])
         self.rows = np.array([model.joints[int(i) + 1].idx_q for i in place])
@@ -113,12 +114,10 @@ class Scipy:
             evaluations: Budget of a descent.
             tight: Whether to go on to the last digits.
         """
-        import pinocchio as pin
-        from scipy.optimize import least_squares
-
-        self._least_squares, self._robot = least_squares, robot
+        self._least_squares: Any = import_module("scipy.optimize").least_squares
+        self._robot = robot
         self._evaluations, self._tolerance = evaluations, 1e-15 if tight else 1e-6
-        self._pin = PinContacts(robot, pin.buildModelFromXML(robot.urdf()))
+        self._pin = PinContacts(robot)
         self._data = self._pin.model.createData()
 
     def aim(self, points: Array, normals: Array) -> None:
@@ -158,22 +157,19 @@ class Pink:
 
     def __init__(self, robot: ik.ArmHand, damping: float) -> None:
         """Set it up; `damping` is the task's Levenberg-Marquardt damping."""
-        import pink
-        import pinocchio as pin
-        import qpsolvers
-        from pink.tasks import JointCouplingTask, Task
-
-        self._pink, self._qp = pink, qpsolvers
-        self._pin = contacts = PinContacts(robot, pin.buildModelFromXML(robot.urdf()))
+        self._pink: Any = import_module("pink")
+        self._qp: Any = import_module("qpsolvers")
+        tasks: Any = import_module("pink.tasks")
+        self._pin = contacts = PinContacts(robot)
         model = contacts.model
         names, place = contacts.joints.names, contacts.joints.order(model.names[1:].tolist())
         self._place = place
         start = contacts.theta(robot.home)
-        self._configuration = pink.Configuration(model, model.createData(), start)
+        self._configuration = self._pink.Configuration(model, model.createData(), start)
         self._lower, self._upper = model.lowerPositionLimit, model.upperPositionLimit
         peer = self
 
-        class Contacts(Task):
+        class Contacts(tasks.Task):
             def compute_error(self, configuration: Any) -> Array:
                 del configuration
                 return _residual(*peer._now, *peer._target)
@@ -186,7 +182,7 @@ class Pink:
 
         self._tasks = [Contacts(lm_damping=damping)]
         self._coupled = [
-            JointCouplingTask([names[a], names[b]], [1.0, -1.0], 1.0, self._configuration)
+            tasks.JointCouplingTask([names[a], names[b]], [1.0, -1.0], 1.0, self._configuration)
             for a, b in contacts.joints.pairs
         ]
 
@@ -224,11 +220,10 @@ class Mink:
 
     def __init__(self, robot: ik.ArmHand, damping: float) -> None:
         """Set it up; `damping` is the task's Levenberg-Marquardt damping."""
-        import mink
-        import mujoco
-        import qpsolvers
-
-        self._mink, self._mujoco, self._qp = mink, mujoco, qpsolvers
+        mink: Any = import_module("mink")
+        mujoco: Any = import_module("mujoco")
+        self._mink, self._mujoco = mink, mujoco
+        self._qp: Any = import_module("qpsolvers")
         joints = self._joints = Joints(robot)
         self._model = model = self._built(robot)
         order = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, n) for n in joints.names]
@@ -316,8 +311,7 @@ class Placo:
 
     def __init__(self, robot: ik.ArmHand, damping: float) -> None:
         """Set it up; `damping` is the weight of the regularization task."""
-        import placo
-
+        placo: Any = import_module("placo")
         self._joints = Joints(robot)
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "robot.urdf"

@@ -77,7 +77,7 @@ class Layout:
         """A layout whose fields are sorted by falling storage width (stable)."""
         return cls(tuple(sorted(fields, key=lambda item: -np.dtype(item.dtype).itemsize)))
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Length of the vector."""
         return sum(item.size for item in self.fields)

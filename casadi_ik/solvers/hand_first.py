@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -121,22 +121,49 @@ class HandFirstMethod:
             trace=tuple(np.concatenate(rows) for rows in outcome.traces),
         )
 
-    def rows(self, problems: Problems, q0: Array, number: int = 0) -> tuple[Array, Array]:
-        """States and parameters of a round, a row per target, to be changed before `run_rows`."""
-        lookup = self._postures(problems, number)
-        return self._states(q0), self._parameters(problems, q0, lookup)
+    def rows(
+        self, problems: Problems, q0: Array, numbers: Sequence[int] = (0,)
+    ) -> tuple[Array, Array]:
+        """States and parameters of rounds, to be changed before `run_rows`.
+
+        Args:
+            problems: k targets.
+            q0: (k, n).
+            numbers: m rounds; of none there is a row per target without hand postures, fit for
+                refinement only.
+
+        Returns:
+            (m k, ...) states and parameters, round by round.
+        """
+        count, hand = self.options.candidates, self.step.layouts.hand
+        if not numbers:
+            lookup = np.zeros((len(problems), count, len(hand)))
+            return self._states(q0), self._parameters(problems, q0, lookup)
+        found = self._postures(problems, max(numbers), all_wide=True)
+        parts = []
+        for number in numbers:
+            last = slice((number - 1) * count, number * count)
+            lookup = found[:, last] if number else self._postures(problems, 0)
+            parts.append(self._parameters(problems, q0, lookup))
+        return np.tile(self._states(q0), (len(numbers), 1)), np.concatenate(parts)
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
-    def _postures(self, problems: Problems, number: int) -> Array:
-        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one."""
+    def _postures(self, problems: Problems, number: int, all_wide: bool = False) -> Array:
+        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
+
+        Args:
+            problems: k targets.
+            number: The round.
+            all_wide: Whether those of the rounds 1, 2, ... before it are to stand before them.
+        """
         count = self.options.candidates
         if number == 0:
             return self.table.nearest(problems.points, problems.normals, count)
         found = self.wide_table.nearest(problems.points, problems.normals, number * count)
-        return found[:, -count:]
+        return found if all_wide else found[:, -count:]
 
     def _parameters(self, problems: Problems, q0: Array, postures: Array) -> Array:
         layout = self.step.layouts.parameters
