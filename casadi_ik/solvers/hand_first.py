@@ -103,7 +103,7 @@ class HandFirstMethod:
             begin = time.perf_counter()
             first = number * options.candidates
             chosen = problems.rows(waiting)
-            lookup = self._postures(chosen, number)
+            lookup = self.postures(chosen, number)
             parameters = self._parameters(chosen, q0[waiting], lookup)
             outcome.time[waiting] += (time.perf_counter() - begin) / max(len(waiting), 1)
             result = self.kernel.run(self._states(q0[waiting]), parameters, MAX_ITERATIONS, trace)
@@ -139,11 +139,13 @@ class HandFirstMethod:
         if not numbers:
             lookup = np.zeros((len(problems), count, len(hand)))
             return self._states(q0), self._parameters(problems, q0, lookup)
-        found = self._postures(problems, max(numbers), all_wide=True)
+        wide = self.postures(problems, max(numbers), all_wide=True) if any(numbers) else None
         parts = []
         for number in numbers:
-            last = slice((number - 1) * count, number * count)
-            lookup = found[:, last] if number else self._postures(problems, 0)
+            if number and wide is not None:
+                lookup = wide[:, (number - 1) * count : number * count]
+            else:
+                lookup = self.postures(problems, 0)
             parts.append(self._parameters(problems, q0, lookup))
         return np.tile(self._states(q0), (len(numbers), 1)), np.concatenate(parts)
 
@@ -151,7 +153,7 @@ class HandFirstMethod:
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
-    def _postures(self, problems: Problems, number: int, all_wide: bool = False) -> Array:
+    def postures(self, problems: Problems, number: int, all_wide: bool = False) -> Array:
         """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
 
         Args:
