@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from bench_report import Section
 from numpy.typing import NDArray
-from peer_steps import Mink, Peer, Pink, Placo, Scipy
+from peer_qp import Mink, Pink, Placo
+from peer_steps import Peer, Scipy
 from random_arms import random_arm_targets
 
 import casadi_ik as ik
