@@ -142,7 +142,7 @@ class Scipy:
         )
         return found.x - q
 
-    def residual(self, q: Array) -> Array:
+    def _residual(self, q: Array) -> Array:
         return residual(*self.contacts(q), *self._target)
 
     def _jacobian(self, q: Array) -> Array:
