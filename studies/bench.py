@@ -211,7 +211,7 @@ def _peak() -> float:
 
 def iterations(robot: ik.ArmHand, sizes: Sizes) -> Section:
     """What an iteration of the other methods costs."""
-    names = ik.shipped_names("grasps")
+    names = ik.shipped_grasps(robot.name)
     each = max(sizes.iterations // len(names), 1)
     rng = np.random.default_rng(0)
     targets = random_arm_targets(robot, names, each, rng)

@@ -185,7 +185,7 @@ def measured(count: int, seed: int, names: Sequence[str]) -> Section:
 def kinds(robot: ik.ArmHand, count: int, seed: int) -> list[tuple[str, ik.Tolerance, Targets]]:
     """Grasps and random hands, at the usual and at a tight tolerance."""
     rng = np.random.default_rng(seed)
-    grasps = ik.shipped_names("grasps")
+    grasps = ik.shipped_grasps(robot.name)
     sets = {
         "grasps": random_arm_targets(robot, grasps, max(count // len(grasps), 1), rng),
         "random hands": robot.contacts(robot.random(rng, count)),

@@ -66,7 +66,7 @@ class Trials:
 
     def limits(self, problems: Problems) -> Bounds:
         """The bounds (n,) that a solution has to keep."""
-        return Bounds(*problems.bounds(self.robot.lower, self.robot.upper, UNBOUNDED))
+        return Bounds(*problems.bounds(self.robot.description, UNBOUNDED))
 
     def search(self, problems: Problems, start: Array, bounds: Bounds) -> Array:
         """The first round of hand-first for each of k targets.
@@ -116,10 +116,8 @@ class Trials:
 
     def misses(self, problems: Problems, q: Array) -> Array:
         """(k, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
-        points, normals = self.robot.contacts(q)
-        far = np.linalg.norm(points - problems.points, axis=2) / LENGTH
-        chord = np.linalg.norm(normals - problems.normals, axis=2)
-        return np.nan_to_num(np.stack([far, chord], axis=2))
+        position, angle = self.robot.errors(q, problems.points, problems.normals)
+        return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
 
     def set_bounds(self, parameters: Array, bounds: Bounds) -> None:
         """Put bounds into rows of parameters."""
