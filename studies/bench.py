@@ -44,7 +44,7 @@ class Sizes:
     batch: int = 6000
     repeats: int = 7
     memory: int = 1_000_000
-    peers: int = 120
+    peers: int = 60
     iterations: int = 24
     later: int = 3
 
@@ -237,33 +237,37 @@ def iterations(robot: ik.ArmHand, sizes: Sizes) -> Section:
     return Section("An iteration of other methods", columns, rows, "CPU time of one thread.")
 
 
-def sections(sizes: Sizes) -> Iterator[Section]:
-    """All measurements, one after the other."""
-    robot = ik.load_robot(ROBOT)
-    yield memory(robot, sizes)
-    yield solves(robot, sizes)
-    yield single(robot, sizes)
-    yield diagnoses(robot, sizes)
-    yield threads(robot, sizes)
-    yield first_use(ik.METHODS, sizes.later)
-    yield iterations(robot, sizes)
-    yield measured(sizes.peers, 0, installed())
+MEASUREMENTS: dict[str, Callable[[ik.ArmHand, Sizes], Section]] = {
+    "memory": memory,
+    "solves": solves,
+    "single": single,
+    "diagnoses": diagnoses,
+    "threads": threads,
+    "first-use": lambda _, sizes: first_use(ik.METHODS, sizes.later),
+    "iterations": iterations,
+    "peers": lambda _, sizes: measured(sizes.peers, 0, installed()),
+}
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure, print, write the report."""
     parser = argparse.ArgumentParser(description="Timings on this machine.")
     parser.add_argument("--quick", action="store_true", help="small sizes; no report unless --out")
+    parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=list(MEASUREMENTS))
     parser.add_argument("--out", type=Path, help=f"the report (default: {REPORT.name} of results)")
     options = parser.parse_args(arguments)
+    robot = ik.load_robot(ROBOT)
     found = []
-    for section in sections(QUICK if options.quick else Sizes()):
+    for name in options.only:
+        section = MEASUREMENTS[name](robot, QUICK if options.quick else Sizes())
         section.show()
         found.append(section)
     out = options.out or (None if options.quick else REPORT)
     if out is not None:
-        quick = " --quick" if options.quick else ""
-        write_report(out, f"python studies/bench.py{quick}", found)
+        words = ["--quick"] * options.quick
+        if len(found) < len(MEASUREMENTS):
+            words += ["--only", *options.only]
+        write_report(out, " ".join(["python studies/bench.py", *words]), found)
 
 
 if __name__ == "__main__":
