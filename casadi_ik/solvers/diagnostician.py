@@ -139,7 +139,8 @@ class Diagnostician:
     ) -> tuple[list[tuple[Lift, Array]], tuple[Freed, ...], Array]:
         """Solve with limits lifted or something left free, all together.
 
-        Limits that nothing presses against in the nearest configurations would not help.
+        Limits that nothing presses against in the nearest configurations would not help; where
+        little is missing they are lifted all the same, as further starts.
 
         Returns:
             The lifts that solve it with their solutions, what may be left free, and all
@@ -147,7 +148,9 @@ class Diagnostician:
         """
         hand_only = hand is not None and not hand.fits
         movable = limits.lower < limits.upper
-        pressed = movable & (self._at_limit(best.q) | self._at_limit(best.fair))
+        pressed = movable.copy()
+        if best.ratio > CLOSE:
+            pressed &= self._at_limit(best.q) | self._at_limit(best.fair)
         tried = lifts(self.robot, movable, pressed, hand_only) if problems.enforce_limits else []
         freeings = self._freeings(problems)
         parts = [problems] * len(tried) + [item.problems for item in freeings]
