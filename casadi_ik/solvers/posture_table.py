@@ -151,10 +151,18 @@ def _rounded(values: Array) -> NDArray[np.float32]:
 def _smallest(distance: NDArray[np.float32], count: int) -> NDArray[np.intp]:
     """Columns of the smallest entries of each row, in order; `distance` is used up."""
     if count > SEARCHES:
-        return distance.argsort(axis=1, kind="stable")[:, :count]
+        return np.stack([_smallest_of_row(row, count) for row in distance])
     found = np.empty((len(distance), count), dtype=np.intp)
     every = np.arange(len(distance))
     for i in range(count):
         found[:, i] = distance.argmin(axis=1)
         distance[every, found[:, i]] = np.inf
     return found
+
+
+def _smallest_of_row(distance: NDArray[np.float32], count: int) -> NDArray[np.intp]:
+    """The same for one row: only what is as small as the last one wanted has to be sorted."""
+    if count >= len(distance):
+        return distance.argsort(kind="stable")[:count]
+    places = np.flatnonzero(distance <= np.partition(distance, count - 1)[count - 1])
+    return places[distance[places].argsort(kind="stable")[:count]]
