@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
-from casadi_ik.logs import McapRecorder
+from casadi_ik.logs import Compression, Keep, McapRecorder
 from casadi_ik.solvers import (
     FINGER_STEPS,
     LIMITS,
@@ -144,8 +144,10 @@ class Solver:
         q0: ArrayLike | None = None,
         seed: int = 0,
         jobs: int = 1,
-        log: str | PathLike[str] | None = None,
+        log: str | PathLike[str] | Recorder | None = None,
         diagnose: bool = False,
+        keep: Keep | None = None,
+        compression: Compression = "zstd",
     ) -> BatchSolution:
         """Solve k targets.
 
@@ -156,9 +158,12 @@ class Solver:
             q0: (n,) or (k, n) start; None is `robot.home`.
             seed: Of all random numbers, an integer >= 0.
             jobs: Threads, at least 1.
-            log: Path of an MCAP file to write every iteration to.
+            log: Path of an MCAP file to write every iteration to; or an open recorder, which
+                stays open, for several batches in one log.
             diagnose: Whether to find out why, for every target that is not solved
                 (`BatchSolution.diagnoses`).
+            keep: Which solves keep their iterations in the log; None: all.
+            compression: Of the log: "zstd" (level 1), "lz4" or "none".
 
         Returns:
             The same fields as a `Solution`, as arrays.
@@ -169,7 +174,7 @@ class Solver:
         """
         p, n = target_arrays(points, normals, len(self.robot.fingers))
         problems = Problems(p, n, self.tolerance, self.limits == "enforce")
-        with self._recorder(log, seed) as recorder:
+        with self._recorder(log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
 
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
@@ -198,14 +203,20 @@ class Solver:
         return Stepper(method.kernel.step, states[0], parameters[0])
 
     def _recorder(
-        self, log: str | PathLike[str] | None, seed: int
+        self,
+        log: str | PathLike[str] | Recorder | None,
+        seed: int,
+        keep: Keep | None,
+        compression: Compression,
     ) -> AbstractContextManager[Recorder | None]:
-        if log is None:
-            return nullcontext()
+        if not isinstance(log, str | PathLike):
+            return nullcontext(log)
         return McapRecorder(
             log,
             robot_name=self.robot.name,
             urdf=self.robot.urdf(),
             parameters=self.parameters,
             seed=seed,
+            keep=keep,
+            compression=compression,
         )
