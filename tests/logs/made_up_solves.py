@@ -74,6 +74,7 @@ def make_block(
         angle_error=rng.random((k, 3)),
         ok=np.tile([True, False, True], (k, 1)),
         limits_ok=np.ones(k, dtype=bool),
+        tolerances=(Tolerance(),) * 3,
         phases={PHASES[0]: iterations // 2, PHASES[1]: iterations - iterations // 2},
     )
     rows = [
