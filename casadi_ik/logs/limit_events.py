@@ -50,10 +50,11 @@ def limit_changes(traces: Traces, slack: float) -> Iterator[tuple[EventKind, Lim
         of_hit, of_left = (
             traces.solve[places[:, 0]] * bits + places[:, 1] for places in (hit, left)
         )
-        unsure = np.unique(of_left[flickers])
-        hits, lefts = _follow(traces, unsure // bits, unsure % bits, slack)
-        hit = np.concatenate([hit[~np.isin(of_hit, unsure)], hits])
-        left = np.concatenate([left[~np.isin(of_left, unsure)], lefts])
+        unsure = np.zeros(len(traces.counts) * bits, dtype=bool)
+        unsure[of_left[flickers]] = True
+        hits, lefts = _follow(traces, *np.divmod(np.flatnonzero(unsure), bits), slack)
+        hit = np.concatenate([hit[~unsure[of_hit]], hits])
+        left = np.concatenate([left[~unsure[of_left]], lefts])
     for kind, places in ((EventKind.LIMIT_HIT, hit), (EventKind.LIMIT_LEFT, left)):
         row, bit, last = places.T
         yield kind, LimitChanges(row, bit, _q(traces, row, bit), _q(traces, last, bit))
