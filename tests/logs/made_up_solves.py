@@ -75,7 +75,11 @@ def make_block(
         ok=np.tile([True, False, True], (k, 1)),
         limits_ok=np.ones(k, dtype=bool),
         tolerances=(Tolerance(),) * 3,
-        phases={PHASES[0]: iterations // 2, PHASES[1]: iterations - iterations // 2},
+        phases={
+            # As in `make_rows`: a third each, rounded up.
+            phase: -(-iterations * (i + 1) // 3) - -(-iterations * i // 3)
+            for i, phase in enumerate(PHASES)
+        },
     )
     rows = [
         make_rows(number, count, form.layout) for number, count in zip(numbers, counts, strict=True)
