@@ -214,4 +214,4 @@ def test_labels_of_solves_and_events() -> None:
     assert labels["ok"] == labels["target_points"] == FINGERS
     assert labels["phase_iterations"] == PHASES
     assert labels["q"] == JOINTS
-    assert event_format(FORMAT).labels["jacobian"] == ("", "closed_chain")
+    assert event_format(FORMAT).labels["jacobian"] == ("none", "closed_chain")
