@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
@@ -59,8 +60,13 @@ class Kept:
     def __enter__(self) -> Kept:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        pass
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Nothing to do."""
 
 
 def least(run: Callable[[], object], repeats: int) -> float:
@@ -82,7 +88,7 @@ def report(count: int = 12_000, repeats: int = 5) -> Report:
         repeats: Of each measurement.
     """
     robot = ik.load_robot("kuka_lwr_barrett")
-    names = ik.shipped_names("grasps")
+    names = ik.shipped_grasps(robot.name)
     rows: list[list[str]] = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.mcap"
