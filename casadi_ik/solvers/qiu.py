@@ -60,7 +60,7 @@ class QiuMethod:
             "phase": Phase.labels(),
             "status": Status.labels(),
         }
-        return TraceFormat(self.step.record, labels)
+        return TraceFormat(self.step.record, labels, self.step.jacobians)
 
     @property
     def parameters(self) -> Mapping[str, Any]:
@@ -126,7 +126,7 @@ class QiuMethod:
                     result.states, result.iterations
                 ).items()
             },
-            trace=result.trace,
+            rows=result.rows,
         )
 
     def _check(self, problems: Problems) -> None:

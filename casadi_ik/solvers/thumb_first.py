@@ -159,7 +159,7 @@ class ThumbFirstMethod:
             restarts=np.minimum(last["start"][:, 0], self.options.starts - 1).astype(np.int64),
             time=seconds,
             phases={stage.label: counts[:, i] for i, stage in enumerate(STAGES)},
-            trace=tuple(traces),
+            rows=np.concatenate(traces) if traces else result.rows,
         )
 
     def _round(
