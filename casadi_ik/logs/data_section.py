@@ -1,0 +1,264 @@
+"""What the data section of an MCAP file really holds, record by record, checksums verified."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+from collections import defaultdict
+from dataclasses import dataclass, field
+from typing import IO, TypeVar
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
+
+from casadi_ik.errors import LogError
+
+HEAD = struct.Struct("<BQ")
+"""Opcode and length in front of every record."""
+
+_MESSAGE = struct.Struct("<HIQ")
+"""Channel, sequence and log time: how a Message's content begins."""
+
+_DAMAGED = (McapError, struct.error, ValueError, RuntimeError, MemoryError, ZstdError)
+"""What a record with wrong bytes was seen to raise (RuntimeError is lz4's)."""
+
+Kind = TypeVar("Kind", Attachment, Channel, Chunk, MessageIndex, Metadata, Schema)
+
+Entries = dict[int, list[tuple[int, int]]]
+"""Log time and offset of every message in a chunk, by channel."""
+
+
+@dataclass
+class DataSection:
+    """The data section as far as it is whole.
+
+    Attributes:
+        summary: What is in it, with statistics.
+        end: Where it ends: behind the last whole record [bytes].
+        closed: Whether a DataEnd record stands there.
+        owed: Entries of the last chunk whose MessageIndex records are not all there.
+    """
+
+    summary: Summary
+    end: int = len(MCAP0_MAGIC)
+    closed: bool = False
+    owed: Entries = field(default_factory=dict)
+
+    def owed_indexes(self) -> bytes:
+        """The missing MessageIndex records, to be written at `end`; now they count as there."""
+        builder = RecordBuilder()
+        for channel, entries in self.owed.items():
+            index = self.summary.chunk_indexes[-1]
+            index.message_index_offsets[channel] = self.end + builder.count
+            before = builder.count
+            MessageIndex(channel, entries).write(builder)
+            index.message_index_length += builder.count - before
+        self.owed = {}
+        return builder.end()
+
+
+def scan(stream: IO[bytes]) -> DataSection:
+    """Read the data section from its beginning to its end or to where it is torn.
+
+    Args:
+        stream: An MCAP file.
+
+    Raises:
+        LogError: Not an MCAP file, torn before its first record was whole, or damaged where it
+            cannot be torn: in a file that was closed, or in front of a chunk that is whole.
+    """
+    magic = stream.read(len(MCAP0_MAGIC))
+    if magic != MCAP0_MAGIC:
+        found = f"it begins with {magic!r}" if magic else "it is empty"
+        raise LogError(f"not an MCAP file: {found}")
+    size = stream.seek(-len(MCAP0_MAGIC), os.SEEK_END) + len(MCAP0_MAGIC)
+    was_closed = size > len(MCAP0_MAGIC) and stream.read() == MCAP0_MAGIC
+    stream.seek(len(MCAP0_MAGIC))
+    found, wrong = _Scan(), "it is cut off"
+    while (record := _record(stream, size)) is not None:
+        opcode, body = record
+        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            found.section.closed = True
+            return found.section
+        try:
+            found.take(opcode, body)
+        except _DAMAGED as error:
+            wrong = str(error) or type(error).__name__
+            break
+    place = found.section.end
+    if was_closed or _chunk_follows(stream, size):
+        raise LogError(
+            f"the log is damaged in its middle: the record at byte {place} is not as it was"
+            f" written: {wrong}"
+        )
+    if place == len(MCAP0_MAGIC):
+        raise LogError(f"the log is truncated: none of its {size} bytes is a whole record")
+    return found.section
+
+
+def _record(stream: IO[bytes], size: int) -> tuple[int, bytes] | None:
+    """Opcode and content of the next record; None if it is not all there."""
+    head = stream.read(HEAD.size)
+    if len(head) < HEAD.size:
+        return None
+    opcode, length = HEAD.unpack(head)
+    if opcode == 0 or stream.tell() + length > size:
+        return None
+    return opcode, stream.read(length)
+
+
+def _chunk_follows(stream: IO[bytes], size: int) -> bool:
+    while (record := _record(stream, size)) is not None:
+        opcode, body = record
+        if opcode == Opcode.CHUNK:
+            try:
+                _Scan().chunk(body)
+            except _DAMAGED:
+                continue
+            return True
+    return False
+
+
+class _Scan:
+    """Takes one record after the other."""
+
+    def __init__(self) -> None:
+        self._counts: defaultdict[int, int] = defaultdict(int)
+        self._statistics = Statistics(0, 0, self._counts, 0, 0, 0, 0, 0, 0)
+        self.section = DataSection(Summary())
+        self.section.summary.statistics = self._statistics
+
+    def take(self, opcode: int, body: bytes) -> None:
+        """Account for one record; if it raises, nothing has changed."""
+        if opcode == Opcode.CHUNK:
+            self.chunk(body)
+        elif opcode == Opcode.MESSAGE_INDEX:
+            self._message_index(body)
+        elif opcode == Opcode.MESSAGE:
+            channel, _, log_time = _MESSAGE.unpack_from(body)
+            self._count({channel: [(log_time, 0)]})
+        elif opcode == Opcode.ATTACHMENT:
+            self._attachment(body)
+        elif opcode == Opcode.METADATA:
+            name = _read(Metadata, body).name
+            index = MetadataIndex(self.section.end, HEAD.size + len(body), name)
+            self.section.summary.metadata_indexes.append(index)
+            self._statistics.metadata_count += 1
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._declare(opcode, body)
+        self.section.end += HEAD.size + len(body)
+
+    def chunk(self, body: bytes) -> None:
+        """A chunk, unpacked and its checksum verified."""
+        chunk = _read(Chunk, body)
+        unpacked, length = get_chunk_data_stream(chunk, validate_crc=True)
+        data = unpacked.read(length)
+        if len(data) != chunk.uncompressed_size:
+            raise ValueError(f"{len(data)} bytes for {chunk.uncompressed_size}")
+        entries: Entries = defaultdict(list)
+        declared: list[tuple[int, bytes]] = []
+        offset = 0
+        while offset < len(data):
+            opcode, size = HEAD.unpack_from(data, offset)
+            content = offset + HEAD.size
+            if opcode == Opcode.MESSAGE:
+                channel, _, log_time = _MESSAGE.unpack_from(data, content)
+                entries[channel].append((log_time, offset))
+            else:
+                declared.append((opcode, data[content : content + size]))
+            offset = content + size
+        for opcode, content in declared:
+            self._declare(opcode, content)
+        self._count(entries)
+        self.section.owed = dict(entries)
+        self._statistics.chunk_count += 1
+        self.section.summary.chunk_indexes.append(
+            ChunkIndex(
+                chunk_length=HEAD.size + len(body),
+                chunk_start_offset=self.section.end,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=chunk.message_end_time,
+                message_index_length=0,
+                message_index_offsets={},
+                message_start_time=chunk.message_start_time,
+                uncompressed_size=chunk.uncompressed_size,
+            )
+        )
+
+    def _message_index(self, body: bytes) -> None:
+        """An index must say what the chunk before it holds."""
+        index = _read(MessageIndex, body)
+        expected = self.section.owed.get(index.channel_id)
+        if expected is None or sorted(index.records) != sorted(expected):
+            raise ValueError(f"the message index of channel {index.channel_id} is wrong")
+        del self.section.owed[index.channel_id]
+        chunk = self.section.summary.chunk_indexes[-1]
+        chunk.message_index_offsets[index.channel_id] = self.section.end
+        chunk.message_index_length += HEAD.size + len(body)
+
+    def _attachment(self, body: bytes) -> None:
+        attachment = _read(Attachment, body)
+        self.section.summary.attachment_indexes.append(
+            AttachmentIndex(
+                offset=self.section.end,
+                length=HEAD.size + len(body),
+                log_time=attachment.log_time,
+                create_time=attachment.create_time,
+                data_size=len(attachment.data),
+                name=attachment.name,
+                media_type=attachment.media_type,
+            )
+        )
+        self._statistics.attachment_count += 1
+
+    def _declare(self, opcode: int, body: bytes) -> None:
+        summary = self.section.summary
+        if opcode == Opcode.SCHEMA:
+            schema = _read(Schema, body)
+            summary.schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = _read(Channel, body)
+            summary.channels[channel.id] = channel
+        self._statistics.schema_count = len(summary.schemas)
+        self._statistics.channel_count = len(summary.channels)
+
+    def _count(self, entries: Entries) -> None:
+        statistics = self._statistics
+        for channel, found in entries.items():
+            times = [log_time for log_time, _ in found]
+            first, last = min(times), max(times)
+            if statistics.message_count:
+                first = min(first, statistics.message_start_time)
+            statistics.message_start_time = first
+            statistics.message_end_time = max(last, statistics.message_end_time)
+            statistics.message_count += len(found)
+            self._counts[channel] += len(found)
+
+
+def _read(kind: type[Kind], body: bytes) -> Kind:
+    """A record that, written again, is the very same: lengths and checksums in it are right."""
+    record = kind.read(ReadDataStream(io.BytesIO(body)))
+    builder = RecordBuilder()
+    record.write(builder)
+    if builder.end()[HEAD.size :] != body:
+        raise ValueError(f"{kind.__name__} contradicts its own length or checksum")
+    return record
