@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import secrets
 import stat
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from casadi_ik.errors import CasadiIKError
+from casadi_ik.files.writing import part_of, target_of, written_whole
 
 
 class OutputError(CasadiIKError):
@@ -26,17 +25,17 @@ def check_outputs(outputs: Iterable[tuple[str, Path | None]], inputs: Iterable[P
     Raises:
         OutputError: The message names path and option.
     """
-    taken = {_target(path): "the input" for path in inputs}
+    taken = {target_of(path): "the input" for path in inputs}
     for option, path in outputs:
         if path is None:
             continue
-        where, target = f"{path}: {option}", _target(path)
+        where, target = f"{path}: {option}", target_of(path)
         if target in taken:
             raise OutputError(f"{where}: found the file of {taken[target]}, expected another")
         taken[target] = option
         try:
             _refuse_special(target)
-            part = _part(target)
+            part = part_of(target)
             part.touch(exist_ok=False)
             part.unlink()
         except OSError as error:
@@ -54,24 +53,11 @@ def write_output(path: Path, option: str, write: Callable[[Path], object]) -> No
     Raises:
         OutputError: It cannot be written; nothing is left behind.
     """
-    target = _target(path)
-    part = _part(target)
     try:
-        write(part)
-        part.replace(target)
+        with written_whole(path) as part:
+            write(part)
     except OSError as error:
         raise OutputError(f"{path}: {option}: cannot be written: {_reason(error)}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()
-
-
-def _target(path: Path) -> Path:
-    return Path(os.path.realpath(path))
-
-
-def _part(target: Path) -> Path:
-    return target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
 
 
 def _refuse_special(target: Path) -> None:
