@@ -25,14 +25,18 @@ class Happening:
     Attributes:
         iteration: In which iteration, from 0.
         kind: What happened, e.g. "NEAR_SINGULAR".
-        subject: The Jacobian, joint, phase or finger concerned.
+        jacobian: The Jacobian concerned; "" if none.
+        joints: The actuators concerned.
+        phase: The phase it happened in; "" without phases.
         value: The number that made it an event.
         threshold: The number it was compared with, or the value before.
     """
 
     iteration: int
     kind: str
-    subject: str
+    jacobian: str
+    joints: tuple[str, ...]
+    phase: str
     value: float
     threshold: float
 
@@ -168,7 +172,9 @@ def one_solve(log: LogFile, solve_id: int | None = None, method: str | None = No
             Happening(
                 e.event.iteration,
                 e.event.kind.name,
-                e.event.subject,
+                e.event.subject if e.event.kind.name == "NEAR_SINGULAR" else "",
+                (e.event.subject,) if "LIMIT" in e.event.kind.name else (),
+                "",
                 e.event.value,
                 e.event.threshold,
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from casadi_ik.logs.one_solve import Happening
 
@@ -16,8 +17,14 @@ def plain_name(name: str) -> str:
 
 
 def number(value: float) -> str:
-    """Three digits, no exponent where it can be done without."""
+    """Three digits."""
     return f"{value:.3g}"
+
+
+def listed(names: Sequence[str], most: int = 4) -> str:
+    """Names with commas, the first few of many."""
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
 def errors(position: float, angle: float) -> str:
@@ -34,28 +41,26 @@ def errors(position: float, angle: float) -> str:
 
 def told(event: Happening) -> str:
     """An event in a few words."""
-    subject, value, threshold = event.subject, number(event.value), number(event.threshold)
+    jacobian, joints = plain_name(event.jacobian), listed(event.joints)
+    value, threshold = number(event.value), number(event.threshold)
     match event.kind:
         case "NEAR_SINGULAR":
-            return (
-                f"{plain_name(subject)} near singular: smallest singular value {value}"
-                f" (below {threshold})"
-            )
+            return f"{jacobian} near singular: smallest singular value {value} (below {threshold})"
         case "ILL_CONDITIONED":
-            return f"{plain_name(subject)} ill-conditioned: condition {value} (above {threshold})"
+            return f"{jacobian} ill-conditioned: condition number {value} (above {threshold})"
         case "LIMIT_HIT":
-            return f"{subject} at its limit ({value})"
+            return f"{joints} at its limit ({value})"
         case "LIMIT_LEFT":
-            return f"{subject} off its limit ({threshold}), now {value}"
-        case "ACTIVE_SET":
-            return f"active constraints: {subject} ({value} in all)"
+            return f"{joints} off its limit ({threshold}), now {value}"
+        case "ACTIVATED" | "RELEASED":
+            return f"{joints} {event.kind.lower()}: {value} active constraints, {threshold} before"
         case "RESTART":
             return f"restart {value}"
         case "PHASE_CHANGE":
-            return f"phase {subject}"
+            return f"on to {plain_name(event.phase)}"
         case "STALL":
-            return f"{subject} stalls: errors change by {value} of themselves"
+            return f"{plain_name(event.phase)} stalls: errors change by {value} of themselves"
         case "OSCILLATION":
-            return f"{subject} to and fro without progress: steps of {value}"
-        case _:
-            return f"{plain_name(event.kind.lower())}: {subject} {value}"
+            return f"{joints} to and fro without progress: steps up to {value}"
+        case kind:
+            return f"{plain_name(kind.lower())}: {value}"
