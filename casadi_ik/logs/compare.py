@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from casadi_ik.errors import InputError
-from casadi_ik.logs.columns import columns
+from casadi_ik.logs.log import Log
 from casadi_ik.logs.one_solve import OneSolve
 from casadi_ik.logs.phrases import errors, number, plain_name
 from casadi_ik.logs.why import held, within, worst
@@ -99,7 +100,7 @@ def _smallest(solve: OneSolve) -> dict[str, str]:
     for name in solve.layout.names:
         if not name.startswith("sigma_"):
             continue
-        sigma = columns(solve.rows[name])
+        sigma = solve.columns(name)
         if np.isnan(sigma).all():
             continue
         row = int(np.nanargmin(np.nanmin(np.where(np.isnan(sigma), np.inf, sigma), axis=1)))
@@ -107,4 +108,85 @@ def _smallest(solve: OneSolve) -> dict[str, str]:
         found[f"smallest sigma, {jacobian}"] = (
             f"{number(float(np.nanmin(sigma)))} in iteration {row}"
         )
+    return found
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a solve ended, and in which log it is.
+
+    Attributes:
+        log: The log.
+        method: Its method.
+        solve_id: Its number.
+        success: Whether it was solved.
+        iterations: How many it took.
+        time: How long it took [s].
+    """
+
+    log: Log
+    method: str
+    solve_id: int
+    success: bool
+    iterations: int
+    time: float
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Solves of two methods on the same targets, by the number of the first.
+
+    Attributes:
+        first: The first method.
+        second: The second method.
+        pairs: A solve of each.
+    """
+
+    first: str
+    second: str
+    pairs: tuple[tuple[Ending, Ending], ...]
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def of_first(self, solve: int) -> Matched:
+        """Only the pair of a solve of the first method."""
+        pairs = tuple(pair for pair in self.pairs if pair[0].solve_id == solve)
+        return Matched(self.first, self.second, pairs)
+
+
+def matched(logs: Sequence[Log], first: str, second: str) -> Matched:
+    """Find solves of two methods that were asked the same.
+
+    A target that one method was given several times is taken once, the first time.
+
+    Args:
+        logs: Logs to look in.
+        first: A method.
+        second: Another.
+
+    Raises:
+        LogError: A log is damaged.
+    """
+    one, other = _endings(logs, first), _endings(logs, second)
+    return Matched(first, second, tuple((one[key], other[key]) for key in one if key in other))
+
+
+def _endings(logs: Sequence[Log], method: str) -> dict[bytes, Ending]:
+    found: dict[bytes, Ending] = {}
+    for log in logs:
+        if method not in log.methods:
+            continue
+        part = log.solves(method=method).part
+        for solve_id, row in zip(part.solve_id.tolist(), part.rows, strict=True):
+            key = target_key(row["target_points"], row["target_normals"])
+            ending = Ending(
+                log,
+                method,
+                solve_id,
+                bool(row["success"]),
+                int(row["iterations"]),
+                float(row["time"]),
+            )
+            found.setdefault(key, ending)
     return found

@@ -22,14 +22,13 @@ from mcap.records import (
     Metadata,
     MetadataIndex,
     Schema,
-    Statistics,
 )
 from mcap.stream_reader import get_chunk_data_stream
-from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 from casadi_ik.errors import LogError
+from casadi_ik.logs.mcap_file import Summary
 
 HEAD = struct.Struct("<BQ")
 """Opcode and length in front of every record."""
@@ -51,7 +50,7 @@ class DataSection:
     """The data section as far as it is whole.
 
     Attributes:
-        summary: What is in it, with statistics.
+        summary: What is in it.
         end: Where it ends: behind the last whole record [bytes].
         closed: Whether a DataEnd record stands there.
         owed: Entries of the last chunk whose MessageIndex records are not all there.
@@ -66,7 +65,7 @@ class DataSection:
         """The missing MessageIndex records, to be written at `end`; now they count as there."""
         builder = RecordBuilder()
         for channel, entries in self.owed.items():
-            index = self.summary.chunk_indexes[-1]
+            index = self.summary.chunks[-1]
             index.message_index_offsets[channel] = self.end + builder.count
             before = builder.count
             MessageIndex(channel, entries).write(builder)
@@ -141,10 +140,7 @@ class _Scan:
     """Takes one record after the other."""
 
     def __init__(self) -> None:
-        self._counts: defaultdict[int, int] = defaultdict(int)
-        self._statistics = Statistics(0, 0, self._counts, 0, 0, 0, 0, 0, 0)
         self.section = DataSection(Summary())
-        self.section.summary.statistics = self._statistics
 
     def take(self, opcode: int, body: bytes) -> None:
         """Account for one record; if it raises, nothing has changed."""
@@ -153,15 +149,13 @@ class _Scan:
         elif opcode == Opcode.MESSAGE_INDEX:
             self._message_index(body)
         elif opcode == Opcode.MESSAGE:
-            channel, _, log_time = _MESSAGE.unpack_from(body)
-            self._count({channel: [(log_time, 0)]})
+            raise ValueError("a message outside of the chunks, which casadi_ik does not write")
         elif opcode == Opcode.ATTACHMENT:
             self._attachment(body)
         elif opcode == Opcode.METADATA:
             name = _read(Metadata, body).name
             index = MetadataIndex(self.section.end, HEAD.size + len(body), name)
-            self.section.summary.metadata_indexes.append(index)
-            self._statistics.metadata_count += 1
+            self.section.summary.metadata.append(index)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._declare(opcode, body)
         self.section.end += HEAD.size + len(body)
@@ -187,10 +181,11 @@ class _Scan:
             offset = content + size
         for opcode, content in declared:
             self._declare(opcode, content)
-        self._count(entries)
+        counts = self.section.summary.counts
+        for channel, found in entries.items():
+            counts[channel] = counts.get(channel, 0) + len(found)
         self.section.owed = dict(entries)
-        self._statistics.chunk_count += 1
-        self.section.summary.chunk_indexes.append(
+        self.section.summary.chunks.append(
             ChunkIndex(
                 chunk_length=HEAD.size + len(body),
                 chunk_start_offset=self.section.end,
@@ -211,13 +206,13 @@ class _Scan:
         if expected is None or sorted(index.records) != sorted(expected):
             raise ValueError(f"the message index of channel {index.channel_id} is wrong")
         del self.section.owed[index.channel_id]
-        chunk = self.section.summary.chunk_indexes[-1]
+        chunk = self.section.summary.chunks[-1]
         chunk.message_index_offsets[index.channel_id] = self.section.end
         chunk.message_index_length += HEAD.size + len(body)
 
     def _attachment(self, body: bytes) -> None:
         attachment = _read(Attachment, body)
-        self.section.summary.attachment_indexes.append(
+        self.section.summary.attachments.append(
             AttachmentIndex(
                 offset=self.section.end,
                 length=HEAD.size + len(body),
@@ -228,7 +223,6 @@ class _Scan:
                 media_type=attachment.media_type,
             )
         )
-        self._statistics.attachment_count += 1
 
     def _declare(self, opcode: int, body: bytes) -> None:
         summary = self.section.summary
@@ -238,20 +232,6 @@ class _Scan:
         elif opcode == Opcode.CHANNEL:
             channel = _read(Channel, body)
             summary.channels[channel.id] = channel
-        self._statistics.schema_count = len(summary.schemas)
-        self._statistics.channel_count = len(summary.channels)
-
-    def _count(self, entries: Entries) -> None:
-        statistics = self._statistics
-        for channel, found in entries.items():
-            times = [log_time for log_time, _ in found]
-            first, last = min(times), max(times)
-            if statistics.message_count:
-                first = min(first, statistics.message_start_time)
-            statistics.message_start_time = first
-            statistics.message_end_time = max(last, statistics.message_end_time)
-            statistics.message_count += len(found)
-            self._counts[channel] += len(found)
 
 
 def _read(kind: type[Kind], body: bytes) -> Kind:

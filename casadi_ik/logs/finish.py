@@ -14,10 +14,17 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from casadi_ik.errors import LogError
-from casadi_ik.logs.closing import FOOTER_CHECKED, closing_bytes
 from casadi_ik.logs.data_section import HEAD, DataSection, scan
 
+try:
+    import fcntl
+except ImportError:  # Windows: no lock
+    fcntl = None
+
 _FOOTER_SIZE = HEAD.size + 20
+
+_UNCHECKED = 4
+"""Bytes at the footer's end that its checksum does not cover: the checksum."""
 
 
 @dataclass(frozen=True)
@@ -49,33 +56,35 @@ def finish_log(path: str | os.PathLike[str]) -> Finished:
         path: An MCAP file.
 
     Raises:
-        LogError: The file is missing, cannot be written, is no MCAP file, or is damaged elsewhere
-            than at its end. Then it has not been changed.
+        LogError: The file is missing, cannot be written, is still being written, is no MCAP file,
+            or is damaged elsewhere than at its end. Then it has not been changed.
     """
     path = Path(path)
     try:
         with path.open("rb") as stream:
             section = scan(stream)
             whole = section.closed and _ends_well(stream, section)
-        statistics = section.summary.statistics
-        chunks, messages = (
-            (0, 0) if statistics is None else (statistics.chunk_count, statistics.message_count)
-        )
         cut = 0 if whole else _close(path, section)
     except OSError as error:
         reason = error.strerror or str(error)
         raise LogError(f"{path}: cannot finish the log: {reason}") from error
     except LogError as error:
         raise LogError(f"{path}: {error}") from error
-    return Finished(path, not whole, chunks, messages, cut)
+    summary = section.summary
+    return Finished(path, not whole, len(summary.chunks), sum(summary.counts.values()), cut)
 
 
 def _close(path: Path, section: DataSection) -> int:
     """Cut what is torn and write the end; gives the bytes that were cut."""
     end = section.end
     indexes = section.owed_indexes()
-    tail = indexes + closing_bytes(section.summary, end + len(indexes))
+    tail = indexes + section.summary.ending(end + len(indexes))
     with path.open("r+b") as stream:
+        if fcntl is not None:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise LogError("cannot finish the log: its writer is still at it") from None
         cut = stream.seek(0, os.SEEK_END) - end
         stream.truncate(end)
         stream.seek(end)
@@ -99,5 +108,5 @@ def _ends_well(stream: IO[bytes], section: DataSection) -> bool:
         return False
     if not isinstance(footer, Footer) or footer.summary_start < section.end:
         return False
-    checked = tail[footer.summary_start - section.end : -magic - FOOTER_CHECKED]
+    checked = tail[footer.summary_start - section.end : -magic - _UNCHECKED]
     return not footer.summary_crc or zlib.crc32(checked) == footer.summary_crc

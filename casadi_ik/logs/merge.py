@@ -15,31 +15,27 @@ from pathlib import Path
 from typing import IO, TypeVar
 
 import numpy as np
-from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import (
     Attachment,
-    AttachmentIndex,
     Channel,
     ChunkIndex,
     Header,
-    McapRecord,
     Metadata,
-    MetadataIndex,
     Schema,
-    Statistics,
 )
-from mcap.summary import Summary
+from mcap.summary import Summary as Found
 from mcap.writer import MCAP0_MAGIC
 
 from casadi_ik.errors import LogError
 from casadi_ik.files.writing import written_whole
+from casadi_ik.logs.chunk import definitions
 from casadi_ik.logs.clock import LogClock
-from casadi_ik.logs.closing import closing_bytes
 from casadi_ik.logs.data_section import HEAD
-from casadi_ik.logs.provenance import METADATA_NAME
+from casadi_ik.logs.mcap_file import Summary
+from casadi_ik.logs.provenance import CHECKSUM, METADATA_NAME, checksum
 
 VARYING = ("created", "machine", "python", "packages", "code_version", "compression")
 """What may differ between shards; what does is kept in the metadata, shard by shard."""
@@ -73,8 +69,7 @@ class _Shard:
     path: Path
     stream: IO[bytes]
     header: Header
-    summary: Summary
-    statistics: Statistics
+    summary: Found
     metadata: Mapping[str, str]
     attachments: tuple[Attachment, ...]
 
@@ -110,8 +105,7 @@ def merge_logs(shards: Sequence[str | os.PathLike[str]], target: str | os.PathLi
         except OSError as error:
             reason = error.strerror or str(error)
             raise LogError(f"{path}: cannot write the merged log: {reason}") from error
-    messages = sum(shard.statistics.message_count for shard in opened)
-    return Merged(path, len(opened), solves, messages, size)
+    return Merged(path, len(opened), solves, sum(summary.counts.values()), size)
 
 
 @contextmanager
@@ -137,16 +131,16 @@ def _opened(path: Path) -> Iterator[_Shard]:
                 f"{path}: the log is truncated or damaged (`casadi-ik log finish` repairs what"
                 " was torn)"
             ) from error
-        if summary is None or summary.statistics is None or METADATA_NAME not in records:
+        if summary is None or METADATA_NAME not in records:
             raise LogError(f"{path}: not a log of casadi_ik: no metadata {METADATA_NAME!r}")
         metadata = records[METADATA_NAME]
-        yield _Shard(path, stream, header, summary, summary.statistics, metadata, attachments)
+        yield _Shard(path, stream, header, summary, metadata, attachments)
 
 
 def _joint_metadata(shards: Sequence[_Shard]) -> dict[str, str]:
     first = shards[0]
     for shard in shards[1:]:
-        for key in sorted({*first.metadata, *shard.metadata} - {*VARYING}):
+        for key in sorted({*first.metadata, *shard.metadata} - {*VARYING, CHECKSUM}):
             found, expected = shard.metadata.get(key), first.metadata.get(key)
             if found != expected:
                 raise LogError(
@@ -157,7 +151,8 @@ def _joint_metadata(shards: Sequence[_Shard]) -> dict[str, str]:
         | {key: shard.metadata[key] for key in VARYING if key in shard.metadata}
         for shard in shards
     ]
-    return {**first.metadata, "shards": json.dumps(origins)}
+    record = {**first.metadata, "shards": json.dumps(origins)}
+    return {**record, CHECKSUM: checksum(record)}
 
 
 def _joint_solves(shards: Sequence[_Shard], clock: LogClock) -> dict[str, int]:
@@ -202,24 +197,12 @@ def _index_times(shard: _Shard, position: int) -> np.ndarray:
 def _joint_summary(shards: Sequence[_Shard]) -> Summary:
     """Schemas, channels and counts of all; one number stands for one thing."""
     joint = Summary()
-    counts: dict[int, int] = {}
     for shard in shards:
         _unite(shard, shards[0], joint.channels, shard.summary.channels)
         _unite(shard, shards[0], joint.schemas, shard.summary.schemas)
-        for channel, count in shard.statistics.channel_message_counts.items():
-            counts[channel] = counts.get(channel, 0) + count
-    filled = [shard.statistics for shard in shards if shard.statistics.message_count]
-    joint.statistics = Statistics(
-        attachment_count=0,
-        channel_count=len(joint.channels),
-        channel_message_counts=counts,
-        chunk_count=sum(each.chunk_count for each in filled),
-        message_count=sum(each.message_count for each in filled),
-        message_end_time=max((each.message_end_time for each in filled), default=0),
-        message_start_time=min((each.message_start_time for each in filled), default=0),
-        metadata_count=1,
-        schema_count=len(joint.schemas),
-    )
+        if shard.summary.statistics is not None:
+            for channel, count in shard.summary.statistics.channel_message_counts.items():
+                joint.counts[channel] = joint.counts.get(channel, 0) + count
     return joint
 
 
@@ -259,41 +242,14 @@ def _write(
     metadata: dict[str, str],
     attachments: Sequence[Attachment],
 ) -> None:
-    stream.write(MCAP0_MAGIC)
-    _put(stream, shards[0].header)
+    header = shards[0].header
     record = Metadata(METADATA_NAME, metadata)
-    summary.metadata_indexes.append(MetadataIndex(*_put(stream, record), METADATA_NAME))
-    for attachment in attachments:
-        place, length = _put(stream, attachment)
-        summary.attachment_indexes.append(
-            AttachmentIndex(
-                offset=place,
-                length=length,
-                log_time=attachment.log_time,
-                create_time=attachment.create_time,
-                data_size=len(attachment.data),
-                name=attachment.name,
-                media_type=attachment.media_type,
-            )
-        )
-    if summary.statistics is not None:
-        summary.statistics.attachment_count = len(attachments)
-    for declared in (*summary.schemas.values(), *summary.channels.values()):
-        _put(stream, declared)
+    stream.write(summary.beginning(header.profile, header.library, record, attachments))
+    stream.write(definitions([*summary.schemas.values()], [*summary.channels.values()]))
     pairs = [(index, shard) for shard in shards for index in shard.summary.chunk_indexes]
     for index, shard in sorted(pairs, key=lambda pair: pair[0].message_start_time):
-        summary.chunk_indexes.append(_copy(stream, shard, index))
-    stream.write(closing_bytes(summary, stream.tell()))
-
-
-def _put(stream: IO[bytes], record: McapRecord) -> tuple[int, int]:
-    """Write a record; gives its place and length."""
-    builder = RecordBuilder()
-    record.write(builder)
-    data = builder.end()
-    place = stream.tell()
-    stream.write(data)
-    return place, len(data)
+        summary.chunks.append(_copy(stream, shard, index))
+    stream.write(summary.ending(stream.tell()))
 
 
 def _copy(stream: IO[bytes], shard: _Shard, index: ChunkIndex) -> ChunkIndex:

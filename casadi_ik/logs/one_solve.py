@@ -10,12 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.kernels.layout import Layout
-from casadi_ik.logs.columns import label_of
-from casadi_ik.logs.reader import LogFile
+from casadi_ik.errors import UnknownNameError
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.logs.event_kinds import SINGULAR
+from casadi_ik.logs.log import Log
+from casadi_ik.logs.table import Part, Table, label_of
+from casadi_ik.logs.traces import bits_of
 from casadi_ik.solvers import Tolerance
 
 Array = NDArray[np.float64]
+
+SINGULAR_KINDS = tuple(kind.name for kind in SINGULAR)
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,19 @@ class OneSolve:
         """What counted as reached."""
         return Tolerance(**self.parameters.get("tolerance", {}))
 
+    def columns(self, name: str) -> Array:
+        """A field of all rows as a matrix, (k, size)."""
+        return self.rows[name].reshape(len(self.rows), -1).astype(float)
+
+    def bits(self, name: str) -> NDArray[np.bool_]:
+        """The bits of a mask in all rows, (k, bits)."""
+        return bits_of(self.rows[name].reshape(len(self.rows), -1))
+
+    def name_of(self, field: str, index: int) -> str:
+        """The name of an element or bit of a field, or its number."""
+        names = self.labels.get(field, ())
+        return names[index] if index < len(names) else f"{field} {index}"
+
     @cached_property
     def stretches(self) -> tuple[Stretch, ...]:
         """The phases in the order in which they were gone through; one without phases."""
@@ -127,58 +145,91 @@ class OneSolve:
         starts = [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist()]
         ends = [*(start - 1 for start in starts[1:]), count - 1]
         return tuple(
-            Stretch(label_of(self.labels, "phase", int(codes[first])), first, last)
+            Stretch(label_of(self.labels.get("phase", ()), int(codes[first])), first, last)
             for first, last in zip(starts, ends, strict=True)
         )
 
 
-def one_solve(log: LogFile, solve_id: int | None = None, method: str | None = None) -> OneSolve:
+def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> OneSolve:
     """Take one solve out of a log.
 
     Args:
         log: The log.
-        solve_id: Its number; may be left out if the log holds one solve only.
-        method: Its method; may be left out if the log holds one method only.
+        solve: Its number; may be left out if the log holds one solve only.
+        method: Its method; may be left out if only one has a solve of that number.
 
     Raises:
         UnknownNameError: There is no such solve, or it is not said which of several.
         LogError: The log is damaged.
     """
-    candidates = [
-        each for each in log.solves(method) if solve_id is None or each.solve_id == solve_id
-    ]
-    summary = candidates[0]
-    iterations = log.iterations(summary.method, summary.solve_id)
+    table = log.solves(solve=solve, method=method)
+    found = [part for part in table.parts if len(part)]
+    if len(table) != 1:
+        asked = "a solve" if solve is None else f"solve {solve}"
+        asked += "" if method is None else f" of {method}"
+        held = ", ".join(
+            f"{part.method} {_range(part.solve_id)}" for part in found or log.solves().parts
+        )
+        problem = f"no {asked}" if not found else f"which one? There are several of {asked}"
+        raise UnknownNameError(f"{problem}; the log holds: {held or 'nothing'}")
+    (part,) = found
+    row, number = part.rows[0], int(part.solve_id[0])
+    record = next(Table("solve", (part,)).records())
+    iterations = log.iterations(method=part.method, solve=number).part
+    events = log.events(method=part.method, solve=number)
     return OneSolve(
-        method=summary.method,
-        robot=summary.robot,
-        solve_id=summary.solve_id,
-        started=summary.started,
-        time=summary.time,
-        status=summary.status,
-        success=summary.success,
-        restarts=summary.restarts,
-        iterations=summary.iterations,
-        fingers=summary.fingers,
-        position_error=summary.position_error,
-        angle_error=summary.angle_error,
-        ok=summary.ok,
-        target_points=summary.target_points,
-        target_normals=summary.target_normals,
-        layout=iterations.layout,
+        method=part.method,
+        robot=log.metadata["robot"],
+        solve_id=number,
+        started=round(float(row["started"]) * 1e9),
+        time=float(row["time"]),
+        status=record["status"],
+        success=bool(row["success"]),
+        restarts=int(row["restarts"]),
+        iterations=int(row["iterations"]),
+        fingers=tuple(part.labels["position_error"]),
+        position_error=row["position_error"],
+        angle_error=row["angle_error"],
+        ok=row["ok"].astype(bool),
+        target_points=row["target_points"],
+        target_normals=row["target_normals"],
+        layout=_layout(iterations),
         labels=iterations.labels,
         rows=iterations.rows,
-        events=tuple(
-            Happening(
-                e.event.iteration,
-                e.event.kind.name,
-                e.event.subject if e.event.kind.name == "NEAR_SINGULAR" else "",
-                (e.event.subject,) if "LIMIT" in e.event.kind.name else (),
-                "",
-                e.event.value,
-                e.event.threshold,
-            )
-            for e in log.events(summary.method, summary.solve_id)
-        ),
+        events=tuple(map(happening, events.records())) if len(events) else (),
         parameters=log.metadata.get("parameters", {}),
+    )
+
+
+def _range(numbers: NDArray[np.int64]) -> str:
+    first, last = int(numbers.min()), int(numbers.max())
+    return f"solve {first}" if first == last else f"solves {first} to {last}"
+
+
+def _layout(part: Part) -> Layout:
+    """The layout of the rows, which must be numbers only."""
+    described = part.rows.dtype
+    return Layout(
+        tuple(
+            Field(
+                name,
+                described[name].shape,
+                described[name].base.str[1:],
+                part.units.get(name, ""),
+            )
+            for name in described.names or ()
+        )
+    )
+
+
+def happening(record: Mapping[str, Any]) -> Happening:
+    """An event as `Table.records` gives it."""
+    return Happening(
+        iteration=record["iteration"],
+        kind=record["kind"],
+        jacobian=record["subject"] if record["kind"] in SINGULAR_KINDS else "",
+        joints=tuple(record["joint_mask"]),
+        phase=record["phase"],
+        value=record["value"],
+        threshold=record["threshold"],
     )

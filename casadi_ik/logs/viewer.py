@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 from functools import cache
 from pathlib import Path
 
@@ -31,7 +32,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import LogError, MissingExtraError
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs import schema
-from casadi_ik.logs.cdr import HEADER, Codec
+from casadi_ik.logs.message import CDR_HEADER
 from casadi_ik.logs.one_solve import OneSolve
 from casadi_ik.logs.phrases import SERIOUS, errors, told
 from casadi_ik.symbolic.so3 import quaternion_from_matrix
@@ -69,17 +70,6 @@ int32 sec
 uint32 nanosec
 """,
 )
-
-JOINT_STATE_FLAT = """\
-int32 sec
-uint32 nanosec
-string frame_id
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-"""
-"""The same bytes: in CDR a message inside another is but its fields."""
 
 Color = tuple[float, float, float]
 TARGET, MET, MISSED = (0.94, 0.71, 0.0), (0.12, 0.62, 0.33), (0.84, 0.18, 0.24)
@@ -157,7 +147,7 @@ class _View:
 
     def write(self) -> None:
         """All topics, each in its order; a reader sorts by time."""
-        self._once("/robot_description", STRING, {"data": self.robot.urdf()})
+        self._add(self._ros("/robot_description", STRING), 0, _cdr(self.robot.urdf()))
         self._targets()
         self._transforms()
         self._joint_states()
@@ -177,9 +167,6 @@ class _View:
     def _add(self, channel: int, i: int, data: bytes) -> None:
         time = int(self.times[i])
         self.writer.add_message(channel, time, data, time, sequence=i)
-
-    def _once(self, topic: str, definition: tuple[str, str], values: dict[str, str]) -> None:
-        self._add(self._ros(topic, definition), 0, Codec(definition[1]).encode(values))
 
     def _transforms(self) -> None:
         description, links = self.robot.description, self.robot.links(self.q)
@@ -213,19 +200,11 @@ class _View:
     def _joint_states(self) -> None:
         joints = self.robot.joints(self.q)
         positions = np.stack([np.atleast_1d(values) for values in joints.values()], axis=1)
-        channel, codec = self._ros("/joint_states", JOINT_STATE), Codec(JOINT_STATE_FLAT)
+        channel = self._ros("/joint_states", JOINT_STATE)
+        none = np.zeros(0)
         for i, time in enumerate(self.times.tolist()):
-            seconds, rest = divmod(time, 1_000_000_000)
-            values = {
-                "sec": seconds,
-                "nanosec": rest,
-                "frame_id": self.root,
-                "name": list(joints),
-                "position": positions[i],
-                "velocity": [],
-                "effort": [],
-            }
-            self._add(channel, i, codec.encode(values))
+            state = _cdr(_stamp(time), self.root, list(joints), positions[i], none, none)
+            self._add(channel, i, state)
 
     def _targets(self) -> None:
         solve = self.solve
@@ -272,11 +251,11 @@ class _View:
 
     def _iterations(self) -> None:
         solve = self.solve
-        name = schema.iteration_name(solve.method, solve.layout, len(solve.fingers))
-        text = schema.iteration_schema(solve.layout, solve.labels)
+        name = schema.schema_name("iteration", solve.method, solve.layout, len(solve.fingers))
+        text = schema.schema_text(solve.layout, solve.labels)
         channel = self._ros("/ik/iteration", (name, text))
         for i, row in enumerate(solve.rows):
-            self._add(channel, i, HEADER + row.tobytes())
+            self._add(channel, i, CDR_HEADER + row.tobytes())
 
     def _messages(self) -> None:
         solve, last = self.solve, len(self.q) - 1
@@ -313,6 +292,25 @@ def _inverse(pose: Array) -> Array:
     result[:, :3, 3] = -(turned @ pose[:, :3, 3, None])[..., 0]
     result[:, 3, 3] = 1.0
     return result
+
+
+def _cdr(*values: str | list[str] | Array | fox.Timestamp) -> bytes:
+    """A ROS 2 message of texts, lists of them, sequences of float64, and times."""
+    out = bytearray()
+    for value in values:
+        if isinstance(value, fox.Timestamp):
+            out += struct.pack("<iI", value.sec, value.nsec)
+        elif isinstance(value, np.ndarray):
+            out += bytes(-len(out) % 4) + struct.pack("<I", len(value))
+            if len(value):
+                out += bytes(-len(out) % 8) + value.astype("<f8").tobytes()
+        else:
+            if isinstance(value, list):
+                out += bytes(-len(out) % 4) + struct.pack("<I", len(value))
+            for text in [value] if isinstance(value, str) else value:
+                data = text.encode() + b"\0"
+                out += bytes(-len(out) % 4) + struct.pack("<I", len(data)) + data
+    return CDR_HEADER + bytes(out)
 
 
 def _stamp(time: int) -> fox.Timestamp:

@@ -16,7 +16,6 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import LogError
 from casadi_ik.files.shipped import models_folder
 from casadi_ik.files.writing import written_whole
-from casadi_ik.logs.columns import name_of
 from casadi_ik.logs.one_solve import OneSolve
 
 COLORS = ("#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6", "#c2334d", "#0f8b8d")
@@ -73,9 +72,8 @@ def _lines(solve: OneSolve, name: str) -> list[Line]:
         return []
     if not fields[name].shape:
         return [(f"/ik/iteration.{name}", name.removeprefix("sigma_"))]
-    labels = solve.labels.get(name, ())
     return [
-        (f"/ik/iteration.{name}[{i}]", name_of(labels, i, name)) for i in range(fields[name].size)
+        (f"/ik/iteration.{name}[{i}]", solve.name_of(name, i)) for i in range(fields[name].size)
     ]
 
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.logs.columns import bits_of, columns, name_of
 from casadi_ik.logs.one_solve import OneSolve, Stretch
 from casadi_ik.logs.phrases import errors, listed, number, plain_name
 
@@ -95,11 +94,10 @@ def errors_of(solve: OneSolve) -> tuple[Array, Array]:
 
     A row in which they were not measured (NaN) has those of the row before.
     """
-    return _filled(solve.rows["position_error"]), _filled(solve.rows["angle_error"])
+    return _filled(solve.columns("position_error")), _filled(solve.columns("angle_error"))
 
 
-def _filled(values: Array) -> Array:
-    matrix = columns(values)
+def _filled(matrix: Array) -> Array:
     rows = np.arange(len(matrix))[:, None]
     last = np.maximum.accumulate(np.where(np.isnan(matrix), 0, rows), axis=0)
     return np.take_along_axis(matrix, last, axis=0)
@@ -107,7 +105,7 @@ def _filled(values: Array) -> Array:
 
 def _phases(solve: OneSolve) -> Iterator[str]:
     position, angle = errors_of(solve)
-    seen: NDArray[np.bool_] = np.any(~np.isnan(columns(solve.rows["position_error"])), axis=1)
+    seen: NDArray[np.bool_] = np.any(~np.isnan(solve.columns("position_error")), axis=1)
     for name, stretches in _by_phase(solve).items():
         first, last = stretches[0].first, stretches[-1].last
         count = sum(map(len, stretches))
@@ -223,10 +221,9 @@ def held(solve: OneSolve) -> dict[str, int]:
     """Actuators that stand at a limit in the last row, and since which row."""
     if len(solve.rows) == 0 or "limit_mask" not in solve.layout.names:
         return {}
-    names = solve.labels.get("limit_mask") or solve.labels.get("q", ())
-    bits = bits_of(solve.rows["limit_mask"])
+    bits = solve.bits("limit_mask")
     return {
-        name_of(names, bit, "actuator"): _entered(bits[:, bit])
+        solve.name_of("limit_mask", bit): _entered(bits[:, bit])
         for bit in np.flatnonzero(bits[-1]).tolist()
     }
 
@@ -269,7 +266,7 @@ def _at_the_end(solve: OneSolve) -> Iterator[str]:
         event.jacobian: event.threshold for event in solve.events if event.kind == "NEAR_SINGULAR"
     }
     for jacobian, threshold in singular.items():
-        sigma = columns(solve.rows[f"sigma_{jacobian}"])[last]
+        sigma = solve.columns(f"sigma_{jacobian}")[last]
         if np.any(sigma < threshold):
             yield f"at its end the {plain_name(jacobian)} is near singular"
     at_limit = held(solve)

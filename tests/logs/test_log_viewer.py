@@ -27,7 +27,7 @@ def solve(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> OneSol
     path = tmp_path_factory.mktemp("log") / "mug.mcap"
     solver = ik.Solver(robot, method="enhanced-dls", finger_step="closed-form")
     solver.solve(ik.load_grasp("mug"), log=path)
-    return one_solve(ik.logs.open_log(path))
+    return one_solve(ik.logs.open(path))
 
 
 @pytest.fixture(scope="module")
