@@ -62,7 +62,7 @@ def plot(arguments: argparse.Namespace) -> Answer:
             log.iterations(**chosen),
             out,
             events=log.events(**chosen),
-            tolerance=solve.tolerance,
+            tolerance=min(solve.tolerances, key=lambda each: each.position),
             title=f"{solve.method} · solve {solve.solve_id} · {solve.iterations} iterations"
             f" · {solve.status}",
         )

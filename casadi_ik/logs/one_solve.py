@@ -118,9 +118,20 @@ class OneSolve:
     parameters: Mapping[str, Any]
 
     @cached_property
-    def tolerance(self) -> Tolerance:
-        """What counted as reached."""
-        return Tolerance(**self.parameters.get("tolerance", {}))
+    def tolerances(self) -> tuple[Tolerance, ...]:
+        """What counted as reached, by finger; a contact's own tolerance is not in the log."""
+        known = self.parameters.get("tolerance", {})
+        return tuple(Tolerance(**known.get(finger, {})) for finger in self.fingers)
+
+    @property
+    def position_tolerance(self) -> Array:
+        """(f,) [m]."""
+        return np.array([each.position for each in self.tolerances])
+
+    @property
+    def angle_tolerance(self) -> Array:
+        """(f,) [rad]."""
+        return np.array([each.angle for each in self.tolerances])
 
     def columns(self, name: str) -> Array:
         """A field of all rows as a matrix, (k, size)."""

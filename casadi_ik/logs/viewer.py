@@ -218,11 +218,11 @@ class _View:
         self._add(channel, 0, self._scene(0, contacts, thickness=0.008))
 
     def _contacts(self) -> None:
-        solve, tolerance = self.solve, self.solve.tolerance
+        solve = self.solve
         points, normals = self.robot.contacts(self.q)
         turned = _quaternions(_along(normals.reshape(-1, 3))).reshape(*normals.shape[:2], 4)
-        missed = (solve.rows["position_error"] > tolerance.position) | (
-            solve.rows["angle_error"] > tolerance.angle
+        missed = (solve.rows["position_error"] > solve.position_tolerance) | (
+            solve.rows["angle_error"] > solve.angle_tolerance
         )
         channel = self._protobuf("/ik/contacts", fox.SceneUpdate.get_schema())
         for i in range(len(self.q)):

@@ -74,18 +74,16 @@ def within(solve: OneSolve) -> NDArray[np.bool_]:
     What is free always is; what was not yet measured is not.
     """
     position, angle = errors_of(solve)
-    tolerance = solve.tolerance
-    near = (position <= tolerance.position) | np.isnan(solve.position_error)
-    return near & ((angle <= tolerance.angle) | np.isnan(solve.angle_error))
+    near = (position <= solve.position_tolerance) | np.isnan(solve.position_error)
+    return near & ((angle <= solve.angle_tolerance) | np.isnan(solve.angle_error))
 
 
 def worst(solve: OneSolve) -> Array:
     """Error of the worst finger in multiples of its tolerance, (k,)."""
     position, angle = errors_of(solve)
-    tolerance = solve.tolerance
     return np.fmax(
-        np.nanmax(position, axis=1, initial=0.0) / tolerance.position,
-        np.nanmax(angle, axis=1, initial=0.0) / tolerance.angle,
+        np.nanmax(position / solve.position_tolerance, axis=1, initial=0.0),
+        np.nanmax(angle / solve.angle_tolerance, axis=1, initial=0.0),
     )
 
 
@@ -146,8 +144,8 @@ def _short(position: float, angle: float) -> str:
 def _fingers(solve: OneSolve) -> Iterator[str]:
     """Who lagged: on failure every finger that is out, otherwise the last one to come in."""
     inside, (position, angle) = within(solve), errors_of(solve)
-    tolerance = solve.tolerance
     for i in np.flatnonzero(~solve.ok).tolist():
+        tolerance = solve.tolerances[i]
         share = np.fmax(position[:, i] / tolerance.position, angle[:, i] / tolerance.angle)
         best = int(np.nanargmin(share))
         line = (
@@ -243,15 +241,14 @@ def _standstills(solve: OneSolve) -> Iterator[str]:
 
 
 def _verdict(solve: OneSolve) -> Iterator[str]:
-    tolerance = solve.tolerance
     for i, finger in enumerate(solve.fingers):
-        missed = []
+        tolerance, missed = solve.tolerances[i], []
         if solve.position_error[i] > tolerance.position:
             missed.append(f"its point by {1e3 * solve.position_error[i]:.2f} mm")
         if solve.angle_error[i] > tolerance.angle:
             missed.append(f"its normal by {math.degrees(solve.angle_error[i]):.2f} deg")
-        if missed:
-            yield f"{finger} misses {' and '.join(missed)}"
+        if not solve.ok[i]:
+            yield f"{finger} misses {' and '.join(missed) or 'a tolerance of its own'}"
     if solve.ok.all():
         good = "every contact is within tolerance"
         yield good if solve.success else f"{good}, but a limit is violated"

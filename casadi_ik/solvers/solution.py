@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.grasps import Tolerance
 from casadi_ik.solvers.contact_verdict import ContactVerdict
 from casadi_ik.solvers.diagnosis import Diagnosis
 from casadi_ik.solvers.problem import Array
@@ -66,6 +68,7 @@ class BatchSolution:
         ok: (k, f) bool.
         limits_ok: (k,) bool.
         phases: (k,) iterations by phase name.
+        tolerances: When a contact counted as reached, by finger.
         diagnoses: Why each target is not solved (None if it is); empty if not asked for.
     """
 
@@ -80,10 +83,26 @@ class BatchSolution:
     ok: NDArray[np.bool_]
     limits_ok: NDArray[np.bool_]
     phases: Mapping[str, NDArray[np.int64]]
+    tolerances: tuple[Tolerance, ...]
     diagnoses: tuple[Diagnosis | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @classmethod
+    def joined(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
+        """One batch after the other, at least one."""
+        first = parts[0]
+        arrays = {
+            item.name: np.concatenate([getattr(part, item.name) for part in parts])
+            for item in fields(cls)
+            if isinstance(getattr(first, item.name), np.ndarray)
+        }
+        phases = {
+            name: np.concatenate([part.phases[name] for part in parts]) for name in first.phases
+        }
+        diagnoses = tuple(chain.from_iterable(part.diagnoses for part in parts))
+        return replace(first, **arrays, phases=phases, diagnoses=diagnoses)
 
     @property
     def status_names(self) -> NDArray[np.str_]:
@@ -104,6 +123,7 @@ class BatchSolution:
                 float(self.position_error[row, i]),
                 float(self.angle_error[row, i]),
                 bool(self.ok[row, i]),
+                self.tolerances[i],
             )
             for i, name in enumerate(fingers)
         }

@@ -65,7 +65,9 @@ def make_one(rows: np.ndarray[Any, np.dtype[Any]], **changes: Any) -> OneSolve:
         "labels": LABELS,
         "rows": rows,
         "events": (),
-        "parameters": {"tolerance": {"position": 5e-3, "angle": float(np.deg2rad(3))}},
+        "parameters": {
+            "tolerance": {f: {"position": 5e-3, "angle": float(np.deg2rad(3))} for f in FINGERS}
+        },
     }
     return OneSolve(**(values | changes))
 

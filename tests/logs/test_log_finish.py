@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_solves import make_solve
+from made_up_solves import make_block
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
@@ -106,7 +106,7 @@ def test_every_chunk_that_was_written_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_finished_log_is_a_log(write: Write) -> None:
-    path = write(make_solve(0), make_solve(1))
+    path = write(make_block(50, 50))
     data, messages = path.read_bytes(), read_messages(path)
     assert not finish_log(path).changed
     assert path.read_bytes() == data

@@ -96,9 +96,8 @@ def test_contacts_turn_green_when_they_are_reached(decoded: Decoded, solve: OneS
         return [entity.arrows[0].color.g > 0.5 for entity in message.entities]
 
     contacts = [green(message) for _, message in decoded.topics["/ik/contacts"]]
-    tolerance = solve.tolerance
-    reached = (solve.rows["position_error"] <= tolerance.position) & (
-        solve.rows["angle_error"] <= tolerance.angle
+    reached = (solve.rows["position_error"] <= solve.position_tolerance) & (
+        solve.rows["angle_error"] <= solve.angle_tolerance
     )
     np.testing.assert_array_equal(contacts, reached)
     assert contacts[-1] == [True, True, True]
