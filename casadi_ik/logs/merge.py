@@ -213,8 +213,8 @@ def _unite(
         known = joint.setdefault(number, record)
         if known != record:
             raise LogError(
-                f"{shard.path}: {type(record).__name__.lower()} {number}, {_name(record)}, is not as"
-                f" in {first.path} ({_name(known)})"
+                f"{shard.path}: {type(record).__name__.lower()} {number}, {_name(record)}, is not"
+                f" as in {first.path} ({_name(known)})"
             )
 
 

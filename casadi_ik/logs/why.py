@@ -19,6 +19,9 @@ from casadi_ik.logs.phrases import errors, listed, number, plain_name
 STRETCHES_SHOWN = 6
 """More stretches than this are told phase by phase."""
 
+DIP = 0.1
+"""A smallest singular value below this share of its median is worth a line."""
+
 STILL_FALLING = 0.05
 """Share by which the worst error has to fall over the last tenth to count as still falling."""
 
@@ -79,12 +82,14 @@ def within(solve: OneSolve) -> NDArray[np.bool_]:
 
 
 def worst(solve: OneSolve) -> Array:
-    """Error of the worst finger in multiples of its tolerance, (k,)."""
+    """Error of the worst finger in multiples of its tolerance, (k,); inf if not yet measured."""
     position, angle = errors_of(solve)
-    return np.fmax(
+    share = np.fmax(
         np.nanmax(position / solve.position_tolerance, axis=1, initial=0.0),
         np.nanmax(angle / solve.angle_tolerance, axis=1, initial=0.0),
     )
+    share[np.isnan(np.hstack([position, angle])).all(axis=1)] = np.inf
+    return share
 
 
 def errors_of(solve: OneSolve) -> tuple[Array, Array]:
@@ -201,6 +206,17 @@ def _singularities(solve: OneSolve) -> Iterator[str]:
         if len(iterations) > 1:
             line += f", entered {len(iterations)} times"
         yield line
+    for name in solve.layout.names:
+        jacobian = name.removeprefix("sigma_")
+        if jacobian == name or jacobian in entries or np.isnan(sigma := solve.columns(name)).all():
+            continue
+        lowest, usual = float(np.nanmin(sigma)), float(np.nanmedian(sigma))
+        if lowest < DIP * usual:
+            row = int(np.nanargmin(np.fmin.reduce(sigma, axis=1)))
+            yield (
+                f"smallest singular value of the {plain_name(jacobian)} down to {number(lowest)} in"
+                f" iteration {row} (median {number(usual)})"
+            )
 
 
 def _limits(solve: OneSolve) -> Iterator[str]:

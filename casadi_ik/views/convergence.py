@@ -32,7 +32,7 @@ FIELDS = {
     "angle_error": ("angle to the normal [deg]", float(np.rad2deg(1.0)), 1e-6),
     "cost": ("cost", 1.0, 1e-16),
     "step_size": ("largest motor change [rad or m]", 1.0, 1e-10),
-    "damping": ("damping", 1.0, 1e-16),
+    "damping": ("damping", 1.0, 1e-8),
 }
 """What is drawn if the method records it: label, factor to the unit drawn, and the value below
 which nothing is told apart (zero, above all, would need all the height of a logarithm)."""

@@ -66,6 +66,19 @@ def test_a_singularity_is_told_with_its_depth_and_time() -> None:
     assert not any("near singular" in line for line in found.verdict)
 
 
+def test_a_dip_without_a_threshold_is_told_against_the_median() -> None:
+    rows = make_rows()
+    rows["sigma_closed_chain"][:20] = np.nan
+    rows["sigma_closed_chain"][33] = 0.004
+    assert explain(make_one(rows)).met == (
+        "smallest singular value of the closed chain down to 0.004 in iteration 33 (median 0.5)",
+    )
+    rows["sigma_closed_chain"][33] = 0.06
+    assert explain(make_one(rows)).met == ()
+    rows["sigma_closed_chain"] = np.nan
+    assert explain(make_one(rows)).met == ()
+
+
 def test_a_finger_that_was_there_and_left() -> None:
     rows = make_rows()
     rows["position_error"], rows["angle_error"] = 0.001, 0.0
