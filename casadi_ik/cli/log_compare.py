@@ -48,7 +48,7 @@ def _methods(opened: list[logs.Log], asked: list[str] | None) -> tuple[str, str]
         return asked[0], asked[1]
     if len(held) != 2:
         raise InputError(
-            f"the logs hold {len(held)} methods ({', '.join(held)}), expected two; say --methods"
+            f"the logs hold {', '.join(held) or 'no method'}, expected two methods (say --methods)"
         )
     return held[0], held[1]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rich.console import Group
+from rich.console import Group, RenderableType
+from rich.text import Text
 
 from casadi_ik import logs
 from casadi_ik.arm_hand import load_robot
@@ -14,7 +15,7 @@ from casadi_ik.cli.log import filters, size
 from casadi_ik.cli.log_solve import the_solve
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import located
-from casadi_ik.cli.report import fields, files, table
+from casadi_ik.cli.report import fields, files
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
 from casadi_ik.logs.finish import finish_log
 from casadi_ik.logs.merge import merge_logs
@@ -69,12 +70,13 @@ def finish(arguments: argparse.Namespace) -> Answer:
     Raises:
         LogError: A file is missing, no MCAP file, or damaged elsewhere than at its end.
     """
-    rows = table("log", "what was done", "chunks", "messages", right=("chunks", "messages"))
+    parts: list[RenderableType] = []
     for name in arguments.files:
         done = finish_log(name)
         text = f"finished, {size(done.cut)} of a torn tail cut" if done.changed else "whole already"
-        rows.add_row(name, text, str(done.chunks), str(done.messages))
-    return Answer(rows)
+        about = {"done": text, "holds": f"{done.chunks} chunks, {done.messages} messages"}
+        parts += [Text(name, "bold", no_wrap=True, overflow="ignore"), fields(about)]
+    return Answer(Group(*parts))
 
 
 def merge(arguments: argparse.Namespace) -> Answer:

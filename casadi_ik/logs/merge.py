@@ -9,10 +9,10 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -141,10 +141,10 @@ def _joint_metadata(shards: Sequence[_Shard]) -> dict[str, str]:
     first = shards[0]
     for shard in shards[1:]:
         for key in sorted({*first.metadata, *shard.metadata} - {*VARYING, CHECKSUM}):
-            found, expected = shard.metadata.get(key), first.metadata.get(key)
+            place, found, expected = _difference(key, shard.metadata, first.metadata)
             if found != expected:
                 raise LogError(
-                    f"{shard.path}: {key}: found {found}, expected {expected} as in {first.path}"
+                    f"{shard.path}: {place}: found {found}, expected {expected} as in {first.path}"
                 )
     origins = [
         {"file": shard.path.name}
@@ -153,6 +153,27 @@ def _joint_metadata(shards: Sequence[_Shard]) -> dict[str, str]:
     ]
     record = {**first.metadata, "shards": json.dumps(origins)}
     return {**record, CHECKSUM: checksum(record)}
+
+
+def _difference(
+    key: str, found: Mapping[str, Any], expected: Mapping[str, Any]
+) -> tuple[str, Any, Any]:
+    """The first place under a key where two records differ, and what is there."""
+    first, second = _parsed(found.get(key)), _parsed(expected.get(key))
+    if isinstance(first, dict) and isinstance(second, dict):
+        for name in sorted({*first, *second}):
+            if first.get(name) != second.get(name):
+                place, *rest = _difference(name, first, second)
+                return f"{key}.{place}", rest[0], rest[1]
+    return key, first, second
+
+
+def _parsed(value: Any) -> Any:
+    """JSON as what it says; anything else as it is."""
+    if isinstance(value, str):
+        with suppress(ValueError):
+            return json.loads(value)
+    return value
 
 
 def _joint_solves(shards: Sequence[_Shard], clock: LogClock) -> dict[str, int]:

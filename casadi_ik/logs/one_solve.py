@@ -176,12 +176,12 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
     table = log.solves(solve=solve, method=method)
     found = [part for part in table.parts if len(part)]
     if len(table) != 1:
-        asked = "a solve" if solve is None else f"solve {solve}"
-        asked += "" if method is None else f" of {method}"
         held = ", ".join(
             f"{part.method} {_range(part.solve_id)}" for part in found or log.solves().parts
         )
-        problem = f"no {asked}" if not found else f"which one? There are several of {asked}"
+        problem = f"no solve {solve}" if solve is not None else "no solve"
+        if found:
+            problem = "which solve?" if solve is None else f"solve {solve} of which method?"
         raise UnknownNameError(f"{problem}; the log holds: {held or 'nothing'}")
     (part,) = found
     row, number = part.rows[0], int(part.solve_id[0])

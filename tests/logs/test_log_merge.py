@@ -118,6 +118,9 @@ def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> Non
     cases = {
         f"t0_ns: found {T0 + 10**9}, expected {T0}": write(one(1), name="late.mcap", clock=clock),
         "robot: found ar10, expected made_up": write(one(1), name="robot.mcap", robot_name="ar10"),
+        "parameters.damping: found 0.2, expected None as in": write(
+            one(1), name="parameters.mcap", parameters={"damping": 0.2}
+        ),
         "seed: found 5, expected 0": write(one(1), name="seed.mcap", seed=5),
         "channel 1, /ik/hand-first/iteration, is not as": write(
             one(1, "hand-first"), name="method.mcap", urdf="<robot/>"
