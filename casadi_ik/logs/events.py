@@ -20,7 +20,6 @@ Fields that a layout does not have give no events. All solves of a block are loo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.logs.event_kinds import EventKind, event_format, mask_words
 from casadi_ik.logs.event_rules import EventRules
 from casadi_ik.logs.limit_events import limit_changes
+from casadi_ik.logs.message import octets_of
 from casadi_ik.logs.singular_events import jacobians, near_singular, nearest_singular
 from casadi_ik.logs.standstill import oscillations, stalls
 from casadi_ik.logs.traces import Bools, Rows, Traces, bits_of, words_of
@@ -111,20 +111,16 @@ def _mask_changes(traces: Traces, name: str) -> tuple[Bools, Bools]:
     return bits, before
 
 
-@dataclass(eq=False)
 class _Collected:
     """Events as they are found, in any order."""
 
-    traces: Traces
-
-    def __post_init__(self) -> None:
-        self._form = event_format(self.traces.form)
-        self._parts = [np.zeros(0, self._dtype)]
-        self.bits = 32 * mask_words(self.traces.form)
-
-    @property
-    def _dtype(self) -> np.dtype[Any]:
-        return np.dtype([("row", np.intp), ("event", self._form.layout.dtype)])
+    def __init__(self, traces: Traces) -> None:
+        self._traces = traces
+        self._form = event_format(traces.form)
+        self._dtype = self._form.layout.dtype
+        self._rows = [np.zeros(0, np.intp)]
+        self._events = [np.zeros(0, self._dtype)]
+        self.bits = 32 * mask_words(traces.form)
 
     def mask(self, joints: tuple[str, ...]) -> Bools:
         """(bits,) which actuators these are."""
@@ -145,25 +141,25 @@ class _Collected:
         """Take events: their rows (e,), and the rest as numbers or (e,), the joints (e, n)."""
         if not len(row):
             return
-        part = np.zeros(len(row), self._dtype)
-        part["row"] = row
-        event = part["event"]
-        event["kind"], event["value"], event["threshold"] = kind, value, threshold
-        event["jacobian"] = jacobian
+        events = np.zeros(len(row), self._dtype)
+        events["kind"], events["value"], events["threshold"] = kind, value, threshold
+        events["jacobian"] = jacobian
         if joints is not None:
             padded = np.zeros((len(row), self.bits), dtype=bool)
             padded[:, : joints.shape[1]] = joints
-            event["joint_mask"] = words_of(padded).reshape(event["joint_mask"].shape)
-        self._parts.append(part)
+            events["joint_mask"] = words_of(padded).reshape(events["joint_mask"].shape)
+        self._rows.append(row)
+        self._events.append(events)
 
     def sorted(self) -> NDArray[Any]:
         """The events by row and kind, their solve, iteration and phase filled in."""
-        found = np.concatenate(self._parts)
-        found = found[np.lexsort((found["event"]["kind"], found["row"]))]
-        row, events = found["row"], np.ascontiguousarray(found["event"])
-        solve = self.traces.solve[row]
+        row, octets = np.concatenate(self._rows), np.concatenate(list(map(octets_of, self._events)))
+        kind = np.concatenate([events["kind"] for events in self._events])
+        order = np.argsort(row * len(EventKind) + kind, kind="stable")
+        row, events = row[order], octets[order].view(self._dtype)[:, 0]
+        solve = self._traces.solve[row]
         events["solve_id"] = solve
-        events["iteration"] = row - self.traces.starts[solve]
-        if "phase" in self.traces.names:
-            events["phase"] = self.traces.matrix("phase")[row, 0]
+        events["iteration"] = row - self._traces.starts[solve]
+        if "phase" in self._traces.names:
+            events["phase"] = self._traces.matrix("phase")[row, 0]
         return events

@@ -40,19 +40,21 @@ def limit_changes(traces: Traces, slack: float) -> Iterator[tuple[EventKind, Lim
     before = np.concatenate([np.zeros_like(mask[:1]), mask[:-1]])
     before[traces.first] = 0
     changed = np.flatnonzero((mask != before).any(axis=1))
-    bits, bits_before = bits_of(mask[changed]), bits_of(before[changed])
-    hit, left = _places(changed, bits & ~bits_before, 0), _places(changed, bits_before & ~bits, 1)
-    flickers = (
-        np.abs(_q(traces, left[:, 0], left[:, 1]) - _q(traces, left[:, 2], left[:, 1])) <= slack
-    )
+    bits_now, bits_before = bits_of(mask[changed]), bits_of(before[changed])
+    hit = _places(changed, bits_now & ~bits_before, 0)
+    left = _places(changed, bits_before & ~bits_now, 1)
+    gone = _q(traces, left[:, 2], left[:, 1]) - _q(traces, left[:, 0], left[:, 1])
+    flickers = np.abs(gone) <= slack
     if flickers.any():
-        key = traces.solve[left[:, 0]] * bits.shape[1] + left[:, 1]
-        unsure = np.unique(key[flickers])
-        hit = hit[~np.isin(traces.solve[hit[:, 0]] * bits.shape[1] + hit[:, 1], unsure)]
-        left = left[~np.isin(key, unsure)]
-        followed = [_follow(traces, *divmod(int(pair), bits.shape[1]), slack) for pair in unsure]
-        hit = np.concatenate([hit, *(hits for hits, _ in followed)])
-        left = np.concatenate([left, *(lefts for _, lefts in followed)])
+        bits = bits_now.shape[1]
+        of_hit, of_left = (
+            traces.solve[places[:, 0]] * bits + places[:, 1] for places in (hit, left)
+        )
+        unsure = np.zeros(len(traces.counts) * bits, dtype=bool)
+        unsure[of_left[flickers]] = True
+        hits, lefts = _follow(traces, *np.divmod(np.flatnonzero(unsure), bits), slack)
+        hit = np.concatenate([hit[~unsure[of_hit]], hits])
+        left = np.concatenate([left[~unsure[of_left]], lefts])
     for kind, places in ((EventKind.LIMIT_HIT, hit), (EventKind.LIMIT_LEFT, left)):
         row, bit, last = places.T
         yield kind, LimitChanges(row, bit, _q(traces, row, bit), _q(traces, last, bit))
@@ -65,18 +67,29 @@ def _places(changed: Rows, bits: Bools, back: int) -> Rows:
     return np.stack([row, bit, row - back], axis=1)
 
 
-def _follow(traces: Traces, solve: int, bit: int, slack: float) -> tuple[Rows, Rows]:
-    """Hits and leavings (e, 3) of a coordinate whose bit flickers, through a whole solve."""
-    start = int(traces.starts[solve])
-    rows = np.arange(start, start + int(traces.counts[solve]))
-    word, shift = divmod(bit, 32)
-    on = (traces.matrix("limit_mask")[rows, word] >> np.uint32(shift)) & np.uint32(1) > 0
-    last = np.maximum.accumulate(np.where(on, rows, start))
-    bits = np.full(len(rows), bit)
-    away = ~on & ~(np.abs(_q(traces, rows, bits) - _q(traces, last, bits)) <= slack)
+def _follow(traces: Traces, solve: Rows, bit: Rows, slack: float) -> tuple[Rows, Rows]:
+    """Hits and leavings (e, 3) of coordinates whose bits flicker, through their whole solves.
+
+    Args:
+        traces: All solves.
+        solve: (p,) the solves.
+        bit: (p,) a coordinate for each.
+        slack: As in `limit_changes`.
+    """
+    counts = traces.counts[solve]
+    ends = np.cumsum(counts)
+    place = np.arange(ends[-1])
+    start = np.repeat(ends - counts, counts)
+    row = place - start + np.repeat(traces.starts[solve], counts)
+    bits = np.repeat(bit, counts)
+    words = traces.matrix("limit_mask")[row, bits // 32]
+    on = (words >> (bits % 32).astype(np.uint32)) & np.uint32(1) > 0
+    last = row[np.maximum.accumulate(np.where(on, place, start))]
+    away = ~on & ~(np.abs(_q(traces, row, bits) - _q(traces, last, bits)) <= slack)
     decided = np.flatnonzero(on | away)
     before = np.concatenate([[False], on[decided][:-1]])
-    places = np.stack([rows, bits, last], axis=1)
+    before &= np.concatenate([[-1], start[decided][:-1]]) == start[decided]
+    places = np.stack([row, bits, last], axis=1)
     return places[decided[on[decided] & ~before]], places[decided[~on[decided] & before]]
 
 

@@ -20,7 +20,7 @@ from casadi_ik.logs.table import Part, Table
 
 logger = logging.getLogger(__name__)
 
-Names = str | Iterable[str] | None
+Names = str | EventKind | Iterable[str | EventKind] | None
 Solves = int | Iterable[int] | None
 
 
@@ -311,7 +311,7 @@ class Log:
     def _methods(self, method: Names) -> tuple[str, ...]:
         if method is None:
             return self.methods
-        names = (method,) if isinstance(method, str) else tuple(method)
+        names = tuple(_names(method))
         for name in names:
             if name not in self.methods:
                 known = ", ".join(self.methods) or "none"
@@ -329,8 +329,7 @@ class Log:
         if values is None:
             return
         known = dict.fromkeys(label for part in parts for label in part.labels.get(field, ()))
-        for value in (values,) if isinstance(values, str) else values:
-            name = value.name if isinstance(value, EventKind) else value
+        for name in _names(values):
             if name not in known or not name:
                 raise UnknownNameError(
                     f"{self.shards[0].path}: no {what} {name!r}; there are: "
@@ -348,9 +347,12 @@ def _numbers(solve: Solves) -> NDArray[np.int64] | None:
 def _codes(part: Part, field: str, values: Names) -> list[int]:
     """The codes of names; of those the method does not know none."""
     labels = part.labels.get(field, ())
-    names = [values] if isinstance(values, str | EventKind) else list(values or ())
-    plain = [name.name if isinstance(name, EventKind) else name for name in names]
-    return [labels.index(name) for name in plain if name in labels]
+    return [labels.index(name) for name in _names(values) if name in labels]
+
+
+def _names(values: Names) -> list[str]:
+    several = [values] if isinstance(values, str | EventKind) else list(values or ())
+    return [value.name if isinstance(value, EventKind) else value for value in several]
 
 
 def _chosen(part: Part, keep: NDArray[np.bool_]) -> Part:

@@ -26,14 +26,14 @@ def stalls(traces: Traces, rules: EventRules) -> tuple[Rows, NDArray[np.float64]
     groups = _errors(traces) if len(traces) else []
     if not groups:
         return np.zeros(0, np.intp), np.zeros(0)
-    spread = np.zeros(len(traces) - window)
+    still, spread = _one_piece(traces, window), np.zeros(len(traces) - window)
     largest = np.zeros(len(traces) - window)
     for errors in groups:
         high, low = (over_window(errors, window + 1, top) for top in (True, False))
-        top = high.max(axis=1)
-        spread = np.maximum(spread, (high - low).max(axis=1) / np.where(top > 0, top, 1))
+        top = high.max(axis=0)
+        spread = np.maximum(spread, (high - low).max(axis=0) / np.where(top > 0, top, 1))
         largest = np.maximum(largest, top)
-    still = (spread <= rules.stall_change) & (largest > 0) & _one_piece(traces, window)
+    still &= (spread <= rules.stall_change) & (largest > 0)
     found = _begins(still)
     return number[found + window], spread[found].astype(float)
 
@@ -53,20 +53,20 @@ def oscillations(traces: Traces, rules: EventRules) -> tuple[Rows, NDArray[np.fl
     traces, number = _longer(traces, window)
     if "q" not in traces.names or not len(traces):
         return np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 0), dtype=bool)
-    steps = np.diff(traces.matrix("q"), axis=0)
-    sign = (steps > rules.oscillation_step).astype(np.int8)
-    sign -= steps < -rules.oscillation_step
-    turning = sign[1:] * sign[:-1] < 0
+    steps = np.diff(traces.columns("q"), axis=1)
+    up, down = steps > rules.oscillation_step, steps < -rules.oscillation_step
+    turning = (up[:, 1:] & down[:, :-1]) | (down[:, 1:] & up[:, :-1])
     swinging = over_window(turning, window - 1, largest=False)
-    caught = swinging.any(axis=1)
+    caught = np.logical_or.reduce(swinging, axis=0)
     if caught.any():
         caught &= _one_piece(traces, window)
         for errors in _errors(traces):
-            norm = np.linalg.norm(errors, axis=1)
+            norm = np.sqrt(np.einsum("ij,ij->j", errors, errors))
             caught &= norm[window:] >= (1 - rules.oscillation_progress) * norm[:-window]
     found = _begins(caught)
-    step = np.where(swinging[found], np.abs(steps[found + window - 1]), 0).max(axis=1)
-    return number[found + window], step, swinging[found]
+    joints = swinging[:, found].T
+    step = np.where(joints, np.abs(steps[:, found + window - 1]).T, 0).max(axis=1)
+    return number[found + window], step, joints
 
 
 def _longer(traces: Traces, window: int) -> tuple[Traces, Rows]:
@@ -84,18 +84,18 @@ def _begins(holds: Bools) -> Rows:
 
 
 def _errors(traces: Traces) -> list[NDArray[Any]]:
-    """What a solve brings down, one matrix per unit; a column that is never a number is zero."""
+    """What a solve brings down, (columns, m) per unit; a column that is never a number is zero."""
     names = ("cost",) if "cost" in traces.names else ("position_error", "angle_error")
-    matrices = []
+    found = []
     for name in names:
         if name in traces.names:
-            errors = np.abs(traces.matrix(name))
+            errors = np.abs(traces.columns(name))
             missing = np.isnan(errors)
             if missing.any():
-                never = np.logical_and.reduceat(missing, traces.starts, axis=0)
-                errors[np.repeat(never, traces.counts, axis=0)] = 0
-            matrices.append(errors)
-    return matrices
+                never = np.logical_and.reduceat(missing, traces.starts, axis=1)
+                errors[np.repeat(never, traces.counts, axis=1)] = 0
+            found.append(errors)
+    return found
 
 
 def _one_piece(traces: Traces, window: int) -> Bools:

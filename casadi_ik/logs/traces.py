@@ -33,7 +33,7 @@ class Traces:
     def __len__(self) -> int:
         return len(self.rows)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Fields there are."""
         return self.form.layout.names
@@ -65,14 +65,18 @@ class Traces:
                 new[1:] |= codes[1:] != codes[:-1]
         return np.cumsum(new, dtype=np.int32)
 
-    @property
+    @cached_property
     def starts_fields(self) -> tuple[str, ...]:
         """Fields that count the starts of a solve."""
         return tuple(name for name in ("restart", "candidate") if name in self.names)
 
     def matrix(self, name: str) -> NDArray[Any]:
-        """A field of all rows, (m, size)."""
+        """A field of all rows, (m, size); a view."""
         return as_matrix(self.rows[name])
+
+    def columns(self, name: str) -> NDArray[Any]:
+        """The same as (size, m), each column in one piece: what is done to it then runs fast."""
+        return self.matrix(name).T.copy(order="C")
 
     def of_solves(self, wanted: Bools) -> Traces:
         """Only some of the solves (k,)."""
@@ -119,11 +123,11 @@ def entries(traces: Traces, begun: Bools, ended: Bools) -> Rows:
 
 
 def over_window(values: NDArray[Any], window: int, largest: bool) -> NDArray[Any]:
-    """Largest or smallest of each `window` rows one after the other, (m - window + 1, ...)."""
+    """Largest or smallest of each `window` columns one after the other, (n, m - window + 1)."""
     pick = np.maximum if largest else np.minimum
     width = 1
     while 2 * width <= window:
-        values = pick(values[width:], values[:-width])
+        values = pick(values[:, width:], values[:, :-width])
         width *= 2
     rest = window - width
-    return pick(values[rest:], values[:-rest]) if rest else values
+    return pick(values[:, rest:], values[:, :-rest]) if rest else values

@@ -2,13 +2,12 @@
 
 The iterations come as the array that the compiled loop wrote; they are copied once, into the
 chunk, and everything about them is done for a whole block of solves at once. A chunk is closed at
-the first solve boundary past `CHUNK_SIZE` and written with its index in one go, so that a crash
-loses at most the chunk that was being filled.
+a solve boundary and written with its index in one go, so that a crash loses at most the chunk
+that was being filled and the one on its way to the disk.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import time
@@ -20,18 +19,18 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
-from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError
 from casadi_ik.logs import schema
-from casadi_ik.logs.chunk import COMPRESSORS, Run, chunk_bytes, definitions
+from casadi_ik.logs.chunk import COMPRESSORS
+from casadi_ik.logs.chunk_stream import ChunkStream
 from casadi_ik.logs.clock import LogClock
 from casadi_ik.logs.event_kinds import SINGULAR, EventKind, event_format
 from casadi_ik.logs.event_rules import EventRules
 from casadi_ik.logs.events import detect_events
 from casadi_ik.logs.keep import Keep
 from casadi_ik.logs.mcap_file import McapFile, Summary
-from casadi_ik.logs.message import HEAD, fill
+from casadi_ik.logs.messages import block_messages
 from casadi_ik.logs.provenance import METADATA_NAME, log_metadata
 from casadi_ik.logs.solve_rows import solve_format, solve_rows
 from casadi_ik.solvers.method import TraceFormat
@@ -39,50 +38,8 @@ from casadi_ik.solvers.recorder import SolveBlock
 
 Compression = Literal["none", "lz4", "zstd"]
 
-CHUNK_SIZE = 2**21
-"""A chunk is closed at the end of the first solve with which it is larger [bytes]."""
-
 URDF_ATTACHMENT = "robot.urdf"
 """Name of the attachment that holds the robot description."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Messages:
-    """What some solves of a method have to say on one of its topics.
-
-    Attributes:
-        channel: Channel id.
-        rows: (m,) payloads, solve by solve.
-        sequence: (m,).
-        log_time: (m,) [ns].
-        publish_time: (m,) [ns].
-        ends: (k,) how many of them belong to the first solves up to each.
-    """
-
-    channel: int
-    rows: NDArray[Any]
-    sequence: np.ndarray
-    log_time: np.ndarray
-    publish_time: np.ndarray
-    ends: NDArray[np.int64]
-
-    @property
-    def size(self) -> int:
-        """Of one message [bytes]."""
-        return HEAD.itemsize + self.rows.dtype.itemsize
-
-    def of_solves(self, start: int, stop: int) -> _Messages:
-        """Those of some of the solves."""
-        first = int(self.ends[start - 1]) if start else 0
-        part = slice(first, int(self.ends[stop - 1]))
-        return _Messages(
-            self.channel,
-            self.rows[part],
-            self.sequence[part],
-            self.log_time[part],
-            self.publish_time[part],
-            self.ends[start:stop] - first,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,13 +96,8 @@ class McapRecorder:
         self.clock = clock or LogClock()
         self.keep = keep or Keep()
         self._rules = rules or EventRules()
-        self._compression = compression
         self._methods: dict[str, _Method] = {}
         self._recorded: dict[str, list[range]] = {}
-        self._waiting: list[_Messages] = []
-        self._waiting_size = 0
-        self._new: tuple[list[Schema], list[Channel]] = ([], [])
-        self._summary = Summary()
         metadata = log_metadata(
             robot_name,
             seed,
@@ -158,13 +110,14 @@ class McapRecorder:
         if urdf is not None:
             data = urdf.encode()
             attached.append(Attachment(now, now, URDF_ATTACHMENT, "application/xml", data))
-        self._file = McapFile(self.path)
-        self._beginning = self._summary.beginning(
+        file, summary = McapFile(self.path), Summary()
+        beginning = summary.beginning(
             "ros2",
             f"casadi_ik {metadata['code_version']}",
             Metadata(METADATA_NAME, metadata),
             attached,
         )
+        self._chunks = ChunkStream(file, summary, beginning, compression)
 
     def record(self, block: SolveBlock) -> None:
         """Write solves: their totals, and of those that are kept their iterations and events.
@@ -179,24 +132,14 @@ class McapRecorder:
         method = self._method(block)
         counts = block.batch.iterations
         events = detect_events(block.format, block.rows, counts, self._rules)
-        tally = np.zeros((len(block), len(EventKind)), dtype=np.int64)
-        np.add.at(tally, (events["solve_id"], events["kind"]), 1)
+        kinds = len(EventKind)
+        cell = events["solve_id"].astype(np.int64) * kinds + events["kind"]
+        tally = np.bincount(cell, minlength=len(block) * kinds).reshape(-1, kinds)
         solves = solve_rows(block, tally, method.formats["solve"].layout)
-        kept = self.keep(block.first, block.batch.success, tally[:, SINGULAR].any(axis=1))
-        solves["kept"] = kept
-        parts = self._messages(block, method, events, solves, kept)
-        self._recorded.setdefault(block.method, []).append(_numbers(block))
-        start = 0
-        size = sum(part.ends * part.size for part in parts)
-        while start < len(block):
-            done = int(size[start - 1]) if start else 0
-            full = done + CHUNK_SIZE - self._waiting_size
-            stop = min(int(np.searchsorted(size, full)) + 1, len(block))
-            self._waiting += [part.of_solves(start, stop) for part in parts]
-            self._waiting_size += int(size[stop - 1]) - done
-            if self._waiting_size >= CHUNK_SIZE:
-                self._flush()
-            start = stop
+        singular = tally[:, list(SINGULAR)].sum(axis=1) > 0
+        solves["kept"] = self.keep(block.first, block.batch.success, singular)
+        self._note(block)
+        self._chunks.add(block_messages(block, events, solves, method.channels, self.clock))
 
     def close(self) -> None:
         """Finish the file; a second call does nothing.
@@ -204,18 +147,11 @@ class McapRecorder:
         Raises:
             LogError: It could not be written; the chunks before can be read.
         """
-        if self._file.closed:
-            return
-        self._flush()
-        self._finish()
+        self._chunks.close()
 
     def discard(self) -> None:
         """Give up what is not on the disk; a log of which nothing is there is gone."""
-        if self._file.closed:
-            return
-        if self._file.position:
-            self._finish()
-        self._file.close()
+        self._chunks.discard()
 
     def __enter__(self) -> Self:
         return self
@@ -228,13 +164,12 @@ class McapRecorder:
     ) -> None:
         if error is None:
             self.close()
-            return
-        with contextlib.suppress(LogError):
+        else:
             self.discard()
 
     def _check(self, block: SolveBlock) -> None:
         where = f"{self.path}: method {block.method!r}, solve {block.first}"
-        if self._file.closed:
+        if self._chunks.closed:
             raise LogError(f"{where}: the log is closed")
         if len(block) > 1:
             where += f" to {block.first + len(block) - 1}"
@@ -258,6 +193,13 @@ class McapRecorder:
         except LogError as error:
             raise LogError(f"{where}: {error}") from None
 
+    def _note(self, block: SolveBlock) -> None:
+        """Remember which solves are recorded, numbers that follow each other as one range."""
+        numbers, recorded = _numbers(block), self._recorded.setdefault(block.method, [])
+        if recorded and recorded[-1].stop == numbers.start:
+            numbers = range(recorded.pop().start, numbers.stop)
+        recorded.append(numbers)
+
     def _method(self, block: SolveBlock) -> _Method:
         """The method's channels, registered when it comes for the first time."""
         known = self._methods.get(block.method)
@@ -271,124 +213,21 @@ class McapRecorder:
         texts = {kind: schema.schema_text(f.layout, f.labels) for kind, f in formats.items()}
         channels = {}
         for kind, form in formats.items():
-            number = len(self._summary.channels) + 1
+            number = len(schema.KINDS) * len(self._methods) + len(channels) + 1
             name = schema.schema_name(kind, block.method, block.format.layout, len(block.fingers))
             metadata = {
                 "offered_qos_profiles": "",
                 "method": block.method,
                 "labels": json.dumps({key: list(names) for key, names in form.labels.items()}),
             }
-            described = Schema(number, texts[kind].encode(), "ros2msg", name)
-            channel = Channel(number, schema.topic(block.method, kind), "cdr", metadata, number)
-            self._summary.schemas[number] = described
-            self._summary.channels[number] = channel
-            self._new[0].append(described)
-            self._new[1].append(channel)
+            self._chunks.define(
+                Schema(number, texts[kind].encode(), "ros2msg", name),
+                Channel(number, schema.topic(block.method, kind), "cdr", metadata, number),
+            )
             channels[kind] = number
         method = _Method(block.format, block.fingers, formats, channels)
         self._methods[block.method] = method
         return method
-
-    def _messages(
-        self,
-        block: SolveBlock,
-        method: _Method,
-        events: NDArray[Any],
-        solves: NDArray[Any],
-        kept: NDArray[np.bool_],
-    ) -> list[_Messages]:
-        """The block's messages by topic; `events` are numbered within the block."""
-        counts, k = block.batch.iterations, len(block)
-        seconds = block.batch.time * 1e9
-        solve = np.arange(k)
-        of_row = np.repeat(solve, counts)
-        iteration = np.arange(len(block.rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        published = block.started[of_row] + (
-            (iteration + 1) * (seconds / np.maximum(counts, 1))[of_row]
-        ).astype(np.int64)
-        rows = block.rows
-        event_of, event_at = (events[key].astype(np.int64) for key in ("solve_id", "iteration"))
-        event_row = (np.cumsum(counts) - counts)[event_of] + event_at
-        event_published = published[event_row]
-        events["solve_id"] += block.first
-        if not kept.all():
-            wanted = kept[of_row]
-            rows, of_row, iteration = rows[wanted], of_row[wanted], iteration[wanted]
-            published = published[wanted]
-            wanted = kept[event_of]
-            events, event_of, event_at = events[wanted], event_of[wanted], event_at[wanted]
-            event_published = event_published[wanted]
-        last = np.maximum(counts - 1, 0)
-        numbers, times = method.channels, self.clock.times
-        return [
-            _Messages(
-                numbers["iteration"],
-                rows,
-                iteration,
-                times(block.first + of_row, iteration),
-                published,
-                np.cumsum(np.where(kept, counts, 0)),
-            ),
-            _Messages(
-                numbers["event"],
-                events,
-                event_at,
-                times(block.first + event_of, event_at),
-                event_published,
-                np.cumsum(np.bincount(event_of, minlength=k)),
-            ),
-            _Messages(
-                numbers["solve"],
-                solves,
-                block.first + solve,
-                times(block.first + solve, last),
-                block.started + seconds.astype(np.int64),
-                1 + solve,
-            ),
-        ]
-
-    def _flush(self) -> None:
-        """Write what waits as a chunk."""
-        if not self._waiting:
-            return
-        defined = definitions(*self._new)
-        data = np.empty(len(defined) + self._waiting_size, np.uint8)
-        data[: len(defined)] = np.frombuffer(defined, np.uint8)
-        runs, start = [], len(defined)
-        for channel in sorted({part.channel for part in self._waiting}):
-            parts = [part for part in self._waiting if part.channel == channel]
-            first, size = start, parts[0].size
-            for part in parts:
-                count = len(part.rows)
-                stop = start + count * size
-                fill(
-                    data[start:stop].reshape(count, size),
-                    channel,
-                    part.rows,
-                    part.sequence,
-                    part.log_time,
-                    part.publish_time,
-                )
-                start = stop
-            if start > first:
-                offsets = np.arange(first, start, size, dtype=np.uint64)
-                log_time = np.concatenate([part.log_time for part in parts])
-                runs.append(Run(channel, log_time, offsets))
-        pieces = [] if self._file.position else [self._beginning]
-        position = self._file.position + sum(map(len, pieces))
-        written, index = chunk_bytes(memoryview(data), runs, self._compression, position)
-        self._file.write([*pieces, *written])
-        self._summary.chunks.append(index)
-        for run in runs:
-            counts = self._summary.counts
-            counts[run.channel] = counts.get(run.channel, 0) + len(run.log_time)
-        self._waiting, self._waiting_size, self._new = [], 0, ([], [])
-
-    def _finish(self) -> None:
-        pieces = [] if self._file.position else [self._beginning]
-        position = self._file.position + sum(map(len, pieces))
-        self._file.write([*pieces, self._summary.ending(position)])
-        self._file.close()
 
 
 def _numbers(block: SolveBlock) -> range:

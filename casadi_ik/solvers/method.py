@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.kernels.rows import split_rows
 from casadi_ik.solvers.problem import Array, Problems
+from casadi_ik.steps.recorded_jacobian import RecordedJacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,23 +44,6 @@ class Outcome:
         return () if self.rows is None else split_rows(self.rows, self.iterations)
 
 
-@dataclass(frozen=True)
-class Jacobian:
-    """A Jacobian whose singular values a method records.
-
-    Attributes:
-        joints: Actuators whose motion it maps.
-        singular: Smallest singular value below which it counts as near singular, in the unit of
-            its field ``sigma_<name>``.
-        condition: Condition number above which it counts as ill-conditioned, for its field
-            ``condition_<name>``.
-    """
-
-    joints: tuple[str, ...] = ()
-    singular: float = 0.0
-    condition: float = math.inf
-
-
 @dataclass(frozen=True, eq=False)
 class TraceFormat:
     """How to read a trace.
@@ -76,7 +59,7 @@ class TraceFormat:
 
     layout: Layout
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    jacobians: Mapping[str, Jacobian] = field(default_factory=dict)
+    jacobians: Mapping[str, RecordedJacobian] = field(default_factory=dict)
 
 
 class Method(Protocol):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-PART_BYTES = 2**24
+PART_BYTES = 2**22
 """About how many bytes of iterations a part may have if they are to be kept."""
 
 FIRST_PART = 64

@@ -60,7 +60,7 @@ class QiuMethod:
             "phase": Phase.labels(),
             "status": Status.labels(),
         }
-        return TraceFormat(self.step.record, labels)
+        return TraceFormat(self.step.record, labels, self.step.jacobians)
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -126,7 +126,7 @@ def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
         np.testing.assert_array_equal(block.rows["row"], np.arange(rows.start, rows.stop))
 
 
-@pytest.mark.parametrize(("bytes_per_solve", "size"), [(2**14, 2**10), (2**30, 1), (1, 10**6)])
+@pytest.mark.parametrize(("bytes_per_solve", "size"), [(2**12, 2**10), (2**30, 1), (1, 10**6)])
 def test_parts_are_as_large_as_their_iterations_allow(bytes_per_solve, size):
     parts = Parts(10**6, 1, trace=True)
     found = []
