@@ -145,11 +145,20 @@ def _report(log: logs.Log) -> list[RenderableType]:
                 "size": f"{size(about.size)}{each}",
                 "chunks": packed,
                 "attached": ", ".join(attached) or "nothing",
+                **_unfinished(about),
             }
         ),
         _methods(log),
         fields(_origin(about.metadata)),
     ]
+
+
+def _unfinished(about: logs.LogInfo) -> dict[str, str]:
+    """Files without an end, if there are any."""
+    if not about.unfinished:
+        return {}
+    files = ", ".join(map(str, about.unfinished))
+    return {"unfinished": f"{files}: killed while writing, or still at it (casadi-ik log finish)"}
 
 
 def _methods(log: logs.Log) -> RenderableType:

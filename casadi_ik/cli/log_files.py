@@ -43,11 +43,11 @@ def _view(arguments: argparse.Namespace, out: Path) -> Answer:
 
     layout = out.with_suffix(".layout.json")
     check_outputs([("--out", out), ("the layout", layout)], inputs=[Path(arguments.file)])
-    solve = the_solve(arguments)
+    log = logs.open(arguments.file)
+    solve = the_solve(arguments, log)
     with located(f"{arguments.file}: robot (say --robot)", (UnknownNameError,)):
         robot = load_robot(arguments.robot or solve.robot)
-    urdf = logs.open(arguments.file).attachment("robot.urdf").decode()
-    check_robot(robot, urdf, arguments.file)
+    check_robot(robot, log.attachment("robot.urdf").decode(), arguments.file)
     write_view(out, solve, robot)
     write_layout(layout, layout_of(solve, robot))
     return Answer(Group(*files([("viewer", out), ("layout", layout)])))

@@ -26,7 +26,7 @@ def why(arguments: argparse.Namespace) -> Answer:
         LogError: The file is missing, damaged or no log of casadi_ik.
         UnknownNameError: There is no such solve, or several.
     """
-    solve = the_solve(arguments)
+    solve = the_solve(arguments, logs.open(arguments.file))
     found = explain(solve)
     parts: list[RenderableType] = [headline(solve.success, solve.status, found.headline)]
     for title, lines in (
@@ -52,7 +52,8 @@ def plot(arguments: argparse.Namespace) -> Answer:
     """
     with located("log plot", (MissingExtraError,)):
         from casadi_ik.views import draw_convergence
-    log, solve = logs.open(arguments.file), the_solve(arguments)
+    log = logs.open(arguments.file)
+    solve = the_solve(arguments, log)
     default = f"{Path(arguments.file).stem}-{solve.method}-{solve.solve_id}.png"
     out: Path = arguments.out or Path(default)
     check_outputs([("--out", out)], inputs=[Path(arguments.file)])
@@ -69,14 +70,13 @@ def plot(arguments: argparse.Namespace) -> Answer:
     return Answer(Group(*files([("plot", out)])))
 
 
-def the_solve(arguments: argparse.Namespace) -> OneSolve:
+def the_solve(arguments: argparse.Namespace, log: logs.Log) -> OneSolve:
     """The solve that was asked for.
 
     Raises:
-        LogError: The file is missing, damaged or no log of casadi_ik.
+        LogError: The log is damaged.
         UnknownNameError: There is no such solve, or several; the message names the file.
     """
-    log = logs.open(arguments.file)
     try:
         return one_solve(log, arguments.solve, arguments.method)
     except UnknownNameError as error:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 import os
 import struct
-from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import IO, TypeVar
 
+import numpy as np
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -25,6 +25,7 @@ from mcap.records import (
 )
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 from zstandard import ZstdError
 
 from casadi_ik.errors import LogError
@@ -33,16 +34,22 @@ from casadi_ik.logs.mcap_file import Summary
 HEAD = struct.Struct("<BQ")
 """Opcode and length in front of every record."""
 
-_MESSAGE = struct.Struct("<HIQ")
-"""Channel, sequence and log time: how a Message's content begins."""
+_SAME = HEAD.size + 2
+"""Bytes at the beginning of a message that are the same in those of its channel and size."""
+
+_LOG_TIME = slice(HEAD.size + 6, HEAD.size + 14)
+"""Where in a message its log time is, behind channel and sequence."""
+
+_INDEX_HEAD = struct.Struct("<HI")
+"""Channel and size of the entries: how the content of a MessageIndex begins."""
 
 _DAMAGED = (McapError, struct.error, ValueError, RuntimeError, MemoryError, ZstdError)
 """What a record with wrong bytes was seen to raise (RuntimeError is lz4's)."""
 
-Kind = TypeVar("Kind", Attachment, Channel, Chunk, MessageIndex, Metadata, Schema)
+Kind = TypeVar("Kind", Attachment, Channel, Chunk, Metadata, Schema)
 
-Entries = dict[int, list[tuple[int, int]]]
-"""Log time and offset of every message in a chunk, by channel."""
+Entries = dict[int, NDArray[np.uint64]]
+"""Log time and offset of every message in a chunk, (k, 2), by channel."""
 
 
 @dataclass
@@ -54,12 +61,14 @@ class DataSection:
         end: Where it ends: behind the last whole record [bytes].
         closed: Whether a DataEnd record stands there.
         owed: Entries of the last chunk whose MessageIndex records are not all there.
+        size: Size of the file when it was read [bytes].
     """
 
     summary: Summary
     end: int = len(MCAP0_MAGIC)
     closed: bool = False
     owed: Entries = field(default_factory=dict)
+    size: int = 0
 
     def owed_indexes(self) -> bytes:
         """The missing MessageIndex records, to be written at `end`; now they count as there."""
@@ -68,7 +77,7 @@ class DataSection:
             index = self.summary.chunks[-1]
             index.message_index_offsets[channel] = self.end + builder.count
             before = builder.count
-            MessageIndex(channel, entries).write(builder)
+            MessageIndex(channel, [(int(t), int(o)) for t, o in entries]).write(builder)
             index.message_index_length += builder.count - before
         self.owed = {}
         return builder.end()
@@ -92,6 +101,7 @@ def scan(stream: IO[bytes]) -> DataSection:
     was_closed = size > len(MCAP0_MAGIC) and stream.read() == MCAP0_MAGIC
     stream.seek(len(MCAP0_MAGIC))
     found, wrong = _Scan(), "it is cut off"
+    found.section.size = size
     while (record := _record(stream, size)) is not None:
         opcode, body = record
         if opcode in (Opcode.DATA_END, Opcode.FOOTER):
@@ -167,24 +177,13 @@ class _Scan:
         data = unpacked.read(length)
         if len(data) != chunk.uncompressed_size:
             raise ValueError(f"{len(data)} bytes for {chunk.uncompressed_size}")
-        entries: Entries = defaultdict(list)
-        declared: list[tuple[int, bytes]] = []
-        offset = 0
-        while offset < len(data):
-            opcode, size = HEAD.unpack_from(data, offset)
-            content = offset + HEAD.size
-            if opcode == Opcode.MESSAGE:
-                channel, _, log_time = _MESSAGE.unpack_from(data, content)
-                entries[channel].append((log_time, offset))
-            else:
-                declared.append((opcode, data[content : content + size]))
-            offset = content + size
+        entries, declared = _walked(data)
         for opcode, content in declared:
             self._declare(opcode, content)
         counts = self.section.summary.counts
         for channel, found in entries.items():
             counts[channel] = counts.get(channel, 0) + len(found)
-        self.section.owed = dict(entries)
+        self.section.owed = entries
         self.section.summary.chunks.append(
             ChunkIndex(
                 chunk_length=HEAD.size + len(body),
@@ -201,13 +200,15 @@ class _Scan:
 
     def _message_index(self, body: bytes) -> None:
         """An index must say what the chunk before it holds."""
-        index = _read(MessageIndex, body)
-        expected = self.section.owed.get(index.channel_id)
-        if expected is None or sorted(index.records) != sorted(expected):
-            raise ValueError(f"the message index of channel {index.channel_id} is wrong")
-        del self.section.owed[index.channel_id]
+        channel, size = _INDEX_HEAD.unpack_from(body)
+        found = np.frombuffer(body, "<u8", offset=_INDEX_HEAD.size).reshape(-1, 2)
+        expected = self.section.owed.get(channel)
+        in_order = found[np.argsort(found[:, 1], kind="stable")]
+        if expected is None or size != found.nbytes or not np.array_equal(in_order, expected):
+            raise ValueError(f"the message index of channel {channel} is wrong")
+        del self.section.owed[channel]
         chunk = self.section.summary.chunks[-1]
-        chunk.message_index_offsets[index.channel_id] = self.section.end
+        chunk.message_index_offsets[channel] = self.section.end
         chunk.message_index_length += HEAD.size + len(body)
 
     def _attachment(self, body: bytes) -> None:
@@ -232,6 +233,36 @@ class _Scan:
         elif opcode == Opcode.CHANNEL:
             channel = _read(Channel, body)
             summary.channels[channel.id] = channel
+
+
+def _walked(data: bytes) -> tuple[Entries, list[tuple[int, bytes]]]:
+    """Where the messages of a chunk are, and its other records."""
+    octets = np.frombuffer(data, np.uint8)
+    parts: dict[int, list[NDArray[np.uint64]]] = {}
+    declared: list[tuple[int, bytes]] = []
+    offset, most = 0, 1
+    while offset < len(data):
+        opcode, length = HEAD.unpack_from(data, offset)
+        size = HEAD.size + length
+        if offset + size > len(data):
+            raise ValueError("a record reaches beyond its chunk")
+        if opcode != Opcode.MESSAGE:
+            declared.append((opcode, data[offset + HEAD.size : offset + size]))
+            offset += size
+            continue
+        # Messages of one channel and size that follow each other are taken at once.
+        most = min(2 * most, (len(data) - offset) // size)
+        block = octets[offset : offset + most * size].reshape(most, size)
+        other = np.flatnonzero((block[:, :_SAME] != block[0, :_SAME]).any(axis=1))
+        count = int(other[0]) if len(other) else most
+        entries = np.empty((count, 2), np.uint64)
+        entries[:, 0] = np.ascontiguousarray(block[:count, _LOG_TIME]).view("<u8")[:, 0]
+        entries[:, 1] = offset + size * np.arange(count)
+        channel = int.from_bytes(data[offset + HEAD.size : offset + _SAME], "little")
+        parts.setdefault(channel, []).append(entries)
+        offset += count * size
+        most = max(count, 1)
+    return {channel: np.concatenate(found) for channel, found in parts.items()}, declared
 
 
 def _read(kind: type[Kind], body: bytes) -> Kind:

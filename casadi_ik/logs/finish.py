@@ -80,18 +80,25 @@ def _close(path: Path, section: DataSection) -> int:
     indexes = section.owed_indexes()
     tail = indexes + section.summary.ending(end + len(indexes))
     with path.open("r+b") as stream:
-        if fcntl is not None:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise LogError("cannot finish the log: its writer is still at it") from None
-        cut = stream.seek(0, os.SEEK_END) - end
+        if not _locked(stream) or stream.seek(0, os.SEEK_END) != section.size:
+            raise LogError("cannot finish the log: its writer is still at it")
         stream.truncate(end)
         stream.seek(end)
         stream.write(tail)
         stream.flush()
         os.fsync(stream.fileno())
-    return cut
+    return section.size - end
+
+
+def _locked(stream: IO[bytes]) -> bool:
+    """Whether nobody else is writing."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _ends_well(stream: IO[bytes], section: DataSection) -> bool:

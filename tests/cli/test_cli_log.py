@@ -123,6 +123,13 @@ def test_export_of_tables(run: Command, folder: Path, tmp_path: Path) -> None:
     assert set(pl.read_csv(path)["phase"]) == {"hand-alignment"}
 
 
+def test_a_torn_log_is_said_to_be_one(run: Command, folder: Path) -> None:
+    done = run("log", "info", folder / "torn" / "torn.mcap")
+    assert done.exit == 0
+    assert "(casadi-ik log finish)" in " ".join(done.out.split())
+    assert "unfinished" not in run("log", "info", folder / "hand-first.mcap").out
+
+
 def test_finish_and_merge(run: Command, folder: Path, tmp_path: Path) -> None:
     torn = tmp_path / "torn.mcap"
     torn.write_bytes((folder / "torn" / "torn.mcap").read_bytes())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from casadi_ik.errors import LogError
+from casadi_ik.logs import McapRecorder
 from casadi_ik.logs.finish import finish_log
 
 Write = Callable[..., Path]
@@ -114,6 +116,19 @@ def test_a_finished_log_is_a_log(write: Write) -> None:
     done = finish_log(path)
     assert done.changed
     assert read_messages(path) == messages
+
+
+def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with McapRecorder(path, robot_name="made_up", compression="none") as recorder:
+        for first in range(40):
+            recorder.record(make_block(1000, first=first))
+        while not path.stat().st_size:
+            time.sleep(0.01)
+        with pytest.raises(LogError, match="its writer is still at it"):
+            finish_log(path)
+    assert not finish_log(path).changed
+    assert len(read_messages(path)) > 40_000
 
 
 def test_a_damaged_summary_is_written_anew(tmp_path: Path) -> None:
