@@ -190,9 +190,8 @@ def _element_names(shape: tuple[int, ...], labels: Sequence[str]) -> list[str]:
     """Names of the elements of a field, row by row."""
     names: list[str] = []
     for index in np.ndindex(shape):
-        first: str = labels[index[0]] if index[0] < len(labels) else str(index[0])
         rest = (_AXES[i] if shape[-1] == len(_AXES) else str(i) for i in index[1:])
-        names.append(".".join((first, *rest)))
+        names.append(".".join((element_name(labels, index[0]), *rest)))
     return names
 
 
@@ -207,6 +206,11 @@ def _readable(part: Part, name: str) -> list[Any]:
     if values.ndim == 1 and values.dtype.kind in "iu" and labels:
         return [label_of(labels, code) for code in values.tolist()]
     return values.tolist() if values.ndim == 1 else list(values)
+
+
+def element_name(labels: Sequence[str], index: int) -> str:
+    """The name of an element, or its number."""
+    return labels[index] if index < len(labels) else str(index)
 
 
 def label_of(labels: Sequence[str], code: int) -> str:

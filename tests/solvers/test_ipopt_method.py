@@ -47,7 +47,7 @@ def test_agrees_with_hand_first(name):
     np.testing.assert_allclose(ours[1], theirs[1], atol=2e-6)
 
 
-@pytest.mark.parametrize("name", ik.shipped_names("grasps"))
+@pytest.mark.parametrize("name", ik.shipped_grasps("kuka_lwr_barrett"))
 def test_shipped_grasps(name, solver):
     solution = solver.solve(ik.load_grasp(name))
     assert solution.success, solution.status
@@ -99,7 +99,7 @@ def test_limits_are_never_left(robot, tmp_path, targets):
     """Neither by the answer nor by any iterate; ignored, they are no bounds."""
     path = tmp_path / "log.mcap"
     batch = ik.Solver(robot, "ipopt").solve_batch(*targets, log=path)
-    q = ik.logs.open_log(path).iterations().rows["q"]
+    q = ik.logs.open(path).iterations().rows["q"]
     assert len(q) == batch.iterations.sum()
     assert np.all((q >= robot.lower) & (q <= robot.upper))
     assert np.all((batch.q >= robot.lower) & (batch.q <= robot.upper))
