@@ -72,8 +72,9 @@ uint32 nanosec
 )
 
 Color = tuple[float, float, float]
-TARGET, MET, MISSED = (0.94, 0.71, 0.0), (0.12, 0.62, 0.33), (0.84, 0.18, 0.24)
-"""Of contacts: asked for, within tolerance, out of it."""
+TARGET, FREE = (0.94, 0.71, 0.0), (0.6, 0.6, 0.6)
+MET, MISSED = (0.12, 0.62, 0.33), (0.84, 0.18, 0.24)
+"""Of contacts: asked for, of a free finger; within tolerance, out of it."""
 
 ARROW = 0.05
 """Length of a contact's normal [m]."""
@@ -225,11 +226,12 @@ class _View:
             solve.rows["angle_error"] > solve.angle_tolerance
         )
         channel = self._protobuf("/ik/contacts", fox.SceneUpdate.get_schema())
+        free = [bool(np.isnan(point).any()) for point in solve.target_points]
         for i in range(len(self.q)):
-            contacts = [
-                (finger, points[i, j], turned[i, j], MISSED if missed[i, j] else MET)
-                for j, finger in enumerate(solve.fingers)
+            colors = [
+                FREE if free[j] else MISSED if missed[i, j] else MET for j in range(len(free))
             ]
+            contacts = list(zip(solve.fingers, points[i], turned[i], colors, strict=True))
             self._add(channel, i, self._scene(i, contacts, thickness=0.004))
 
     def _scene(

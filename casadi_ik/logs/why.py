@@ -95,9 +95,12 @@ def worst(solve: OneSolve) -> Array:
 def errors_of(solve: OneSolve) -> tuple[Array, Array]:
     """Distances [m] and angles [rad] of all fingers in each row, (k, f) each.
 
-    A row in which they were not measured (NaN) has those of the row before.
+    A row in which they were not measured (NaN) has those of the row before; what is free is NaN.
     """
-    return _filled(solve.columns("position_error")), _filled(solve.columns("angle_error"))
+    position, angle = solve.columns("position_error"), solve.columns("angle_error")
+    position[:, np.isnan(solve.position_error)] = np.nan
+    angle[:, np.isnan(solve.angle_error)] = np.nan
+    return _filled(position), _filled(angle)
 
 
 def _filled(matrix: Array) -> Array:

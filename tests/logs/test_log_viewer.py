@@ -136,7 +136,10 @@ def test_free_contacts_are_left_out(solve: OneSolve, robot: ik.ArmHand, tmp_path
     points[1] = normals[1] = normals[2] = np.nan
     freed = dataclasses.replace(solve, target_points=points, target_normals=normals)
     write_view(tmp_path / "view.mcap", freed, robot)
-    entities = decode(tmp_path / "view.mcap").last("/ik/targets").entities
+    decoded = decode(tmp_path / "view.mcap")
+    colors = [entity.spheres[0].color for entity in decoded.last("/ik/contacts").entities]
+    assert [color.r == color.g == color.b for color in colors] == [False, True, False]
+    entities = decoded.last("/ik/targets").entities
     assert [(entity.id, len(entity.arrows)) for entity in entities] == [
         ("thumb target", 1),
         ("finger_3 target", 0),

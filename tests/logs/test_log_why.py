@@ -172,6 +172,14 @@ def test_free_fingers_and_unmeasured_rows() -> None:
     assert found.fingers[0].startswith("thumb was the last to come within tolerance, in iteration")
 
 
+def test_a_free_finger_whose_errors_are_logged_as_zero_is_not_told() -> None:
+    rows = make_rows()
+    rows["position_error"][:, 1] = rows["angle_error"][:, 1] = 0.0
+    free = np.array([0.1, np.nan])
+    found = explain(make_one(rows, position_error=free, angle_error=free))
+    assert "finger_2" not in " ".join((*found.phases, *found.fingers, *found.verdict))
+
+
 def test_without_a_trace_only_the_end_is_told() -> None:
     solve = make_one(make_rows())
     found = explain(dataclasses.replace(solve, rows=solve.rows[:0]))

@@ -19,7 +19,7 @@ COUNT = 5
 @pytest.fixture(scope="module")
 def failed(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> list[OneSolve]:
     """What enhanced-dls does not solve of the shipped grasps with random arms."""
-    names = ik.shipped_names("grasps")
+    names = ik.shipped_grasps(robot.name)
     q = robot.random(np.random.default_rng(0), len(names) * COUNT)
     for i, name in enumerate(names):
         for actuator, value in ik.load_grasp(name).posture.items():
