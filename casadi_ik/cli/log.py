@@ -1,30 +1,132 @@
-"""`casadi-ik log`: looking into logs."""
+"""`casadi-ik log info`, `solves` and `events`: what is in logs, as tables."""
 
 from __future__ import annotations
 
+import argparse
 import json
+import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
+import numpy as np
 from rich.console import Group, RenderableType
+from rich.table import Table
 from rich.text import Text
 
 from casadi_ik import logs
 from casadi_ik.cli.answer import Answer
-from casadi_ik.cli.report import fields, table
+from casadi_ik.cli.report import duration, fields, table
+from casadi_ik.logs.one_solve import happening
+from casadi_ik.logs.phrases import SERIOUS, plain_name, told
 
 
-def info(files: Iterable[str]) -> Answer:
+def info(arguments: argparse.Namespace) -> Answer:
     """What logs hold.
 
     Raises:
         LogError: A file is missing, damaged or no log of casadi_ik.
     """
     parts: list[RenderableType] = []
-    for name in files:
+    for name in arguments.files:
         parts += _report(logs.open(name))
     return Answer(Group(*parts))
+
+
+def solves(arguments: argparse.Namespace) -> Answer:
+    """The solves of logs, as one.
+
+    Raises:
+        LogError: A file is missing, damaged or no log of casadi_ik.
+        UnknownNameError: A filter names what there is not.
+    """
+    found = logs.open(arguments.files).solves(**filters(arguments))
+    parts: list[RenderableType] = []
+    left = arguments.most
+    for part in found.parts:
+        shown = islice(logs.Table("solve", (part,)).records(), left)
+        if len(part) and left:
+            parts += [Text(f"  {part.method}", "bold"), _solve_rows(part, shown)]
+            left -= min(left, len(part))
+    return Answer(Group(*parts, _count(len(found), arguments.most, "solves")))
+
+
+def events(arguments: argparse.Namespace) -> Answer:
+    """The events of logs, as one.
+
+    Raises:
+        LogError: A file is missing, damaged or no log of casadi_ik.
+        UnknownNameError: A filter names what there is not.
+    """
+    found = logs.open(arguments.files).events(**filters(arguments))
+    rows = table("solve", "iteration", "method", "phase", "what happened", right=_NUMBERS)
+    for record in islice(found.records() if len(found) else (), arguments.most):
+        event = happening(record)
+        rows.add_row(
+            str(record["solve_id"]),
+            str(event.iteration),
+            record["method"],
+            event.phase,
+            Text(told(event), "yellow" if event.kind in SERIOUS else ""),
+        )
+    return Answer(Group(_kept_whole(rows), _count(len(found), arguments.most, "events")))
+
+
+def filters(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The filters of a command as `Log` takes them."""
+    return {
+        name: getattr(arguments, name) for name in ("method", "solve", "status", "event", "phase")
+    }
+
+
+def _solve_rows(part: logs.Part, records: Iterable[Mapping[str, Any]]) -> Table:
+    """A row per solve of one method; restarts only if there are any."""
+    restarts = ["restarts"] if part.rows["restarts"].any() else []
+    heads = ["solve", "status", "iterations", *restarts, "mm off", "deg off", "time", "events"]
+    rows = table(*heads, right=_NUMBERS)
+    for record in records:
+        rows.add_row(
+            str(record["solve_id"]),
+            Text(record["status"], "green" if record["success"] else "red"),
+            str(record["iterations"]),
+            *(str(record[name]) for name in restarts),
+            _worst(record["position_error"], 1e3),
+            _worst(record["angle_error"], math.degrees(1.0)),
+            duration(record["time"]),
+            _tally(part.labels["events"], record) + ("" if record["kept"] else " (totals only)"),
+        )
+    return _kept_whole(rows)
+
+
+_NUMBERS = ("solve", "iteration", "iterations", "restarts", "mm off", "deg off", "time")
+
+
+def _kept_whole(rows: Table) -> Table:
+    """Only the last column wraps."""
+    for column in rows.columns[:-1]:
+        column.no_wrap = True
+    return rows
+
+
+def _count(count: int, most: int, what: str) -> RenderableType:
+    if count <= most:
+        return Text(f"  {count or 'no'} {what}")
+    return Text(f"  the first {most} of {count} {what} (--most shows more)")
+
+
+def _worst(values: Any, factor: float) -> str:
+    """The largest error of all fingers; "free" if none has one."""
+    known = [value for value in np.ravel(values).tolist() if not math.isnan(value)]
+    return f"{factor * max(known):.2f}" if known else "free"
+
+
+def _tally(kinds: Sequence[str], record: Mapping[str, Any]) -> str:
+    """How often what happened in a solve, but for what happens in every one."""
+    counts = zip(kinds, np.ravel(record["events"]).tolist(), strict=True)
+    usual = ("PHASE_CHANGE", "LIMIT_LEFT", "RELEASED")
+    found = [f"{count} {plain_name(k.lower())}" for k, count in counts if count and k not in usual]
+    return ", ".join(found)
 
 
 def _report(log: logs.Log) -> list[RenderableType]:
@@ -43,11 +145,20 @@ def _report(log: logs.Log) -> list[RenderableType]:
                 "size": f"{size(about.size)}{each}",
                 "chunks": packed,
                 "attached": ", ".join(attached) or "nothing",
+                **_unfinished(about),
             }
         ),
         _methods(log),
         fields(_origin(about.metadata)),
     ]
+
+
+def _unfinished(about: logs.LogInfo) -> dict[str, str]:
+    """Files without an end, if there are any."""
+    if not about.unfinished:
+        return {}
+    files = ", ".join(map(str, about.unfinished))
+    return {"unfinished": f"{files}: killed while writing, or still at it (casadi-ik log finish)"}
 
 
 def _methods(log: logs.Log) -> RenderableType:

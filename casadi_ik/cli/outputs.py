@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from casadi_ik.errors import CasadiIKError
+from casadi_ik.files.writing import part_of, target_of, written_whole
 
 
 class OutputError(CasadiIKError):
@@ -26,17 +26,17 @@ def check_outputs(outputs: Iterable[tuple[str, Path | None]], inputs: Iterable[P
     Raises:
         OutputError: The message names path and option.
     """
-    taken = {_target(path): "the input" for path in inputs}
+    taken = {target_of(path): "the input" for path in inputs}
     for option, path in outputs:
         if path is None:
             continue
-        where, target = f"{path}: {option}", _target(path)
+        where, target = f"{path}: {option}", target_of(path)
         if target in taken:
             raise OutputError(f"{where}: found the file of {taken[target]}, expected another")
         taken[target] = option
         try:
             _refuse_special(target)
-            part = _part(target)
+            part = part_of(target)
             part.touch(exist_ok=False)
             part.unlink()
         except OSError as error:
@@ -54,15 +54,8 @@ def write_output(path: Path, option: str, write: Callable[[Path], object]) -> No
     Raises:
         OutputError: It cannot be written; nothing is left behind.
     """
-    target = _target(path)
-    part = _part(target)
-    try:
-        with writing(path, option):
-            write(part)
-            part.replace(target)
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()
+    with writing(path, option), written_whole(path) as part:
+        write(part)
 
 
 @contextlib.contextmanager
@@ -84,15 +77,7 @@ def writing(path: Path, option: str) -> Iterator[None]:
 
 def folder_of(path: Path) -> Path:
     """The folder an output will stand in, whatever links lead there."""
-    return _target(path).parent
-
-
-def _target(path: Path) -> Path:
-    return Path(os.path.realpath(path))
-
-
-def _part(target: Path) -> Path:
-    return target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
+    return target_of(path).parent
 
 
 def _refuse_special(target: Path) -> None:

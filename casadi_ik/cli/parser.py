@@ -7,6 +7,7 @@ import re
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.values import assignment, file_name, numbers, one_of, positive, whole
 from casadi_ik.errors import InputError
 
@@ -104,7 +105,7 @@ def build_parser() -> Parser:
         commands.add_parser(name, help=text, description=text.capitalize() + ".").set_defaults(
             run=run
         )
-    _add_log(commands)
+    add_log(commands)
     return parser
 
 
@@ -218,20 +219,6 @@ def _add_diagnose(parser: argparse.ArgumentParser, default: bool) -> None:
     )
 
 
-def _add_log(commands: Any) -> None:
-    log = commands.add_parser(
-        "log", help="look into logs", description="Look into logs that `--log` has written."
-    )
-    actions = log.add_subparsers(metavar="ACTION", required=True, title="actions")
-    info = actions.add_parser(
-        "info",
-        help="what a log holds",
-        description="Methods, solves, iterations, events, size and origin of logs.",
-    )
-    info.add_argument("files", metavar="FILE", nargs="+", help="an MCAP file written by --log")
-    info.set_defaults(run=_log_info)
-
-
 def _solve(arguments: argparse.Namespace) -> Answer:
     from casadi_ik.cli.solve import solve
 
@@ -260,9 +247,3 @@ def _grasps(_: argparse.Namespace) -> Answer:
     from casadi_ik.cli.lists import grasps
 
     return grasps()
-
-
-def _log_info(arguments: argparse.Namespace) -> Answer:
-    from casadi_ik.cli.log import info
-
-    return info(arguments.files)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from os import PathLike
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,6 +17,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.logs import Table
 from casadi_ik.solvers import Tolerance
 from casadi_ik.views.picture import DPI, FAINT, INK, new_figure, save_picture
+from casadi_ik.views.strips import draw_strip, events_strip, limits_strip, mark_events, runs
 
 Array = NDArray[np.float64]
 
@@ -25,13 +27,12 @@ COLORS = ("#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6", "#c2334d", "#0f8b8d")
 PHASE_COLORS = ("#f3f1ec", "#fbecd9", "#deebf7", "#e3f2e1")
 """By the code of the phase."""
 
-LIMIT_COLOR = "#c2334d"
-
 FIELDS = {
     "position_error": ("distance to the contact [mm]", 1e3, 1e-6),
     "angle_error": ("angle to the normal [deg]", float(np.rad2deg(1.0)), 1e-6),
     "cost": ("cost", 1.0, 1e-16),
     "step_size": ("largest motor change [rad or m]", 1.0, 1e-10),
+    "damping": ("damping", 1.0, 1e-8),
 }
 """What is drawn if the method records it: label, factor to the unit drawn, and the value below
 which nothing is told apart (zero, above all, would need all the height of a logarithm)."""
@@ -45,26 +46,32 @@ class Panel:
         label: What it shows.
         lines: Values (k,) by name; NaN where not computed.
         bound: What has to be fallen below, if anything.
+        linear: Whether the scale is linear; otherwise logarithmic.
     """
 
     label: str
     lines: dict[str, Array]
     bound: float | None = None
+    linear: bool = False
 
 
 def draw_convergence(
     iterations: Table,
     path: str | PathLike[str] | None = None,
     *,
+    events: Table | None = None,
     tolerance: Tolerance | None = None,
     title: str = "",
     dpi: float = DPI,
 ) -> Figure:
-    """Draw one solve.
+    """Draw one solve: errors, steps, damping, singular values and joints over its iterations.
+
+    Phases are shaded, events marked, and below stands which actuator was at a limit when.
 
     Args:
         iterations: Of one solve, e.g. ``log.iterations(method="hand-first", solve=3)``.
         path: PNG file to write, if any.
+        events: Its events, e.g. ``log.events(method="hand-first", solve=3)``.
         tolerance: What counts as reached; `Tolerance()` unless said.
         title: Above the picture; method, number of iterations and ending unless said.
         dpi: Dots per inch.
@@ -81,8 +88,8 @@ def draw_convergence(
     if len(np.unique(iterations.solve_id)) > 1:
         raise InputError("iterations: of several solves, expected one (give a solve)")
     panels = _panels(iterations, tolerance or Tolerance())
-    limits = _at_limits(iterations)
-    heights = [1.0] * len(panels) + ([0.12 + 0.11 * len(limits)] if limits else [])
+    strips = [strip for strip in (events_strip(events), limits_strip(iterations)) if strip.rows]
+    heights = [1.0] * len(panels) + [0.12 + 0.11 * len(strip.rows) for strip in strips]
     figure = new_figure(9.0, 1.0 + 1.7 * sum(heights), dpi)
     grid = figure.subplots(
         len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
@@ -91,8 +98,9 @@ def draw_convergence(
         _dress(axes, iterations)
     for axes, panel in zip(grid, panels, strict=False):
         _draw(axes, panel)
-    if limits:
-        _draw_limits(grid[-1], limits)
+        mark_events(axes, events)
+    for axes, strip in zip(grid[len(panels) :], strips, strict=True):
+        draw_strip(axes, strip)
     grid[-1].set_xlabel("iteration", color=INK)
     grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     grid[-1].set_xlim(-0.5, len(iterations.rows) - 0.5)
@@ -121,6 +129,11 @@ def _panels(iterations: Table, tolerance: Tolerance) -> list[Panel]:
             sigmas |= _lines(iterations, name, 1.0, 1e-9)
     if sigmas:
         panels.append(Panel("smallest singular value", sigmas))
+    if "q" in names:
+        joints = _lines(iterations, "q", 1.0, -np.inf)
+        panels.append(
+            Panel(f"actuators [{iterations.part.units.get('q', '')}]", joints, linear=True)
+        )
     return [panel for panel in panels if panel.lines]
 
 
@@ -137,36 +150,24 @@ def _lines(iterations: Table, name: str, factor: float, smallest: float) -> dict
     return lines
 
 
-def _at_limits(iterations: Table) -> dict[str, NDArray[np.bool_]]:
-    """(k,) whether it is at a limit, for every actuator that ever is."""
-    if "limit_mask" not in iterations.names:
-        return {}
-    mask = iterations.rows["limit_mask"].astype(np.uint64)
-    names = iterations.labels.get("limit_mask", ())
-    bits = {name: (mask >> np.uint64(bit)) & np.uint64(1) > 0 for bit, name in enumerate(names)}
-    return {name: hit for name, hit in bits.items() if hit.any()}
-
-
-def _runs(values: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """First and last index of every run of equal values."""
-    edges = np.flatnonzero(np.diff(values)) + 1
-    return list(zip([0, *edges.tolist()], [*(edges - 1).tolist(), len(values) - 1], strict=True))
-
-
 def _draw(axes: Axes, panel: Panel) -> None:
     marker = "." if len(next(iter(panel.lines.values()))) <= 60 else ""
+    many = len(panel.lines) > len(COLORS)
     for i, (label, values) in enumerate(panel.lines.items()):
-        axes.semilogy(
+        axes.plot(
             values,
-            color=COLORS[i % len(COLORS)],
-            lw=max(2.8 - 0.7 * i, 1.2),  # so that equal lines do not hide one another
-            marker=marker,
+            color=matplotlib.colormaps["tab20"](i % 20) if many else COLORS[i % len(COLORS)],
+            lw=1.2 if many else max(2.8 - 0.7 * i, 1.2),  # equal lines must not hide one another
+            marker="" if many else marker,
             markersize=5,
             label=label.replace("_", " "),
         )
+    if not panel.linear:
+        axes.set_yscale("log")
     if panel.bound is not None:
         axes.axhline(panel.bound, color=INK, lw=1.0, ls=(0, (4, 3)), label="tolerance")
-    _show_decades(axes)
+    if not panel.linear:
+        _show_decades(axes)
     axes.set_title(panel.label, loc="left", size=10, color=INK, pad=4)
     if len(panel.lines) == 1 and panel.bound is None:
         return
@@ -174,9 +175,10 @@ def _draw(axes: Axes, panel: Panel) -> None:
         loc="center left",
         bbox_to_anchor=(1.005, 0.5),
         frameon=False,
-        fontsize=9,
+        fontsize=6 if many else 9,
         labelcolor=INK,
         handlelength=1.6,
+        labelspacing=0.15 if many else 0.5,
     )
 
 
@@ -189,24 +191,11 @@ def _show_decades(axes: Axes) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def _draw_limits(axes: Axes, limits: dict[str, NDArray[np.bool_]]) -> None:
-    for row, hit in enumerate(limits.values()):
-        runs = _runs(hit.astype(np.int64))
-        bars = [(first - 0.5, last - first + 1) for first, last in runs if hit[first]]
-        axes.broken_barh(bars, (row - 0.32, 0.64), facecolor=LIMIT_COLOR, lw=0)
-    axes.set_ylim(len(limits) - 0.5, -0.5)
-    axes.yaxis.set_ticks_position("right")
-    axes.set_yticks(range(len(limits)), [name.replace("_", " ") for name in limits], fontsize=9)
-    axes.tick_params(axis="y", length=0, colors=INK)
-    axes.grid(visible=False, axis="y")
-    axes.set_title("at a limit", loc="left", size=10, color=INK, pad=4)
-
-
 def _dress(axes: Axes, iterations: Table) -> None:
     """Phases as shades, a faint grid, no box."""
     if "phase" in iterations.names:
         codes = iterations.rows["phase"].astype(np.int64)
-        for first, last in _runs(codes):
+        for first, last in runs(codes):
             color = PHASE_COLORS[codes[first] % len(PHASE_COLORS)]
             axes.axvspan(first - 0.5, last + 0.5, color=color, lw=0, zorder=0)
     axes.grid(visible=True, color="white", lw=0.9)

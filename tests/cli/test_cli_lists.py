@@ -21,6 +21,14 @@ WORDS = {
     "grasps": "grasps",
     "log": "info",
     "log info": "FILE",
+    "log solves": "--status",
+    "log events": "--event",
+    "log why": "SOLVE",
+    "log plot": "--out",
+    "log compare": "--methods",
+    "log export": "layout",
+    "log finish": "FILE",
+    "log merge": "--out",
 }
 
 

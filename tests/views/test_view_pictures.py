@@ -17,10 +17,11 @@ from matplotlib.image import imread
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, PictureError
-from casadi_ik.logs import Table
+from casadi_ik.logs import EventKind, Part, Table
 from casadi_ik.views import draw_alternatives, draw_convergence, draw_solution
 from casadi_ik.views.captions import MET_COLOR, MISSED_COLOR, OBJECT_COLOR, TARGET_COLOR
 from casadi_ik.views.picture import new_figure, save_picture
+from casadi_ik.views.strips import events_strip
 
 pytestmark = pytest.mark.opengl
 
@@ -244,3 +245,39 @@ def test_without_the_extra_the_error_says_what_to_install(missing: str) -> None:
     assert done.stdout.startswith(f"MissingExtraError pictures need {missing},")
     assert "pip install casadi-ik[plots]" in done.stdout
     assert done.stdout.count("\n") == 1
+
+
+def test_convergence_marks_events_and_draws_every_actuator(robot, log) -> None:
+    events = log.events()
+    figure = draw_convergence(log.iterations(), events=events, dpi=COARSE)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert "actuators [rad or m]" in titles
+    actuators = figure.axes[titles.index("actuators [rad or m]")]
+    assert len(actuators.lines) == len(robot.actuators)
+    assert actuators.get_yscale() == "linear"
+
+
+def test_the_strip_of_events_has_a_row_per_kind_and_jacobian() -> None:
+    layout = np.dtype(
+        [("value", "f8"), ("threshold", "f8"), ("joint_mask", "u4")]
+        + [(name, "u1") for name in ("kind", "jacobian", "phase")]
+    )
+    rows = np.zeros(4, layout)
+    rows["kind"] = [0, 0, 8, 6]
+    rows["jacobian"] = [1, 2, 0, 0]
+    labels = {
+        "kind": tuple(kind.name for kind in EventKind),
+        "jacobian": ("", "closed_chain", "thumb"),
+        "joint_mask": (),
+        "phase": ("",),
+    }
+    numbers = np.arange(4)
+    part = Part("made-up", rows, numbers * 0, numbers * 10, labels, {})
+    strip = events_strip(Table("event", (part,)))
+    assert {name: spans for name, (spans, _) in strip.rows.items()} == {
+        "near singular closed chain": [(-0.5, 1.0)],
+        "near singular thumb": [(9.5, 1.0)],
+        "stall": [(19.5, 1.0)],
+        "restart": [(29.5, 1.0)],
+    }
+    assert events_strip(None).rows == {}

@@ -1,0 +1,100 @@
+"""`casadi-ik log export`, `finish` and `merge`: logs as other files, whole again, as one."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from casadi_ik import logs
+from casadi_ik.arm_hand import load_robot
+from casadi_ik.cli.answer import Answer
+from casadi_ik.cli.log import filters, size
+from casadi_ik.cli.log_solve import the_solve
+from casadi_ik.cli.outputs import check_outputs, write_output
+from casadi_ik.cli.question import located
+from casadi_ik.cli.report import fields, files
+from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
+from casadi_ik.logs.finish import finish_log
+from casadi_ik.logs.merge import merge_logs
+
+SUFFIXES = {".mcap": "viewer", ".parquet": "parquet", ".csv": "csv"}
+
+
+def export(arguments: argparse.Namespace) -> Answer:
+    """Write a file for a viewer, or a table.
+
+    Raises:
+        CasadiIKError: Bad input, a missing extra, or an output that cannot be written.
+    """
+    out: Path = arguments.out
+    kind = arguments.to or SUFFIXES.get(out.suffix.lower())
+    if kind is None:
+        raise InputError(f"--out: found {str(out)!r}, expected {', '.join(SUFFIXES)}, or say --to")
+    return _view(arguments, out) if kind == "viewer" else _table(arguments, out, kind)
+
+
+def _view(arguments: argparse.Namespace, out: Path) -> Answer:
+    with located("log export", (MissingExtraError,)):
+        from casadi_ik.logs.viewer import check_robot, write_view
+    from casadi_ik.logs.viewer_layout import layout_of, write_layout
+
+    layout = out.with_suffix(".layout.json")
+    check_outputs([("--out", out), ("the layout", layout)], inputs=[Path(arguments.file)])
+    log = logs.open(arguments.file)
+    solve = the_solve(arguments, log)
+    with located(f"{arguments.file}: robot (say --robot)", (UnknownNameError,)):
+        robot = load_robot(arguments.robot or solve.robot)
+    check_robot(robot, log.attachment("robot.urdf").decode(), arguments.file)
+    write_view(out, solve, robot)
+    write_layout(layout, layout_of(solve, robot))
+    return Answer(Group(*files([("viewer", out), ("layout", layout)])))
+
+
+def _table(arguments: argparse.Namespace, out: Path, kind: str) -> Answer:
+    check_outputs([("--out", out)], inputs=[Path(arguments.file)])
+    log = logs.open(arguments.file)
+    with located("log export", (MissingExtraError,)):
+        frame = getattr(log, arguments.what)(**filters(arguments)).frame()
+    write = frame.write_parquet if kind == "parquet" else frame.write_csv
+    write_output(out, "--out", write)
+    about = {"rows": f"{frame.height} {arguments.what}", "columns": str(frame.width)}
+    return Answer(Group(fields(about), *files([(kind, out)])))
+
+
+def finish(arguments: argparse.Namespace) -> Answer:
+    """Repair logs in place.
+
+    Raises:
+        LogError: A file is missing, no MCAP file, or damaged elsewhere than at its end.
+    """
+    parts: list[RenderableType] = []
+    for name in arguments.files:
+        done = finish_log(name)
+        text = f"finished, {size(done.cut)} of a torn tail cut" if done.changed else "whole already"
+        about = {"done": text, "holds": f"{done.chunks} chunks, {done.messages} messages"}
+        parts += [Text(name, "bold", no_wrap=True, overflow="ignore"), fields(about)]
+    return Answer(Group(*parts))
+
+
+def merge(arguments: argparse.Namespace) -> Answer:
+    """Join shards.
+
+    Raises:
+        LogError: A shard is missing, damaged, contradicts the others or doubles a solve; or the
+            new log cannot be written.
+    """
+    out: Path = arguments.out
+    shards = [Path(name) for name in arguments.files]
+    check_outputs([("--out", out)], inputs=shards)
+    done = merge_logs(shards, out)
+    solves = ", ".join(f"{count} of {method}" for method, count in done.solves.items()) or "none"
+    about = {
+        "shards": str(done.shards),
+        "solves": solves,
+        "messages": str(done.messages),
+        "size": size(done.size),
+    }
+    return Answer(Group(fields(about), *files([("log", out)])))

@@ -1,0 +1,191 @@
+"""`casadi-ik log`: what a person or a script sees, in processes of their own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from command_line import FAST, POSTURE, Command
+from mcap.reader import make_reader
+
+import casadi_ik as ik
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> Path:
+    """Two methods on four targets, of which the last is out of reach; one solve torn off."""
+    folder = tmp_path_factory.mktemp("logs")
+    points, normals = robot.contacts(np.tile(POSTURE, (4, 1)))
+    points[:, :, 2] += 0.01 * np.arange(4)[:, None]
+    points[3, :, 0] += 5.0
+    for method in ("enhanced-dls", "hand-first"):
+        options = {"max_iterations": 300} if method == "enhanced-dls" else None
+        step = FAST[-1] if method == "enhanced-dls" else None
+        solver = ik.Solver(robot, method, finger_step=step, options=options)
+        solver.solve_batch(points, normals, log=folder / f"{method}.mcap")
+    torn = (folder / "enhanced-dls.mcap").read_bytes()[:-1000]
+    (folder / "torn").mkdir()
+    (folder / "torn" / "torn.mcap").write_bytes(torn)
+    return folder
+
+
+def test_solves_as_a_table(run_process: Command, folder: Path) -> None:
+    done = run_process("log", "solves", folder / "enhanced-dls.mcap", folder / "hand-first.mcap")
+    assert (done.exit, done.err) == (0, "")
+    lines = done.out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert [line.strip() for line in lines if "-" in line and " " not in line.strip()] == [
+        "enhanced-dls",
+        "hand-first",
+    ]
+    assert done.out.count("SOLVED") == 6
+    assert "8 solves" in done.out
+
+
+def test_solves_that_are_asked_for(run: Command, folder: Path) -> None:
+    log = folder / "hand-first.mcap"
+    assert "1 solves" in run("log", "solves", log, "--most", "2", "--solve", "1").out
+    assert "the first 2 of 4 solves" in run("log", "solves", log, "--most", "2").out
+    assert "3 solves" in run("log", "solves", log, "--status", "SOLVED").out
+
+
+def test_events_as_a_table(run: Command, folder: Path) -> None:
+    done = run("log", "events", folder / "enhanced-dls.mcap", "--event", "PHASE_CHANGE")
+    assert (done.exit, done.err) == (0, "")
+    assert "on to hand alignment" in done.out
+    assert max(map(len, done.out.splitlines())) <= 80
+    none = run("log", "events", folder / "hand-first.mcap", "--event", "STALL", "--solve", 0)
+    assert "no events" in none.out
+
+
+def test_why(run_process: Command, folder: Path) -> None:
+    good = run_process("log", "why", folder / "enhanced-dls.mcap", "0")
+    assert (good.exit, good.err) == (0, "")
+    assert "enhanced-dls, solve 0: solved after" in good.out
+    assert "every contact is within tolerance" in good.out
+    bad = run_process("log", "why", folder / "enhanced-dls.mcap", "3")
+    text = " ".join(bad.out.split())
+    assert bad.exit == 0
+    assert "enhanced-dls, solve 3: not solved" in text
+    for words in ("thumb reaching (iterations 0 to", "thumb lagged: it ends", "misses its point"):
+        assert words in text
+
+
+def test_compare(run: Command, folder: Path) -> None:
+    files = [folder / "hand-first.mcap", folder / "enhanced-dls.mcap"]
+    many = run("log", "compare", *files)
+    assert (many.exit, many.err) == (0, "")
+    assert "solved by both 3, by neither 1" in many.out
+    one = run("log", "compare", *files, "--solve", 3)
+    assert "hand-first, solve 3" in one.out
+    assert "limits at the end" in one.out
+    other = run("log", "compare", *files, "--methods", "enhanced-dls", "hand-first").out
+    rows = [line.split()[0] for line in other.splitlines() if " of 4" in line]
+    assert rows == ["enhanced-dls", "hand-first"]
+
+
+def test_plot(run: Command, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run("log", "plot", folder / "enhanced-dls.mcap", "--solve", 1)
+    assert (done.exit, done.err) == (0, "")
+    assert done.out.split() == ["plot", "enhanced-dls-enhanced-dls-1.png"]
+    assert (tmp_path / "enhanced-dls-enhanced-dls-1.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_export_for_a_viewer(run_process: Command, folder: Path, tmp_path: Path) -> None:
+    log = folder / "enhanced-dls.mcap"
+    done = run_process("log", "export", log, "--solve", 0, "--out", "view.mcap")
+    assert (done.exit, done.err) == (0, "")
+    assert done.out.split() == ["viewer", "view.mcap", "layout", "view.layout.json"]
+    with (tmp_path / "view.mcap").open("rb") as stream:
+        summary = make_reader(stream, validate_crcs=True).get_summary()
+    assert summary is not None
+    topics = {channel.topic for channel in summary.channels.values()}
+    assert {"/tf", "/robot_description", "/joint_states", "/ik/targets"} <= topics
+    layout = json.loads((tmp_path / "view.layout.json").read_text())
+    assert set(layout) >= {"configById", "layout", "playbackConfig"}
+
+
+def test_export_of_tables(run: Command, folder: Path, tmp_path: Path) -> None:
+    log = folder / "enhanced-dls.mcap"
+    for what in ("iterations", "solves", "events"):
+        table = getattr(ik.logs.open(log), what)()
+        for suffix, read in ((".parquet", pl.read_parquet), (".csv", pl.read_csv)):
+            path = tmp_path / f"{what}{suffix}"
+            done = run("log", "export", log, "--what", what, "--out", path)
+            assert (done.exit, done.err) == (0, "")
+            assert read(path).height == len(table)
+    path = tmp_path / "other"
+    run("log", "export", log, "--to", "csv", "--phase", "hand-alignment", "--out", path)
+    assert set(pl.read_csv(path)["phase"]) == {"hand-alignment"}
+
+
+def test_a_torn_log_is_said_to_be_one(run: Command, folder: Path) -> None:
+    done = run("log", "info", folder / "torn" / "torn.mcap")
+    assert done.exit == 0
+    assert "(casadi-ik log finish)" in " ".join(done.out.split())
+    assert "unfinished" not in run("log", "info", folder / "hand-first.mcap").out
+
+
+def test_finish_and_merge(run: Command, folder: Path, tmp_path: Path) -> None:
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes((folder / "torn" / "torn.mcap").read_bytes())
+    assert "cut" in run("log", "finish", torn).out
+    assert "whole already" in run("log", "finish", torn).out
+    done = run("log", "merge", torn, "--out", tmp_path / "all.mcap")
+    assert (done.exit, done.err) == (0, "")
+    assert "of enhanced-dls" in done.out
+    assert len(ik.logs.open(tmp_path / "all.mcap").solves()) == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("solves {log} --status SOLV", "{log}: no status 'SOLV'; there are: "),
+        ("solves {log} --method paper", "{log}: no method 'paper'; the log holds: enhanced-dls"),
+        ("solves {log} --solve -1", "--solve: found '-1', expected a whole number >= 0"),
+        ("solves {log} --most 0", "--most: found '0', expected a whole number >= 1"),
+        ("events {log} --event BOOM", "{log}: no event 'BOOM'; there are: "),
+        ("events {log} --phase nap", "{log}: no phase 'nap'; there are: "),
+        ("why {log} 99", "{log}: no solve 99; the log holds: enhanced-dls solves 0 to 3"),
+        ("why {log}", "{log}: which solve?; the log holds: enhanced-dls solves 0 to 3"),
+        ("why {folder}/nothing.mcap", "{folder}/nothing.mcap: cannot read the log: No such file"),
+        ("plot {log} --solve 0 --out {folder}/a.jpg", "--out: found '{folder}/a.jpg', expected a"),
+        ("plot {log} --solve 0 --out {folder}/no/a.png", "{folder}/no/a.png: --out: cannot be"),
+        ("compare {log}", "the logs hold enhanced-dls, expected two methods (say --methods)"),
+        ("compare {log} --methods paper hand-first", "--methods: found 'paper', the logs hold"),
+        ("export {log} --solve 0 --out {folder}/a.txt", "--out: found '{folder}/a.txt', expected"),
+        ("export {log} --solve 0 --out {log}", "{log}: --out: found the file of the input"),
+        ("export {log} --out {folder}/view.mcap", "{log}: which solve?; the log holds"),
+        (
+            "export {log} --solve 0 --robot nobody --out {folder}/view.mcap",
+            "{log}: robot (say --robot): no shipped arm-hand is called 'nobody'",
+        ),
+        (
+            "export {log} --solve 0 --robot kuka_lwr_barrett_coupled --out {folder}/view.mcap",
+            "{log}: the robot 'kuka_lwr_barrett_coupled' is not the one in the log",
+        ),
+        ("export {log} --what rows --out {folder}/a.csv", "--what: found 'rows', expected one of"),
+        ("finish {folder}/nothing.mcap", "{folder}/nothing.mcap: cannot finish the log: No such"),
+        ("merge {log} {log} --out {folder}/all.mcap", "{log}: solve 0 of enhanced-dls is in {log}"),
+        ("merge {log} --out {log}", "{log}: --out: found the file of the input"),
+        ("merge {log}", "the following arguments are required: --out"),
+        ("wonder {log}", "ACTION: found 'wonder', expected one of 'info', 'solves'"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    words: str, expected: str, run: Command, folder: Path
+) -> None:
+    before = sorted(folder.rglob("*"))
+    log = folder / "enhanced-dls.mcap"
+    line = [word.format(log=log, folder=folder) for word in words.split()]
+    error = run("log", *line).error
+    assert error.startswith(expected.format(log=log, folder=folder)), error
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_bad_input_of_a_process(run_process: Command, folder: Path) -> None:
+    assert "no solve 99" in run_process("log", "why", folder / "hand-first.mcap", 99).error

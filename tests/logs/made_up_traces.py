@@ -1,0 +1,78 @@
+"""Solves whose story is known because it was made up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.logs.one_solve import Happening, OneSolve
+
+FINGERS = ("thumb", "finger_2")
+JOINTS = ("joint_a", "joint_b", "joint_c")
+LAYOUT = Layout.record(
+    Field("q", (3,), "f8", "rad"),
+    Field("position_error", (2,), "f4", "m"),
+    Field("angle_error", (2,), "f4", "rad"),
+    Field("sigma_closed_chain", (), "f4"),
+    Field("limit_mask", (), "u4"),
+    Field("phase", (), "u1"),
+)
+LABELS = {
+    "q": JOINTS,
+    "limit_mask": JOINTS,
+    "position_error": FINGERS,
+    "angle_error": FINGERS,
+    "phase": ("", "thumb-reaching", "hand-alignment"),
+}
+
+
+def make_rows(count: int = 40) -> np.ndarray[Any, np.dtype[Any]]:
+    """20 iterations of thumb reaching, then hand alignment; far off, at no limit, regular."""
+    rows = np.zeros(count, LAYOUT.dtype)
+    rows["position_error"] = 0.1
+    rows["angle_error"] = 0.2
+    rows["sigma_closed_chain"] = 0.5
+    rows["phase"] = np.where(np.arange(count) < 20, 1, 2)
+    return rows
+
+
+def make_one(rows: np.ndarray[Any, np.dtype[Any]], **changes: Any) -> OneSolve:
+    """A solve with a trace; how it ended follows from its last row."""
+    position, angle = (
+        rows["position_error"][-1].astype(float),
+        rows["angle_error"][-1].astype(float),
+    )
+    ok = ~(position > 5e-3) & ~(angle > np.deg2rad(3))
+    values: dict[str, Any] = {
+        "method": "enhanced-dls",
+        "robot": "made_up",
+        "solve_id": 7,
+        "started": 1_700_000_000_000_000_000,
+        "time": 0.012,
+        "status": "SOLVED" if ok.all() else "STALLED",
+        "success": bool(ok.all()),
+        "restarts": 0,
+        "iterations": len(rows),
+        "fingers": FINGERS,
+        "position_error": position,
+        "angle_error": angle,
+        "ok": ok,
+        "target_points": np.zeros((2, 3)),
+        "target_normals": np.tile([0.0, 0.0, 1.0], (2, 1)),
+        "layout": LAYOUT,
+        "labels": LABELS,
+        "rows": rows,
+        "events": (),
+        "parameters": {
+            "tolerance": {f: {"position": 5e-3, "angle": float(np.deg2rad(3))} for f in FINGERS}
+        },
+    }
+    return OneSolve(**(values | changes))
+
+
+def event(iteration: int, kind: str, value: float = 0.0, **changes: Any) -> Happening:
+    """An event with nothing in it but what is said."""
+    values: dict[str, Any] = {"jacobian": "", "joints": (), "phase": "", "threshold": 0.0}
+    return Happening(iteration, kind, value=value, **(values | changes))

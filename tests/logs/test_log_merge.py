@@ -1,0 +1,178 @@
+"""Shards become one log: nothing is recompressed, nothing lost, nothing doubled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_up_solves import LABELS, T0, make_block, make_rows
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from casadi_ik.errors import LogError
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.logs import LogClock
+from casadi_ik.logs import open as open_log
+from casadi_ik.logs.merge import merge_logs
+from casadi_ik.solvers.method import TraceFormat
+from casadi_ik.solvers.recorder import SolveBlock
+
+Write = Callable[..., Path]
+
+
+def one(number: int, method: str = "enhanced-dls") -> SolveBlock:
+    """A block of one solve of 50 iterations."""
+    return make_block(50, first=number, method=method)
+
+
+def test_shards_are_joined(write: Write, tmp_path: Path) -> None:
+    shards = [
+        write(*(one(i) for i in numbers), name=f"{numbers[0]}.mcap", urdf="<robot/>")
+        for numbers in ((1, 3, 5), (0, 4), (2,))
+    ]
+    target = tmp_path / "all.mcap"
+    merged = merge_logs(shards, target)
+    assert merged.solves == {"enhanced-dls": 6}
+    assert merged.size == target.stat().st_size
+    log = open_log(target)
+    assert log.solves().solve_id.tolist() == list(range(6))
+    iterations = log.iterations()
+    for i in range(6):
+        rows = iterations.rows[iterations.solve_id == i]
+        assert rows.tobytes() == make_rows(i, 50).tobytes()
+        assert log.iterations(solve=i).rows.tobytes() == rows.tobytes()
+    assert len(log.events()) == sum(len(open_log(shard).events()) for shard in shards)
+    assert log.attachment("robot.urdf") == b"<robot/>"
+
+
+def test_chunks_are_copied_as_they_are_and_others_can_read_the_result(
+    write: Write, tmp_path: Path
+) -> None:
+    shards = [write(one(i), name=f"{i}.mcap") for i in range(3)]
+    target = tmp_path / "all.mcap"
+    merged = merge_logs(shards, target)
+    data = target.read_bytes()
+    messages = 0
+    for shard in shards:
+        with shard.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        assert summary is not None
+        whole = shard.read_bytes()
+        for chunk in summary.chunk_indexes:
+            begin = chunk.chunk_start_offset
+            length = chunk.chunk_length + chunk.message_index_length
+            assert whole[begin : begin + length] in data
+    with target.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        messages = len(list(reader.iter_messages()))
+        summary = reader.get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert messages == merged.messages == summary.statistics.message_count
+    with AnyReader([target]) as reader:
+        assert reader.message_count == messages
+        assert sum(1 for _ in reader.messages()) == messages
+
+
+def test_where_the_shards_come_from_is_kept(write: Write, tmp_path: Path) -> None:
+    shards = [
+        write(one(i), name=f"{i}.mcap", compression=compression)
+        for i, compression in enumerate(("none", "lz4", "zstd"))
+    ]
+    log = open_log(merge_logs(shards, tmp_path / "all.mcap").path)
+    assert '"file": "2.mcap"' in log.metadata["shards"]
+    assert '"compression": "lz4"' in log.metadata["shards"]
+    assert len(log.iterations().rows) == 150
+
+
+def test_one_solve_in_two_shards_is_refused(write: Write, tmp_path: Path) -> None:
+    first = write(one(0), one(1), name="a.mcap")
+    second = write(one(1), one(2), one(0), name="b.mcap")
+    target = tmp_path / "all.mcap"
+    for shards, number in (([first, second], 2), ([first, first], 2)):
+        with pytest.raises(LogError) as caught:
+            merge_logs(shards, target)
+        assert str(caught.value) == (
+            f"{shards[1]}: solve 0 of enhanced-dls is in {first} too ({number} such solves)"
+        )
+    assert not target.exists()
+
+
+def test_the_same_number_under_two_methods_is_no_doubling(write: Write, tmp_path: Path) -> None:
+    both = (one(0), one(0, "hand-first"))
+    first = write(*both, name="a.mcap")
+    second = write(one(1), one(1, "hand-first"), name="b.mcap")
+    assert merge_logs([first, second], tmp_path / "all.mcap").solves == {
+        "enhanced-dls": 2,
+        "hand-first": 2,
+    }
+
+
+def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> None:
+    first = write(one(0), name="first.mcap", urdf="<robot/>")
+    layout = Layout.record(Field("q", (3,)), Field("phase", dtype="u1"))
+    other = TraceFormat(layout, LABELS)
+    clock = LogClock(T0 + 10**9)
+    cases = {
+        f"t0_ns: found {T0 + 10**9}, expected {T0}": write(one(1), name="late.mcap", clock=clock),
+        "robot: found ar10, expected made_up": write(one(1), name="robot.mcap", robot_name="ar10"),
+        "parameters.damping: found 0.2, expected None as in": write(
+            one(1), name="parameters.mcap", parameters={"damping": 0.2}
+        ),
+        "seed: found 5, expected 0": write(one(1), name="seed.mcap", seed=5),
+        "channel 1, /ik/hand-first/iteration, is not as": write(
+            one(1, "hand-first"), name="method.mcap", urdf="<robot/>"
+        ),
+        "channel 2, /ik/enhanced-dls/solve, is not as": write(
+            make_block(50, first=1, form=other), name="layout.mcap", urdf="<robot/>"
+        ),
+        "the attachment 'robot.urdf' is not the same": write(
+            one(1), name="urdf.mcap", urdf="<other/>"
+        ),
+    }
+    before = sorted(tmp_path.iterdir())
+    for reason, shard in cases.items():
+        with pytest.raises(LogError) as caught:
+            merge_logs([first, shard], tmp_path / "all.mcap")
+        assert reason in str(caught.value)
+        assert str(shard) in str(caught.value)
+        assert str(first) in str(caught.value)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_shards_that_cannot_be_read(write: Write, tmp_path: Path) -> None:
+    good = write(one(0))
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(write(one(1), name="1.mcap").read_bytes()[:-30])
+    (tmp_path / "text").write_text("robot: ar10 and some more\n")
+    cases = {
+        torn: "truncated or damaged .*log finish",
+        tmp_path / "missing": "cannot read the log: No such file",
+        tmp_path: "cannot read the log: Is a directory",
+        tmp_path / "text": "not an MCAP file",
+    }
+    for shard, reason in cases.items():
+        with pytest.raises(LogError, match=reason) as caught:
+            merge_logs([good, shard], tmp_path / "all.mcap")
+        assert str(caught.value).startswith(f"{shard}: ")
+    with pytest.raises(LogError, match="found no shards"):
+        merge_logs([], tmp_path / "all.mcap")
+    with pytest.raises(LogError, match="cannot write the merged log: No such file"):
+        merge_logs([good], tmp_path / "nowhere" / "all.mcap")
+    assert not (tmp_path / "all.mcap").exists()
+
+
+def test_a_bit_flip_in_a_shard_is_found_by_whoever_reads_the_result(
+    write: Write, tmp_path: Path
+) -> None:
+    """The checksum is copied with the chunk, so damage stays visible."""
+    shard = write(make_block(500, first=0), compression="none")
+    data = bytearray(shard.read_bytes())
+    rng = np.random.default_rng(2)
+    data[int(rng.integers(len(data) // 2, len(data) // 2 + 1000))] ^= 1
+    shard.write_bytes(data)
+    merged = merge_logs([shard, write(one(1), name="b.mcap")], tmp_path / "all.mcap")
+    with pytest.raises(LogError, match="fails its checksum"):
+        open_log(merged.path).iterations()

@@ -1,0 +1,265 @@
+"""The explanation of a solve says what is known to have happened, and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from made_up_traces import LAYOUT, event, make_one, make_rows
+
+from casadi_ik.errors import InputError
+from casadi_ik.kernels.layout import Layout
+from casadi_ik.logs.compare import side_by_side, target_key
+from casadi_ik.logs.phrases import told
+from casadi_ik.logs.why import explain
+
+DEGREE = float(np.deg2rad(1.0))
+
+
+def test_a_finger_that_lags_at_a_limit() -> None:
+    """The thumb arrives; finger_2 comes to 8 mm and stays there, joint_b at its limit."""
+    rows = make_rows()
+    rows["position_error"][:, 0] = np.where(np.arange(40) < 12, 0.1, 0.001)
+    rows["angle_error"] = 2 * DEGREE
+    rows["position_error"][25:, 1] = 0.009
+    rows["position_error"][30, 1] = 0.008
+    rows["limit_mask"][24:] = 0b010
+    stall = event(36, "STALL", 1e-6, phase="hand-alignment", threshold=1e-4)
+    found = explain(make_one(rows, events=(stall,)))
+    assert found.headline == "enhanced-dls, solve 7: not solved (STALLED) after 40 iterations"
+    assert found.phases == (
+        "thumb reaching (iterations 0 to 19, 20): thumb 100.0 mm 2.0 deg -> 1.0 mm 2.0 deg, "
+        "finger_2 100.0 mm 2.0 deg -> 100.0 mm 2.0 deg",
+        "hand alignment (iterations 20 to 39, 20): thumb 1.0 mm 2.0 deg -> 1.0 mm 2.0 deg, "
+        "finger_2 100.0 mm 2.0 deg -> 9.0 mm 2.0 deg",
+    )
+    assert found.fingers == (
+        "finger_2 lagged: it ends 9.00 mm and 2.00 deg off; at its nearest, in iteration 30, it "
+        "was 8.00 mm and 2.00 deg off",
+    )
+    assert found.met == (
+        "joint_b at its limit from iteration 24 to the end",
+        "hand alignment stood still in iteration 36",
+    )
+    assert found.verdict == (
+        "finger_2 misses its point by 9.00 mm",
+        "at its end at a limit: joint_b",
+    )
+
+
+def test_a_singularity_is_told_with_its_depth_and_time() -> None:
+    rows = make_rows()
+    rows["sigma_closed_chain"][28:32] = 0.008, 0.002, 0.004, 0.009
+    rows["sigma_closed_chain"][36:] = 0.005
+    singular = [
+        event(i, "NEAR_SINGULAR", 0.008, jacobian="closed_chain", threshold=0.01) for i in (28, 36)
+    ]
+    found = explain(make_one(rows, events=tuple(singular)))
+    assert found.met == (
+        "closed chain near singular from iteration 28 on, 8 iterations in all; smallest singular "
+        "value 0.002 in iteration 29 (threshold 0.01), entered 2 times",
+    )
+    assert "at its end the closed chain is near singular" in found.verdict
+    rows["sigma_closed_chain"][-1] = 0.4
+    found = explain(make_one(rows, events=tuple(singular)))
+    assert not any("near singular" in line for line in found.verdict)
+
+
+def test_a_dip_without_a_threshold_is_told_against_the_median() -> None:
+    rows = make_rows()
+    rows["sigma_closed_chain"][:20] = np.nan
+    rows["sigma_closed_chain"][33] = 0.004
+    assert explain(make_one(rows)).met == (
+        "smallest singular value of the closed chain down to 0.004 in iteration 33 (median 0.5)",
+    )
+    rows["sigma_closed_chain"][33] = 0.06
+    assert explain(make_one(rows)).met == ()
+    rows["sigma_closed_chain"] = np.nan
+    assert explain(make_one(rows)).met == ()
+
+
+def test_a_finger_that_was_there_and_left() -> None:
+    rows = make_rows()
+    rows["position_error"], rows["angle_error"] = 0.001, 0.0
+    rows["angle_error"][31:, 0] = 10 * DEGREE
+    found = explain(make_one(rows))
+    assert found.fingers == (
+        "thumb lagged: it ends 1.00 mm and 10.00 deg off; it was within tolerance in 31 "
+        "iterations, the last of them 30",
+    )
+    assert found.verdict == ("thumb misses its normal by 10.00 deg",)
+
+
+def test_who_came_last_when_it_is_solved() -> None:
+    rows = make_rows()
+    rows["position_error"], rows["angle_error"] = 0.001, 0.0
+    rows["position_error"][:22, 0] = 0.05
+    rows["position_error"][:34, 1] = 0.05
+    found = explain(make_one(rows, restarts=2))
+    assert found.headline == "enhanced-dls, solve 7: solved after 40 iterations and 2 restarts"
+    assert found.fingers == (
+        "finger_2 was the last to come within tolerance, in iteration 34; the others were there "
+        "in iteration 22",
+    )
+    assert found.verdict == ("every contact is within tolerance",)
+    rows["position_error"][:34, 0] = 0.05
+    assert explain(make_one(rows)).fingers == (
+        "the fingers came within tolerance together, in iteration 34",
+    )
+
+
+@pytest.mark.parametrize(
+    ("end", "expected"),
+    [
+        (0.06, "while the worst error was still falling: by 40 % over the last 4 iterations"),
+        (0.099, "and over the last 4 iterations the worst error did not fall"),
+    ],
+)
+def test_a_budget_that_ran_out(end: float, expected: str) -> None:
+    rows = make_rows()
+    rows["angle_error"] = 0.0
+    rows["position_error"][-4:] = np.linspace(0.1, end, 5)[1:, None]
+    found = explain(make_one(rows, status="ITERATION_LIMIT"))
+    assert found.verdict[-1] == f"its budget ran out {expected}".replace("out and", "out, and")
+
+
+def test_restless_joints_and_oscillations() -> None:
+    events = [event(i, "LIMIT_HIT", 1.0, joints=("joint_c",)) for i in range(5, 30, 5)]
+    events += [event(3, "LIMIT_HIT", 1.0, joints=("joint_a",))]
+    events += [event(i, "OSCILLATION", 0.1, joints=("joint_a", "joint_c")) for i in (11, 22)]
+    events += [event(12, "OSCILLATION", 0.1, joints=("joint_c",))]
+    found = explain(make_one(make_rows(), events=tuple(sorted(events, key=lambda e: e.iteration))))
+    assert found.met == (
+        "to its limit and off again: joint_c 5 times",
+        "joint_c, joint_a went to and fro without progress, first in iteration 11, 3 times",
+    )
+
+
+def test_phases_that_come_again_are_told_one_by_one_or_together() -> None:
+    rows = make_rows()
+    rows["phase"] = np.arange(40) // 10 % 2 + 1
+    rows["position_error"][35:] = 0.02
+    names = [line.partition(" (")[0] for line in explain(make_one(rows)).phases]
+    assert names == [
+        "thumb reaching 1",
+        "hand alignment 1",
+        "thumb reaching 2",
+        "hand alignment 2",
+    ]
+    rows["phase"] = np.arange(40) % 2 + 1
+    lines = explain(make_one(rows)).phases
+    assert [line.partition(":")[0] for line in lines] == [
+        "thumb reaching (iterations 0 to 38, 20 in 20 goes)",
+        "hand alignment (iterations 1 to 39, 20 in 20 goes)",
+    ]
+    assert "-> 20.0 mm" in lines[0]
+
+
+def test_free_fingers_and_unmeasured_rows() -> None:
+    rows = make_rows()
+    rows["position_error"][:, 1] = rows["angle_error"][:, 1] = np.nan
+    rows["position_error"][:20] = rows["angle_error"][:20] = np.nan
+    rows["position_error"][25:, 0], rows["angle_error"][25:, 0] = 0.001, 0.0
+    rows["position_error"][-1] = rows["angle_error"][-1] = np.nan
+    nan = np.array([0.001, np.nan]), np.array([0.0, np.nan])
+    solve = make_one(rows, position_error=nan[0], angle_error=nan[1])
+    found = explain(solve)
+    assert found.phases == (
+        "thumb reaching (iterations 0 to 19, 20): errors not measured",
+        "hand alignment (iterations 20 to 39, 20): thumb 100.0 mm 11.5 deg -> 1.0 mm 0.0 deg",
+    )
+    assert found.fingers[0].startswith("thumb was the last to come within tolerance, in iteration")
+
+
+def test_a_free_finger_whose_errors_are_logged_as_zero_is_not_told() -> None:
+    rows = make_rows()
+    rows["position_error"][:, 1] = rows["angle_error"][:, 1] = 0.0
+    free = np.array([0.1, np.nan])
+    found = explain(make_one(rows, position_error=free, angle_error=free))
+    assert "finger_2" not in " ".join((*found.phases, *found.fingers, *found.verdict))
+
+
+def test_without_a_trace_only_the_end_is_told() -> None:
+    solve = make_one(make_rows())
+    found = explain(dataclasses.replace(solve, rows=solve.rows[:0]))
+    assert found.verdict == (
+        "the log kept no iterations of this solve",
+        "thumb misses its point by 100.00 mm and its normal by 11.46 deg",
+        "finger_2 misses its point by 100.00 mm and its normal by 11.46 deg",
+    )
+
+
+def test_without_limits_phases_or_singular_values() -> None:
+    """A method that records less is explained with less."""
+    lean = Layout.record(*(f for f in LAYOUT if f.name in ("q", "position_error", "angle_error")))
+    rows = np.zeros(3, lean.dtype)
+    rows["position_error"] = 0.1
+    found = explain(make_one(rows, layout=lean))
+    assert found.phases[0].startswith("the solve (iterations 0 to 2, 3): thumb 100.0 mm")
+    assert found.met == ()
+
+
+@pytest.mark.parametrize(
+    ("happening", "expected"),
+    [
+        (
+            event(1, "NEAR_SINGULAR", 0.00312, jacobian="closed_chain", threshold=0.01),
+            "closed chain near singular: smallest singular value 0.00312 (below 0.01)",
+        ),
+        (
+            event(1, "ILL_CONDITIONED", 2.5e4, jacobian="closed_chain", threshold=1e4),
+            "closed chain ill-conditioned: condition number 2.5e+04 (above 1e+04)",
+        ),
+        (event(1, "LIMIT_HIT", 2.09, joints=("a",)), "a at its limit (2.09)"),
+        (event(1, "LIMIT_LEFT", 1.5, joints=("a",), threshold=2), "a off its limit (2), now 1.5"),
+        (
+            event(1, "ACTIVATED", 3, joints=("a", "b"), threshold=1),
+            "a, b activated: 3 active constraints, 1 before",
+        ),
+        (event(1, "RESTART", 2), "restart 2"),
+        (event(1, "PHASE_CHANGE", phase="hand-alignment"), "on to hand alignment"),
+        (
+            event(1, "STALL", 1e-5, phase="refinement"),
+            "refinement stalls: errors change by 1e-05 of themselves",
+        ),
+        (
+            event(1, "OSCILLATION", 0.2, joints=("a", "b", "c", "d", "e", "f")),
+            "a, b, c, d and 2 more to and fro without progress: steps up to 0.2",
+        ),
+        (event(1, "SOMETHING_NEW", 0.2), "something new: 0.2"),
+    ],
+)
+def test_events_in_words(happening, expected: str) -> None:
+    assert told(happening) == expected
+
+
+def test_two_methods_side_by_side() -> None:
+    rows = make_rows()
+    rows["position_error"][30:], rows["angle_error"][30:] = 0.001, 0.0
+    rows["sigma_closed_chain"][7] = 0.03
+    solved = make_one(rows)
+    failed = make_one(make_rows()[20:], method="original-dls", time=0.5)
+    lines = {line.what: (line.first, line.second) for line in side_by_side(solved, failed)}
+    assert lines["status"] == ("SOLVED", "STALLED")
+    assert lines["time"] == ("12 ms", "500 ms")
+    assert lines["thumb off by"] == ("1.00 mm and 0.00 deg", "100.00 mm and 11.46 deg")
+    assert lines["phases"] == ("thumb reaching 20, hand alignment 20", "hand alignment 20")
+    assert lines["all within tolerance"] == ("from iteration 30", "never")
+    assert lines["nearest"][1] == "20 tolerances in iteration 0"
+    assert lines["smallest sigma, closed chain"] == ("0.03 in iteration 7", "0.5 in iteration 0")
+    assert lines["limits at the end"] == ("none", "none")
+    other = make_one(make_rows(), target_points=np.ones((2, 3)))
+    with pytest.raises(InputError, match="not the same target"):
+        side_by_side(solved, other)
+
+
+def test_targets_are_the_same_but_for_rounding() -> None:
+    rng = np.random.default_rng(0)
+    points, normals = rng.normal(size=(2, 3, 3))
+    normals[1] = np.nan
+    key = target_key(points, normals)
+    assert target_key(points * (1 + 1e-15), normals) == key
+    assert target_key(points + 1e-6, normals) != key
+    assert target_key(points, np.nan_to_num(normals)) != key
+    assert target_key(np.zeros((3, 3)), normals) == target_key(-np.zeros((3, 3)), normals)
