@@ -3,6 +3,7 @@
 from casadi_ik import logs
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
+from casadi_ik.control import ScrewControl, ScrewTask, Trajectory
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, load_grasp
@@ -29,10 +30,13 @@ __all__ = [
     "Grasp",
     "Phase",
     "Reason",
+    "ScrewControl",
+    "ScrewTask",
     "Solution",
     "Solver",
     "Status",
     "Tolerance",
+    "Trajectory",
     "load_grasp",
     "load_robot",
     "logs",

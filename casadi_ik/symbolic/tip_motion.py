@@ -141,7 +141,7 @@ class TipMotion:
         return ca.densify(self.joint_jacobian @ drive)
 
     def _rate(self, name: str) -> Expr:
-        """d theta / d theta_driver of a joint, down its couplings."""
+        """How fast a joint moves per unit of its driving joint, down its couplings."""
         joint, rate = self.tip.joint(name), ca.DM(1)
         while joint.coupling is not None and joint.coupling.of in self.joints:
             rate = rate * coupling_rate(joint, self.joints[joint.coupling.of])
@@ -199,7 +199,7 @@ def relative_chain(robot: RobotDescription, reference: str, finger: str) -> TipC
 
 
 def coupling_rate(joint: Joint, source: Expr) -> Expr:
-    """d theta / d source of a joint that follows something: eq. (10), for every coupling.
+    """Rate d theta / d source of a joint that follows something: eq. (10), for every coupling.
 
     Args:
         joint: The joint; one that follows nothing has rate 1.
