@@ -14,7 +14,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
 from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.couplings import joint_positions
+from casadi_ik.symbolic.couplings import joint_positions, toggle_margins
 from casadi_ik.symbolic.kinematics import Pose
 
 Array = NDArray[np.float64]
@@ -105,10 +105,28 @@ class ArmHand:
             InputError: See `configuration`.
         """
         (theta,) = self._joints(self.configuration(q))
-        names = self.description.joint_names
-        if theta.ndim == 1:
-            return {name: float(value) for name, value in zip(names, theta, strict=True)}
-        return dict(zip(names, theta.T, strict=True))
+        return _by_name(self.description.joint_names, theta)
+
+    def toggle_margins(self, q: ArrayLike) -> dict[str, Any]:
+        """How far every lead screw and four-bar is from its singular (toggle) position.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            By joint the squared sine of its transmission angle, a float or (k,) for a batch: 1 at
+            best, 0 at the toggle, negative where the mechanism cannot be assembled. Empty if the
+            robot has no such couplings.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        configuration = self.configuration(q)
+        names, kernel = self._toggle_margins
+        if not names:
+            return {}
+        (margins,) = kernel(configuration)
+        return _by_name(names, margins.reshape(*configuration.shape[:-1], len(names)))
 
     def contacts(self, q: ArrayLike) -> tuple[Array, Array]:
         """Where the fingertips are and which way they face.
@@ -166,6 +184,13 @@ class ArmHand:
         return self._kernel("joints", q, [joint_positions(self.description, q)])
 
     @cached_property
+    def _toggle_margins(self) -> tuple[tuple[str, ...], FunctionKernel]:
+        q = self._symbols()
+        margins = toggle_margins(self.description, q)
+        values = ca.vertcat(ca.SX(0, 1), *margins.values())
+        return tuple(margins), self._kernel("toggle_margins", q, [values])
+
+    @cached_property
     def _contacts(self) -> FunctionKernel:
         q = self._symbols()
         kinematics = actuated(self.description, q).kinematics
@@ -206,6 +231,13 @@ def load_robot(name_or_path: str | Path) -> ArmHand:
         DescriptionError: The file is missing or malformed; the message names file and key.
     """
     return ArmHand(load_description(name_or_path))
+
+
+def _by_name(names: tuple[str, ...], values: Array) -> dict[str, Any]:
+    """Values (m,) or (k, m) by name: floats, or (k,) for a batch."""
+    if values.ndim == 1:
+        return {name: float(value) for name, value in zip(names, values, strict=True)}
+    return dict(zip(names, values.T, strict=True))
 
 
 def _matrix(pose: Pose) -> ca.SX:
