@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from os import PathLike
 from typing import Any
 
@@ -18,6 +18,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError
 from casadi_ik.kernels import FunctionKernel, LoopKernel
 from casadi_ik.logs import McapRecorder
+from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers import Stepper, Tolerance
 from casadi_ik.solvers.recorder import SolveRecord, SolveSummary
 from casadi_ik.steps.screw_control import ScrewControlStep
@@ -133,14 +134,14 @@ class ScrewControl:
             "largest_step": np.minimum(_each("speed", fastest, n) * self.period, UNLIMITED),
             "resolution": _each("resolution", 0.0 if resolution is None else resolution, n),
         }
-        self._step = ScrewControlStep(robot.description, task)
-        self._step.task.chain(robot.description)  # refuses unknown fingers now, not at the run
+        task.chain(robot.description)  # refuses unknown fingers now, not at the run
+        self._step = _step(robot.description, task)
         self._compiled = compiled
 
-    @cached_property
+    @property
     def kernel(self) -> LoopKernel:
-        """The compiled loop."""
-        return LoopKernel(self._step.graph(), self._compiled)
+        """The compiled loop, one for all gains."""
+        return _kernel(self._step, self._compiled)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -159,7 +160,7 @@ class ScrewControl:
         Raises:
             InputError: Wrong shape or numbers.
         """
-        fulfilled = self._target(self._posture(q, "q"))
+        fulfilled = _target_kernel(self._step, self._compiled)(self._posture(q, "q"))
         names = [field.name for field in self.task.target_fields]
         return dict(zip(names, fulfilled, strict=True))
 
@@ -222,10 +223,6 @@ class ScrewControl:
         numbers = {**self._numbers, "tolerance": 0.0}
         vector = self._step.parameter_vector(self._checked(target), numbers)
         return Stepper(self.kernel.step, start, vector)
-
-    @cached_property
-    def _target(self) -> FunctionKernel:
-        return FunctionKernel(self._step.target_function, self._compiled)
 
     def _posture(self, q: ArrayLike | None, name: str) -> Array:
         array = self.robot.configuration(q, name)
@@ -302,6 +299,21 @@ class ScrewControl:
             seed=0,
         ) as recorder:
             recorder.record(SolveRecord(summary, self._step.record, rows, labels))
+
+
+@lru_cache(maxsize=64)
+def _step(robot: RobotDescription, task: ScrewTask) -> ScrewControlStep:
+    return ScrewControlStep(robot, task)
+
+
+@lru_cache(maxsize=64)
+def _kernel(step: ScrewControlStep, compiled: bool) -> LoopKernel:
+    return LoopKernel(step.graph(), compiled)
+
+
+@lru_cache(maxsize=64)
+def _target_kernel(step: ScrewControlStep, compiled: bool) -> FunctionKernel:
+    return FunctionKernel(step.target_function, compiled)
 
 
 def _number(

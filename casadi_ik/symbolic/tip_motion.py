@@ -21,7 +21,7 @@ from casadi_ik.robots.couplings import FourBar, LeadScrew
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
 from casadi_ik.symbolic import four_bar, lead_screw
-from casadi_ik.symbolic.couplings import joint_positions
+from casadi_ik.symbolic.couplings import joint_positions, linkage
 from casadi_ik.symbolic.kinematics import number
 from casadi_ik.symbolic.screws import Screw, ScrewChain, Screws, screw_chain_to_contact
 from casadi_ik.symbolic.smooth import Expr
@@ -212,6 +212,5 @@ def coupling_rate(joint: Joint, source: Expr) -> Expr:
     if isinstance(coupling, LeadScrew):
         return lead_screw.angle_rate(source, coupling.b, coupling.c)
     if isinstance(coupling, FourBar):
-        bar = four_bar.FourBar(coupling.p, coupling.q, coupling.g, coupling.h, coupling.branch)
-        return four_bar.theta3_rate(coupling.phi_0 + source, bar)
+        return four_bar.theta3_rate(coupling.phi_0 + source, linkage(coupling))
     return ca.DM(1 if coupling is None else coupling.ratio)
