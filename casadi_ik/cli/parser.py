@@ -60,6 +60,20 @@ OUT.npz then holds:
 exit codes: 0 all solved, 1 not all solved, 2 bad input
 """
 
+_CALIBRATE_EXAMPLES = """\
+example:
+  casadi-ik calibrate poses.csv --robot ar10 --out my_ar10.yaml
+  casadi-ik solve my_grasp.yaml --robot my_ar10.yaml
+
+DATA.csv has a header and a row per measured fingertip pose, in the robot's base frame:
+  finger,index_proximal_slider,index_middle_slider,x,y,z,qw,qx,qy,qz
+  index,0.0485,0.0512,-0.0466,0.0921,0.1607,0.0831,0.7023,-0.0829,0.7021
+the actuators that move the finger [rad or m], the contact point [m] and, if measured, the contact
+frame as a unit quaternion (its four columns may be left out, or empty in a row)
+
+exit codes: 0 written, 1 no estimate was found, 2 bad input
+"""
+
 
 _INVALID_CHOICE = re.compile(r"invalid choice: (.*) \(choose from (.*)\)")
 
@@ -91,6 +105,7 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True, title="commands")
     _add_solve(commands)
     _add_batch(commands)
+    _add_calibrate(commands)
     for name, run, text in (
         ("robots", _robots, "list the shipped robots: fingers and actuators"),
         ("methods", _methods, "list the methods"),
@@ -146,6 +161,40 @@ def _add_batch(commands: Any) -> None:
         "--out", metavar="OUT.npz", type=file_name(), required=True, help="write the solutions"
     )
     parser.set_defaults(run=_batch)
+
+
+def _add_calibrate(commands: Any) -> None:
+    parser = commands.add_parser(
+        "calibrate",
+        help="estimate a hand's dimensions from measured fingertip poses",
+        description="Estimate linkage dimensions, joint axes and contact frames of a robot's hand.",
+        epilog=_CALIBRATE_EXAMPLES,
+    )
+    parser.add_argument("data", metavar="DATA.csv", help="measured poses, see below")
+    parser.add_argument("--robot", metavar="R", required=True, help="a shipped name or a YAML file")
+    parser.add_argument(
+        "--estimate",
+        metavar="GROUP",
+        nargs="+",
+        type=one_of("linkage", "axes", "tips"),
+        default=["linkage", "axes", "tips"],
+        help="which numbers: linkage, axes, tips (default: all three)",
+    )
+    parser.add_argument(
+        "--loss",
+        metavar="cauchy|huber|squares",
+        type=one_of("cauchy", "huber", "squares"),
+        default="cauchy",
+        help="how outliers count; squares takes them in full (default: cauchy)",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="CALIBRATED.yaml",
+        type=file_name(".yaml"),
+        required=True,
+        help="write the robot with its estimated numbers",
+    )
+    parser.set_defaults(run=_calibrate)
 
 
 def _add_solver_options(parser: argparse.ArgumentParser) -> None:
@@ -218,6 +267,12 @@ def _batch(arguments: argparse.Namespace) -> Answer:
     from casadi_ik.cli.batch import batch
 
     return batch(arguments)
+
+
+def _calibrate(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.calibrate import calibrate
+
+    return calibrate(arguments)
 
 
 def _robots(_: argparse.Namespace) -> Answer:
