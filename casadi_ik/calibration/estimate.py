@@ -10,13 +10,13 @@ about a direction than the prior does.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import proxsuite
 from numpy.typing import NDArray
 
+from casadi_ik.calibration.losses import LOSSES, Loss
 from casadi_ik.calibration.measurements import Measurements
 from casadi_ik.calibration.model import HandModel
 from casadi_ik.calibration.parameters import Parameter
@@ -30,44 +30,12 @@ CHI_SQUARE_MEDIAN = 2.366
 NORMAL_95 = 1.959964
 """95 % of a normal variable lie within so many standard deviations."""
 
-UNKNOWN = 1e-4
+UNKNOWN = 1e-6
 """Singular value, relative to the largest, below which the data say nothing at all."""
 
 MAX_ITERATIONS = 60
 SMALLEST_STEP = 1e-7
 """Step at which the iteration ends, in prior standard deviations."""
-
-
-@dataclass(frozen=True)
-class Loss:
-    """How much a misfit counts, as a function of rho, its root mean square over the noise.
-
-    Attributes:
-        weight: Weight of a measurement in the normal equations.
-        slope: Its share in the curvature: weight + rho weight' / m over m components.
-    """
-
-    weight: Callable[[Array], Array]
-    slope: Callable[[Array, Array], Array]
-
-
-def _cauchy_slope(rho: Array, m: Array) -> Array:
-    w = 1 / (1 + (rho / CAUCHY) ** 2)
-    return w - 2 * (w * rho / CAUCHY) ** 2 / m
-
-
-def _huber_slope(rho: Array, m: Array) -> Array:
-    return np.where(rho <= HUBER, 1.0, HUBER / np.maximum(rho, HUBER) * (1 - 1 / m))
-
-
-CAUCHY, HUBER = 2.385, 1.345
-"""Tuning constants for 95 % efficiency on one normal component (Holland & Welsch 1977)."""
-
-LOSSES = {
-    "cauchy": Loss(lambda rho: 1 / (1 + (rho / CAUCHY) ** 2), _cauchy_slope),
-    "huber": Loss(lambda rho: HUBER / np.maximum(rho, HUBER), _huber_slope),
-    "squares": Loss(np.ones_like, lambda rho, _: np.ones_like(rho)),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +186,7 @@ class _Fit:
         rows = np.vstack([_stacked(jacobians, noise, roots), np.eye(len(x))])
         right = -np.concatenate([(roots[:, None] * white).ravel(), x])
         lower, upper = self._bounds()
-        step = np.linalg.lstsq(rows, right)[0]
+        step = np.asarray(np.linalg.lstsq(rows, right)[0], dtype=float)
         if np.any(x + step < lower) or np.any(x + step > upper):
             step = _in_box(rows.T @ rows, -rows.T @ right, lower - x, upper - x)
         start = self._cost(x, noise)
@@ -245,7 +213,7 @@ class _Fit:
             angle = np.median((errors[turned, 3:] ** 2).sum(axis=1))
             estimate[1] = math.sqrt(angle / CHI_SQUARE_MEDIAN / free)
         # Exact data have no noise; what is left of them is rounding.
-        return np.maximum(estimate, 1e-8)
+        return np.maximum(np.array(estimate), 1e-8)
 
     def result(
         self, x: Array, noise: Array, before: Array, steps: int, converged: bool
@@ -289,13 +257,7 @@ class _Fit:
     def _cost(self, x: Array, noise: Array) -> float:
         errors, _ = self.misfit(x)
         _, rho, numbers = self.whitened(errors, noise)
-        if self.loss is LOSSES["cauchy"]:
-            costs = 0.5 * CAUCHY**2 * np.log1p((rho / CAUCHY) ** 2)
-        elif self.loss is LOSSES["huber"]:
-            costs = np.where(rho <= HUBER, 0.5 * rho**2, HUBER * (rho - 0.5 * HUBER))
-        else:
-            costs = 0.5 * rho**2
-        return float((numbers * costs).sum() + 0.5 * x @ x)
+        return float((numbers * self.loss.cost(rho)).sum() + 0.5 * x @ x)
 
     def _bounds(self) -> tuple[Array, Array]:
         bounds = np.array([parameter.bounds for parameter in self.model.parameters])

@@ -96,8 +96,8 @@ def hand_parameters(
     """
     unknown = [group for group in groups if group not in GROUPS]
     if unknown or not groups:
-        found = repr(unknown[0]) if unknown else "nothing"
-        raise InputError(f"groups: found {found}, expected some of {', '.join(GROUPS)}")
+        wrong = repr(unknown[0]) if unknown else "nothing"
+        raise InputError(f"groups: found {wrong}, expected some of {', '.join(GROUPS)}")
     if not fingers:
         raise InputError("fingers: none, expected at least one")
     spread = priors or Priors()
@@ -119,7 +119,7 @@ def _coupling(joint: Joint, spread: Priors) -> list[Parameter]:
     if isinstance(joint.coupling, LeadScrew):
         keys = ("b", "c", "theta_0")
     elif isinstance(joint.coupling, FourBar):
-        keys = (*"pqgh", "phi_0", "theta_3_0")
+        keys = ("p", "q", "g", "h", "phi_0", "theta_3_0")
     found = []
     for key in keys:
         is_length = len(key) == 1
