@@ -163,3 +163,20 @@ def test_a_log_of_a_run(toy, rng, tmp_path):
 def test_bad_input_is_one_clear_error(make, error, words, toy):
     with pytest.raises(error, match=words):
         make(toy)
+
+
+def test_an_arm_helps_where_a_finger_alone_cannot_reach(rng):
+    """On Baxter the index tip goes 10 cm away; arm and sliders share the work, within limits."""
+    baxter = ik.load_robot("baxter_ar10")
+    control = ik.ScrewControl(baxter, ik.ScrewTask("position", "index"), 0.3, compiled=False)
+    start = 0.5 * (baxter.lower + baxter.upper)
+    goal = control.target(start)["point"] + [0.05, 0.07, -0.05]
+    run = control.run(start, {"point": goal}, 60)
+    assert run.error_norm[-1] < 1e-6
+    moved = np.abs(run.q[-1] - start) > 1e-6
+    arm = [name.startswith("right_") for name in baxter.actuators]
+    index = [name.startswith("index_") for name in baxter.actuators]
+    assert moved[np.array(arm)].any()
+    assert moved[np.array(index)].all()
+    assert not moved[~(np.array(arm) | np.array(index))].any()
+    assert ((run.q >= baxter.lower) & (run.q <= baxter.upper)).all()
