@@ -6,21 +6,26 @@ from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.control import ScrewControl, ScrewTask, Trajectory
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
-from casadi_ik.grasps import Contact, Grasp, load_grasp
+from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp
 from casadi_ik.solvers import (
     METHODS,
+    Alternative,
+    ArmBranch,
     BatchSolution,
     ContactVerdict,
     Diagnosis,
+    Jump,
     Phase,
     Reason,
     Solution,
     Status,
-    Tolerance,
+    Track,
 )
 
 __all__ = [
     "METHODS",
+    "Alternative",
+    "ArmBranch",
     "ArmHand",
     "BatchSolution",
     "CasadiIKError",
@@ -28,6 +33,7 @@ __all__ = [
     "ContactVerdict",
     "Diagnosis",
     "Grasp",
+    "Jump",
     "Phase",
     "Reason",
     "ScrewControl",
@@ -36,6 +42,7 @@ __all__ = [
     "Solver",
     "Status",
     "Tolerance",
+    "Track",
     "Trajectory",
     "load_grasp",
     "load_robot",

@@ -134,12 +134,7 @@ class Descent:
     def __init__(self, trials: Trials, problems: Problems) -> None:
         """Lay out the rows once, for any number of runs."""
         self._trials = trials
-        home = np.tile(trials.robot.home, (len(problems), 1))
-        self._states, self._parameters = trials.method.rows(problems, home)
-        last = trials.method.options.candidates - 1
-        values = {"phase": Phase.REFINEMENT, "candidate": last} | fresh_fit()
-        for name, value in values.items():
-            self._states[:, trials.state.slice(name)] = value
+        self._states, self._parameters = refinement_rows(trials, problems)
 
     def run(self, q: Array, bounds: Bounds, weights: Array | None = None) -> Array:
         """Refine.
@@ -166,6 +161,16 @@ class Descent:
         return trials.run(states, parameters)
 
 
+def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:
+    """States and parameters of the loop that begin with the refinement of the whole arm-hand."""
+    home = np.tile(trials.robot.home, (len(problems), 1))
+    states, parameters = trials.method.rows(problems, home)
+    last = trials.method.options.candidates - 1
+    for name, value in ({"phase": Phase.REFINEMENT, "candidate": last} | fresh_fit()).items():
+        states[:, trials.state.slice(name)] = value
+    return states, parameters
+
+
 def repeated(problems: Problems, count: int) -> Problems:
     """One target, several times."""
     return problems.rows(np.zeros(count, dtype=np.intp))
@@ -173,6 +178,6 @@ def repeated(problems: Problems, count: int) -> Problems:
 
 def allowed(problems: Problems) -> Array:
     """(f, 2) the residuals that the tolerances allow, as `Trials.misses`; 0 where free."""
-    tolerance = problems.tolerance
-    known = np.stack([~np.isnan(problems.points[0, :, 0]), ~np.isnan(problems.normals[0, :, 0])], 1)
-    return known * np.array([tolerance.position / LENGTH, 2 * np.sin(tolerance.angle / 2)])
+    known = [~np.isnan(problems.points[0, :, 0]), ~np.isnan(problems.normals[0, :, 0])]
+    tolerated = [problems.position_tolerance / LENGTH, 2 * np.sin(problems.angle_tolerance / 2)]
+    return np.stack(known, axis=1) * np.stack(tolerated, axis=1)

@@ -14,7 +14,7 @@ from casadi_ik.steps.limits import kept_within, limit_mask
 from casadi_ik.steps.palm_estimate import palm_orientation, thumb_first
 from casadi_ik.steps.qiu_parameters import OriginalParameters
 from casadi_ik.steps.status import Phase, Status
-from casadi_ik.steps.targets import contact_errors, target_fields, targets
+from casadi_ik.steps.targets import contact_errors, target_fields, targets, within_tolerance
 from casadi_ik.steps.tasks import (
     Task,
     TaskSolver,
@@ -72,9 +72,7 @@ class OriginalStep:
         robot, q = self.robot, s["q"]
         body, goals = actuated(robot, q), targets(robot, p)
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
-        solved = ca.logic_and(
-            ca.mmax(positions) <= p["position_tolerance"], ca.mmax(angles) <= p["angle_tolerance"]
-        )
+        solved = within_tolerance(positions, angles, p)
         step = combine(self._tasks(body, p), self._solver(p), self.options.projection)
         q_next = kept_within(robot, q + step, p["enforce_limits"])
         size = ca.mmax(ca.fabs(q_next - q))
@@ -102,8 +100,8 @@ class OriginalStep:
         return StepGraph(name, function, self.state, self.parameters, self.record)
 
     def parameter_values(
-        self, position_tolerance: float, angle_tolerance: float, enforce_limits: bool
-    ) -> dict[str, float]:
+        self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool
+    ) -> dict[str, float | Array]:
         """Values of all parameter fields but the targets."""
         options = self.options
         return {
