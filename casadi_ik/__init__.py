@@ -6,7 +6,7 @@ from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.control import ScrewControl, ScrewTask, Trajectory
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
-from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp
+from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
 from casadi_ik.solvers import (
     METHODS,
     Alternative,
@@ -47,5 +47,6 @@ __all__ = [
     "load_grasp",
     "load_robot",
     "logs",
+    "shipped_grasps",
     "shipped_names",
 ]

@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args(arguments)
     robot = ik.load_robot("kuka_lwr_barrett")
-    names = ik.shipped_names("grasps")
+    names = ik.shipped_grasps(robot.name)
     rng = np.random.default_rng(options.seed)
     points, normals = random_arm_targets(robot, names, options.count, rng)
     results = {}

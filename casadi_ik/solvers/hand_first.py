@@ -99,6 +99,8 @@ class HandFirstMethod:
         count = len(problems)
         outcome = _Collected(count, len(self._robot.actuators), trace)
         waiting = np.arange(count)
+        states = self._states(q0)
+        passed = layouts.state.slice("passed")
         for number in range(options.rounds if count else 0):
             begin = time.perf_counter()
             first = number * options.candidates
@@ -106,8 +108,10 @@ class HandFirstMethod:
             lookup = self.postures(chosen, number)
             parameters = self._parameters(chosen, q0[waiting], lookup)
             outcome.time[waiting] += (time.perf_counter() - begin) / max(len(waiting), 1)
-            result = self.kernel.run(self._states(q0[waiting]), parameters, MAX_ITERATIONS, trace)
+            result = self.kernel.run(states[waiting], parameters, MAX_ITERATIONS, trace)
             outcome.take(layouts, waiting, result, first)
+            # The next round goes on where this one stopped in the numeric arm's list of starts.
+            states[waiting, passed] = result.states[:, passed]
             waiting = waiting[result.status != Status.SOLVED]
             if not len(waiting):
                 break
@@ -141,8 +145,11 @@ class HandFirstMethod:
     def _parameters(self, problems: Problems, q0: Array, postures: Array) -> Array:
         layout = self.step.layouts.parameters
         count = len(problems)
-        lower, upper = problems.bounds(self._robot.lower, self._robot.upper, UNBOUNDED)
+        lower, upper = problems.bounds(self._robot, UNBOUNDED)
         hand = list(self.step.layouts.hand)
+        # What moves free fingers only stays where it is.
+        needed = ~np.isnan(problems.points[..., 0]) @ self._moves
+        postures = np.where(needed[:, None], postures, q0[:, None, hand])
         values: dict[str, Any] = {
             "points": np.nan_to_num(problems.points),
             "normals": np.nan_to_num(problems.normals),
@@ -164,6 +171,12 @@ class HandFirstMethod:
                 array.reshape(count, -1) if array.ndim > 1 and len(array) == count else array
             )
         return parameters
+
+    @cached_property
+    def _moves(self) -> NDArray[np.bool_]:
+        """(f, hand) whether a motor of the hand moves a finger."""
+        robot, hand = self._robot, self.step.layouts.hand
+        return np.array([np.isin(hand, robot.finger_actuators(f)) for f in robot.finger_names])
 
     def _states(self, q0: Array) -> Array:
         layout = self.step.layouts.state

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Tolerance
+from casadi_ik.robots.description import RobotDescription
 
 Array = NDArray[np.float64]
 
@@ -76,16 +77,16 @@ class Problems:
         points, normals = self.points[rows], self.normals[rows]
         return replace(self, points=points, normals=normals, first_row=first_row)
 
-    def bounds(self, lower: Array, upper: Array, unbounded: float) -> tuple[Array, Array]:
-        """Bounds (n,) that a method has to keep to.
+    def bounds(self, robot: RobotDescription, unbounded: float) -> tuple[Array, Array]:
+        """Bounds (n,) that a method has to keep to: limits, or what the mechanisms permit.
 
         Args:
-            lower: (n,) limits of the robot's actuators.
-            upper: (n,).
+            robot: The robot.
             unbounded: What stands for no limit [rad or m].
         """
+        lower, upper = robot.lower, robot.upper
         if not self.enforce_limits:
-            lower, upper = np.full_like(lower, -unbounded), np.full_like(upper, unbounded)
+            lower, upper = (np.clip(ends, -unbounded, unbounded) for ends in robot.mechanical)
         if self.fixed is None:
             return lower, upper
         free = np.isnan(self.fixed)

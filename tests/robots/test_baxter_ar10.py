@@ -53,7 +53,9 @@ def test_arm_and_mount(baxter, rng):
 def test_the_hand_is_the_ar10(baxter, rng):
     alone = ik.load_robot("ar10")
     assert baxter.actuators[7:] == alone.actuators
-    assert baxter.actuators[:7] == tuple(f"right_{n}" for n in "s0 s1 e0 e1 w0 w1 w2".split())
+    assert baxter.actuators[:7] == (
+        "right_s0", "right_s1", "right_e0", "right_e1", "right_w0", "right_w1", "right_w2",
+    )  # fmt: skip
     assert baxter.fingers == alone.fingers
     q = baxter.random(rng, 20)
     hand = baxter.links(q)["hand_base"]

@@ -31,7 +31,7 @@ def singular(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> np.ndar
 
 def shipped_hands(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> np.ndarray:
     """Hands of the shipped grasps on random arms."""
-    arrays = [ik.load_grasp(name).arrays(robot.fingers) for name in ik.shipped_names("grasps")]
+    arrays = [ik.load_grasp(name).arrays(robot.fingers) for name in ik.shipped_grasps(robot.name)]
     points, normals = (np.array(part) for part in zip(*arrays, strict=True))
     hands = ik.Solver(robot, tolerance=EXACT).solve_batch(points, normals).q[:, ARM:]
     q = robot.random(rng, count)
