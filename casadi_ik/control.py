@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from os import PathLike
 from typing import Any
@@ -19,8 +18,9 @@ from casadi_ik.errors import InputError
 from casadi_ik.kernels import FunctionKernel, LoopKernel
 from casadi_ik.logs import McapRecorder
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solvers import Stepper, Tolerance
+from casadi_ik.solvers import Stepper
 from casadi_ik.solvers.recorder import SolveRecord, SolveSummary
+from casadi_ik.solvers.trajectory import Trajectory
 from casadi_ik.steps.screw_control import ScrewControlStep
 from casadi_ik.steps.screw_objectives import ScrewTask
 from casadi_ik.steps.status import Status
@@ -30,44 +30,6 @@ Array = NDArray[np.float64]
 
 UNLIMITED = 1e9
 """A step that no actuator reaches [rad or m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """What the control law made of one target; s steps were made.
-
-    Attributes:
-        times: (s + 1,) [s], the start first.
-        q: (s + 1, n) actuator positions [rad or m].
-        points: (s + 1, 3) contact point in the frame of the target [m].
-        error: (s + 1, m) rows of the task, desired minus current [m, rad].
-        error_norm: (s + 1,) their norm; of a pose the screw error norm of Chandra eq. (17).
-        sigma: (s + 1,) smallest singular value of the Jacobian over half ranges.
-        status: `SOLVED` if the error norm fell below the tolerance, else `ITERATION_LIMIT`, or
-            `INVALID`.
-    """
-
-    times: Array
-    q: Array
-    points: Array
-    error: Array
-    error_norm: Array
-    sigma: Array
-    status: Status
-
-    def rate(self, floor: float = 1e-9) -> float:
-        """Exponential rate [1/s] fitted to the error norm: -slope of its logarithm over time.
-
-        Args:
-            floor: Norms at or below it are rounding and left out.
-
-        Returns:
-            The rate, NaN if fewer than two norms are above the floor.
-        """
-        rows = self.error_norm > floor
-        if rows.sum() < 2:
-            return math.nan
-        return -float(np.polyfit(self.times[rows], np.log(self.error_norm[rows]), 1)[0])
 
 
 class ScrewControl:
@@ -214,7 +176,8 @@ class ScrewControl:
             status=status,
         )
         if log is not None:
-            self._write(log, began, float(result.time[0]), trajectory, rows)
+            parameters = self.parameters | {"tolerance": {"error_norm": numbers["tolerance"]}}
+            self._write(log, parameters, began, float(result.time[0]), trajectory, rows)
         return trajectory
 
     def stepper(self, q0: ArrayLike | None, target: Mapping[str, ArrayLike]) -> Stepper:
@@ -258,6 +221,7 @@ class ScrewControl:
     def _write(
         self,
         path: str | PathLike[str],
+        parameters: dict[str, Any],
         began: int,
         seconds: float,
         trajectory: Trajectory,
@@ -295,7 +259,7 @@ class ScrewControl:
             path,
             robot_name=self.robot.name,
             urdf=self.robot.urdf(),
-            parameters={**self.parameters, "tolerance": vars(Tolerance())},
+            parameters=parameters,
             seed=0,
         ) as recorder:
             recorder.record(SolveRecord(summary, self._step.record, rows, labels))

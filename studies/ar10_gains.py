@@ -15,7 +15,8 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-from matplotlib.axes import Axes
+from ar10.figures import draw_run, finish, translation
+from ar10.report import table
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -299,7 +300,7 @@ the distance never notices.
 """
 
 
-ROWS = {"pose": 6, "position": 3, "distance": 1}
+ROWS = {"pose": "6", "position": "3", "distance": "1"}
 
 
 def asked(kind: str, pose: Array, point: Array) -> dict[str, Array]:
@@ -325,55 +326,12 @@ def final_distance(control: ik.ScrewControl, start: Array, goal: Array, steps: i
     return 1e3 * float(np.linalg.norm(end - translation(target)))
 
 
-def translation(target: dict[str, Array]) -> Array:
-    """Point of a target pose [m]."""
-    return np.array(dq.translation(ca.DM(target["pose"]))).ravel()
-
-
-def draw_run(
-    path: Axes,
-    norms: Axes,
-    run: ik.Trajectory,
-    label: str,
-    color: str,
-    style: str,
-    axes: tuple[int, int] = (1, 2),
-) -> None:
-    """A run's path in millimetres and its norm over the steps."""
-    x, y = (1e3 * run.points[:, i] for i in axes)
-    path.plot(x, y, style, color=color, ms=3, marker=".", lw=1.2, label=label or None)
-    norms.semilogy(np.maximum(run.error_norm, 1e-12), style, color=color, lw=1.4)
-
-
-def finish(
-    path: Axes,
-    norms: Axes,
-    pose: Array,
-    axes: tuple[int, int] = (1, 2),
-    names: str = "yz",
-    frame: str = "hand base",
-) -> None:
-    """Goal, labels and legend of a figure."""
-    goal = 1e3 * translation({"pose": pose})
-    path.plot(*goal[list(axes)], "k+", ms=12, label="goal")
-    path.set(xlabel=f"{names[0]} [mm], {frame}", ylabel=f"{names[1]} [mm]", aspect="equal")
-    path.set_adjustable("datalim")
-    path.legend(frameon=False, fontsize=8)
-    norms.set(xlabel="step", ylabel="screw error norm", ylim=(1e-9, 5))
-
-
 def rate_rows(rates: list[tuple[float, float]]) -> list[tuple[str, str, str]]:
     """Fitted rates beside the law's."""
     return [
         (f"{gain:g}", f"{rate:.3f}", "infinite" if gain == 1 else f"{-np.log(1 - gain):.3f}")
         for gain, rate in rates
     ]
-
-
-def table(header: tuple[str, ...], rows: list[tuple]) -> str:
-    """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
 
 if __name__ == "__main__":

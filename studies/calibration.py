@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from ar10.report import table
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -189,8 +190,8 @@ says so.
 
 The weakest directions of one estimate without outliers, with their larger components. Among those
 with zero are, mixed with one another: the size of the four-bar, of which angles know only ratios;
-shifts of the parallel axes along themselves against one another; and reference angles against
-turns of the frames that follow.
+a shift of each of the three axes along itself, made up for by what follows; and a turn about each,
+made up for by the reference angles.
 
 {directions}
 """
@@ -286,12 +287,6 @@ def draw_spectrum(found: Calibration, path: Path) -> None:
 def spread(values: Array) -> str:
     """Median and 90th percentile."""
     return f"{np.median(values):.3f} / {np.percentile(values, 90):.3f}"
-
-
-def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """A Markdown table."""
-    lines = [header, ("---",) * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 if __name__ == "__main__":
