@@ -33,6 +33,9 @@ NORMAL_95 = 1.959964
 UNKNOWN = 1e-6
 """Singular value, relative to the largest, below which the data say nothing at all."""
 
+FEWEST = 12
+"""Measured numbers beyond those that the parameters can explain, so that noise can be seen."""
+
 MAX_ITERATIONS = 60
 SMALLEST_STEP = 1e-7
 """Step at which the iteration ends, in prior standard deviations."""
@@ -49,8 +52,9 @@ class Calibration:
         singular_values: (k,) of the whitened Jacobian in units of the priors, descending.
         directions: (k, k) their directions in units of the priors, one per row.
         weights: (m,) weight of each measurement, 1 where it is taken in full.
-        noise: Estimated standard deviations of a measured coordinate [m] and angle [rad]; NaN if
-            no orientation was measured.
+        noise: Standard deviations of a measured coordinate [m] and angle [rad]; NaN if no
+            orientation was measured.
+        noise_estimated: Whether the noise is from the data; with too few it is what was assumed.
         before: (m, 2) misfit of the description: distance [m] and angle [rad, NaN].
         after: (m, 2) the same of the estimate.
         iterations: Gauss-Newton steps.
@@ -64,6 +68,7 @@ class Calibration:
     directions: Array
     weights: Array
     noise: tuple[float, float]
+    noise_estimated: bool
     before: Array
     after: Array
     iterations: int
@@ -128,8 +133,9 @@ def calibrate(
         model: The description with its free numbers.
         measurements: Measured poses.
         loss: "cauchy" (the default), "huber", or "squares" (not robust).
-        sigma_position: Noise of a measured coordinate to begin with [m].
-        sigma_angle: Noise of a measured angle to begin with [rad].
+        sigma_position: Noise of a measured coordinate [m] to begin with; with too few data to
+            estimate it, it is taken as it is.
+        sigma_angle: The same of a measured angle [rad].
 
     Raises:
         UnknownNameError: No such loss.
@@ -144,15 +150,16 @@ def calibrate(
     noise = np.array([sigma_position, sigma_angle])
     x = np.zeros(len(model.parameters))
     before, _ = fit.misfit(x)
+    estimated = fit.enough()
     converged, steps = False, 0
     while not converged and steps < MAX_ITERATIONS:
         step = fit.step(x, noise)
         x, last = x + step, noise
-        noise = fit.noise(x, last)
+        noise = fit.noise(x, last) if estimated else last
         converged = bool(np.abs(step).max() < SMALLEST_STEP)
         converged = converged and bool(np.allclose(noise, last, rtol=1e-4))
         steps += 1
-    return fit.result(x, noise, before, steps, converged)
+    return fit.result(x, noise, estimated, before, steps, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,10 +209,18 @@ class _Fit:
         numbers = np.where(self.measurements.turned, 6.0, 3.0)
         return white, np.sqrt((white**2).sum(axis=1) / numbers), numbers
 
+    def enough(self) -> bool:
+        """Whether there are rows enough beyond what the parameters can explain."""
+        _, jacobians = self.misfit(np.zeros(len(self.model.parameters)))
+        rows = jacobians.reshape(-1, jacobians.shape[2])
+        return self._rows() - int(np.linalg.matrix_rank(rows, rtol=UNKNOWN)) >= FEWEST
+
     def noise(self, x: Array, noise: Array) -> Array:
         """Standard deviations from the medians of the misfits, which outliers hardly move."""
-        errors, _ = self.misfit(x)
-        free = max(1.0, errors.size - len(x)) / errors.size
+        errors, jacobians = self.misfit(x)
+        _, rho, _ = self.whitened(errors, noise)
+        known, _ = self._known(jacobians, noise, self.loss.weight(rho))
+        free = 1 - _used(known) / self._rows()
         turned = self.measurements.turned
         position = np.median((errors[:, :3] ** 2).sum(axis=1))
         estimate = [math.sqrt(position / CHI_SQUARE_MEDIAN / free), float(noise[1])]
@@ -215,10 +230,19 @@ class _Fit:
         # Exact data have no noise; what is left of them is rounding.
         return np.maximum(np.array(estimate), 1e-8)
 
+    def _rows(self) -> int:
+        """How many numbers were measured."""
+        return int(np.where(self.measurements.turned, 6, 3).sum())
+
+    def _known(self, jacobians: Array, noise: Array, weights: Array) -> tuple[Array, Array]:
+        """Singular values (k,) and directions (k, k) of the whitened, weighted Jacobian."""
+        _, known, directions = np.linalg.svd(_stacked(jacobians, noise, np.sqrt(weights)))
+        return np.concatenate([known, np.zeros(len(directions) - len(known))]), directions
+
     def result(
-        self, x: Array, noise: Array, before: Array, steps: int, converged: bool
+        self, x: Array, noise: Array, estimated: bool, before: Array, steps: int, converged: bool
     ) -> Calibration:
-        """The estimate with all that is said about it."""
+        """The estimate with all that is said about it; `estimated`: the noise is from the data."""
         errors, jacobians = self.misfit(x)
         _, rho, numbers = self.whitened(errors, noise)
         weights = self.loss.weight(rho)
@@ -232,11 +256,11 @@ class _Fit:
         curved = _stacked(jacobians, noise, np.sqrt(self.loss.slope(rho, numbers)))
         _, sizes, turns = np.linalg.svd(np.vstack([curved, eye]), full_matrices=False)
         outer = (turns.T / sizes**2) @ turns
-        _, known, directions = np.linalg.svd(_stacked(jacobians, noise, np.sqrt(weights)))
-        known = np.concatenate([known, np.zeros(len(x) - len(known))])
-        used = float((known**2 / (known**2 + 1)).sum())
-        free = numbers.sum() / max(1.0, numbers.sum() - used)
-        inner = free * information((weights * rho) ** 2) + eye
+        known, directions = self._known(jacobians, noise, weights)
+        # Where there are too few data to see the scatter, the noise that was assumed stands for it.
+        scatter = (weights * rho) ** 2 / (1 - _used(known) / self._rows())
+        share = scatter if estimated else self.loss.slope(rho, numbers)
+        inner = information(share) + eye
         prior = self.model.prior
         covariance = np.outer(prior, prior) * (outer @ inner @ outer)
         turned = self.measurements.turned
@@ -248,6 +272,7 @@ class _Fit:
             directions=directions,
             weights=weights,
             noise=(float(noise[0]), float(noise[1]) if turned.any() else math.nan),
+            noise_estimated=estimated,
             before=_sizes(before, turned),
             after=_sizes(errors, turned),
             iterations=steps,
@@ -269,6 +294,11 @@ def _stacked(jacobians: Array, noise: Array, roots: Array) -> Array:
     """Whitened Jacobians (m, 6, k) as rows (6 m, k), each measurement times its root weight."""
     scaled = jacobians * (roots[:, None] / _each(noise))[:, :, None]
     return scaled.reshape(-1, jacobians.shape[2])
+
+
+def _used(known: Array) -> float:
+    """How many of the measured numbers the estimate follows, by its singular values."""
+    return float((known**2 / (known**2 + 1)).sum())
 
 
 def _each(noise: Array) -> Array:

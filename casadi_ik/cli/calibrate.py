@@ -56,7 +56,7 @@ def _report(found: calibration.Calibration, written: list[tuple[str, object]]) -
     lines = {
         "tip misses, median": f"{1e3 * np.median(found.before[:, 0]):.3f} mm described, "
         f"{1e3 * np.median(found.after[:, 0]):.3f} mm estimated",
-        "noise found": noise,
+        "noise found" if found.noise_estimated else "noise assumed": noise,
         "outliers": f"{len(found.outliers)} poses count less than a quarter",
         "directions": f"{len(found.parameters)}, of which the data say less than the priors about "
         f"{weak}, and nothing about {found.unknown_directions}",

@@ -188,6 +188,21 @@ def _add_calibrate(commands: Any) -> None:
         help="how outliers count; squares takes them in full (default: cauchy)",
     )
     parser.add_argument(
+        "--noise-position",
+        metavar="METRES",
+        type=positive,
+        default=0.5e-3,
+        help="standard deviation of a measured coordinate, as long as the data are too few to show "
+        "it (default: 0.0005)",
+    )
+    parser.add_argument(
+        "--noise-angle",
+        metavar="RADIANS",
+        type=positive,
+        default=0.0175,
+        help="the same of a measured angle (default: 0.0175, 1 deg)",
+    )
+    parser.add_argument(
         "--out",
         metavar="CALIBRATED.yaml",
         type=file_name(".yaml"),

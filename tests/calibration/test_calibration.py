@@ -170,6 +170,21 @@ def test_points_alone_are_enough_for_a_smaller_estimate(index, rng):
     assert result.deviation.sum() > whole.deviation.sum()
 
 
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_few_poses_leave_the_priors_and_the_assumed_noise(count, index):
+    """No overconfidence: with too few data to show their noise, the assumed one stands."""
+    inside = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        truth = true_values(index, rng)
+        data = simulate(index, truth, "index", count, rng)
+        result = calibrate(index, data, sigma_position=2e-4, sigma_angle=np.deg2rad(0.5))
+        assert result.converged
+        assert not result.noise_estimated or count == 5
+        inside.append(np.abs(result.values - truth) <= result.interval)
+    assert 0.9 < np.mean(inside) < 0.99
+
+
 def test_bounds_hold(index, rng):
     """Data of a hand far off: no number leaves three prior deviations."""
     far = index.nominal + 2.9 * index.prior * np.sign(rng.standard_normal(len(index.prior)))
