@@ -150,6 +150,9 @@ def target_arrays(points: ArrayLike, normals: ArrayLike, f: int) -> tuple[Array,
             raise InputError(f"{name}: expected an array of numbers") from error
         if array.ndim != 3 or array.shape[1:] != (f, 3):
             raise InputError(f"{name}: found shape {array.shape}, expected (k, {f}, 3)")
+        if np.isfinite(array).all():
+            arrays.append(array)
+            continue
         free = np.isnan(array)
         partly = np.any(free, axis=2) & ~np.all(free, axis=2)
         _refuse(partly, f"{name}: is partly NaN, expected three numbers or three NaN")
@@ -158,7 +161,7 @@ def target_arrays(points: ArrayLike, normals: ArrayLike, f: int) -> tuple[Array,
     p, n = arrays
     if len(p) != len(n):
         raise InputError(f"points and normals: found {len(p)} and {len(n)} rows, expected as many")
-    length = np.linalg.norm(n, axis=2)
+    length = np.sqrt(np.einsum("kfi,kfi->kf", n, n))
     _refuse(length < 1e-9, "normals: is zero, expected a direction")
     free_point = np.isnan(p[..., 0])
     _refuse(free_point & ~np.isnan(length), "normals: is given for a finger without a point")

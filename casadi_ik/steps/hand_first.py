@@ -177,7 +177,7 @@ class HandFirstStep:
         inside = ca.fmin(ca.fmax(arm, p["lower"][rows]), p["upper"][rows])
         palm = Pose(s["palm_rotation"], s["palm_origin"])
         tried = pose_step(self.robot, inside, palm, s["damping"], p)
-        judged = judge(s, tried, ca.sumsqr(tried.there) < EXACT * EXACT)
+        judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
         now = ca.if_else(judged.accepted, tried.reached, inside)
         margin = -ca.sqrt(judged.cost)
         better = margin > s["margin"]
