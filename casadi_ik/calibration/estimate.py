@@ -236,7 +236,9 @@ class _Fit:
 
     def _known(self, jacobians: Array, noise: Array, weights: Array) -> tuple[Array, Array]:
         """Singular values (k,) and directions (k, k) of the whitened, weighted Jacobian."""
-        _, known, directions = np.linalg.svd(_stacked(jacobians, noise, np.sqrt(weights)))
+        rows = _stacked(jacobians, noise, np.sqrt(weights))
+        few = len(rows) < rows.shape[1]  # else the directions are complete without the rest of U
+        _, known, directions = np.linalg.svd(rows, full_matrices=few)
         return np.concatenate([known, np.zeros(len(directions) - len(known))]), directions
 
     def result(

@@ -67,7 +67,7 @@ example:
 
 DATA.csv has a header and a row per measured fingertip pose, in the robot's base frame:
   finger,index_proximal_slider,index_middle_slider,x,y,z,qw,qx,qy,qz
-  index,0.0485,0.0512,-0.0466,0.0921,0.1607,0.0831,0.7023,-0.0829,0.7021
+  index,0.0485,0.0512,-0.0462,0.0896,0.1447,0.7065,0.0282,-0.7065,-0.0282
 the actuators that move the finger [rad or m], the contact point [m] and, if measured, the contact
 frame as a unit quaternion (its four columns may be left out, or empty in a row)
 
