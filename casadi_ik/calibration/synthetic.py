@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +62,7 @@ def simulate(
     return Measurements((finger,) * count, q, seen, np.ones(count, dtype=bool))
 
 
+@cache
 def _displaced() -> FunctionKernel:
     """A pose turned about its own point and shifted, both in the base frame."""
     pose, turn, shift = ca.SX.sym("pose", 8), ca.SX.sym("turn", 3), ca.SX.sym("shift", 3)
