@@ -115,18 +115,20 @@ def index_pose(robot: ik.ArmHand, out: Path, goals: int, rng: np.random.Generato
 
 ![Index fingertip: path and screw error norm](index_pose.png)
 
-Left the path of the tip in the finger's plane, right the screw error norm (17). The paper's Figs. 2
-and 3 show the same: exponential fall, slowest for 0.1. With exact sliders (full lines) every gain
-ends at zero error. The paper's does not (Table I): 4 mm are left at gain 0.1, under 1 mm at 0.5 and
-1. Sliders that move in steps of {1e3 * RESOLUTION:g} mm (an assumption; dotted) explain this: once
-the gain times the remaining slider error is less than half a step, nothing moves any more, so what
-is left grows as 1/gain.
+Left the path of the tip in the finger's plane, right the screw error norm (17). The paper describes
+its Figs. 2 and 3 the same way: exponential fall, slowest for 0.1. With exact sliders (full lines)
+every gain ends at zero error. The paper's does not (Table I): 4 mm are left at gain 0.1, under 1 mm
+at 0.5 and 1. Sliders that move in steps of {1e3 * RESOLUTION:g} mm (an assumption; dotted) would
+explain that: once the gain times the remaining slider error is less than half a step, nothing moves
+any more, so what is left grows as 1/gain. With that one number assumed, the model's figures are of
+the table's size.
 
 {table(("gain", "Table I, X and Y [mm]", "its norm [mm]", header), rows)}
 
-The gain of 1 ends closer in the model than on their hand, where it also oscillated a little. That
-needs a delay between measurement and motion, which the model does not have; there 1 is a Newton
-step. Their finger frame's orientation is not published, so the norms are what can be compared.
+The gain of 1 ends closer in the model than on their hand, where it also oscillated a little; in the
+model it is a Newton step. A delay between measurement and motion, which the model does not have,
+may be the difference. Their finger frame's orientation is not published, so the norms are what can
+be compared.
 
 The rate of the fall, fitted to the logarithm of the norm above 1e-7 with exact sliders. A discrete
 law of gain g per step multiplies the error by 1 - g, a rate of -ln(1 - g) per step; the continuous
@@ -253,9 +255,9 @@ the offset, but only a task that asks for no more than the hand has makes it van
 
 {table(("task", "rows", "left, median [mm]", "90th percentile [mm]", "below 1 um"), rows)}
 
-{goals} goals, gain 0.6, 200 steps; the distance task is measured by its own error. Goals that a
-task with fewer rows does not reach end at a slider's limit. The paper's {RELATIVE_OFFSET[0]} mm are
-of the size that the six-row law leaves.
+{goals} goals, gain 0.6, 200 steps; the distance task is measured by its own error. The
+paper's {RELATIVE_OFFSET[0]} mm are of the size that the six-row law leaves; how large it is depends
+on how far the wanted pose is from the family, which is assumed here and not published.
 """
 
 
