@@ -216,7 +216,7 @@ class ArmHand:
         q = self._symbols()
         margins = toggle_margins(self.description, q)
         values = ca.vertcat(ca.SX(0, 1), *margins.values())
-        return tuple(margins), self._kernel("toggle_margins", q, [values])
+        return tuple(margins), self._kernel("toggle_margins", [q], [values])
 
     @cached_property
     def _contacts(self) -> FunctionKernel:

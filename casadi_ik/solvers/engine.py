@@ -17,6 +17,7 @@ from casadi_ik.solvers.alternatives import AlternativeFinder
 from casadi_ik.solvers.diagnosis import Diagnosis, Reason
 from casadi_ik.solvers.diagnostician import Diagnostician
 from casadi_ik.solvers.hand_first import HandFirstMethod
+from casadi_ik.solvers.joining import joined
 from casadi_ik.solvers.method import Method, Outcome
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.recorder import Recorder, SolveRecord, SolveSummary
@@ -136,7 +137,7 @@ class Engine:
                     parts,
                 )
             )
-        return _joined(outcomes)
+        return joined(outcomes)
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
@@ -200,7 +201,7 @@ class Engine:
         names = batch.status_names
         for row in range(len(batch)):
             summary = SolveSummary(
-                solve_id=row,
+                solve_id=problems.first_row + row,
                 method=self.method.name,
                 robot=self.robot.name,
                 seed=seed,
@@ -220,17 +221,3 @@ class Engine:
                 target_normals=problems.normals[row],
             )
             recorder.record(SolveRecord(summary, form.layout, outcome.trace[row], form.labels))
-
-
-def _joined(parts: list[Outcome]) -> Outcome:
-    return Outcome(
-        q=np.concatenate([part.q for part in parts]),
-        status=np.concatenate([part.status for part in parts]),
-        iterations=np.concatenate([part.iterations for part in parts]),
-        restarts=np.concatenate([part.restarts for part in parts]),
-        time=np.concatenate([part.time for part in parts]),
-        phases={
-            name: np.concatenate([part.phases[name] for part in parts]) for name in parts[0].phases
-        },
-        trace=tuple(trace for part in parts for trace in part.trace),
-    )

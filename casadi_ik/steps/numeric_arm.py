@@ -22,8 +22,8 @@ from casadi_ik.symbolic.so3 import skew
 TABLE = 1024
 """Configurations of the arm to start from."""
 
-STARTS = 16
-"""Of these, how many are tried for a palm pose."""
+STARTS = 22
+"""Of these, how many are tried for a palm pose; all rounds of a solve together try them all."""
 
 FAR = 1e30
 """Farther than any palm."""
