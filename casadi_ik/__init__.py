@@ -3,6 +3,7 @@
 from casadi_ik import logs
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
+from casadi_ik.control import ScrewControl
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
@@ -20,6 +21,8 @@ from casadi_ik.solvers import (
     Status,
     Track,
 )
+from casadi_ik.solvers.trajectory import Trajectory
+from casadi_ik.steps.screw_objectives import ScrewTask
 
 __all__ = [
     "METHODS",
@@ -35,11 +38,14 @@ __all__ = [
     "Jump",
     "Phase",
     "Reason",
+    "ScrewControl",
+    "ScrewTask",
     "Solution",
     "Solver",
     "Status",
     "Tolerance",
     "Track",
+    "Trajectory",
     "load_grasp",
     "load_robot",
     "logs",

@@ -99,8 +99,10 @@ def _read(path: Path, type_: type[T]) -> T:
     return convert(data, type_, path)
 
 
-def _part(name_or_path: str, key: str, type_: type[T], beside: Path) -> tuple[Path, T]:
-    """The arm or hand file that an arm-hand file names."""
+def _part(name_or_path: str | T, key: str, type_: type[T], beside: Path) -> tuple[Path, T]:
+    """The arm or hand file that an arm-hand file names, or what stands there in full."""
+    if not isinstance(name_or_path, str):
+        return beside, name_or_path
     try:
         path = resolve(name_or_path, f"{key}s", beside=beside)
     except (UnknownNameError, DescriptionError) as error:

@@ -76,10 +76,13 @@ class HandFile(Struct, frozen=True):
 
 
 class ArmHandFile(Struct, frozen=True):
-    """``models/arm_hands/*.yaml``: an arm (or none), a hand, and what joins them."""
+    """``models/arm_hands/*.yaml``: an arm (or none), a hand, and what joins them.
+
+    ``hand`` is a shipped name, a path, or the hand itself.
+    """
 
     name: str
-    hand: str
+    hand: str | HandFile
     thumb: str
     fingers: list[str]
     arm: str | None = None

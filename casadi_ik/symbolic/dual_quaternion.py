@@ -94,6 +94,19 @@ def translation(x: Expr) -> Expr:
     return 2 * (x[0] * d - x[4] * r + ca.cross(r, d))
 
 
+def directed_line(direction: Expr, point: Expr) -> tuple[Expr, Expr]:
+    """Unit dual vector l + eps m of a line: Chandra eq. (2), where m = point x direction.
+
+    Args:
+        direction: l (3, 1), unit.
+        point: (3, 1) [m], any point of the line.
+
+    Returns:
+        l (3, 1) and m (3, 1) [m].
+    """
+    return direction, ca.cross(point, direction)
+
+
 def exp_screw(angle: Expr, distance: Expr, direction: Expr, moment: Expr) -> Expr:
     """Displacement along a screw, exp((theta + eps d)/2 (l + eps m)): Chandra eq. (1).
 
@@ -190,6 +203,35 @@ def error(current: Expr, desired: Expr) -> Expr:
     In the base frame: current = e desired. The control law (14) is the twist -gain log(e).
     """
     return multiply(current, conjugate(desired))
+
+
+def twist(x: Expr, rate: Expr) -> tuple[Expr, Expr]:
+    """Twist w + eps v = 2 x' x* of a moving pose, in the base frame: Chandra eq. (4).
+
+    Args:
+        x: unit dual quaternion (8, 1).
+        rate: its derivative x' (8, 1) [1/s, m/s].
+
+    Returns:
+        w (3, 1) [rad/s] and v (3, 1) [m/s], the velocity of the moving point that is instantly
+        at the origin.
+    """
+    product = 2 * multiply(rate, conjugate(x))
+    return product[1:4], product[5:]
+
+
+def control_twist(e: Expr, gain: Expr) -> tuple[Expr, Expr]:
+    """Twist -gain log(e) of the screw control law: Chandra eq. (14).
+
+    Args:
+        e: unit dual quaternion (8, 1) of the error, see `error`.
+        gain: [1/s], or the part of the error that one discrete step is to remove.
+
+    Returns:
+        w (3, 1) and v (3, 1), as `twist`.
+    """
+    w, v = log(e)
+    return -gain * w, -gain * v
 
 
 def screw_error_norm(e: Expr) -> Expr:

@@ -1,0 +1,169 @@
+"""A hand whose dimensions are symbols: fingertip poses over sliders and parameters.
+
+The same graphs as everywhere: eq. (8) for the triangles, eq. (9) for the four-bars, eq. (3) for the
+chain (Chandra et al. 2019), with the description's numbers as inputs. A four-bar keeps the branch
+of its known pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.calibration.parameters import Parameter
+from casadi_ik.kernels import FunctionKernel
+from casadi_ik.robots.couplings import FourBar, LeadScrew
+from casadi_ik.robots.description import Joint, RobotDescription
+from casadi_ik.symbolic import dual_quaternion as dq
+from casadi_ik.symbolic import four_bar, lead_screw
+from casadi_ik.symbolic.couplings import linkage
+from casadi_ik.symbolic.directions import perpendicular
+from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.so3 import exp_so3
+from casadi_ik.symbolic.subexpressions import shared
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class HandModel:
+    """A description with some of its numbers free.
+
+    Attributes:
+        robot: The description.
+        parameters: The free numbers, in the order of every (k,) vector of values.
+        compiled: Whether to compile the graphs.
+    """
+
+    robot: RobotDescription
+    parameters: tuple[Parameter, ...]
+    compiled: bool = True
+
+    @cached_property
+    def nominal(self) -> Array:
+        """(k,) what the description says."""
+        return np.array([parameter.nominal for parameter in self.parameters])
+
+    @cached_property
+    def prior(self) -> Array:
+        """(k,) standard deviations of the priors."""
+        return np.array([parameter.prior for parameter in self.parameters])
+
+    def poses(self, finger: str, q: Array, values: Array) -> Array:
+        """Fingertip poses.
+
+        Args:
+            finger: The finger.
+            q: (m, n) actuator positions [rad or m].
+            values: (k,) of the parameters.
+
+        Returns:
+            (m, 8) unit dual quaternions in the base frame.
+        """
+        (poses,) = self._kernel(finger, "pose")(q, values)
+        return poses
+
+    def misfit(self, finger: str, q: Array, values: Array, measured: Array) -> tuple[Array, Array]:
+        """What the model misses of measured poses, and how the parameters move it.
+
+        Args:
+            finger: The finger.
+            q: (m, n) actuator positions.
+            values: (k,) of the parameters.
+            measured: (m, 8) unit dual quaternions in the base frame.
+
+        Returns:
+            error (m, 6), point of the model minus the measured one [m] and rotation vector from
+            measured to model [rad], and its Jacobian (m, 6, k).
+        """
+        error, jacobian = self._kernel(finger, "misfit")(q, values, measured)
+        return error, jacobian.reshape(len(error), 6, len(values))
+
+    def _kernel(self, finger: str, kind: str) -> FunctionKernel:
+        key = (finger, kind)
+        if key not in self._kernels:
+            q = ca.SX.sym("q", len(self.robot.actuators))
+            p = ca.SX.sym("p", len(self.parameters))
+            pose = self._pose(finger, q, p)
+            name = ca.Function.fix_name(f"calibrate_{kind}_{self.robot.name}_{finger}")
+            if kind == "pose":
+                function = ca.Function(name, [q, p], shared(ca.densify(pose)))
+            else:
+                seen = ca.SX.sym("measured", 8)
+                turn, _ = dq.log(dq.error(pose, seen))
+                error = ca.vertcat(dq.translation(pose) - dq.translation(seen), turn)
+                outputs = shared(error, ca.densify(ca.jacobian(error, p)))
+                function = ca.Function(name, [q, p, seen], outputs)
+            self._kernels[key] = FunctionKernel(function, self.compiled)
+        return self._kernels[key]
+
+    @cached_property
+    def _kernels(self) -> dict[tuple[str, str], FunctionKernel]:
+        return {}
+
+    def _pose(self, finger: str, q: ca.SX, p: ca.SX) -> Expr:
+        """The product of the joints' screws, each joint's frame placed in its parent's."""
+        symbols = {parameter.name: p[i] for i, parameter in enumerate(self.parameters)}
+        positions = {name: q[i] for i, name in enumerate(self.robot.actuator_names)}
+        joints = {joint.name: joint for joint in self.robot.movable}
+
+        def position(name: str) -> Expr:
+            if name not in positions:
+                joint = joints[name]
+                source = position(joint.coupling.of)  # type: ignore[union-attr]
+                positions[name] = _follow(joint, source, symbols)
+            return positions[name]
+
+        entry = self.robot.finger(finger)
+        pose: Expr = dq.identity()
+        for joint in self.robot.chain(entry.link):
+            origin = _vector(symbols, joint.name, "origin", joint.placement[:3, 3])
+            pose = dq.multiply(pose, dq.from_pose(ca.DM(joint.placement[:3, :3]), origin))
+            if joint.type == "fixed":
+                continue
+            axis = tilted(joint.axis, _vector(symbols, joint.name, "axis", np.zeros(2)))
+            value = position(joint.name)
+            angle, distance = (value, 0.0) if joint.type == "revolute" else (0.0, value)
+            moved = dq.exp_screw(angle, distance, axis, ca.DM.zeros(3, 1))
+            pose = dq.multiply(pose, moved)
+        point = _vector(symbols, finger, "tip", entry.placement[:3, 3])
+        placed = dq.from_pose(ca.DM(entry.placement[:3, :3]), point)
+        turn = _vector(symbols, finger, "turn", np.zeros(3))
+        return dq.multiply(dq.multiply(pose, placed), dq.exp(turn, ca.DM.zeros(3, 1)))
+
+
+def tilted(axis: Array, tilts: Expr) -> Expr:
+    """A unit axis (3,) turned by the rotation vector of two tilts (2, 1) [rad] across it."""
+    first = perpendicular(ca.DM(axis.tolist()))
+    across = ca.horzcat(first, ca.cross(ca.DM(axis.tolist()), first))
+    return exp_so3(across @ tilts) @ ca.DM(axis.tolist())
+
+
+def _follow(joint: Joint, source: Expr, symbols: dict[str, Expr]) -> Expr:
+    """Position of a coupled joint, the coupling's numbers being symbols where they are free."""
+    coupling = joint.coupling
+
+    def number(key: str) -> Expr:
+        return symbols.get(f"{joint.name}.{key}", getattr(coupling, key))
+
+    if isinstance(coupling, LeadScrew):
+        angle = lead_screw.angle_from_slider(source, number("b"), number("c"))
+        return angle - number("theta_0")
+    if isinstance(coupling, FourBar):
+        bar = four_bar.FourBar(*(number(key) for key in "pqgh"), branch=linkage(coupling).branch)
+        # Continuous about the known pose, whatever the estimate of its angle.
+        theta_3 = four_bar.theta3(number("phi_0") + source, bar, coupling.theta_3_0)
+        return theta_3 - number("theta_3_0")
+    return source if coupling is None else coupling.ratio * source + coupling.offset
+
+
+def _vector(symbols: dict[str, Expr], owner: str, part: str, nominal: Array) -> Expr:
+    """A vector whose entries are symbols where they are free."""
+    keys: Sequence[str] = "12" if part == "axis" else "xyz"
+    pairs = zip(keys, nominal, strict=True)
+    return ca.vertcat(*(symbols.get(f"{owner}.{part}.{key}", float(value)) for key, value in pairs))

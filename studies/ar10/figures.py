@@ -1,0 +1,50 @@
+"""Runs of the control law as pictures."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+import casadi_ik as ik
+from casadi_ik.symbolic import dual_quaternion as dq
+
+Array = NDArray[np.float64]
+
+
+def translation(target: dict[str, Array]) -> Array:
+    """Point of a target pose [m]."""
+    return np.array(dq.translation(ca.DM(target["pose"]))).ravel()
+
+
+def draw_run(
+    path: Axes,
+    norms: Axes,
+    run: ik.Trajectory,
+    label: str,
+    color: str,
+    style: str,
+    axes: tuple[int, int] = (1, 2),
+) -> None:
+    """A run's path in millimetres and its norm over the steps."""
+    x, y = (1e3 * run.points[:, i] for i in axes)
+    path.plot(x, y, style, color=color, ms=3, marker=".", lw=1.2, label=label or None)
+    norms.semilogy(np.maximum(run.error_norm, 1e-12), style, color=color, lw=1.4)
+
+
+def finish(
+    path: Axes,
+    norms: Axes,
+    pose: Array,
+    axes: tuple[int, int] = (1, 2),
+    names: str = "yz",
+    frame: str = "hand base",
+) -> None:
+    """Goal, labels and legend of a figure."""
+    goal = 1e3 * translation({"pose": pose})
+    path.plot(*goal[list(axes)], "k+", ms=12, label="goal")
+    path.set(xlabel=f"{names[0]} [mm], {frame}", ylabel=f"{names[1]} [mm]", aspect="equal")
+    path.set_adjustable("datalim")
+    path.legend(frameon=False, fontsize=8)
+    norms.set(xlabel="step", ylabel="screw error norm", ylim=(1e-9, 5))

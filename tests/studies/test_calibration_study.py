@@ -1,0 +1,36 @@
+"""The calibration study writes its report, and the committed one says that the bars are true."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+STUDIES = Path(__file__).parents[2] / "studies"
+
+
+def coverages(report: str) -> list[float]:
+    """What the 95 % intervals held, of every loss and part of outliers [%]."""
+    rows = re.findall(r"^\| \d+ % \| \w+ \| ([\d.]+) % \|", report, re.MULTILINE)
+    return [float(row) for row in rows]
+
+
+def test_the_study_runs(tmp_path):
+    run = subprocess.run(
+        [sys.executable, STUDIES / "calibration.py", "--hands", "2", "--out", tmp_path],
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {"report.md", "error_bars.png", "singular_values.png"}
+    assert len(coverages((tmp_path / "report.md").read_text())) == 9
+
+
+def test_the_committed_report_is_of_many_hands_and_its_bars_are_true():
+    committed = (STUDIES / "results" / "calibration" / "report.md").read_text()
+    assert "--hands 150" in committed
+    held = coverages(committed)
+    assert len(held) == 9
+    assert all(93 < percent < 97 for percent in held)
