@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from casadi_ik.errors import CasadiIKError
@@ -53,11 +54,30 @@ def write_output(path: Path, option: str, write: Callable[[Path], object]) -> No
     Raises:
         OutputError: It cannot be written; nothing is left behind.
     """
+    with writing(path, option), written_whole(path) as part:
+        write(part)
+
+
+@contextlib.contextmanager
+def writing(path: Path, option: str) -> Iterator[None]:
+    """Say of what the system refuses which output it concerns.
+
+    Args:
+        path: Where the output shall stand.
+        option: The option that asked for it.
+
+    Raises:
+        OutputError: The system refused.
+    """
     try:
-        with written_whole(path) as part:
-            write(part)
+        yield
     except OSError as error:
         raise OutputError(f"{path}: {option}: cannot be written: {_reason(error)}") from error
+
+
+def folder_of(path: Path) -> Path:
+    """The folder an output will stand in, whatever links lead there."""
+    return target_of(path).parent
 
 
 def _refuse_special(target: Path) -> None:

@@ -86,20 +86,53 @@ class BatchSolution:
     tolerances: tuple[Tolerance, ...]
     diagnoses: tuple[Diagnosis | None, ...] = ()
 
+    @classmethod
+    def invalid(
+        cls, count: int, n: int, tolerances: tuple[Tolerance, ...], diagnosed: bool
+    ) -> BatchSolution:
+        """Rows for targets that could not be asked: status INVALID, NaN for every number."""
+        f = len(tolerances)
+        none = np.zeros(count, dtype=np.int64)
+        return cls(
+            success=np.zeros(count, dtype=bool),
+            status=np.full(count, int(Status.INVALID), dtype=np.int64),
+            q=np.full((count, n), np.nan),
+            iterations=none,
+            restarts=none,
+            time=np.zeros(count),
+            position_error=np.full((count, f), np.nan),
+            angle_error=np.full((count, f), np.nan),
+            ok=np.zeros((count, f), dtype=bool),
+            limits_ok=np.zeros(count, dtype=bool),
+            phases={},
+            tolerances=tolerances,
+            diagnoses=(None,) * count if diagnosed else (),
+        )
+
     def __len__(self) -> int:
         return len(self.q)
 
     @classmethod
     def joined(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
-        """One batch after the other, at least one."""
+        """One batch after the other, at least one.
+
+        A phase that a part does not know counts 0 iterations there.
+        """
         first = parts[0]
+        if len(parts) == 1:
+            return first
         arrays = {
             item.name: np.concatenate([getattr(part, item.name) for part in parts])
             for item in fields(cls)
             if isinstance(getattr(first, item.name), np.ndarray)
         }
+        none = [np.zeros(len(part), dtype=np.int64) for part in parts]
+        names = dict.fromkeys(chain.from_iterable(part.phases for part in parts))
         phases = {
-            name: np.concatenate([part.phases[name] for part in parts]) for name in first.phases
+            name: np.concatenate(
+                [part.phases.get(name, no) for part, no in zip(parts, none, strict=True)]
+            )
+            for name in names
         }
         diagnoses = tuple(chain.from_iterable(part.diagnoses for part in parts))
         return replace(first, **arrays, phases=phases, diagnoses=diagnoses)
@@ -107,7 +140,7 @@ class BatchSolution:
     @property
     def status_names(self) -> NDArray[np.str_]:
         """(k,) names of the statuses."""
-        return np.array([Status(int(code)).name for code in self.status], dtype=str)
+        return np.array([status.name for status in sorted(Status)])[self.status - min(Status)]
 
     def solution(
         self,
