@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Layout
+from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.problem import Array, Problems
+from casadi_ik.steps.status import Phase, Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,25 @@ class TraceFormat:
 
     layout: Layout
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def trace_format(layout: Layout, robot: RobotDescription) -> TraceFormat:
+    """How to read a trace whose fields have the names all methods use.
+
+    Args:
+        layout: Fields of a row: "q", "position_error", "angle_error", "limit_mask", "phase" and
+            "status", and whatever else needs no names.
+        robot: The robot.
+    """
+    labels = {
+        "q": robot.actuator_names,
+        "position_error": robot.finger_names,
+        "angle_error": robot.finger_names,
+        "limit_mask": robot.actuator_names,
+        "phase": Phase.labels(),
+        "status": Status.labels(),
+    }
+    return TraceFormat(layout, labels)
 
 
 class Method(Protocol):

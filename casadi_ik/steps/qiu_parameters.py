@@ -6,10 +6,14 @@ import math
 from dataclasses import dataclass, fields
 
 from casadi_ik.errors import InputError
-from casadi_ik.steps.hierarchy import PROJECTIONS
+from casadi_ik.steps.hierarchy import PROJECTIONS as HIERARCHIES
 
 ORDERS = ("per-finger", "points-first")
 """Order of the tasks of the original methods: finger by finger, or all points, then all normals."""
+
+PROJECTIONS = (*HIERARCHIES, "stacked")
+"""How the tasks of the original methods share the motors: a hierarchy, or one damped least squares
+problem of all of them (DLS only: selective damping is per task here)."""
 
 FINGER_STEPS = ("ipopt", "closed-form")
 PALM_ERRORS = ("euler", "rotation-vector")
@@ -23,7 +27,7 @@ CHOICES = {
     "projection": PROJECTIONS,
     "order": ORDERS,
 }
-MAY_BE_ZERO = ("borrowed", "stall_step")
+MAY_BE_ZERO = ("borrowed",)
 
 
 @dataclass(frozen=True)
@@ -62,10 +66,6 @@ class QiuParameters:
         reaching_iterations: ... and after this many iterations in any case.
         step_cap: Longest change of any motor in one iteration [rad or m]. Not in the paper: none.
         max_iterations: Budget of a solve, both phases together (paper: 10,000).
-        stall_step: A solve ends as STALLED when the largest motor change stays below this
-            [rad or m] for `stall_patience` iterations: a fixed point, from which counting on to
-            the budget would change no verdict.
-        stall_patience: See `stall_step`.
     """
 
     steps: str = "dls"
@@ -85,8 +85,6 @@ class QiuParameters:
     reaching_iterations: int = 100
     step_cap: float = 1e9
     max_iterations: int = 10_000
-    stall_step: float = 1e-10
-    stall_patience: int = 5
 
     def __post_init__(self) -> None:
         _check_fields(self)
@@ -129,15 +127,14 @@ class OriginalParameters:
         steps: How a task is solved: "dls" or "sdls".
         palm_task: Whether the palm's estimated orientation is the first task.
         order: Order of the contact tasks, see `ORDERS`; the thumb is the first finger.
-        projection: How a lower task is kept from disturbing the higher ones, see `hierarchy`.
+        projection: How a lower task is kept from disturbing the higher ones, see `hierarchy`;
+            "stacked": all tasks are one, without priorities.
         damping: lambda (paper: 1) [mm; rad/rad].
         gamma: SDLS: largest joint change in one step (paper: pi/9) [rad].
         longest_error: SDLS: position errors are shortened to this (paper: 200) [mm].
         widest_error: SDLS: orientation errors are shortened to this (paper: pi/6) [rad].
         palm_error: See `QiuParameters`.
         max_iterations: Budget of a solve (paper: 10,000).
-        stall_step: See `QiuParameters`.
-        stall_patience: See `QiuParameters`.
     """
 
     steps: str = "dls"
@@ -150,8 +147,8 @@ class OriginalParameters:
     widest_error: float = math.pi / 6
     palm_error: str = "euler"
     max_iterations: int = 10_000
-    stall_step: float = 1e-10
-    stall_patience: int = 5
 
     def __post_init__(self) -> None:
         _check_fields(self)
+        if self.projection == "stacked" and self.steps != "dls":
+            raise InputError(f"projection: found 'stacked' with {self.steps}, expected it with dls")
