@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from random_arms import random_arm_targets
 from rich.console import Console
 from rich.table import Table
+from targets import random_arm_targets
 
 import casadi_ik as ik
 

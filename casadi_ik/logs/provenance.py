@@ -6,7 +6,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -40,17 +40,21 @@ def log_metadata(
         "iteration_ns": str(ITERATION),
         "compression": compression,
         "code_version": _version("casadi-ik"),
-        "packages": json.dumps({name: _version(name) for name in PACKAGES}),
+        "packages": json.dumps(package_versions(PACKAGES)),
         "python": platform.python_version(),
-        "machine": json.dumps(
-            {
-                "system": platform.platform(),
-                "processor": _processor(),
-                "cores": os.cpu_count(),
-            }
-        ),
+        "machine": json.dumps(machine()),
         "parameters": json.dumps(plain(parameters)),
     }
+
+
+def machine() -> dict[str, Any]:
+    """What it runs on: system, processor, cores."""
+    return {"system": platform.platform(), "processor": _processor(), "cores": os.cpu_count()}
+
+
+def package_versions(names: Iterable[str]) -> dict[str, str]:
+    """Versions of installed packages by name."""
+    return {name: _version(name) for name in names}
 
 
 def plain(value: Any) -> Any:

@@ -80,6 +80,7 @@ class EnhancedStep:
                 Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not"),
                 Field("reaching_damping"),
                 Field("chain_damping"),
+                Field("chain_lever", unit="mm"),
                 Field("reaching_gamma"),
                 Field("chain_gamma"),
                 Field("longest_error", unit="mm"),
@@ -115,25 +116,17 @@ class EnhancedStep:
     ) -> dict[str, float | list[float]]:
         """Values of all parameter fields but the targets."""
         options = self.options
-        weights = [
-            options.virtual_weight if column == VIRTUAL else options.joint_weight
-            for column in self.chain.active
-        ]
-        return {
+        given = {
             "position_tolerance": position_tolerance,
             "angle_tolerance": angle_tolerance,
             "enforce_limits": float(enforce_limits),
-            "reaching_damping": options.reaching_damping,
-            "chain_damping": options.chain_damping,
-            "reaching_gamma": options.reaching_gamma,
-            "chain_gamma": options.chain_gamma,
-            "longest_error": options.longest_error,
-            "widest_error": options.widest_error,
-            "weights": weights,
-            "reaching_patience": float(options.reaching_patience),
-            "reaching_iterations": float(options.reaching_iterations),
-            "step_cap": options.step_cap,
+            "weights": [
+                options.virtual_weight if column == VIRTUAL else options.joint_weight
+                for column in self.chain.active
+            ],
         }
+        named = (name for name in self.parameters.names if hasattr(options, name))
+        return given | {name: float(getattr(options, name)) for name in named}
 
     def first_state(self) -> dict[str, float]:
         """Values of all state fields but q."""
@@ -171,24 +164,19 @@ class EnhancedStep:
             body, palm_orientation(robot, goals), columns, self.options.palm_error == "euler"
         )
         position, normal = contact_tasks(body, robot.thumb, goals[robot.thumb], columns)
-        tasks = [palm, position, normal]
+        tasks = [palm, position, normal] if self.options.palm_task else [position, normal]
         step = self._spread(self._combined(tasks, self._reaching(p)), columns)
         q_next = self._moved(s["q"], step, p)
 
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
         thumb = robot.finger_names.index(robot.thumb)
-        within = ca.logic_and(
-            safe_norm(palm.error) <= p["angle_tolerance"],
-            ca.logic_and(
-                positions[thumb] <= p["position_tolerance"], angles[thumb] <= p["angle_tolerance"]
-            ),
+        # In units of their tolerances, so that they can be summed.
+        errors = ca.vertcat(
+            positions[thumb] / p["position_tolerance"], angles[thumb] / p["angle_tolerance"]
         )
-        # The three errors in units of their tolerances, so that they can be summed.
-        summed = (
-            safe_norm(palm.error) / p["angle_tolerance"]
-            + positions[thumb] / p["position_tolerance"]
-            + angles[thumb] / p["angle_tolerance"]
-        )
+        if self.options.palm_task:
+            errors = ca.vertcat(errors, safe_norm(palm.error) / p["angle_tolerance"])
+        within, summed = ca.mmax(errors) <= 1, ca.sum1(errors)
         better = summed < 0.99 * s["best"]
         waited = ca.if_else(better, 0.0, s["waited"] + 1)
         enough = ca.logic_or(
@@ -233,12 +221,11 @@ class EnhancedStep:
         others = {name: goal for name, goal in goals.items() if name != robot.thumb}
         translation, rotation = palm_motion(body, others)
         chain = closed_chain(body, self.chain, MILLIMETRE, self.options.platform)
-        motion = [
-            Task(chain.J_cc[:3, :], translation, is_position=True),
-            Task(chain.J_cc[3:, :], rotation, is_position=False),
-        ]
-        active = self._combined(motion, self._chain_solver(p))
-        moved = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
+        moved = closed
+        if self.options.closed_chain:
+            motion = self._palm_tasks(chain.J_cc, translation, rotation, p)
+            active = self._combined(motion, self._chain_solver(p))
+            moved = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
 
         columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
         keep = contact_tasks(actuated(robot, moved), robot.thumb, goals[robot.thumb], columns)
@@ -264,6 +251,19 @@ class EnhancedStep:
             condition_closed_chain=condition_number(spectrum),
         )
         return ca.Function("align_rest", [state, parameters, closed], shared(after, record, status))
+
+    def _palm_tasks(
+        self, J_cc: ca.SX, translation: ca.SX, rotation: ca.SX, p: dict[str, ca.SX]
+    ) -> list[Task]:
+        """What the closed chain is to do: position, then orientation, or both as one."""
+        if self.options.chain_tasks == "successive":
+            return [
+                Task(J_cc[:3, :], translation, is_position=True),
+                Task(J_cc[3:, :], rotation, is_position=False),
+            ]
+        lever = p["chain_lever"]
+        stacked = ca.vertcat(J_cc[:3, :], lever * J_cc[3:, :])
+        return [Task(stacked, ca.vertcat(translation, lever * rotation), is_position=True)]
 
     def _combined(self, tasks: Sequence[Task], solve: TaskSolver) -> ca.SX:
         """One step for all tasks, the highest first, as in the paper by successive projection."""

@@ -91,16 +91,13 @@ class OriginalStep:
         self, position_tolerance: float, angle_tolerance: float, enforce_limits: bool
     ) -> dict[str, float]:
         """Values of all parameter fields but the targets."""
-        options = self.options
-        return {
+        given = {
             "position_tolerance": position_tolerance,
             "angle_tolerance": angle_tolerance,
             "enforce_limits": float(enforce_limits),
-            "damping": options.damping,
-            "gamma": options.gamma,
-            "longest_error": options.longest_error,
-            "widest_error": options.widest_error,
         }
+        named = (name for name in self.parameters.names if hasattr(self.options, name))
+        return given | {name: float(getattr(self.options, name)) for name in named}
 
     def first_state(self) -> dict[str, float]:
         """Values of all state fields but q."""

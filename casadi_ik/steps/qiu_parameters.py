@@ -19,7 +19,9 @@ FINGER_STEPS = ("ipopt", "closed-form")
 PALM_ERRORS = ("euler", "rotation-vector")
 PLATFORMS = ("arm-leg", "palm")
 STEPS = ("dls", "sdls")
+CHAIN_TASKS = ("successive", "stacked")
 CHOICES = {
+    "chain_tasks": CHAIN_TASKS,
     "steps": STEPS,
     "finger_step": FINGER_STEPS,
     "palm_error": PALM_ERRORS,
@@ -55,6 +57,13 @@ class QiuParameters:
         palm_error: "euler": differences of Euler angles as the paper writes; it names no
             convention, taken is ZYX, each difference wrapped to (-pi, pi]. "rotation-vector":
             rotation logarithm and geometric Jacobian, free of the Euler singularity.
+        palm_task: Whether thumb reaching has the palm's estimated orientation as its first task
+            (paper: yes).
+        closed_chain: Whether the closed chain moves the palm (paper: yes); without it only the
+            fingers close.
+        chain_tasks: "successive": the palm's position, its orientation in the null space of that
+            (paper). "stacked": both as one task, its rotations times `chain_lever`.
+        chain_lever: How much palm motion a turn of the palm counts as [mm/rad].
         platform: Whose twist J_cc of eq. (8) is: "arm-leg" as printed (the arm's last joint is
             left out), "palm" with it.
         borrowed: Arm joints counted to the reversed thumb (paper: 1, the 7th).
@@ -78,6 +87,10 @@ class QiuParameters:
     virtual_weight: float = 10.0
     joint_weight: float = 1.0
     palm_error: str = "euler"
+    palm_task: bool = True
+    closed_chain: bool = True
+    chain_tasks: str = "successive"
+    chain_lever: float = 300.0
     platform: str = "arm-leg"
     borrowed: int = 1
     finger_step: str = "ipopt"

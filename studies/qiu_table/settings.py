@@ -1,0 +1,159 @@
+"""What is compared: the methods, the readings of the original ones, every open choice."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from runner import Setting, Study, TargetSet
+from targets import grasp_arms
+
+import casadi_ik as ik
+from casadi_ik.files.shipped import models_folder
+
+ROBOT = "kuka_lwr_barrett"
+METHODS = tuple(
+    name
+    for name in (
+        "enhanced-dls",
+        "enhanced-sdls",
+        "original-dls",
+        "original-sdls",
+        "thumb-first",
+        "hand-first",
+    )
+    if name in ik.METHODS
+)
+LIMITS = ("ignore", "enforce")
+CLOSED_FORM = {"finger_step": "closed-form"}
+"""Of the enhanced methods: the answer of eq. (5) that Ipopt also gives, to 1e-9."""
+
+LAMBDA_150 = float(np.sqrt(150.0))
+"""Damping if 150 is what stands in the normal matrix."""
+
+
+def targets() -> tuple[TargetSet, ...]:
+    """The twelve grasps."""
+    return tuple(
+        TargetSet(name, partial(grasp_arms, grasp=name)) for name in ik.shipped_names("grasps")
+    )
+
+
+def table_study(methods: tuple[str, ...], count: int, seed: int, block: int) -> Study:
+    """Table I: methods with limits ignored and enforced."""
+    settings = tuple(
+        Setting(
+            f"{method} {limits}",
+            method,
+            limits,
+            CLOSED_FORM if method.startswith("enhanced") else {},
+        )
+        for method in methods
+        for limits in LIMITS
+    )
+    return Study("table", ROBOT, targets(), settings, count, seed, block)
+
+
+def readings_study(count: int, seed: int, block: int) -> Study:
+    """Every reading of "the methods without the enhancement", limits ignored."""
+    settings = []
+    for steps in ("dls", "sdls"):
+        for projection in ("successive", "augmented", "stacked", "none"):
+            if projection == "stacked" and steps == "sdls":
+                continue
+            for palm in (False, True):
+                # A sum or a stack has no order.
+                ordered = projection in ("successive", "augmented")
+                for order in ("per-finger", "points-first") if ordered else ("per-finger",):
+                    options = {"projection": projection, "palm_task": palm, "order": order}
+                    words = [projection, "palm first"] if palm else [projection]
+                    if ordered:
+                        words.append(
+                            "finger by finger" if order == "per-finger" else "points first"
+                        )
+                    key = f"original-{steps}, {', '.join(words)}"
+                    settings.append(Setting(key, f"original-{steps}", "ignore", options))
+    return Study("readings", ROBOT, targets(), tuple(settings), count, seed, block)
+
+
+def ablation_study(folder: Path, count: int, seed: int, block: int) -> Study:
+    """`enhanced-dls` and `enhanced-sdls` with one choice changed, limits ignored.
+
+    Args:
+        folder: Where the robot with the palm frame on the mounting face is written.
+        count: Targets per grasp.
+        seed: Of the targets.
+        block: Targets per block.
+    """
+    both: dict[str, dict[str, object]] = {
+        "as in the table": {},
+        "errors by rotation vector, not Euler angles": {"palm_error": "rotation-vector"},
+        "J_cc of the palm, not of link 6": {"platform": "palm"},
+        "no arm joint counted to the thumb": {"borrowed": 0},
+        "virtual joint's weight 1, not 10": {"virtual_weight": 1.0},
+        "virtual joint's weight 100": {"virtual_weight": 100.0},
+        "no palm-orientation task": {"palm_task": False},
+        "no closed chain": {"closed_chain": False},
+        "palm's position and orientation stacked": {"chain_tasks": "stacked"},
+        "step cap 0.3 rad": {"step_cap": 0.3},
+        "step cap 0.05 rad": {"step_cap": 0.05},
+        "thumb reaching waits 3 iterations, not 10": {"reaching_patience": 3},
+        "thumb reaching waits 50 iterations": {"reaching_patience": 50},
+    }
+    dls: dict[str, dict[str, object]] = {
+        "lambda^2 = 150 in the closed chain": {"chain_damping": LAMBDA_150},
+        "lambda = 50 in the closed chain": {"chain_damping": 50.0},
+        "lambda = 450 in the closed chain": {"chain_damping": 450.0},
+        "lambda = 0.1 in thumb reaching": {"reaching_damping": 0.1},
+        "lambda = 10 in thumb reaching": {"reaching_damping": 10.0},
+        "stacked, lambda 20, step cap 0.05 rad": {
+            "chain_tasks": "stacked",
+            "chain_damping": 20.0,
+            "step_cap": 0.05,
+        },
+    }
+    settings = [
+        Setting(f"enhanced-{steps}, {name}", f"enhanced-{steps}", "ignore", CLOSED_FORM | change)
+        for steps, changes in (("dls", both | dls), ("sdls", both))
+        for name, change in changes.items()
+    ]
+    face = str(on_mounting_face(folder))
+    for method in ("enhanced-dls", "enhanced-sdls"):
+        settings += [
+            Setting(
+                f"{method}, hand start {proximal}-{distal} deg",
+                method,
+                "ignore",
+                CLOSED_FORM,
+                start=hand_start(proximal, distal),
+            )
+            for proximal, distal in ((40, 15), (60, 20), (75, 15), (120, 10))
+        ]
+        key = f"{method}, palm frame on the mounting face"
+        settings.append(Setting(key, method, "ignore", CLOSED_FORM, robot=face))
+    return Study("ablation", ROBOT, targets(), tuple(settings), count, seed, block)
+
+
+def hand_start(proximal: float, distal: float) -> dict[str, float]:
+    """A start with other flexions of all fingers [deg] than the home's 90 and 10."""
+    return {
+        f"bh_{finger}_{joint}": float(np.radians(value))
+        for finger in ("thumb", "finger_2", "finger_3")
+        for joint, value in (("proximal", proximal), ("distal", distal))
+    }
+
+
+def on_mounting_face(folder: Path) -> Path:
+    """Write the robot whose palm frame sits where the hand is mounted; returns its file."""
+    models = models_folder()
+    hand = (models / "hands" / "barrett_bh8_280.yaml").read_text(encoding="utf-8")
+    raised = "xyz: [0, 0, 80 mm], "
+    if hand.count(raised) != 1:
+        raise ValueError(f"the Barrett's palm frame is no longer given by {raised!r}")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "hand.yaml").write_text(hand.replace(raised, ""), encoding="utf-8")
+    whole = (models / "arm_hands" / f"{ROBOT}.yaml").read_text(encoding="utf-8")
+    path = folder / f"{ROBOT}.yaml"
+    path.write_text(whole.replace("hand: barrett_bh8_280", "hand: hand.yaml"), encoding="utf-8")
+    return path

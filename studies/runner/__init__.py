@@ -1,0 +1,35 @@
+"""Studies: seeded targets solved in several ways, block by block, resumable.
+
+Needs the extra `studies`.
+"""
+
+from importlib.util import find_spec
+
+from casadi_ik.errors import MissingExtraError
+
+for _name in ("dask", "joblib", "polars"):
+    if find_spec(_name) is None:
+        raise MissingExtraError(
+            f"studies need {_name}, which is not installed: pip install casadi-ik[studies]"
+        )
+
+from runner.arguments import add_run_arguments, run_from
+from runner.metric import Metric, interval_text, mean_metric, rate_metric, write_metrics
+from runner.results import read_results
+from runner.run import run
+from runner.study import Setting, Study, TargetSet
+
+__all__ = [
+    "Metric",
+    "Setting",
+    "Study",
+    "TargetSet",
+    "add_run_arguments",
+    "interval_text",
+    "mean_metric",
+    "rate_metric",
+    "read_results",
+    "run",
+    "run_from",
+    "write_metrics",
+]
