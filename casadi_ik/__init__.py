@@ -5,7 +5,7 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
-from casadi_ik.grasps import Contact, Grasp, load_grasp
+from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp
 from casadi_ik.solvers import (
     METHODS,
     BatchSolution,
@@ -15,7 +15,6 @@ from casadi_ik.solvers import (
     Reason,
     Solution,
     Status,
-    Tolerance,
 )
 
 __all__ = [

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
 from typing import Any
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
@@ -27,9 +28,12 @@ from casadi_ik.solvers import (
     Stepper,
     Tolerance,
     build_method,
+    fixed_array,
     method_options,
     target_arrays,
 )
+
+Array = NDArray[np.float64]
 
 
 class Solver:
@@ -38,7 +42,7 @@ class Solver:
     Attributes:
         robot: The robot.
         method: Name of the method.
-        tolerance: When a contact counts as reached.
+        tolerances: When a contact counts as reached, by finger.
         limits: "enforce" or "ignore".
         options: What was set of the method's own parameters.
     """
@@ -47,7 +51,7 @@ class Solver:
         self,
         robot: ArmHand,
         method: str = METHODS[0],
-        tolerance: Tolerance | None = None,
+        tolerance: Tolerance | Mapping[str, Tolerance] | None = None,
         limits: str = "enforce",
         finger_step: str | None = None,
         options: Mapping[str, Any] | None = None,
@@ -58,7 +62,8 @@ class Solver:
         Args:
             robot: From `load_robot`.
             method: One of `METHODS`.
-            tolerance: 5 mm and 3 deg unless said.
+            tolerance: 5 mm and 3 deg unless said; one for all fingers, or by finger name (a
+                finger left out keeps the default). A contact's own tolerance goes before.
             limits: "enforce": being solved includes that every actuator and joint is within its
                 limits. "ignore": only the contacts decide (the paper's reading).
             finger_step: "ipopt" (the default of the paper's methods) or "closed-form", the same
@@ -73,13 +78,11 @@ class Solver:
         """
         if not isinstance(robot, ArmHand):
             raise InputError(f"robot: found {robot!r}, expected what load_robot returns")
-        if tolerance is not None and not isinstance(tolerance, Tolerance):
-            raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance")
         if limits not in LIMITS:
             raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMITS)}")
         self.robot = robot
         self.method = method
-        self.tolerance = tolerance or Tolerance()
+        self.tolerances = _by_finger(tolerance, robot.fingers)
         self.limits = limits
         self.options = dict(options or {})
         if finger_step is not None and finger_step not in FINGER_STEPS:
@@ -100,7 +103,7 @@ class Solver:
         """Everything that determines a solve but target, start and seed; as kept in the log."""
         return {
             "method": self.method,
-            "tolerance": dataclasses.asdict(self.tolerance),
+            "tolerance": {name: dataclasses.asdict(one) for name, one in self.tolerances.items()},
             "limits": self.limits,
             "options": dict(self._engine.method.parameters),
         }
@@ -112,6 +115,7 @@ class Solver:
         seed: int = 0,
         log: str | PathLike[str] | None = None,
         diagnose: bool = True,
+        fixed: Mapping[str, float] | None = None,
     ) -> Solution:
         """Solve one grasp.
 
@@ -121,18 +125,20 @@ class Solver:
             seed: Of all random numbers, an integer >= 0.
             log: Path of an MCAP file to write every iteration to.
             diagnose: Whether to find out why, if it is not solved (`Solution.diagnosis`).
+            fixed: Positions of actuators that are not to move, by name [rad or m].
 
         Returns:
             The solution; not converging is its status, never an exception.
 
         Raises:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
+            UnknownNameError: A fixed actuator that the robot does not have.
+            UnsupportedError: The method cannot keep actuators fixed.
             LogError: The log cannot be written.
         """
-        if not isinstance(grasp, Grasp):
-            raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
-        points, normals = grasp.arrays(self.robot.fingers)
-        batch = self.solve_batch(points[None], normals[None], q0, seed, log=log, diagnose=diagnose)
+        problems = self._problems([grasp], fixed)
+        with self._recorder(log, seed) as recorder:
+            batch = self._engine.solve(problems, q0, seed, 1, recorder, diagnose)
         return batch.solution(
             0, self.method, self.robot.name, self.robot.actuators, self.robot.fingers
         )
@@ -146,6 +152,7 @@ class Solver:
         jobs: int = 1,
         log: str | PathLike[str] | None = None,
         diagnose: bool = False,
+        fixed: Mapping[str, float] | None = None,
     ) -> BatchSolution:
         """Solve k targets.
 
@@ -159,16 +166,20 @@ class Solver:
             log: Path of an MCAP file to write every iteration to.
             diagnose: Whether to find out why, for every target that is not solved
                 (`BatchSolution.diagnoses`).
+            fixed: Positions of actuators that are not to move, by name [rad or m].
 
         Returns:
             The same fields as a `Solution`, as arrays.
 
         Raises:
             InputError: Bad shapes or values; the message names row and finger.
+            UnknownNameError: A fixed actuator that the robot does not have.
+            UnsupportedError: The method cannot keep actuators fixed.
             LogError: The log cannot be written.
         """
         p, n = target_arrays(points, normals, len(self.robot.fingers))
-        problems = Problems(p, n, self.tolerance, self.limits == "enforce")
+        tolerances = tuple(self.tolerances.values())
+        problems = Problems(p, n, tolerances, self._enforce, fixed=self._fixed(fixed))
         with self._recorder(log, seed) as recorder:
             return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
 
@@ -186,16 +197,34 @@ class Solver:
         method = self._engine.method
         if not isinstance(method, SteppedMethod):
             raise UnsupportedError(f"method {self.method!r} cannot be stepped by hand")
-        if not isinstance(grasp, Grasp):
-            raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
-        points, normals = grasp.arrays(self.robot.fingers)
-        targets = target_arrays(points[None], normals[None], len(self.robot.fingers))
-        problems = Problems(*targets, self.tolerance, self.limits == "enforce")
+        problems = self._problems([grasp], None)
         start = self.robot.configuration(q0, "q0")
         if start.ndim != 1:
             raise InputError(f"q0: found shape {start.shape}, expected ({len(start[0])},)")
         states, parameters = method.start(problems, start[None])
         return Stepper(method.kernel.step, states[0], parameters[0])
+
+    @property
+    def _enforce(self) -> bool:
+        return self.limits == "enforce"
+
+    def _fixed(self, fixed: Mapping[str, float] | None) -> Array | None:
+        robot = self.robot
+        return fixed_array(fixed or {}, robot.actuators, robot.lower, robot.upper)
+
+    def _problems(self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None) -> Problems:
+        """Grasps that share the tolerances of the first."""
+        robot = self.robot
+        for grasp in grasps:
+            if not isinstance(grasp, Grasp):
+                raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
+        targets = [grasp.arrays(robot.fingers) for grasp in grasps]
+        stacked = np.stack([np.stack(pair) for pair in targets])
+        points, normals = target_arrays(stacked[:, 0], stacked[:, 1], len(robot.fingers))
+        own = {name: contact.tolerance for name, contact in grasps[0].contacts.items()}
+        tolerances = (own.get(name) or self.tolerances[name] for name in robot.fingers)
+        fixed_at = self._fixed(fixed)
+        return Problems(points, normals, tuple(tolerances), self._enforce, fixed=fixed_at)
 
     def _recorder(
         self, log: str | PathLike[str] | None, seed: int
@@ -209,3 +238,20 @@ class Solver:
             parameters=self.parameters,
             seed=seed,
         )
+
+
+def _by_finger(
+    tolerance: Tolerance | Mapping[str, Tolerance] | None, fingers: Sequence[str]
+) -> dict[str, Tolerance]:
+    if tolerance is None or isinstance(tolerance, Tolerance):
+        return dict.fromkeys(fingers, tolerance or Tolerance())
+    if not isinstance(tolerance, Mapping):
+        raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance, or one by finger")
+    for name, one in tolerance.items():
+        if name not in fingers:
+            raise InputError(
+                f"tolerance.{name}: no such finger; the robot's fingers: {', '.join(fingers)}"
+            )
+        if not isinstance(one, Tolerance):
+            raise InputError(f"tolerance.{name}: found {one!r}, expected a Tolerance")
+    return {name: tolerance.get(name, Tolerance()) for name in fingers}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.outputs import check_outputs, write_output
-from casadi_ik.cli.question import located, the_robot, the_solver, the_start
+from casadi_ik.cli.question import located, the_fixed, the_robot, the_solver, the_start
 from casadi_ik.cli.report import batch_report
 from casadi_ik.errors import InputError
 from casadi_ik.solvers import BatchSolution, target_arrays
@@ -46,13 +46,14 @@ def batch(arguments: argparse.Namespace) -> Answer:
     path = Path(arguments.targets)
     robot = the_robot(arguments.robot)
     q0 = the_start(arguments, robot)
+    fixed = the_fixed(arguments, robot)
     points, normals = read_targets(path, len(robot.fingers))
     outputs = {"--log": arguments.log, "--out": arguments.out}
     check_outputs(outputs.items(), inputs=[path])
     solver = the_solver(arguments, robot)
     with located(str(path)):
         solved = solver.solve_batch(
-            points, normals, q0, arguments.seed, arguments.jobs, arguments.log
+            points, normals, q0, arguments.seed, arguments.jobs, arguments.log, fixed=fixed
         )
     data = as_npz(solved)
     write_output(arguments.out, "--out", lambda part: part.write_bytes(data))

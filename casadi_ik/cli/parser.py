@@ -7,7 +7,7 @@ import re
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from casadi_ik.cli.values import file_name, numbers, one_of, positive, whole
+from casadi_ik.cli.values import assignment, file_name, numbers, one_of, positive, whole
 from casadi_ik.errors import InputError
 
 if TYPE_CHECKING:
@@ -188,6 +188,14 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
         type=one_of("ipopt", "closed-form"),
         help="solver of the fingers' own step in the paper's methods (default: ipopt); "
         "closed-form gives the same answer much faster",
+    )
+    parser.add_argument(
+        "--fixed",
+        metavar="NAME=V",
+        type=assignment,
+        nargs="+",
+        default=[],
+        help="actuators that are not to move, and where they stand [rad or m]",
     )
     parser.add_argument(
         "--log", metavar="FILE.mcap", type=file_name(), help="write every iteration to a log"

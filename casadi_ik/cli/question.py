@@ -19,7 +19,7 @@ from casadi_ik.errors import (
 )
 from casadi_ik.files.shipped import resolve
 from casadi_ik.grasps import Grasp, load_grasp
-from casadi_ik.solvers import METHODS, Tolerance
+from casadi_ik.solvers import METHODS, Tolerance, fixed_array
 
 
 @contextlib.contextmanager
@@ -101,3 +101,19 @@ def the_start(arguments: argparse.Namespace, robot: ArmHand) -> list[float] | No
             + ", ".join(robot.actuators)
         )
     return values
+
+
+def the_fixed(arguments: argparse.Namespace, robot: ArmHand) -> dict[str, float]:
+    """The actuators that are not to move.
+
+    Raises:
+        InputError: One is named twice, or its position is not within its limits.
+        UnknownNameError: No such actuator.
+    """
+    fixed: dict[str, float] = {}
+    for name, value in arguments.fixed:
+        if name in fixed:
+            raise InputError(f"--fixed: {name} appears twice")
+        fixed[name] = value
+    fixed_array(fixed, robot.actuators, robot.lower, robot.upper)
+    return fixed

@@ -15,7 +15,7 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.outputs import check_outputs, write_output
-from casadi_ik.cli.question import located, the_grasp, the_robot, the_solver, the_start
+from casadi_ik.cli.question import located, the_fixed, the_grasp, the_robot, the_solver, the_start
 from casadi_ik.cli.report import solution_report
 from casadi_ik.errors import MissingExtraError
 from casadi_ik.grasps import Grasp, load_object
@@ -33,6 +33,7 @@ def solve(arguments: argparse.Namespace) -> Answer:
     path, grasp = the_grasp(arguments)
     robot = the_robot(arguments.robot, path, grasp)
     q0 = the_start(arguments, robot)
+    fixed = the_fixed(arguments, robot)
     with located(str(path)):
         grasp.arrays(robot.fingers)
     out: Path | None = arguments.out
@@ -42,7 +43,7 @@ def solve(arguments: argparse.Namespace) -> Answer:
     draw = _drawing(path, grasp) if picture is not None else None
     solver = the_solver(arguments, robot)
     with located(str(path)):
-        solution = solver.solve(grasp, q0, arguments.seed, arguments.log)
+        solution = solver.solve(grasp, q0, arguments.seed, arguments.log, fixed=fixed)
     if out is not None:
         text = json.dumps(as_json(solution), indent=2, allow_nan=False) + "\n"
         write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))

@@ -73,3 +73,19 @@ def file_name(*suffixes: str) -> Callable[[str], Path]:
         return path
 
     return parse
+
+
+def assignment(text: str) -> tuple[str, float]:
+    """A name and its number, ``NAME=V``.
+
+    Raises:
+        ArgumentTypeError: Something else.
+    """
+    name, equals, value = text.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not (name and equals and math.isfinite(number)):
+        raise ArgumentTypeError(f"found {text!r}, expected NAME=NUMBER")
+    return name, number

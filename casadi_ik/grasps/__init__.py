@@ -11,6 +11,7 @@ from casadi_ik.grasps.shapes import (
     Shape,
     Sphere,
 )
+from casadi_ik.grasps.tolerance import Tolerance
 
 __all__ = [
     "BentCapsule",
@@ -22,6 +23,7 @@ __all__ = [
     "GraspObject",
     "Shape",
     "Sphere",
+    "Tolerance",
     "load_grasp",
     "load_object",
 ]

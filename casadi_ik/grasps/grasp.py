@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
+from casadi_ik.grasps.tolerance import Tolerance
 
 Array = NDArray[np.float64]
 
@@ -23,16 +24,27 @@ class Contact:
         point: (3,) contact point [m].
         normal: (3,) outward pad normal of the fingertip: it points out of the fingertip, into the
             object. Any length but zero, stored as a unit vector. None leaves it free.
+        tolerance: When it counts as reached, or None: the solver's tolerance.
 
     Raises:
-        InputError: A wrong shape, a number that is not finite, or a zero normal.
+        InputError: A wrong shape, a number that is not finite, a zero normal, or a tolerance that
+            is none.
     """
 
     point: Array
     normal: Array | None = None
+    tolerance: Tolerance | None = None
 
-    def __init__(self, point: ArrayLike, normal: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        point: ArrayLike,
+        normal: ArrayLike | None = None,
+        tolerance: Tolerance | None = None,
+    ) -> None:
+        if tolerance is not None and not isinstance(tolerance, Tolerance):
+            raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance")
         object.__setattr__(self, "point", _vector(point, "point"))
+        object.__setattr__(self, "tolerance", tolerance)
         if normal is None:
             return
         vector = _vector(normal, "normal")

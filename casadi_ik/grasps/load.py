@@ -12,6 +12,14 @@ from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.reading import Frame, Struct, Vector, convert, frame_matrix, read_yaml
 from casadi_ik.files.shipped import resolve
 from casadi_ik.grasps.grasp import Contact, Grasp
+from casadi_ik.grasps.tolerance import Tolerance
+
+
+class ToleranceEntry(Struct, frozen=True):
+    """When a contact counts as reached; what is left out is as everywhere."""
+
+    position: float = Tolerance.position
+    angle: float = Tolerance.angle
 
 
 class ContactEntry(Struct, frozen=True):
@@ -19,6 +27,7 @@ class ContactEntry(Struct, frozen=True):
 
     point: Vector
     normal: Vector | None = None
+    tolerance: ToleranceEntry | None = None
 
 
 class ObjectEntry(Struct, frozen=True):
@@ -53,7 +62,7 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
     contacts: dict[str, Contact] = {}
     for finger, contact in entry.contacts.items():
         try:
-            contacts[finger] = Contact(contact.point, contact.normal)
+            contacts[finger] = _contact(contact)
         except InputError as error:
             raise DescriptionError(f"{path}: contacts.{finger}.{error}") from error
     for key, value in _loose_numbers(entry):
@@ -72,10 +81,21 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
         raise DescriptionError(f"{path}: {error}") from error
 
 
+def _contact(entry: ContactEntry) -> Contact:
+    if entry.tolerance is None:
+        return Contact(entry.point, entry.normal)
+    tolerance = Tolerance(entry.tolerance.position, entry.tolerance.angle)
+    return Contact(entry.point, entry.normal, tolerance)
+
+
 def _loose_numbers(entry: GraspFile) -> Iterator[tuple[str, float]]:
     """The numbers beside the contacts, with their keys."""
     for name, value in entry.posture.items():
         yield f"posture.{name}", value
+    for name, contact in entry.contacts.items():
+        if contact.tolerance is not None:
+            yield f"contacts.{name}.tolerance.position", contact.tolerance.position
+            yield f"contacts.{name}.tolerance.angle", contact.tolerance.angle
     if entry.object is not None:
         yield from (("object.pose.xyz", value) for value in entry.object.pose.xyz)
         yield from (("object.pose.rpy", value) for value in entry.object.pose.rpy)

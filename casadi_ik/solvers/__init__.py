@@ -3,7 +3,7 @@
 from casadi_ik.solvers.contact_verdict import ContactVerdict
 from casadi_ik.solvers.diagnosis import Diagnosis, Reason
 from casadi_ik.solvers.engine import Engine
-from casadi_ik.solvers.problem import LIMITS, Problems, Tolerance, target_arrays
+from casadi_ik.solvers.problem import LIMITS, Problems, Tolerance, fixed_array, target_arrays
 from casadi_ik.solvers.recorder import Recorder
 from casadi_ik.solvers.registry import METHODS, build_method, method_options, method_summary
 from casadi_ik.solvers.solution import BatchSolution, Solution
@@ -29,6 +29,7 @@ __all__ = [
     "Stepper",
     "Tolerance",
     "build_method",
+    "fixed_array",
     "method_options",
     "method_summary",
     "target_arrays",

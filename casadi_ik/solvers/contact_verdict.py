@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from casadi_ik.grasps import Tolerance
+
 
 @dataclass(frozen=True)
 class ContactVerdict:
@@ -13,8 +15,10 @@ class ContactVerdict:
         position_error: Distance from the contact point [m]; NaN if the finger is free.
         angle_error: Angle from the normal [rad]; NaN if it is free.
         ok: Within tolerance (what is free is).
+        tolerance: What it was compared with.
     """
 
     position_error: float
     angle_error: float
     ok: bool
+    tolerance: Tolerance

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.grasps import Tolerance
 from casadi_ik.solvers.diagnosis import ArmReach, Diagnosis, Freed, HandFit, NearContact, Reason
 from casadi_ik.solvers.hand_first import HandFirstMethod
 from casadi_ik.solvers.minimax import closest
 from casadi_ik.solvers.palm_free import palm_free
-from casadi_ik.solvers.problem import Array, Problems, Tolerance
+from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.reliefs import Lift, lifts, relieve
 from casadi_ik.solvers.trials import Bounds, Descent, Trials, repeated
 from casadi_ik.solvers.verdict import judge
@@ -93,6 +94,7 @@ class Diagnostician:
         reliefs = tuple(relieve(self._trials, problems, limits, relaxed, best.q))
         reason = _reason(hand, reach, bool(reliefs))
         verdict = judge(self.robot, problems, best.fair[None])
+        largest = problems.largest_tolerance
         return Diagnosis(
             reason=reason,
             established=reason is not Reason.NOT_FOUND and best.ratio >= MARGIN,
@@ -102,8 +104,8 @@ class Diagnostician:
             reliefs=reliefs,
             freed=freed,
             enough=Tolerance(
-                max(float(np.nanmax(verdict.position_error)), problems.tolerance.position),
-                max(_largest(verdict.angle_error), problems.tolerance.angle),
+                max(float(np.nanmax(verdict.position_error)), largest.position),
+                max(_largest(verdict.angle_error), largest.angle),
             ),
             nearest=self._contacts(problems, best.q),
             q=best.q,
@@ -219,7 +221,7 @@ class Diagnostician:
             active=(),
             reliefs=(),
             freed=(),
-            enough=problems.tolerance,
+            enough=problems.largest_tolerance,
             nearest=self._contacts(problems, q),
             q=q,
             time=time.perf_counter() - begin,

@@ -128,6 +128,7 @@ class Engine:
             ok=verdict.ok,
             limits_ok=verdict.limits_ok,
             phases=outcome.phases,
+            tolerances=problems.tolerances,
         )
 
     def _diagnosed(

@@ -140,8 +140,8 @@ class HandFirstMethod:
             "weights": np.stack(
                 [~np.isnan(problems.points[..., 0]), ~np.isnan(problems.normals[..., 0])], axis=2
             ),
-            "position_tolerance": problems.tolerance.position,
-            "angle_tolerance": problems.tolerance.angle,
+            "position_tolerance": problems.position_tolerance,
+            "angle_tolerance": problems.angle_tolerance,
             "lower": lower,
             "upper": upper,
             "postures": np.clip(postures, lower[hand], upper[hand]),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
-from casadi_ik.solvers.problem import Array, Problems, Tolerance
+from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.ipopt_parameters import IpoptParameters
 from casadi_ik.steps.status import Phase, Status
 from casadi_ik.steps.whole_nlp import NlpRun, WholeNlp, contact_errors
@@ -99,7 +99,7 @@ class IpoptMethod:
             runs = self._runs(starts[row], targets[row], problems, np.random.default_rng(sequence))
             best = min(runs, key=lambda run: run.cost)
             q[row] = best.q
-            status[row] = _ending(best, problems.tolerance)
+            status[row] = _ending(best, problems)
             iterations[row] = sum(len(run.path) for run in runs)
             restarts[row] = len(runs) - 1
             if trace:
@@ -120,12 +120,10 @@ class IpoptMethod:
     ) -> list[NlpRun]:
         """One run after the other, until the contacts are met or the starts are used up."""
         robot, runs = self._robot, []
-        unbounded = np.full(len(start), np.inf)
-        lower = robot.lower if problems.enforce_limits else -unbounded
-        upper = robot.upper if problems.enforce_limits else unbounded
+        lower, upper = problems.bounds(robot.lower, robot.upper, np.inf)
         for _ in range(self.options.restarts + 1):
             runs.append(self.program.solve(start, targets, lower, upper))
-            if _ending(runs[-1], problems.tolerance) is Status.SOLVED:
+            if _ending(runs[-1], problems) is Status.SOLVED:
                 break
             start = rng.uniform(robot.lower, robot.upper)
         return runs
@@ -168,8 +166,9 @@ def _step_sizes(path: Array) -> Array:
     return np.append(np.abs(np.diff(path, axis=0)).max(axis=1), np.nan)
 
 
-def _ending(run: NlpRun, tolerance: Tolerance) -> Status:
+def _ending(run: NlpRun, problems: Problems) -> Status:
     """How a run ended: solved if every contact is within tolerance, whatever Ipopt thinks."""
     distances, angles = contact_errors(run.residual[None])
-    met = np.all(distances <= tolerance.position) and np.all(angles <= tolerance.angle)
+    met = np.all(distances <= problems.position_tolerance)
+    met = met and np.all(angles <= problems.angle_tolerance)
     return Status.SOLVED if met and run.inside else run.status

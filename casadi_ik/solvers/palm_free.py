@@ -39,12 +39,13 @@ class PalmFree:
     def fit(self, robot: ArmHand, problems: Problems) -> HandFit:
         """The best of them."""
         best = int(np.argmin(np.where(self.ok, -1.0, self.cost)))
-        slack, tolerance = 1 + TOLERANCE_SLACK, problems.tolerance
+        missed = _missed(problems, self.position_error[best], self.angle_error[best])
         contacts = {}
         for i, name in enumerate(robot.fingers):
             position, angle = self.position_error[best, i], self.angle_error[best, i]
-            missed = position > tolerance.position * slack or angle > tolerance.angle * slack
-            contacts[name] = ContactVerdict(float(position), float(angle), not missed)
+            contacts[name] = ContactVerdict(
+                float(position), float(angle), not missed[i], problems.tolerances[i]
+            )
         return HandFit(bool(self.ok[best]), contacts)
 
     def reach(self, arm: SrsArm, limits: bool) -> ArmReach:
@@ -86,10 +87,16 @@ def palm_free(robot: ArmHand, problems: Problems, q: Array) -> PalmFree:
     position = np.linalg.norm(there - problems.points[0], axis=2)
     chord = np.linalg.norm(turned - problems.normals[0], axis=2)
     angle = 2 * np.arctan2(chord, np.linalg.norm(turned + problems.normals[0], axis=2))
-    slack, tolerance = 1 + TOLERANCE_SLACK, problems.tolerance
-    ok = ~(position > tolerance.position * slack) & ~(angle > tolerance.angle * slack)
+    missed = _missed(problems, position, angle)
     cost = np.nansum((position / LENGTH) ** 2, axis=1) + np.nansum(chord**2, axis=1)
-    return PalmFree(rotation, shift, position, angle, cost, ok.all(axis=1))
+    return PalmFree(rotation, shift, position, angle, cost, np.asarray(~missed.any(axis=1)))
+
+
+def _missed(problems: Problems, position: Array, angle: Array) -> NDArray[np.bool_]:
+    """Which contacts are out of tolerance (..., f); what is free (NaN) is not."""
+    slack = 1 + TOLERANCE_SLACK
+    far, turned = problems.position_tolerance * slack, problems.angle_tolerance * slack
+    return np.asarray((position > far) | (angle > turned))
 
 
 def span(arm: SrsArm, limits: bool) -> tuple[float, float]:

@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.grasps import Tolerance
 
 Array = NDArray[np.float64]
 
 LIMITS = ("enforce", "ignore")
 """How joint limits are taken: as part of being solved, or not at all (the paper's reading)."""
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """When a contact counts as reached.
-
-    Attributes:
-        position: Distance of the contact point [m].
-        angle: Angle of the pad normal [rad].
-
-    Raises:
-        InputError: Not a positive finite number.
-    """
-
-    position: float = 5e-3
-    angle: float = math.radians(3.0)
-
-    def __post_init__(self) -> None:
-        for name, value in (("position", self.position), ("angle", self.angle)):
-            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
-                raise InputError(f"tolerance.{name}: found {value!r}, expected a number > 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +24,7 @@ class Problems:
     Attributes:
         points: (k, f, 3) contact points [m], base frame; NaN marks a free finger.
         normals: (k, f, 3) unit outward pad normals, base frame; NaN marks a free normal.
-        tolerance: When a contact counts as reached.
+        tolerance: When a contact counts as reached: one for all fingers, or one per finger.
         enforce_limits: Whether limits are part of being solved.
         first_row: Number of the first target in the whole batch; with the seed it decides the
             random numbers of a target, so that a part of a batch gets those of the whole.
@@ -54,13 +33,35 @@ class Problems:
 
     points: Array
     normals: Array
-    tolerance: Tolerance
+    tolerance: Tolerance | tuple[Tolerance, ...]
     enforce_limits: bool
     first_row: int = 0
     fixed: Array | None = None
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def tolerances(self) -> tuple[Tolerance, ...]:
+        """The tolerance of each finger."""
+        if isinstance(self.tolerance, Tolerance):
+            return (self.tolerance,) * self.points.shape[1]
+        return self.tolerance
+
+    @property
+    def position_tolerance(self) -> Array:
+        """(f,) [m]."""
+        return np.array([tolerance.position for tolerance in self.tolerances])
+
+    @property
+    def angle_tolerance(self) -> Array:
+        """(f,) [rad]."""
+        return np.array([tolerance.angle for tolerance in self.tolerances])
+
+    @property
+    def largest_tolerance(self) -> Tolerance:
+        """What every contact keeps to that is within its own tolerance."""
+        return Tolerance(float(self.position_tolerance.max()), float(self.angle_tolerance.max()))
 
     def rows(self, rows: slice | NDArray[np.intp]) -> Problems:
         """Some of the targets.
@@ -72,14 +73,8 @@ class Problems:
         first_row = 0
         if isinstance(rows, slice):
             first_row = self.first_row + rows.indices(len(self))[0]
-        return Problems(
-            self.points[rows],
-            self.normals[rows],
-            self.tolerance,
-            self.enforce_limits,
-            first_row,
-            self.fixed,
-        )
+        points, normals = self.points[rows], self.normals[rows]
+        return replace(self, points=points, normals=normals, first_row=first_row)
 
     def bounds(self, lower: Array, upper: Array, unbounded: float) -> tuple[Array, Array]:
         """Bounds (n,) that a method has to keep to.

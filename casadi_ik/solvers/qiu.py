@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.kernels import REPEATED, LoopKernel
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
@@ -72,11 +72,12 @@ class QiuMethod:
 
         Raises:
             InputError: A free finger or a free normal.
+            UnsupportedError: A fixed actuator.
         """
         self._check(problems)
         count = len(problems)
         values = self.step.parameter_values(
-            problems.tolerance.position, problems.tolerance.angle, problems.enforce_limits
+            problems.position_tolerance, problems.angle_tolerance, problems.enforce_limits
         )
         parameters = np.empty((count, self.step.parameters.size))
         nowhere = np.zeros(problems.points.shape[1:])
@@ -121,6 +122,8 @@ class QiuMethod:
         )
 
     def _check(self, problems: Problems) -> None:
+        if problems.fixed is not None:
+            raise UnsupportedError(f"method {self.name!r} cannot keep actuators fixed")
         for name, array in (("contact", problems.points), ("normal", problems.normals)):
             free = np.argwhere(np.isnan(array[..., 0]))
             if len(free):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.grasps import Tolerance
 from casadi_ik.solvers.contact_verdict import ContactVerdict
 from casadi_ik.solvers.diagnosis import Diagnosis
 from casadi_ik.solvers.problem import Array
@@ -66,6 +67,7 @@ class BatchSolution:
         ok: (k, f) bool.
         limits_ok: (k,) bool.
         phases: (k,) iterations by phase name.
+        tolerances: When a contact counted as reached, by finger.
         diagnoses: Why each target is not solved (None if it is); empty if not asked for.
     """
 
@@ -80,6 +82,7 @@ class BatchSolution:
     ok: NDArray[np.bool_]
     limits_ok: NDArray[np.bool_]
     phases: Mapping[str, NDArray[np.int64]]
+    tolerances: tuple[Tolerance, ...]
     diagnoses: tuple[Diagnosis | None, ...] = ()
 
     def __len__(self) -> int:
@@ -104,6 +107,7 @@ class BatchSolution:
                 float(self.position_error[row, i]),
                 float(self.angle_error[row, i]),
                 bool(self.ok[row, i]),
+                self.tolerances[i],
             )
             for i, name in enumerate(fingers)
         }

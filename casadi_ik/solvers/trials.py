@@ -173,6 +173,6 @@ def repeated(problems: Problems, count: int) -> Problems:
 
 def allowed(problems: Problems) -> Array:
     """(f, 2) the residuals that the tolerances allow, as `Trials.misses`; 0 where free."""
-    tolerance = problems.tolerance
-    known = np.stack([~np.isnan(problems.points[0, :, 0]), ~np.isnan(problems.normals[0, :, 0])], 1)
-    return known * np.array([tolerance.position / LENGTH, 2 * np.sin(tolerance.angle / 2)])
+    known = [~np.isnan(problems.points[0, :, 0]), ~np.isnan(problems.normals[0, :, 0])]
+    tolerated = [problems.position_tolerance / LENGTH, 2 * np.sin(problems.angle_tolerance / 2)]
+    return np.stack(known, axis=1) * np.stack(tolerated, axis=1)

@@ -44,8 +44,8 @@ def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
     )
     slack = 1 + TOLERANCE_SLACK
     # Free is what the target leaves out; an error that is NaN for another reason is no success.
-    met = (position <= problems.tolerance.position * slack) | np.isnan(problems.points[..., 0])
-    ok = met & ((angle <= problems.tolerance.angle * slack) | np.isnan(problems.normals[..., 0]))
+    met = (position <= problems.position_tolerance * slack) | np.isnan(problems.points[..., 0])
+    ok = met & ((angle <= problems.angle_tolerance * slack) | np.isnan(problems.normals[..., 0]))
     return Verdict(position, angle, ok, within_limits(robot, q))
 
 

@@ -26,7 +26,7 @@ from casadi_ik.steps.palm_estimate import palm_orientation
 from casadi_ik.steps.palm_motion import palm_motion
 from casadi_ik.steps.qiu_parameters import QiuParameters
 from casadi_ik.steps.status import Phase, Status
-from casadi_ik.steps.targets import contact_errors, target_fields, targets
+from casadi_ik.steps.targets import contact_errors, target_fields, targets, within_tolerance
 from casadi_ik.steps.tasks import (
     MILLIMETRE,
     Task,
@@ -112,8 +112,8 @@ class EnhancedStep:
         return StepGraph(name, function, self.state, self.parameters, self.record, compilable)
 
     def parameter_values(
-        self, position_tolerance: float, angle_tolerance: float, enforce_limits: bool
-    ) -> dict[str, float | list[float]]:
+        self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool
+    ) -> dict[str, float | list[float] | Array]:
         """Values of all parameter fields but the targets."""
         options = self.options
         given = {
@@ -170,12 +170,13 @@ class EnhancedStep:
 
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
         thumb = robot.finger_names.index(robot.thumb)
-        # In units of their tolerances, so that they can be summed.
+        # In units of the thumb's tolerances, so that they can be summed.
         errors = ca.vertcat(
-            positions[thumb] / p["position_tolerance"], angles[thumb] / p["angle_tolerance"]
+            positions[thumb] / p["position_tolerance"][thumb],
+            angles[thumb] / p["angle_tolerance"][thumb],
         )
         if self.options.palm_task:
-            errors = ca.vertcat(errors, safe_norm(palm.error) / p["angle_tolerance"])
+            errors = ca.vertcat(errors, safe_norm(palm.error) / p["angle_tolerance"][thumb])
         within, summed = ca.mmax(errors) <= 1, ca.sum1(errors)
         better = summed < 0.99 * s["best"]
         waited = ca.if_else(better, 0.0, s["waited"] + 1)
@@ -214,9 +215,7 @@ class EnhancedStep:
         closed = ca.SX.sym("closed", len(self.robot.actuators))
         robot, body, goals = self.robot, actuated(self.robot, closed), targets(self.robot, p)
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
-        solved = ca.logic_and(
-            ca.mmax(positions) <= p["position_tolerance"], ca.mmax(angles) <= p["angle_tolerance"]
-        )
+        solved = within_tolerance(positions, angles, p)
 
         others = {name: goal for name, goal in goals.items() if name != robot.thumb}
         translation, rotation = palm_motion(body, others)

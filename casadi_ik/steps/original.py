@@ -14,7 +14,7 @@ from casadi_ik.steps.limits import kept_within, limit_mask
 from casadi_ik.steps.palm_estimate import palm_orientation, thumb_first
 from casadi_ik.steps.qiu_parameters import OriginalParameters
 from casadi_ik.steps.status import Phase, Status
-from casadi_ik.steps.targets import contact_errors, target_fields, targets
+from casadi_ik.steps.targets import contact_errors, target_fields, targets, within_tolerance
 from casadi_ik.steps.tasks import (
     Task,
     TaskSolver,
@@ -88,8 +88,8 @@ class OriginalStep:
         return StepGraph(name, function, self.state, self.parameters, self.record)
 
     def parameter_values(
-        self, position_tolerance: float, angle_tolerance: float, enforce_limits: bool
-    ) -> dict[str, float]:
+        self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool
+    ) -> dict[str, float | Array]:
         """Values of all parameter fields but the targets."""
         given = {
             "position_tolerance": position_tolerance,
@@ -179,9 +179,7 @@ class OriginalStep:
         errors = ca.SX.sym("errors", len(self.robot.fingers), 2)
         step = ca.SX.sym("step", len(self.robot.actuators))
         robot, q, positions, angles = self.robot, s["q"], errors[:, 0], errors[:, 1]
-        solved = ca.logic_and(
-            ca.mmax(positions) <= p["position_tolerance"], ca.mmax(angles) <= p["angle_tolerance"]
-        )
+        solved = within_tolerance(positions, angles, p)
         q_next = kept_within(robot, q + step, p["enforce_limits"])
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
         after = self.state.pack({"q": ca.if_else(solved, q, q_next)})

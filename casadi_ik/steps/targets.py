@@ -20,8 +20,8 @@ def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
     return (
         Field("points", (f, 3), unit="m", doc="contact points, base frame"),
         Field("normals", (f, 3), doc="outward pad normals, base frame"),
-        Field("position_tolerance", (), unit="m"),
-        Field("angle_tolerance", (), unit="rad"),
+        Field("position_tolerance", (f,), unit="m"),
+        Field("angle_tolerance", (f,), unit="rad"),
     )
 
 
@@ -55,3 +55,17 @@ def contact_errors(
         positions.append(safe_norm(goal[name].point - point))
         angles.append(angle_between(normal, goal[name].normal))
     return ca.vertcat(*positions), ca.vertcat(*angles)
+
+
+def within_tolerance(positions: Expr, angles: Expr, p: dict[str, ca.SX]) -> Expr:
+    """Whether every contact is met; boolean.
+
+    Args:
+        positions: (f, 1) distances [m].
+        angles: (f, 1) angles [rad].
+        p: Parameters of `target_fields`.
+    """
+    return ca.logic_and(
+        ca.mmax(positions - p["position_tolerance"]) <= 0,
+        ca.mmax(angles - p["angle_tolerance"]) <= 0,
+    )

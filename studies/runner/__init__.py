@@ -3,21 +3,18 @@
 Needs the extra `studies`.
 """
 
-from importlib.util import find_spec
-
 from casadi_ik.errors import MissingExtraError
 
-for _name in ("dask", "joblib", "polars"):
-    if find_spec(_name) is None:
-        raise MissingExtraError(
-            f"studies need {_name}, which is not installed: pip install casadi-ik[studies]"
-        )
-
-from runner.arguments import add_run_arguments, run_from
-from runner.metric import Metric, interval_text, mean_metric, rate_metric, write_metrics
-from runner.results import read_results
-from runner.run import run
-from runner.study import Setting, Study, TargetSet
+try:
+    from runner.arguments import add_run_arguments, run_from
+    from runner.metric import Metric, interval_text, mean_metric, rate_metric, write_metrics
+    from runner.results import read_results
+    from runner.run import run
+    from runner.study import Setting, Study, TargetSet
+except ModuleNotFoundError as error:
+    raise MissingExtraError(
+        f"studies need {error.name}, which is not installed: pip install casadi-ik[studies]"
+    ) from error
 
 __all__ = [
     "Metric",

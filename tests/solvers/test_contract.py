@@ -105,7 +105,7 @@ def test_fields_of_a_batch(case):
         "q": (k, n), "position_error": (k, f), "angle_error": (k, f), "ok": (k, f),
     }  # fmt: skip
     for item in dataclasses.fields(ik.BatchSolution):
-        if item.name not in ("phases", "diagnoses"):
+        if item.name not in ("phases", "diagnoses", "tolerances"):
             assert getattr(batch, item.name).shape == shapes.get(item.name, (k,)), item.name
     assert batch.status_names.shape == (k,)
     assert set(batch.status_names) <= {status.name for status in ik.Status}
@@ -266,7 +266,9 @@ def test_a_grasp_of_another_hand(case):
 def test_parameters_say_everything(case):
     found = case.solver().parameters
     assert found["method"] == case.method
-    assert found["tolerance"] == {"position": 5e-3, "angle": math.radians(3)}
+    assert found["tolerance"] == {
+        name: {"position": 5e-3, "angle": math.radians(3)} for name in case.robot.fingers
+    }
     assert found["limits"] == "enforce"
     assert isinstance(found["options"], dict)
     assert case.method in repr(case.solver())

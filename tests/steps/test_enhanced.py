@@ -27,7 +27,9 @@ class Stepper:
         )
 
     def parameters(self, points, normals, enforce_limits=False):
-        values = self.step.parameter_values(5e-3, np.radians(3), enforce_limits)
+        values = self.step.parameter_values(
+            np.full(3, 5e-3), np.full(3, np.radians(3)), enforce_limits
+        )
         return self.step.parameters.pack({"points": points, "normals": normals, **values})
 
     def __call__(self, state, parameters):

@@ -1,0 +1,132 @@
+"""What a question may say beside the contacts: tolerances of their own, actuators held fixed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import DescriptionError, InputError, UnknownNameError, UnsupportedError
+
+FINE = ik.Tolerance(1e-6, 1e-6)
+COARSE = ik.Tolerance(0.08, 0.5)
+
+
+@pytest.fixture(scope="module")
+def robot() -> ik.ArmHand:
+    return ik.load_robot("kuka_lwr_barrett")
+
+
+def grasp(robot, q, tolerances=None, shift=0.0) -> ik.Grasp:
+    """The contacts of a configuration, the thumb's moved along its normal."""
+    points, normals = robot.contacts(q)
+    points = points.copy()
+    points[robot.fingers.index(robot.thumb)] += shift * normals[robot.fingers.index(robot.thumb)]
+    tolerances = tolerances or {}
+    return ik.Grasp(
+        {
+            name: ik.Contact(points[i], normals[i], tolerances.get(name))
+            for i, name in enumerate(robot.fingers)
+        }
+    )
+
+
+@pytest.mark.parametrize("method", ["hand-first", "ipopt", "enhanced-dls"])
+def test_every_contact_is_judged_by_its_own_tolerance(robot, method):
+    """Fingers that must be exact are, at the cost of the thumb that need not be."""
+    options = {"finger_step": "closed-form"} if method.startswith("enhanced") else {}
+    solver = ik.Solver(robot, method, tolerance=ik.Tolerance(1e-3, 1e-2), **options)
+    asked = grasp(robot, robot.home + 0.02, {robot.thumb: COARSE})
+    solution = solver.solve(asked)
+    assert solution.success
+    for name, contact in solution.contacts.items():
+        expected = COARSE if name == robot.thumb else ik.Tolerance(1e-3, 1e-2)
+        assert contact.tolerance == expected
+        assert contact.position_error <= expected.position
+        assert contact.angle_error <= expected.angle
+
+
+def test_a_coarse_contact_makes_a_grasp_possible(robot):
+    """Moved by 70 mm the thumb cannot be met exactly; with a tolerance of its own it need not."""
+    q = robot.home + 0.01
+    assert not ik.Solver(robot).solve(grasp(robot, q, shift=0.07), diagnose=False).success
+    coarse = {robot.thumb: COARSE}
+    solution = ik.Solver(robot).solve(grasp(robot, q, coarse, shift=0.07))
+    assert solution.success
+    others = [solution.contacts[name] for name in robot.fingers if name != robot.thumb]
+    assert max(contact.position_error for contact in others) <= 5e-3
+
+
+def test_tolerances_by_finger_of_a_batch(robot):
+    solver = ik.Solver(robot, tolerance={"thumb": COARSE})
+    points, normals = robot.contacts(robot.home[None] + 0.02)
+    batch = solver.solve_batch(points, normals)
+    assert batch.tolerances == (COARSE, ik.Tolerance(), ik.Tolerance())
+    assert batch.success.all()
+
+
+def test_grasp_file_with_tolerances(tmp_path):
+    path = tmp_path / "grasp.yaml"
+    text = (
+        "contacts:\n"
+        "  thumb: {point: [0, 0, 1], tolerance: {position: 2 mm}}\n"
+        "  finger_2: {point: [0, 0, 1], tolerance: {angle: 1 deg}}\n"
+        "  finger_3: {point: [0, 0, 1]}\n"
+    )
+    path.write_text(text)
+    contacts = ik.load_grasp(path).contacts
+    assert contacts["thumb"].tolerance == ik.Tolerance(position=2e-3)
+    assert contacts["finger_2"].tolerance == ik.Tolerance(angle=np.deg2rad(1))
+    assert contacts["finger_3"].tolerance is None
+    path.write_text(text.replace("2 mm", "-2 mm"))
+    says = (
+        r"grasp\.yaml: contacts\.thumb\.tolerance\.position: found -0\.002, expected a number > 0"
+    )
+    with pytest.raises(DescriptionError, match=says):
+        ik.load_grasp(path)
+
+
+@pytest.mark.parametrize("method", ["hand-first", "ipopt"])
+def test_fixed_actuators_stay_where_they_are(robot, method):
+    """The elbow's swivel is the arm's one freedom: joint 3 can be given, within reason."""
+    solver = ik.Solver(robot, method)
+    points, normals = robot.contacts(robot.random(np.random.default_rng(3), 20))
+    free = solver.solve_batch(points, normals)
+    assert free.success.all()
+    for row in range(3):
+        value = float(free.q[row, 2])
+        held = solver.solve_batch(
+            points[row][None], normals[row][None], fixed={"lwr_joint_3": value}
+        )
+        assert held.success.all()
+        assert held.q[0, 2] == value
+
+
+def test_a_spread_that_does_not_fit_is_found_out(robot):
+    """With the hand's spread held elsewhere the contacts cannot be met, and the verdict says so."""
+    points, normals = robot.contacts(robot.home)
+    asked = ik.Grasp({n: ik.Contact(points[i], normals[i]) for i, n in enumerate(robot.fingers)})
+    solution = ik.Solver(robot).solve(asked, fixed={"bh_spread": 2.5})
+    assert not solution.success
+    assert solution.status is ik.Status.UNREACHABLE
+    assert solution.q[robot.actuators.index("bh_spread")] == 2.5
+    assert solution.diagnosis is not None
+    assert solution.diagnosis.q[robot.actuators.index("bh_spread")] == 2.5
+
+
+def test_what_is_refused(robot):
+    solver = ik.Solver(robot)
+    asked = grasp(robot, robot.home)
+    with pytest.raises(UnknownNameError, match="fixed: no actuator 'elbow', expected one of lwr_"):
+        solver.solve(asked, fixed={"elbow": 0.0})
+    with pytest.raises(InputError, match=r"fixed\.lwr_joint_1: found 7, expected a number from"):
+        solver.solve(asked, fixed={"lwr_joint_1": 7})
+    paper = ik.Solver(robot, "enhanced-dls", finger_step="closed-form")
+    with pytest.raises(UnsupportedError, match="'enhanced-dls' cannot keep actuators fixed"):
+        paper.solve(asked, fixed={"lwr_joint_1": 0.0})
+    with pytest.raises(InputError, match=r"tolerance\.pinky: no such finger; the robot's fingers"):
+        ik.Solver(robot, tolerance={"pinky": COARSE})
+    with pytest.raises(InputError, match=r"tolerance\.thumb: found 3, expected a Tolerance"):
+        ik.Solver(robot, tolerance={"thumb": 3})
+    with pytest.raises(InputError, match=r"tolerance: found 0\.1, expected a Tolerance"):
+        ik.Contact([0, 0, 1], tolerance=0.1)
