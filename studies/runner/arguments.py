@@ -31,4 +31,5 @@ def add_run_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
 def run_from(options: argparse.Namespace, *studies: Study) -> None:
     """Run studies as the arguments say, each in a folder of its own below ``--out``."""
     for study in studies:
-        run(study, options.out / study.name, options.jobs, options.dask)
+        if study.count > 0:
+            run(study, options.out / study.name, options.jobs, options.dask)
