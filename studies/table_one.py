@@ -22,9 +22,10 @@ from pathlib import Path
 
 from qiu_table.report import write_report
 from qiu_table.settings import METHODS, ablation_study, readings_study, table_study
-from runner import add_run_arguments, run_from
+from runner import Study, add_run_arguments, run_from
 
 FULL = 10_000
+ABLATION_BLOCK = 10
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -45,18 +46,17 @@ def main(arguments: list[str] | None = None) -> None:
     )
     add_run_arguments(parser, "out/table_one")
     options = parser.parse_args(arguments)
-    common = (options.seed, options.block)
-    changes = (
-        readings_study(options.ablation_count, *common),
-        ablation_study(options.out / "robots", options.ablation_count, *common),
-    )
-    run_from(options, table_study(tuple(options.methods), options.count, *common), *changes)
-    whole = (
-        table_study(METHODS, FULL, *common),
-        readings_study(FULL, *common),
-        ablation_study(options.out / "robots", FULL, *common),
-    )
-    write_report(whole, options.out, options.report)
+
+    def studies(methods: tuple[str, ...], count: int, ablation_count: int) -> tuple[Study, ...]:
+        seed, robots = options.seed, options.out / "robots"
+        return (
+            table_study(methods, count, seed, options.block),
+            ablation_study(robots, ablation_count, seed, ABLATION_BLOCK),
+            readings_study(ablation_count, seed, ABLATION_BLOCK),
+        )
+
+    run_from(options, *studies(tuple(options.methods), options.count, options.ablation_count))
+    write_report(studies(METHODS, FULL, FULL), options.out, options.report)
 
 
 if __name__ == "__main__":

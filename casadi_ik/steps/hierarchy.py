@@ -18,12 +18,20 @@ from casadi_ik.symbolic.smooth import Expr
 PROJECTIONS = ("successive", "augmented", "none")
 """Which null space a lower task has to stay in."""
 
+EXACT = 1e-6
+"""Damping of a projector that is meant to be exact [unit of the task's Jacobian]."""
+
 RANK_FLOOR = 1e-3
 """Damping of the augmented projector [rad/rad, and mm/rad times 1e-3]: below it a row left over
 from the higher tasks counts as dependent on them."""
 
 
-def combine(tasks: Sequence[Task], steps: Sequence[Expr], projection: str) -> Expr:
+def combine(
+    tasks: Sequence[Task],
+    steps: Sequence[Expr],
+    projection: str,
+    damping: float | None = None,
+) -> Expr:
     """One step for all tasks (k, 1), the highest first.
 
     Args:
@@ -32,6 +40,8 @@ def combine(tasks: Sequence[Task], steps: Sequence[Expr], projection: str) -> Ex
         projection: "successive": dq_1 + N_1 dq_2 + N_1 N_2 dq_3 + ..., each N_i of its own task
             only. "augmented": dq_1 + N_1 dq_2 + N_12 dq_3 + ..., N_12 of the tasks 1 and 2 stacked.
             "none": the plain sum, no priorities.
+        damping: Of the pseudoinverse in the projectors [mm; rad/rad], so that a lower task leaks
+            into the higher ones; None: the projectors are exact wherever that is possible.
     """
     if projection == "none":
         return sum(steps[1:], steps[0])
@@ -40,12 +50,12 @@ def combine(tasks: Sequence[Task], steps: Sequence[Expr], projection: str) -> Ex
         for level in range(1, len(tasks)):
             step = steps[level]
             for higher in reversed(tasks[:level]):
-                step = project_to_null_space(higher.jacobian, step)
+                step = project_to_null_space(higher.jacobian, step, damping or EXACT)
             total = total + step
         return total
     total, spared = steps[0], None
     for higher, step in zip(tasks, steps[1:], strict=False):
-        spared = extended(spared, higher)
+        spared = extended(spared, higher, damping)
         total = total + spared.project(step)
     return total
 
@@ -70,15 +80,17 @@ class Spared:
         return vectors - self.A @ (self.X @ vectors)
 
 
-def extended(spared: Spared | None, task: Task) -> Spared:
-    """One more task to be spared: P' = P N(J P), N(Y) = I - Y' (Y Y' + RANK_FLOOR^2 I)^-1 Y."""
-    J = task.jacobian * (1e-3 if task.is_position else 1.0)
+def extended(spared: Spared | None, task: Task, damping: float | None) -> Spared:
+    """One more task to be spared: P' = P N(J P), N(Y) = I - Y' (Y Y' + damping^2 I)^-1 Y."""
+    J = task.jacobian
+    if damping is None:
+        damping, J = RANK_FLOOR, J * (1e-3 if task.is_position else 1.0)
     if spared is None:
         Y, PY = J, J.T
     else:
         Y = J - (J @ spared.A) @ spared.X
         PY = spared.project(Y.T)
-    G = Y @ Y.T + RANK_FLOOR**2 * ca.DM.eye(Y.shape[0])
+    G = Y @ Y.T + damping**2 * ca.DM.eye(Y.shape[0])
     X = solve_spd(G, Y)
     if spared is None:
         return Spared(PY, X)

@@ -170,7 +170,8 @@ class OriginalStep:
         pairs = [ca.SX.sym(f"pair_{i}", 3, n + 1) for i in range(len(kinds))]
         steps = [ca.SX.sym(f"step_{i}", n) for i in range(len(kinds))]
         tasks = [self._task(pair, kind) for pair, kind in zip(pairs, kinds, strict=True)]
-        step = combine(tasks, steps, self.options.projection)
+        damping = self.options.damping if self.options.projectors == "damped" else None
+        step = combine(tasks, steps, self.options.projection, damping)
         return ca.Function("combined", [*pairs, *steps], shared(step))
 
     def _ending(self) -> ca.Function:

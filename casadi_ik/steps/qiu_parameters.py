@@ -15,6 +15,8 @@ PROJECTIONS = (*HIERARCHIES, "stacked")
 """How the tasks of the original methods share the motors: a hierarchy, or one damped least squares
 problem of all of them (DLS only: selective damping is per task here)."""
 
+PROJECTORS = ("exact", "damped")
+
 FINGER_STEPS = ("ipopt", "closed-form")
 PALM_ERRORS = ("euler", "rotation-vector")
 PLATFORMS = ("arm-leg", "palm")
@@ -27,6 +29,7 @@ CHOICES = {
     "palm_error": PALM_ERRORS,
     "platform": PLATFORMS,
     "projection": PROJECTIONS,
+    "projectors": PROJECTORS,
     "order": ORDERS,
 }
 MAY_BE_ZERO = ("borrowed",)
@@ -142,6 +145,7 @@ class OriginalParameters:
         order: Order of the contact tasks, see `ORDERS`; the thumb is the first finger.
         projection: How a lower task is kept from disturbing the higher ones, see `hierarchy`;
             "stacked": all tasks are one, without priorities.
+        projectors: Their pseudoinverse: "exact", or "damped" by `damping` like a task's own.
         damping: lambda (paper: 1) [mm; rad/rad].
         gamma: SDLS: largest joint change in one step (paper: pi/9) [rad].
         longest_error: SDLS: position errors are shortened to this (paper: 200) [mm].
@@ -154,6 +158,7 @@ class OriginalParameters:
     palm_task: bool = False
     order: str = "per-finger"
     projection: str = "augmented"
+    projectors: str = "exact"
     damping: float = 1.0
     gamma: float = math.pi / 9
     longest_error: float = 200.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -28,6 +29,9 @@ METHODS = tuple(
 LIMITS = ("ignore", "enforce")
 CLOSED_FORM = {"finger_step": "closed-form"}
 """Of the enhanced methods: the answer of eq. (5) that Ipopt also gives, to 1e-9."""
+
+PALM = {False: "", True: ", palm first"}
+ORDER = {"per-finger": "finger by finger", "points-first": "points before normals"}
 
 LAMBDA_150 = float(np.sqrt(150.0))
 """Damping if 150 is what stands in the normal matrix."""
@@ -59,22 +63,32 @@ def readings_study(count: int, seed: int, block: int) -> Study:
     """Every reading of "the methods without the enhancement", limits ignored."""
     settings = []
     for steps in ("dls", "sdls"):
-        for projection in ("successive", "augmented", "stacked", "none"):
-            if projection == "stacked" and steps == "sdls":
-                continue
-            for palm in (False, True):
-                # A sum or a stack has no order.
-                ordered = projection in ("successive", "augmented")
-                for order in ("per-finger", "points-first") if ordered else ("per-finger",):
-                    options = {"projection": projection, "palm_task": palm, "order": order}
-                    words = [projection, "palm first"] if palm else [projection]
-                    if ordered:
-                        words.append(
-                            "finger by finger" if order == "per-finger" else "points first"
-                        )
-                    key = f"original-{steps}, {', '.join(words)}"
-                    settings.append(Setting(key, f"original-{steps}", "ignore", options))
+        for name, options in _readings():
+            if not (steps == "sdls" and options["projection"] == "stacked"):
+                key = f"original-{steps}, {name}"
+                settings.append(Setting(key, f"original-{steps}", "ignore", options))
     return Study("readings", ROBOT, targets(), tuple(settings), count, seed, block)
+
+
+def _readings() -> Iterator[tuple[str, dict[str, object]]]:
+    """Names and options; a sum or a stack has neither an order nor projectors."""
+    for projection in ("successive", "augmented"):
+        for projectors in ("exact", "damped"):
+            for palm in (False, True):
+                for order in ("per-finger", "points-first"):
+                    name = f"{projection}, {projectors} projectors{PALM[palm]}, {ORDER[order]}"
+                    yield (
+                        name,
+                        {
+                            "projection": projection,
+                            "projectors": projectors,
+                            "palm_task": palm,
+                            "order": order,
+                        },
+                    )
+    for projection, name in (("stacked", "one stacked task"), ("none", "plain sum")):
+        for palm in (False, True):
+            yield f"{name}{PALM[palm]}", {"projection": projection, "palm_task": palm}
 
 
 def ablation_study(folder: Path, count: int, seed: int, block: int) -> Study:

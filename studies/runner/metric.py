@@ -67,6 +67,8 @@ def interval_text(metric: Metric, digits: int = 1) -> str:
     """The figure and its interval as "97.4 (97.1-97.7)"; a dash if there is none."""
     if math.isnan(metric.value):
         return "-"
+    if math.isnan(metric.low):
+        return f"{metric.value:.{digits}f}"
     return f"{metric.value:.{digits}f} ({metric.low:.{digits}f}\u2013{metric.high:.{digits}f})"
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from functools import partial
 from importlib.metadata import version
 from importlib.resources import files
@@ -87,16 +86,22 @@ def missing(study: Study, folder: Path) -> list[Block]:
 
 
 def read_results(study: Study, folder: Path) -> pl.DataFrame:
-    """Everything a study has come to so far, a row per solve.
+    """Everything a study has come to so far, a row per solve; no rows if nothing."""
+    paths = [folder / block.path for block in study.blocks()]
+    there = [path for path in paths if path.exists()]
+    return pl.read_parquet(there) if there else pl.DataFrame()
+
+
+def code_of(folder: Path) -> str:
+    """Version of the code a folder's results were made with.
 
     Raises:
-        InputError: There is nothing yet.
+        InputError: There are none.
     """
-    paths = [folder / block.path for block in study.blocks()]
-    there: Sequence[Path] = [path for path in paths if path.exists()]
-    if not there:
-        raise InputError(f"{folder}: found no results of {study.name}, expected some")
-    return pl.read_parquet(list(there))
+    path = folder / STUDY_FILE
+    if not path.exists():
+        raise InputError(f"{folder}: found no results, expected some")
+    return json.loads(path.read_text(encoding="utf-8"))["code"]
 
 
 def _same(path: Path, key: str, found: Any, expected: Any) -> None:
