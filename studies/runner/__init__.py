@@ -7,7 +7,14 @@ from casadi_ik.errors import MissingExtraError
 
 try:
     from runner.arguments import add_run_arguments, run_from
-    from runner.metric import Metric, interval_text, mean_metric, rate_metric, write_metrics
+    from runner.metric import (
+        Metric,
+        interval_text,
+        mean_metric,
+        median_metric,
+        rate_metric,
+        write_metrics,
+    )
     from runner.page import markdown_table, write_page
     from runner.provenance import provenance
     from runner.results import code_of, read_results
@@ -28,6 +35,7 @@ __all__ = [
     "interval_text",
     "markdown_table",
     "mean_metric",
+    "median_metric",
     "provenance",
     "rate_metric",
     "read_results",

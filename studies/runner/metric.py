@@ -63,6 +63,18 @@ def mean_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") 
     return Metric(name, value, unit, better, value - half, value + half, len(samples))
 
 
+def median_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") -> Metric:
+    """A median with the interval between order statistics (normal approximation)."""
+    samples = np.sort(np.asarray(values, dtype=float))
+    n = len(samples)
+    if n == 0:
+        return Metric(name, math.nan, unit, better, math.nan, math.nan, 0)
+    half = Z95 * math.sqrt(n) / 2
+    low = samples[max(0, math.floor(n / 2 - half))]
+    high = samples[min(n - 1, math.ceil(n / 2 + half))]
+    return Metric(name, float(np.median(samples)), unit, better, float(low), float(high), n)
+
+
 def interval_text(metric: Metric, digits: int = 1) -> str:
     """The figure and its interval as "97.4 (97.1-97.7)"; a dash if there is none."""
     if math.isnan(metric.value):
