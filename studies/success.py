@@ -179,7 +179,7 @@ def main(arguments: list[str] | None = None) -> None:
         rerun(asked, options.rerun[0], int(options.rerun[1]))
         return
     run_from(options, asked)
-    write_report(study(FULL, options.seed, options.block), options.out / "success", options.report)
+    write_report(asked, options.out / asked.name, options.report)
 
 
 if __name__ == "__main__":

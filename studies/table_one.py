@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None) -> None:
         )
 
     run_from(options, *studies(tuple(options.methods), options.count, options.ablation_count))
-    write_report(studies(METHODS, FULL, FULL), options.out, options.report)
+    write_report(studies(METHODS, options.count, 0), options.out, options.report)
 
 
 if __name__ == "__main__":

@@ -86,10 +86,14 @@ def missing(study: Study, folder: Path) -> list[Block]:
 
 
 def read_results(study: Study, folder: Path) -> pl.DataFrame:
-    """Everything a study has come to so far, a row per solve; no rows if nothing."""
-    paths = [folder / block.path for block in study.blocks()]
-    there = [path for path in paths if path.exists()]
-    return pl.read_parquet(there) if there else pl.DataFrame()
+    """Everything a study has come to so far, whatever its count; no rows if nothing."""
+    paths = [
+        path
+        for setting in study.settings
+        for group in study.sets
+        for path in sorted((folder / setting.key / group.key).glob("*.parquet"))
+    ]
+    return pl.read_parquet(paths) if paths else pl.DataFrame()
 
 
 def code_of(folder: Path) -> str:

@@ -76,7 +76,7 @@ def test_a_dask_cluster_changes_nothing(done, tmp_path):
     assert contents(tmp_path).equals(contents(done))
 
 
-def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
+def test_not_before_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
     """Two workers and their parent are killed again and again until the study is through."""
     rng = random.Random(3)
     kills = 0
@@ -87,10 +87,11 @@ def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
         process = subprocess.Popen(
             command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True
         )
-        killed_at = time.monotonic() + rng.uniform(0.0, 2.0)
+        not_before = time.monotonic() + rng.uniform(0.0, 2.0)
         while kills < 4 and process.poll() is None:
             # Not before it has begun to work: a process that only imports shows nothing.
-            if time.monotonic() > killed_at and len(list(tmp_path.rglob("*.parquet"))) > len(before):
+            there = len(list(tmp_path.rglob("*.parquet")))
+            if time.monotonic() > not_before and there > len(before):
                 os.killpg(process.pid, signal.SIGKILL)
                 kills += 1
             time.sleep(0.002)
@@ -130,7 +131,7 @@ def test_different_settings_do_not_mix(done, change, says):
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="holds files but no study.json"):
+    with pytest.raises(InputError, match="holds files but no study"):
         run(STUDY, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
