@@ -8,17 +8,23 @@ from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp
 from casadi_ik.solvers import (
     METHODS,
+    Alternative,
+    ArmBranch,
     BatchSolution,
     ContactVerdict,
     Diagnosis,
+    Jump,
     Phase,
     Reason,
     Solution,
     Status,
+    Track,
 )
 
 __all__ = [
     "METHODS",
+    "Alternative",
+    "ArmBranch",
     "ArmHand",
     "BatchSolution",
     "CasadiIKError",
@@ -26,12 +32,14 @@ __all__ = [
     "ContactVerdict",
     "Diagnosis",
     "Grasp",
+    "Jump",
     "Phase",
     "Reason",
     "Solution",
     "Solver",
     "Status",
     "Tolerance",
+    "Track",
     "load_grasp",
     "load_robot",
     "logs",

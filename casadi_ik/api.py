@@ -19,6 +19,7 @@ from casadi_ik.solvers import (
     FINGER_STEPS,
     LIMITS,
     METHODS,
+    Alternative,
     BatchSolution,
     Engine,
     Problems,
@@ -27,10 +28,12 @@ from casadi_ik.solvers import (
     SteppedMethod,
     Stepper,
     Tolerance,
+    Track,
     build_method,
     fixed_array,
     method_options,
     target_arrays,
+    travel_limits,
 )
 
 Array = NDArray[np.float64]
@@ -183,6 +186,77 @@ class Solver:
         with self._recorder(log, seed) as recorder:
             return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
 
+    def solve_all(
+        self,
+        grasp: Grasp,
+        limit: int = 16,
+        prefer: str = "limits",
+        q0: ArrayLike | None = None,
+        seed: int = 0,
+        fixed: Mapping[str, float] | None = None,
+    ) -> tuple[Alternative, ...]:
+        """Find different solutions of one grasp, best first.
+
+        For every hand posture that meets the contacts: of an S-R-S arm every branch (signs of
+        shoulder, elbow and wrist) with its intervals of swivels, and the preferred swivel of each;
+        of another arm the different configurations that many starts lead to.
+
+        Args:
+            grasp: A contact per finger; its fingers must be the robot's.
+            limit: How many at most.
+            prefer: What comes first: "limits" (far from its limits), "manipulability" (of the
+                arm), or "q0" (close to it).
+            q0: (n,) where the robot is [rad or m]; None is `robot.home`.
+            seed: Of all random numbers, an integer >= 0.
+            fixed: Positions of actuators that are not to move, by name [rad or m].
+
+        Returns:
+            The solutions; none if the grasp cannot be solved (`solve` says why).
+
+        Raises:
+            InputError: Bad limit, preference or q0, or a grasp the robot cannot take.
+            UnsupportedError: The method is not hand-first.
+        """
+        finder = self._engine.finder
+        problems = self._problems([grasp], fixed)
+        return finder.find(problems, self._start(q0), seed, limit, prefer)
+
+    def track(
+        self,
+        grasps: Sequence[Grasp],
+        q0: ArrayLike | None = None,
+        period: float | None = None,
+        velocity: ArrayLike | None = None,
+        seed: int = 0,
+        fixed: Mapping[str, float] | None = None,
+    ) -> Track:
+        """Follow a moving grasp: every solution continues the one before.
+
+        The motion begins with the solution of the first grasp from which the others are reached
+        without a jump between branches; a jump that cannot be avoided is reported.
+
+        Args:
+            grasps: In order; the tolerances are those of the first.
+            q0: (n,) where the robot is [rad or m]: the motion begins near it. None: it begins far
+                from the limits.
+            period: Time from one grasp to the next [s]; then the motors' velocity limits are kept,
+                and a grasp that moves too fast is followed as well as they allow.
+            velocity: Other velocity limits, (n,) or a number [rad/s or m/s].
+            seed: Of all random numbers, an integer >= 0.
+            fixed: Positions of actuators that are not to move, by name [rad or m].
+
+        Raises:
+            InputError: No grasp, bad q0, period or velocity, or a grasp the robot cannot take.
+            UnsupportedError: The method is not hand-first.
+        """
+        tracker = self._engine.tracker
+        if not grasps:
+            raise InputError("grasps: found none, expected at least one")
+        problems = self._problems(grasps, fixed)
+        travel = travel_limits(self.robot, period, velocity)
+        prefer = "limits" if q0 is None else "q0"
+        return tracker.track(problems, self._start(q0), prefer, travel, seed)
+
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
         """Solve one grasp by hand, one iteration at a time.
 
@@ -198,15 +272,18 @@ class Solver:
         if not isinstance(method, SteppedMethod):
             raise UnsupportedError(f"method {self.method!r} cannot be stepped by hand")
         problems = self._problems([grasp], None)
-        start = self.robot.configuration(q0, "q0")
-        if start.ndim != 1:
-            raise InputError(f"q0: found shape {start.shape}, expected ({len(start[0])},)")
-        states, parameters = method.start(problems, start[None])
+        states, parameters = method.start(problems, self._start(q0)[None])
         return Stepper(method.kernel.step, states[0], parameters[0])
 
     @property
     def _enforce(self) -> bool:
         return self.limits == "enforce"
+
+    def _start(self, q0: ArrayLike | None) -> Array:
+        start = self.robot.configuration(q0, "q0")
+        if start.ndim != 1:
+            raise InputError(f"q0: found shape {start.shape}, expected ({len(start[0])},)")
+        return start
 
     def _fixed(self, fixed: Mapping[str, float] | None) -> Array | None:
         robot = self.robot

@@ -1,5 +1,7 @@
 """Loops, phases, status and verdicts."""
 
+from casadi_ik.solvers.alternatives import PREFERENCES, Alternative
+from casadi_ik.solvers.arm_branches import ArmBranch
 from casadi_ik.solvers.contact_verdict import ContactVerdict
 from casadi_ik.solvers.diagnosis import Diagnosis, Reason
 from casadi_ik.solvers.engine import Engine
@@ -8,6 +10,7 @@ from casadi_ik.solvers.recorder import Recorder
 from casadi_ik.solvers.registry import METHODS, build_method, method_options, method_summary
 from casadi_ik.solvers.solution import BatchSolution, Solution
 from casadi_ik.solvers.stepper import SteppedMethod, Stepper
+from casadi_ik.solvers.tracking import Jump, Track, travel_limits
 from casadi_ik.steps.qiu_parameters import FINGER_STEPS
 from casadi_ik.steps.status import Phase, Status
 
@@ -15,10 +18,14 @@ __all__ = [
     "FINGER_STEPS",
     "LIMITS",
     "METHODS",
+    "PREFERENCES",
+    "Alternative",
+    "ArmBranch",
     "BatchSolution",
     "ContactVerdict",
     "Diagnosis",
     "Engine",
+    "Jump",
     "Phase",
     "Problems",
     "Reason",
@@ -28,9 +35,11 @@ __all__ = [
     "SteppedMethod",
     "Stepper",
     "Tolerance",
+    "Track",
     "build_method",
     "fixed_array",
     "method_options",
     "method_summary",
     "target_arrays",
+    "travel_limits",
 ]

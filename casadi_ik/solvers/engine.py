@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.solvers.alternatives import AlternativeFinder
 from casadi_ik.solvers.diagnosis import Diagnosis, Reason
 from casadi_ik.solvers.diagnostician import Diagnostician
 from casadi_ik.solvers.hand_first import HandFirstMethod
@@ -20,6 +21,7 @@ from casadi_ik.solvers.method import Method, Outcome
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.recorder import Recorder, SolveRecord, SolveSummary
 from casadi_ik.solvers.solution import BatchSolution
+from casadi_ik.solvers.tracking import Tracker
 from casadi_ik.solvers.verdict import judge
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.status import Status
@@ -46,6 +48,34 @@ class Engine:
         if not isinstance(method, HandFirstMethod):
             method = HandFirstMethod(self.robot.description, HandFirstParameters(), self.compiled)
         return Diagnostician(self.robot, method)
+
+    @property
+    def _hand_first(self) -> HandFirstMethod:
+        method = self.method
+        if not isinstance(method, HandFirstMethod):
+            raise UnsupportedError(
+                f"method {method.name!r} gives one solution; several need {HandFirstMethod.name!r}"
+            )
+        method.prepare()
+        return method
+
+    @cached_property
+    def finder(self) -> AlternativeFinder:
+        """Who finds several solutions.
+
+        Raises:
+            UnsupportedError: The method is not hand-first.
+        """
+        return AlternativeFinder(self.robot, self._hand_first, self.compiled)
+
+    @cached_property
+    def tracker(self) -> Tracker:
+        """Who follows moving grasps.
+
+        Raises:
+            UnsupportedError: The method is not hand-first.
+        """
+        return Tracker(self.robot, self._hand_first, self.finder)
 
     def solve(
         self,

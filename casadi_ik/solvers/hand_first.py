@@ -94,7 +94,7 @@ class HandFirstMethod:
             begin = time.perf_counter()
             first = number * options.candidates
             chosen = problems.rows(waiting)
-            lookup = self._postures(chosen, number)
+            lookup = self.postures(chosen, number)
             parameters = self._parameters(chosen, q0[waiting], lookup)
             outcome.time[waiting] += (time.perf_counter() - begin) / max(len(waiting), 1)
             result = self.kernel.run(self._states(q0[waiting]), parameters, MAX_ITERATIONS, trace)
@@ -114,14 +114,14 @@ class HandFirstMethod:
 
     def rows(self, problems: Problems, q0: Array, number: int = 0) -> tuple[Array, Array]:
         """States and parameters of a round, a row per target, to be changed before `run_rows`."""
-        lookup = self._postures(problems, number)
+        lookup = self.postures(problems, number)
         return self._states(q0), self._parameters(problems, q0, lookup)
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
-    def _postures(self, problems: Problems, number: int) -> Array:
+    def postures(self, problems: Problems, number: int) -> Array:
         """Candidates (k, candidates, hand) of a round: first from the table, then the wide one."""
         count = self.options.candidates
         if number == 0:

@@ -134,12 +134,7 @@ class Descent:
     def __init__(self, trials: Trials, problems: Problems) -> None:
         """Lay out the rows once, for any number of runs."""
         self._trials = trials
-        home = np.tile(trials.robot.home, (len(problems), 1))
-        self._states, self._parameters = trials.method.rows(problems, home)
-        last = trials.method.options.candidates - 1
-        values = {"phase": Phase.REFINEMENT, "candidate": last} | fresh_fit()
-        for name, value in values.items():
-            self._states[:, trials.state.slice(name)] = value
+        self._states, self._parameters = refinement_rows(trials, problems)
 
     def run(self, q: Array, bounds: Bounds, weights: Array | None = None) -> Array:
         """Refine.
@@ -164,6 +159,16 @@ class Descent:
             parameters[:, layout.slice("position_tolerance")] = NEVER
             parameters[:, layout.slice("angle_tolerance")] = NEVER
         return trials.run(states, parameters)
+
+
+def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:
+    """States and parameters of the loop that begin with the refinement of the whole arm-hand."""
+    home = np.tile(trials.robot.home, (len(problems), 1))
+    states, parameters = trials.method.rows(problems, home)
+    last = trials.method.options.candidates - 1
+    for name, value in ({"phase": Phase.REFINEMENT, "candidate": last} | fresh_fit()).items():
+        states[:, trials.state.slice(name)] = value
+    return states, parameters
 
 
 def repeated(problems: Problems, count: int) -> Problems:
