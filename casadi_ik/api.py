@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
-from casadi_ik.logs import McapRecorder
+from casadi_ik.logs import Compression, Keep, McapRecorder
 from casadi_ik.solvers import (
     FINGER_STEPS,
     LIMITS,
@@ -153,9 +153,11 @@ class Solver:
         q0: ArrayLike | None = None,
         seed: int = 0,
         jobs: int = 1,
-        log: str | PathLike[str] | None = None,
+        log: str | PathLike[str] | Recorder | None = None,
         diagnose: bool = False,
         fixed: Mapping[str, float] | None = None,
+        keep: Keep | None = None,
+        compression: Compression = "zstd",
     ) -> BatchSolution:
         """Solve k targets.
 
@@ -166,10 +168,13 @@ class Solver:
             q0: (n,) or (k, n) start; None is `robot.home`.
             seed: Of all random numbers, an integer >= 0.
             jobs: Threads, at least 1.
-            log: Path of an MCAP file to write every iteration to.
+            log: Path of an MCAP file to write every iteration to; or an open recorder, which
+                stays open, for several batches in one log.
             diagnose: Whether to find out why, for every target that is not solved
                 (`BatchSolution.diagnoses`).
             fixed: Positions of actuators that are not to move, by name [rad or m].
+            keep: Which solves keep their iterations in the log; None: all.
+            compression: Of the log: "zstd" (level 1), "lz4" or "none".
 
         Returns:
             The same fields as a `Solution`, as arrays.
@@ -183,7 +188,7 @@ class Solver:
         p, n = target_arrays(points, normals, len(self.robot.fingers))
         tolerances = tuple(self.tolerances.values())
         problems = Problems(p, n, tolerances, self._enforce, fixed=self._fixed(fixed))
-        with self._recorder(log, seed) as recorder:
+        with self._recorder(log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
 
     def solve_all(
@@ -304,16 +309,22 @@ class Solver:
         return Problems(points, normals, tuple(tolerances), self._enforce, fixed=fixed_at)
 
     def _recorder(
-        self, log: str | PathLike[str] | None, seed: int
+        self,
+        log: str | PathLike[str] | Recorder | None,
+        seed: int,
+        keep: Keep | None = None,
+        compression: Compression = "zstd",
     ) -> AbstractContextManager[Recorder | None]:
-        if log is None:
-            return nullcontext()
+        if not isinstance(log, str | PathLike):
+            return nullcontext(log)
         return McapRecorder(
             log,
             robot_name=self.robot.name,
             urdf=self.robot.urdf(),
             parameters=self.parameters,
             seed=seed,
+            keep=keep,
+            compression=compression,
         )
 
 

@@ -10,9 +10,9 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from casadi_ik import logs
 from casadi_ik.cli.answer import Answer
 from casadi_ik.cli.report import fields, table
-from casadi_ik.logs import LogFile, open_log
 
 
 def info(files: Iterable[str]) -> Answer:
@@ -23,12 +23,12 @@ def info(files: Iterable[str]) -> Answer:
     """
     parts: list[RenderableType] = []
     for name in files:
-        parts += _report(open_log(name))
+        parts += _report(logs.open(name))
     return Answer(Group(*parts))
 
 
-def _report(log: LogFile) -> list[RenderableType]:
-    about = log.info
+def _report(log: logs.Log) -> list[RenderableType]:
+    about = log.info()
     iterations = sum(counts["iteration"] for counts in about.counts.values())
     each = f", {about.size / iterations:.0f} bytes/iteration" if iterations else ""
     packed = f"{about.chunks}, compression {about.compression}"
@@ -36,7 +36,7 @@ def _report(log: LogFile) -> list[RenderableType]:
         packed += f" ({about.uncompressed / about.compressed:.1f} times smaller)"
     attached = (f"{name} ({size(length)})" for name, length in about.attachments.items())
     return [
-        Text(str(about.path), "bold", no_wrap=True, overflow="ignore"),
+        Text(", ".join(map(str, about.paths)), "bold", no_wrap=True, overflow="ignore"),
         fields(
             {
                 "robot": about.robot,
@@ -50,12 +50,12 @@ def _report(log: LogFile) -> list[RenderableType]:
     ]
 
 
-def _methods(log: LogFile) -> RenderableType:
+def _methods(log: logs.Log) -> RenderableType:
     right = ("solves", "iterations")
     rows = table("method", *right, "status", "events", right=right)
-    for method, counts in log.info.counts.items():
-        statuses = Counter(solve.status for solve in log.solves(method))
-        kinds = Counter(found.event.kind.name for found in log.events(method))
+    for method, counts in log.info().counts.items():
+        statuses = _counter(log.solves(method=method), "status")
+        kinds = _counter(log.events(method=method), "kind")
         rows.add_row(
             method,
             str(counts["solve"]),
@@ -64,6 +64,10 @@ def _methods(log: LogFile) -> RenderableType:
             _counted(kinds),
         )
     return rows
+
+
+def _counter(table: logs.Table, field: str) -> Counter[str]:
+    return Counter(record[field] for record in table.records())
 
 
 def _counted(counter: Counter[str]) -> str:

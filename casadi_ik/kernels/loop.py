@@ -16,7 +16,7 @@ from casadi_ik.kernels.buffered import BufferedFunction, doubles, memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text, row_major
 from casadi_ik.kernels.outcome import SLICE, Outcome, check
-from casadi_ik.kernels.rows import row_driver, store_rows
+from casadi_ik.kernels.rows import row_driver, split_rows, store_rows
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
 NON_FINITE = -1
@@ -60,12 +60,7 @@ class LoopResult:
     @cached_property
     def trace(self) -> tuple[NDArray[Any], ...]:
         """The rows of each solve, views into `rows`; empty if no trace was asked for."""
-        if self.rows is None:
-            return ()
-        ends = np.cumsum(self.iterations)
-        starts = ends - self.iterations
-        pairs = zip(starts.tolist(), ends.tolist(), strict=True)
-        return tuple(self.rows[start:end] for start, end in pairs)
+        return () if self.rows is None else split_rows(self.rows, self.iterations)
 
 
 class LoopKernel:

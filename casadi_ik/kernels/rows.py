@@ -33,6 +33,13 @@ def store_rows(layout: Layout, vectors: NDArray[np.float64], rows: NDArray[Any])
                 target[...] = values
 
 
+def split_rows(rows: NDArray[Any], counts: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
+    """Views of the rows (sum of counts,) of each solve, by how many each of them has (k,)."""
+    ends = np.cumsum(counts)
+    pairs = zip((ends - counts).tolist(), ends.tolist(), strict=True)
+    return tuple(rows[start:end] for start, end in pairs)
+
+
 def row_driver(layout: Layout) -> str:
     """C text that defines N_RECORD, ROW_BYTES and `store_row(record, row)` for a layout."""
     offsets: Any = layout.dtype.fields

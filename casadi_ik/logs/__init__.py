@@ -1,20 +1,26 @@
 """MCAP logs: every iteration into a file, and back."""
 
 from casadi_ik.logs.clock import LogClock
-from casadi_ik.logs.contents import Iterations, LoggedEvent, LogInfo
+from casadi_ik.logs.event_kinds import EventKind
 from casadi_ik.logs.event_rules import EventRules
 from casadi_ik.logs.events import detect_events
-from casadi_ik.logs.reader import LogFile, open_log
-from casadi_ik.logs.writer import McapRecorder
+from casadi_ik.logs.keep import Keep
+from casadi_ik.logs.log import Log, LogInfo
+from casadi_ik.logs.log import open_log as open  # noqa: A004 - read as `ik.logs.open`
+from casadi_ik.logs.table import Part, Table
+from casadi_ik.logs.writer import Compression, McapRecorder
 
 __all__ = [
+    "Compression",
+    "EventKind",
     "EventRules",
-    "Iterations",
+    "Keep",
+    "Log",
     "LogClock",
-    "LogFile",
     "LogInfo",
-    "LoggedEvent",
     "McapRecorder",
+    "Part",
+    "Table",
     "detect_events",
-    "open_log",
+    "open",
 ]

@@ -1,138 +1,179 @@
-"""Messages of one channel, a chunk at a time, by way of the message index."""
+"""Messages of one channel as rows: chunk bytes taken as an array, after a look at every message.
+
+Nothing is taken on trust: the chunk's checksum is verified, and of every message opcode, length,
+channel and time against the index. What is not of our fixed layout is decoded message by message.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import IO, Any
 
+import lz4.frame
 import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Chunk, ChunkIndex
-from mcap.stream_reader import get_chunk_data_stream
-from mcap.summary import Summary
+from mcap.records import Chunk, ChunkIndex, Message
+from mcap.stream_reader import breakup_chunk
+from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError
-from casadi_ik.logs.cdr import HEADER
-
-_PREFIX = [
-    ("opcode", "u1"),
-    ("length", "<u8"),
-    ("channel", "<u2"),
-    ("sequence", "<u4"),
-    ("log_time", "<u8"),
-    ("publish_time", "<u8"),
-]
-"""An MCAP Message record up to its payload."""
+from casadi_ik.logs.cdr import Codec
+from casadi_ik.logs.contents import Contents
+from casadi_ik.logs.message import CDR_NUMBER, HEAD, RECORD_HEAD
 
 _INDEX_HEAD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("size", "<u4")])
-_RECORD_HEAD = 9
-_MESSAGE_HEAD = 22
+
+TimeFilter = Callable[[np.ndarray], NDArray[np.bool_]]
+"""Which of log times (k,) are wanted."""
 
 
 @dataclass(frozen=True)
-class Slice:
-    """Where messages are wanted from.
+class Wanted:
+    """Which messages are wanted.
 
     Attributes:
         channel: Channel id.
-        start: First log time [ns].
-        stop: First log time no longer wanted [ns]; None for no end.
+        chunk: Whether a chunk with messages from a first to a last log time may hold any;
+            None: it always may.
+        times: Which of them are; None: all.
     """
 
     channel: int
-    start: int = 0
-    stop: int | None = None
+    chunk: Callable[[int, int], bool] | None = None
+    times: TimeFilter | None = None
 
 
 def rows(
-    stream: IO[bytes], summary: Summary, wanted: Slice, dtype: np.dtype[Any]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Payloads of fixed size as numpy rows, by log time.
+    stream: IO[bytes], contents: Contents, wanted: Wanted, dtype: np.dtype[Any]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Rows of fixed size, chunk by chunk.
 
     Args:
-        stream: The MCAP file.
-        summary: Its summary.
+        stream: The file.
+        contents: Where in it what is.
         wanted: Which messages.
         dtype: The payload behind its CDR header.
 
-    Returns:
-        Log times (k,) uint64 [ns] and rows (k,) of `dtype`.
+    Yields:
+        Log times (k,) uint64 [ns] and rows (k,) of `dtype`, which are views where nothing had to
+        be left out.
 
     Raises:
         LogError: A message is not what the index or the schema says.
     """
-    message = np.dtype([*_PREFIX, ("cdr", "<u4"), ("row", dtype)])
-    times, parts = [np.zeros(0, np.uint64)], [np.zeros(0, dtype)]
-    for log_times, offsets, data in _indexed(stream, summary, wanted):
-        if offsets.size and int(offsets.max()) + message.itemsize > len(data):
+    size = HEAD.itemsize + dtype.itemsize
+    for chunk in _chunks(contents, wanted):
+        data = chunk_data(stream, chunk)
+        entries = _entries(stream, chunk, wanted.channel)
+        if entries is None:
+            entries = _walked(stream, chunk, wanted.channel)
+        if not len(entries):
+            continue
+        log_times, offsets = entries[:, 0], entries[:, 1].astype(np.int64)
+        if offsets.min() < 0 or offsets.max() > len(data) - size:
             raise LogError("the message index points outside its chunk")
-        windows = np.lib.stride_tricks.sliding_window_view(
-            np.frombuffer(data, np.uint8), message.itemsize
-        )
-        found = windows[offsets.astype(np.int64)].view(message)[:, 0]
+        messages = _taken(data, offsets, size)
+        head = messages[:, : HEAD.itemsize].view(HEAD)[:, 0]
+        prefix = head["prefix"]
         if not (
-            np.all(found["opcode"] == Opcode.MESSAGE)
-            and np.all(found["length"] == message.itemsize - _RECORD_HEAD)
-            and np.all(found["channel"] == wanted.channel)
-            and np.all(found["log_time"] == log_times)
-            and np.all(found["cdr"] == int.from_bytes(HEADER, "little"))
+            np.all(prefix["opcode"] == Opcode.MESSAGE)
+            and np.all(prefix["length"] == size - RECORD_HEAD)
+            and np.all(prefix["channel"] == wanted.channel)
+            and np.all(prefix["log_time"] == log_times)
+            and np.all(head["cdr"] == CDR_NUMBER)
         ):
-            raise LogError(f"a message of channel {wanted.channel} is not of its schema's size")
-        times.append(log_times)
-        parts.append(found["row"])
-    joined = np.concatenate(times)
-    order = np.argsort(joined, kind="stable")
-    return joined[order], np.concatenate(parts)[order]
+            raise LogError(
+                f"a message of channel {wanted.channel} is not what index and schema say"
+            )
+        payload = messages[:, HEAD.itemsize :]
+        if wanted.times is not None:
+            keep = wanted.times(log_times)
+            if not keep.all():
+                log_times, payload = log_times[keep], payload[keep]
+        yield log_times, payload.view(dtype)[:, 0]
 
 
-def payloads(stream: IO[bytes], summary: Summary, wanted: Slice) -> list[bytes]:
-    """Payloads of any size with their CDR headers, by log time.
+def decoded(
+    stream: IO[bytes], contents: Contents, wanted: Wanted, codec: Codec
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Messages of any kind, one by one: log time [ns] and values by name.
 
     Raises:
-        LogError: A message is not where the index says.
+        LogError: A message is not what the schema says.
     """
-    found: list[tuple[int, bytes]] = []
-    prefix = np.dtype(_PREFIX)
-    for log_times, offsets, data in _indexed(stream, summary, wanted):
-        for log_time, offset in zip(log_times.tolist(), offsets.tolist(), strict=True):
-            if offset + prefix.itemsize > len(data):
-                raise LogError("the message index points outside its chunk")
-            head = np.frombuffer(data, prefix, 1, offset)[0]
-            end = offset + _RECORD_HEAD + int(head["length"])
-            if (
-                head["opcode"] != Opcode.MESSAGE
-                or head["channel"] != wanted.channel
-                or head["log_time"] != log_time
-                or end > len(data)
-            ):
-                raise LogError(f"no message of channel {wanted.channel} where the index says")
-            found.append((log_time, data[offset + prefix.itemsize : end]))
-    return [payload for _, payload in sorted(found, key=lambda item: item[0])]
+    for chunk in _chunks(contents, wanted):
+        for message in _messages(stream, chunk, wanted.channel):
+            if wanted.times is None or wanted.times(np.array([message.log_time], np.uint64))[0]:
+                yield message.log_time, codec.decode(message.data)
 
 
-def _indexed(
-    stream: IO[bytes], summary: Summary, wanted: Slice
-) -> Iterator[tuple[np.ndarray, np.ndarray, bytes]]:
-    """Log times, offsets and uncompressed bytes of every chunk that holds wanted messages."""
-    for chunk in summary.chunk_indexes:
-        late = wanted.stop is not None and chunk.message_start_time >= wanted.stop
-        if late or chunk.message_end_time < wanted.start:
-            continue
-        position = chunk.message_index_offsets.get(wanted.channel)
-        if position is None:
-            continue
-        entries = _message_index(stream, position, wanted.channel)
-        keep = entries[:, 0] >= wanted.start
-        if wanted.stop is not None:
-            keep &= entries[:, 0] < wanted.stop
-        if keep.any():
-            yield entries[keep, 0], entries[keep, 1], _chunk_bytes(stream, chunk)
+def chunk_data(stream: IO[bytes], index: ChunkIndex) -> bytes:
+    """The records in a chunk, uncompressed, header and checksum verified.
+
+    Raises:
+        LogError: The chunk is not what its index says.
+    """
+    chunk = _chunk(stream, index)
+    if chunk.compression == "zstd":
+        data = zstandard.decompress(chunk.data, max_output_size=chunk.uncompressed_size)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.decompress(chunk.data)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise LogError(f"a chunk is compressed by {chunk.compression!r}, which is not known here")
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise LogError(f"the chunk at byte {index.chunk_start_offset} fails its checksum")
+    return data
 
 
-def _message_index(stream: IO[bytes], position: int, channel: int) -> np.ndarray:
-    """The (log time, offset) pairs of a MessageIndex record, (k, 2) uint64."""
+def _chunks(contents: Contents, wanted: Wanted) -> Iterator[ChunkIndex]:
+    """The chunks that may hold wanted messages."""
+    for chunk in contents.chunks:
+        indexed = chunk.message_index_offsets
+        times = chunk.message_start_time, chunk.message_end_time
+        if (not indexed or wanted.channel in indexed) and (
+            wanted.chunk is None or wanted.chunk(*times)
+        ):
+            yield chunk
+
+
+def _chunk(stream: IO[bytes], index: ChunkIndex) -> Chunk:
+    stream.seek(index.chunk_start_offset)
+    head = stream.read(RECORD_HEAD)
+    if len(head) < RECORD_HEAD or head[0] != Opcode.CHUNK:
+        raise LogError(f"no chunk at byte {index.chunk_start_offset}")
+    chunk = Chunk.read(ReadDataStream(stream))
+    found = (
+        int.from_bytes(head[1:], "little") + RECORD_HEAD,
+        chunk.compression,
+        len(chunk.data),
+        chunk.message_start_time,
+        chunk.message_end_time,
+        chunk.uncompressed_size,
+    )
+    expected = (
+        index.chunk_length,
+        index.compression,
+        index.compressed_size,
+        index.message_start_time,
+        index.message_end_time,
+        index.uncompressed_size,
+    )
+    if found != expected:
+        raise LogError(f"the chunk at byte {index.chunk_start_offset} is not what its index says")
+    return chunk
+
+
+def _entries(stream: IO[bytes], chunk: ChunkIndex, channel: int) -> np.ndarray | None:
+    """The (log time, offset) pairs of a chunk's index (k, 2) uint64; None if it has none."""
+    position = chunk.message_index_offsets.get(channel)
+    if position is None:
+        return None
     stream.seek(position)
     head = np.frombuffer(stream.read(_INDEX_HEAD.itemsize), _INDEX_HEAD, 1)[0]
     size = int(head["size"])
@@ -142,12 +183,29 @@ def _message_index(stream: IO[bytes], position: int, channel: int) -> np.ndarray
     return np.frombuffer(stream.read(size), "<u8", size // 8).reshape(-1, 2)
 
 
-def _chunk_bytes(stream: IO[bytes], index: ChunkIndex) -> bytes:
-    """The records of a chunk, uncompressed, their checksum verified."""
-    stream.seek(index.chunk_start_offset)
-    opcode = stream.read(_RECORD_HEAD)[:1]
-    if opcode != bytes([Opcode.CHUNK]):
-        raise LogError(f"no chunk at byte {index.chunk_start_offset}")
-    chunk = Chunk.read(ReadDataStream(stream))
-    data, length = get_chunk_data_stream(chunk, validate_crc=True)
-    return data.read(length)
+def _walked(stream: IO[bytes], chunk: ChunkIndex, channel: int) -> np.ndarray:
+    """The same by going through the chunk."""
+    data, found, position = chunk_data(stream, chunk), [], 0
+    while position < len(data):
+        length = int.from_bytes(data[position + 1 : position + RECORD_HEAD], "little")
+        if data[position] == Opcode.MESSAGE:
+            head = np.frombuffer(data, HEAD["prefix"], 1, position)[0]
+            if head["channel"] == channel:
+                found.append((int(head["log_time"]), position))
+        position += RECORD_HEAD + length
+    return np.array(found, np.uint64).reshape(-1, 2)
+
+
+def _messages(stream: IO[bytes], chunk: ChunkIndex, channel: int) -> Iterator[Message]:
+    for record in breakup_chunk(_chunk(stream, chunk), validate_crc=True):
+        if isinstance(record, Message) and record.channel_id == channel:
+            yield record
+
+
+def _taken(data: bytes, offsets: NDArray[np.int64], size: int) -> np.ndarray:
+    """The bytes (k, size) from each offset on; a view where they stand one after the other."""
+    octets = np.frombuffer(data, np.uint8)
+    if np.all(np.diff(offsets) == size):
+        start = int(offsets[0])
+        return octets[start : start + len(offsets) * size].reshape(-1, size)
+    return np.lib.stride_tricks.sliding_window_view(octets, size)[offsets]

@@ -1,24 +1,21 @@
-"""CDR, the byte format of ROS 2 messages, for flat messages described by ros2msg text.
+"""Reads CDR, the byte format of ROS 2 messages, for flat messages described by ros2msg text.
 
-Covers what our schemas use: numbers, booleans and strings, alone, in fixed arrays and in
-sequences. Little endian, plain CDR (the header is `HEADER`); every primitive is aligned to its
-own size, counted from the end of the header.
+Covers numbers, booleans and strings, alone, in fixed arrays and in sequences; our own layouts use
+but a part of it and have a faster way. Little endian, plain CDR (the header is `CDR_HEADER`);
+every primitive is aligned to its own size, counted from the end of the header.
 """
 
 from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from casadi_ik.errors import LogError
-
-HEADER = b"\x00\x01\x00\x00"
-"""Encapsulation of little-endian plain CDR."""
+from casadi_ik.logs.message import CDR_HEADER
 
 NUMPY_TYPES = {
     "bool": "?",
@@ -78,31 +75,10 @@ def parse_members(schema: str) -> tuple[Member, ...]:
 
 
 class Codec:
-    """Packs and unpacks the messages of one schema."""
+    """Unpacks the messages of one schema."""
 
     def __init__(self, schema: str) -> None:
         self.members = parse_members(schema)
-
-    def encode(self, values: Mapping[str, Any]) -> bytes:
-        """The message with its CDR header.
-
-        Args:
-            values: One value per field: a number, a string, or an array or sequence of them.
-
-        Raises:
-            LogError: A field is missing, out of its type's range or of the wrong length.
-        """
-        out = bytearray()
-        for member in self.members:
-            try:
-                _write(out, member, values[member.name])
-            except KeyError:
-                raise LogError(f"message field {member.name!r} is missing") from None
-            except (struct.error, OverflowError, TypeError, ValueError) as error:
-                raise LogError(
-                    f"message field {member.name!r}: cannot store as {member.type}: {error}"
-                ) from error
-        return HEADER + bytes(out)
 
     def decode(self, data: bytes) -> dict[str, Any]:
         """The fields by name: Python scalars, numpy arrays, lists of strings.
@@ -110,8 +86,10 @@ class Codec:
         Raises:
             LogError: The bytes are no such message.
         """
-        if data[:4] != HEADER:
-            raise LogError(f"message starts with {data[:4].hex(' ')}, expected {HEADER.hex(' ')}")
+        if data[:4] != CDR_HEADER:
+            raise LogError(
+                f"message starts with {data[:4].hex(' ')}, expected {CDR_HEADER.hex(' ')}"
+            )
         values: dict[str, Any] = {}
         offset = 4
         try:
@@ -124,49 +102,6 @@ class Codec:
 
 def _align(offset: int, size: int) -> int:
     return offset + -offset % size
-
-
-def _write(out: bytearray, member: Member, value: Any) -> None:
-    if member.type == "string":
-        texts = [value] if member.length is None else list(value)
-        if member.length is not None:
-            _write_length(out, member, len(texts))
-        for text in texts:
-            if not isinstance(text, str):
-                raise TypeError(f"found {type(text).__name__}")
-            data = text.encode() + b"\0"
-            out.extend(bytes(-len(out) % 4) + struct.pack("<I", len(data)) + data)
-        return
-    dtype = np.dtype(NUMPY_TYPES[member.type])
-    array = _whole_numbers(value, dtype) if dtype.kind in "biu" else np.asarray(value)
-    if array.size and array.dtype.kind not in "biuf":
-        raise TypeError(f"found {array.dtype}")
-    if member.length is None:
-        if array.shape:
-            raise ValueError(f"expected a scalar, found shape {array.shape}")
-    else:
-        _write_length(out, member, array.size)
-    if array.size:
-        out.extend(bytes(-len(out) % dtype.itemsize) + array.astype(dtype).tobytes())
-
-
-def _whole_numbers(value: Any, dtype: np.dtype[Any]) -> np.ndarray:
-    """The value in an integer or boolean type; neither rounds nor wraps."""
-    array = value if isinstance(value, np.ndarray) else np.array(value, dtype=object)
-    numbers = array.ravel().tolist()
-    if not all(isinstance(number, int | np.integer | np.bool_) for number in numbers):
-        raise TypeError("found something that is not a whole number")
-    low, high = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
-    if numbers and not low <= min(numbers) <= max(numbers) <= high:
-        raise OverflowError(f"range is {low} to {high}")
-    return array.astype(dtype)
-
-
-def _write_length(out: bytearray, member: Member, count: int) -> None:
-    if member.length == -1:
-        out.extend(bytes(-len(out) % 4) + struct.pack("<I", count))
-    elif member.length != count:
-        raise ValueError(f"expected {member.length} elements, found {count}")
 
 
 def _read(data: bytes, offset: int, member: Member) -> tuple[Any, int]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError
 
@@ -14,6 +14,10 @@ ITERATION = 1_000_000
 
 SLOT = 60_000_000_000
 """Log time between two solves, unless said otherwise: room for 60,000 iterations [ns]."""
+
+T0 = 946_684_800_000_000_000
+"""Log time of solve 0 unless said otherwise: the first moment of the year 2000 [ns]. The same in
+every log, so that the logs of several workers share one time. True times are publish times."""
 
 
 @dataclass(frozen=True)
@@ -25,35 +29,37 @@ class LogClock:
         slot: Log time between two solves [ns].
     """
 
-    t0: int
+    t0: int = T0
     slot: int = SLOT
-
-    @classmethod
-    def now(cls) -> LogClock:
-        """A clock whose solve 0 is at the present full second."""
-        return cls(time.time_ns() // 1_000_000_000 * 1_000_000_000)
 
     def start(self, solve_id: int) -> int:
         """Log time of a solve's first iteration [ns]."""
         return self.t0 + solve_id * self.slot
 
-    def times(self, solve_id: int, iterations: int) -> np.ndarray:
-        """Log times of a solve's iterations, (iterations,) uint64 [ns].
+    def check(self, first: int, counts: NDArray[np.int64]) -> None:
+        """See to it that there is time for solves from `first` on, of so many iterations (k,).
 
         Raises:
-            LogError: There are more iterations than the slot has room for, or the solve's number is
+            LogError: There are more iterations than the slot has room for, or a solve's number is
                 negative or beyond what 64-bit nanoseconds can tell.
         """
-        if not (solve_id >= 0 and self.start(solve_id + 1) < 2**63):
-            raise LogError(f"solve {solve_id}: the log has no time for a solve of this number")
-        if iterations * ITERATION > self.slot:
+        last = first + len(counts) - 1
+        if not (first >= 0 and last < 2**32 and self.start(last + 1) < 2**63):
+            wrong = first if first < 0 else last
+            raise LogError(f"solve {wrong}: the log has no time for a solve of this number")
+        room = self.slot // ITERATION
+        if counts.size and counts.max() > room:
             raise LogError(
-                f"solve {solve_id}: {iterations} iterations, the log has room for"
-                f" {self.slot // ITERATION} per solve"
+                f"solve {first + int(counts.argmax())}: {counts.max()} iterations, the log has room"
+                f" for {room} per solve"
             )
-        return self.start(solve_id) + np.arange(iterations, dtype=np.uint64) * np.uint64(ITERATION)
 
-    def locate(self, log_times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def times(self, solve_id: NDArray[np.int64], iteration: NDArray[np.int64]) -> np.ndarray:
+        """Log times of iterations, uint64 [ns]; both arguments of the same shape."""
+        return (self.t0 + solve_id * self.slot + iteration * ITERATION).astype(np.uint64)
+
+    def locate(self, log_times: np.ndarray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Solve and iteration of log times: the inverse of `times`, two int64 arrays."""
         since = log_times.astype(np.int64) - self.t0
-        return since // self.slot, since % self.slot // ITERATION
+        solve_id = since // self.slot
+        return solve_id, (since - solve_id * self.slot) // ITERATION

@@ -14,10 +14,12 @@ class EventRules:
 
     Attributes:
         singular: Smallest singular value below which a Jacobian is near singular, by the name
-            behind ``sigma_``; in the unit of that field.
-        singular_default: The same for every Jacobian not named there.
-        singular_release: A near-singular Jacobian has to rise above this multiple of its
-            threshold before it can enter again.
+            behind ``sigma_``, in the unit of that field. One not named here has the threshold
+            that its method states (`Jacobian.singular`).
+        condition: Condition number above which it is ill-conditioned, by the name behind
+            ``condition_``; likewise.
+        release: A Jacobian has to rise above this multiple of its threshold (a condition number
+            to fall below the threshold by this factor) before it can enter again.
         limit_slack: How far a coordinate has to move from its limit to have left it [rad or m];
             so that a rounding error is not an event.
         stall_window: Iterations over which a stall is judged.
@@ -29,8 +31,8 @@ class EventRules:
     """
 
     singular: Mapping[str, float] = field(default_factory=dict)
-    singular_default: float = 0.01
-    singular_release: float = 1.5
+    condition: Mapping[str, float] = field(default_factory=dict)
+    release: float = 1.5
     limit_slack: float = 1e-6
     stall_window: int = 10
     stall_change: float = 1e-4
@@ -44,3 +46,5 @@ class EventRules:
                 f"event rules: windows {self.stall_window} and {self.oscillation_window},"
                 " expected at least 1 (stall) and 3 (oscillation)"
             )
+        if self.release < 1:
+            raise InputError(f"event rules: release {self.release}, expected at least 1")

@@ -6,8 +6,10 @@ import json
 import math
 import os
 import platform
+import zlib
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -19,22 +21,30 @@ from casadi_ik.logs.clock import ITERATION, LogClock
 METADATA_NAME = "casadi_ik"
 """Name of the metadata record that makes an MCAP file a log of ours."""
 
-FORMAT = "1"
+FORMAT = "2"
 """Version of the log's own conventions (topics, schemas, metadata)."""
+
+CHECKSUM = "crc32"
+"""Key of the checksum of all other entries."""
 
 PACKAGES = ("casadi", "numpy", "mcap", "pin", "proxsuite", "msgspec", "pyyaml")
 
 
 def log_metadata(
-    robot_name: str, seed: int, parameters: Mapping[str, Any], compression: str, clock: LogClock
+    robot_name: str,
+    seed: int,
+    parameters: Mapping[str, Any],
+    keep: Mapping[str, Any],
+    compression: str,
+    clock: LogClock,
 ) -> dict[str, str]:
     """The metadata record of a log: text by key; structured values as JSON."""
-    return {
+    record = {
         "format": FORMAT,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "robot": robot_name,
         "seed": str(seed),
-        "keep": "all",
+        "keep": json.dumps(keep),
         "t0_ns": str(clock.t0),
         "slot_ns": str(clock.slot),
         "iteration_ns": str(ITERATION),
@@ -45,6 +55,13 @@ def log_metadata(
         "machine": json.dumps(machine()),
         "parameters": json.dumps(plain(parameters)),
     }
+    return {**record, CHECKSUM: checksum(record)}
+
+
+def checksum(record: Mapping[str, str]) -> str:
+    """CRC-32 of the entries but itself: MCAP has no checksum for metadata."""
+    entries = sorted((key, text) for key, text in record.items() if key != CHECKSUM)
+    return f"{zlib.crc32(json.dumps(entries).encode()):08x}"
 
 
 def machine() -> dict[str, Any]:
@@ -72,6 +89,7 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
+@cache
 def _version(package: str) -> str:
     try:
         return version(package)
@@ -79,6 +97,7 @@ def _version(package: str) -> str:
         return "not installed"
 
 
+@cache
 def _processor() -> str:
     """The processor's name; what the platform module says where the kernel tells nothing."""
     try:

@@ -1,7 +1,7 @@
-"""The messages of a log as ros2msg text: an iteration per layout, a solve, an event.
+"""The messages of a log as ros2msg text: iterations, solves and events, each by its layout.
 
-The text is all a reader needs to get an iteration's `Layout` back: each line carries the type
-and the name and, behind "#", the shape if it has more than one axis, the unit and the doc.
+The text is all a reader needs to get the `Layout` back: each line carries the type and the name
+and, behind "#", the shape if it has more than one axis, the unit and the doc.
 """
 
 from __future__ import annotations
@@ -14,73 +14,42 @@ import numpy as np
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.cdr import Member, parse_members
-from casadi_ik.solvers.recorder import EventKind
 
 PACKAGE = "casadi_ik/msg"
-SOLVE_NAME = f"{PACKAGE}/Solve"
-EVENT_NAME = f"{PACKAGE}/Event"
+KINDS = ("iteration", "solve", "event")
+"""The kinds of messages, each on a topic of its own per method."""
 
 ROS_TYPES = {"f8": "float64", "f4": "float32", "u4": "uint32", "i4": "int32", "u1": "uint8"}
 """How a layout's storage is called in ros2msg."""
-
-SOLVE_SCHEMA = """\
-# One solve; n actuated coordinates, f fingers. NaN marks a finger or normal that was left free.
-int64 started # [ns] since the Unix epoch
-int64 seed
-float64 time # [s]
-uint32 solve_id
-uint32 iterations # over all phases and restarts
-uint32 restarts
-bool success
-string method
-string robot
-string status
-string[] phases
-uint32[] phase_iterations
-string[] fingers
-bool[] ok # (f) contact within tolerance
-float64[] q # (n) [rad or m] coordinates reached
-float64[] position_error # (f) [m]
-float64[] angle_error # (f) [rad]
-float64[] target_points # (f, 3) [m] in the base frame
-float64[] target_normals # (f, 3) in the base frame
-"""
-
-EVENT_SCHEMA = "".join(
-    (
-        "# Something that happened in one iteration.\n",
-        "float64 value # the number that made it an event\n",
-        "float64 threshold # the number it was compared with, or the value before\n",
-        "uint32 solve_id\n",
-        "uint32 iteration # counted from 0\n",
-        *(f"uint8 {kind.name}={kind.value}\n" for kind in EventKind),
-        "uint8 kind\n",
-        "string subject # the Jacobian, joint, phase or finger concerned\n",
-    )
-)
 
 _ROS_NAME = re.compile(r"(?!.*__)(?!.*_\Z)[a-z][a-z0-9_]*\Z")
 _COMMENT = re.compile(r"(?:\((?P<shape>\d+(?:, \d+)*)\) )?\[(?P<unit>[^\]]*)\](?: (?P<doc>.*))?\Z")
 
 
 def topic(method: str, kind: str) -> str:
-    """Topic of a method's messages; kind is "iteration", "solve" or "event"."""
+    """Topic of a method's messages; kind is one of `KINDS`."""
     return f"/ik/{method}/{kind}"
 
 
-def iteration_name(method: str, layout: Layout, fingers: int) -> str:
-    """Schema name of a method's iterations: the method and the robot's shape.
+def schema_name(kind: str, method: str, layout: Layout, fingers: int) -> str:
+    """Schema name of a method's messages: the kind, the method and the robot's shape.
 
     Q is the number of coordinates, F of fingers, J of singular values that are logged:
     "casadi_ik/msg/IterationEnhancedDlsQ14F3J4".
+
+    Args:
+        kind: One of `KINDS`.
+        method: Name of the method.
+        layout: Of its iterations.
+        fingers: How many.
     """
     words = "".join(word[:1].upper() + word[1:] for word in re.findall(r"[A-Za-z0-9]+", method))
     coordinates = next((item.size for item in layout if item.name == "q"), 0)
     jacobians = sum(item.size for item in layout if item.name.startswith("sigma_"))
-    return f"{PACKAGE}/Iteration{words}Q{coordinates}F{fingers}J{jacobians}"
+    return f"{PACKAGE}/{kind.capitalize()}{words}Q{coordinates}F{fingers}J{jacobians}"
 
 
-def iteration_schema(layout: Layout, labels: Mapping[str, tuple[str, ...]] | None = None) -> str:
+def schema_text(layout: Layout, labels: Mapping[str, tuple[str, ...]] | None = None) -> str:
     """The ros2msg text of a record layout.
 
     Args:
@@ -117,7 +86,7 @@ def iteration_schema(layout: Layout, labels: Mapping[str, tuple[str, ...]] | Non
 
 
 def parse_layout(schema: str) -> Layout:
-    """The layout that `iteration_schema` was given.
+    """The layout that `schema_text` was given.
 
     Raises:
         LogError: Not such a text.
@@ -126,7 +95,7 @@ def parse_layout(schema: str) -> Layout:
     try:
         return Layout(tuple(_field(member, storage) for member in parse_members(schema)))
     except InputError as error:
-        raise LogError(f"schema of the iterations: {error}") from error
+        raise LogError(f"schema: {error}") from error
 
 
 def _field(member: Member, storage: Mapping[str, str]) -> Field:

@@ -1,98 +1,103 @@
-"""Finds in a trace where a solve no longer gets anywhere: stalls and oscillations."""
+"""Finds in traces where a solve no longer gets anywhere: stalls and oscillations."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
-from casadi_ik.kernels.layout import Layout
-from casadi_ik.logs.columns import Labels, Rows, columns, entries, label_of, name_of
 from casadi_ik.logs.event_rules import EventRules
-from casadi_ik.solvers.recorder import Event, EventKind
+from casadi_ik.logs.traces import Bools, Rows, Traces, over_window
 
 
-def stalls(layout: Layout, trace: Rows, labels: Labels, rules: EventRules) -> list[Event]:
+def stalls(traces: Traces, rules: EventRules) -> tuple[Rows, NDArray[np.float64]]:
     """Where the error has stood still over the window; the entry only.
 
     Standing still: over the last `EventRules.stall_window` iterations, none of them in another
     phase or restart, the errors spread by at most `EventRules.stall_change` of the largest of
     them (largest of all fingers, so that a finger in place cannot hide the one that is stuck).
+
+    Returns:
+        Rows (e,) and the relative spread there (e,).
     """
     window = rules.stall_window
-    groups = _errors(layout, trace)
-    if not groups or len(trace) <= window:
-        return []
-    spread = np.zeros(len(trace) - window)
-    largest = np.zeros(len(trace) - window)
+    traces, number = _longer(traces, window)
+    groups = _errors(traces) if len(traces) else []
+    if not groups:
+        return np.zeros(0, np.intp), np.zeros(0)
+    still, spread = _one_piece(traces, window), np.zeros(len(traces) - window)
+    largest = np.zeros(len(traces) - window)
     for errors in groups:
-        views = np.lib.stride_tricks.sliding_window_view(errors, window + 1, axis=0)
-        top = views.max(axis=(1, 2))
-        reach = (views.max(axis=2) - views.min(axis=2)).max(axis=1)
-        spread = np.maximum(spread, reach / np.where(top > 0, top, 1))
+        high, low = (over_window(errors, window + 1, top) for top in (True, False))
+        top = high.max(axis=0)
+        spread = np.maximum(spread, (high - low).max(axis=0) / np.where(top > 0, top, 1))
         largest = np.maximum(largest, top)
-    still = (spread <= rules.stall_change) & (largest > 0) & _one_piece(layout, trace, window)
-    return [
-        Event(
-            i + window,
-            EventKind.STALL,
-            _phase_of(layout, trace, labels, i + window),
-            float(spread[i]),
-            rules.stall_change,
-        )
-        for i, _ in entries(still[:, None], ~still[:, None])
-    ]
+    still &= (spread <= rules.stall_change) & (largest > 0)
+    found = _begins(still)
+    return number[found + window], spread[found].astype(float)
 
 
-def oscillations(layout: Layout, trace: Rows, labels: Labels, rules: EventRules) -> list[Event]:
+def oscillations(traces: Traces, rules: EventRules) -> tuple[Rows, NDArray[np.float64], Bools]:
     """Where coordinates go to and fro without progress; the entry only.
 
     To and fro: every step of the coordinate in the last `EventRules.oscillation_window`
     iterations is longer than `EventRules.oscillation_step` and against the one before. Without
     progress: no error has fallen by more than `EventRules.oscillation_progress` over these
-    iterations. The value is the longest step into that row.
+    iterations.
+
+    Returns:
+        Rows (e,), the longest step into each (e,), which coordinates (e, n).
     """
     window = rules.oscillation_window
-    if "q" not in layout.names or len(trace) <= window:
-        return []
-    q = columns(trace["q"])
-    steps = q[1:] - q[:-1]
-    moving = np.abs(steps) > rules.oscillation_step
-    turning = (steps[1:] * steps[:-1] < 0) & moving[1:] & moving[:-1]
-    views = np.lib.stride_tricks.sliding_window_view(turning, window - 1, axis=0)
-    swinging: np.ndarray = np.all(views, axis=2)
-    hopeless = _one_piece(layout, trace, window)
-    for errors in _errors(layout, trace):
-        norm = np.linalg.norm(errors, axis=1)
-        hopeless &= norm[window:] >= (1 - rules.oscillation_progress) * norm[:-window]
-    caught: np.ndarray = np.any(swinging & hopeless[:, None], axis=1)
-    events: list[Event] = []
-    for i, _ in entries(caught[:, None], ~caught[:, None]):
-        joints = np.flatnonzero(swinging[i]).tolist()
-        subject = ", ".join(name_of(labels.get("q", ()), joint, "coordinate") for joint in joints)
-        step = float(np.abs(steps[i + window - 1, joints]).max())
-        events.append(
-            Event(i + window, EventKind.OSCILLATION, subject, step, rules.oscillation_step)
-        )
-    return events
+    traces, number = _longer(traces, window)
+    if "q" not in traces.names or not len(traces):
+        return np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 0), dtype=bool)
+    steps = np.diff(traces.columns("q"), axis=1)
+    up, down = steps > rules.oscillation_step, steps < -rules.oscillation_step
+    turning = (up[:, 1:] & down[:, :-1]) | (down[:, 1:] & up[:, :-1])
+    swinging = over_window(turning, window - 1, largest=False)
+    caught = np.logical_or.reduce(swinging, axis=0)
+    if caught.any():
+        caught &= _one_piece(traces, window)
+        for errors in _errors(traces):
+            norm = np.sqrt(np.einsum("ij,ij->j", errors, errors))
+            caught &= norm[window:] >= (1 - rules.oscillation_progress) * norm[:-window]
+    found = _begins(caught)
+    joints = swinging[:, found].T
+    step = np.where(joints, np.abs(steps[:, found + window - 1]).T, 0).max(axis=1)
+    return number[found + window], step, joints
 
 
-def _errors(layout: Layout, trace: Rows) -> list[np.ndarray]:
-    """What a solve brings down, one matrix per unit; columns that are never a number left out."""
-    names = ("cost",) if "cost" in layout.names else ("position_error", "angle_error")
-    matrices = [np.abs(columns(trace[name])) for name in names if name in layout.names]
-    matrices = [matrix[:, ~np.isnan(matrix).all(axis=0)] for matrix in matrices]
-    return [matrix for matrix in matrices if matrix.shape[1]]
+def _longer(traces: Traces, window: int) -> tuple[Traces, Rows]:
+    """The solves that have more rows than the window, and the numbers of their rows."""
+    wanted = traces.counts > window
+    return traces.of_solves(wanted), np.flatnonzero(np.repeat(wanted, traces.counts))
 
 
-def _one_piece(layout: Layout, trace: Rows, window: int) -> np.ndarray:
+def _begins(holds: Bools) -> Rows:
+    """Where a condition holds that did not hold in the row before.
+
+    It never holds in the first rows of a solve, so that solves need no telling apart.
+    """
+    return np.flatnonzero(holds & ~np.concatenate([[False], holds[:-1]]))
+
+
+def _errors(traces: Traces) -> list[NDArray[Any]]:
+    """What a solve brings down, (columns, m) per unit; a column that is never a number is zero."""
+    names = ("cost",) if "cost" in traces.names else ("position_error", "angle_error")
+    found = []
+    for name in names:
+        if name in traces.names:
+            errors = np.abs(traces.columns(name))
+            missing = np.isnan(errors)
+            if missing.any():
+                never = np.logical_and.reduceat(missing, traces.starts, axis=1)
+                errors[np.repeat(never, traces.counts, axis=1)] = 0
+            found.append(errors)
+    return found
+
+
+def _one_piece(traces: Traces, window: int) -> Bools:
     """For each row from `window` on: do the last `window` steps lie in one phase and restart."""
-    piece = np.zeros(len(trace), dtype=int)
-    for name in ("phase", "restart"):
-        if name in layout.names:
-            piece[1:] += np.cumsum(np.diff(trace[name].astype(int)) != 0)
-    return piece[window:] == piece[:-window]
-
-
-def _phase_of(layout: Layout, trace: Rows, labels: Labels, row: int) -> str:
-    if "phase" not in layout.names:
-        return "whole solve"
-    return label_of(labels, "phase", int(trace["phase"][row]))
+    return traces.piece[window:] == traces.piece[:-window]

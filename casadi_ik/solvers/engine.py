@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
@@ -18,8 +20,9 @@ from casadi_ik.solvers.diagnosis import Diagnosis, Reason
 from casadi_ik.solvers.diagnostician import Diagnostician
 from casadi_ik.solvers.hand_first import HandFirstMethod
 from casadi_ik.solvers.method import Method, Outcome
+from casadi_ik.solvers.parts import Parts
 from casadi_ik.solvers.problem import Array, Problems
-from casadi_ik.solvers.recorder import Recorder, SolveRecord, SolveSummary
+from casadi_ik.solvers.recorder import Recorder, SolveBlock
 from casadi_ik.solvers.solution import BatchSolution
 from casadi_ik.solvers.tracking import Tracker
 from casadi_ik.solvers.verdict import judge
@@ -103,14 +106,20 @@ class Engine:
         for name, value, least in (("jobs", jobs, 1), ("seed", seed, 0)):
             if not isinstance(value, (int, np.integer)) or value < least:
                 raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")
-        started = time.time_ns()
-        outcome = self._run(problems, starts, seed, jobs, recorder is not None)
-        batch = self._judged(problems, outcome)
-        if diagnose:
-            batch = self._diagnosed(problems, starts, outcome, batch)
-        if recorder is not None:
-            self._record(recorder, problems, batch, outcome, seed, started)
-        return batch
+        # Built before the clock and the threads start: no work of a solve, nor for several at once.
+        self.method.prepare()
+        batches = []
+        for part, started, outcome in self._outcomes(
+            problems, starts, int(seed), int(jobs), recorder is not None
+        ):
+            asked = problems.rows(part)
+            batch = self._judged(asked, outcome)
+            if diagnose:
+                batch = self._diagnosed(asked, starts[part], outcome, batch)
+            if recorder is not None and outcome.rows is not None:
+                recorder.record(self._block(asked, batch, outcome.rows, started))
+            batches.append(batch)
+        return BatchSolution.joined(batches)
 
     def _starts(self, q0: ArrayLike | None, count: int) -> Array:
         start = self.robot.configuration(q0, "q0")
@@ -122,21 +131,30 @@ class Engine:
             )
         return start
 
-    def _run(self, problems: Problems, starts: Array, seed: int, jobs: int, trace: bool) -> Outcome:
-        # Built before the clock and the threads start: no work of a solve, nor for several at once.
-        self.method.prepare()
-        if jobs == 1 or len(problems) < 2 * jobs:
-            return self.method.run(problems, starts, seed, trace)
-        edges = np.linspace(0, len(problems), jobs + 1).astype(int)
-        parts = [slice(a, b) for a, b in pairwise(edges)]
+    def _outcomes(
+        self, problems: Problems, starts: Array, seed: int, jobs: int, trace: bool
+    ) -> Iterator[tuple[slice, int, Outcome]]:
+        """Parts of the batch in order, when each began [ns], and what the method made of it."""
+
+        def run(part: slice) -> tuple[slice, int, Outcome]:
+            started = time.time_ns()
+            outcome = self.method.run(problems.rows(part), starts[part], seed, trace)
+            if outcome.rows is not None:
+                parts.learn(len(outcome.q), outcome.rows.nbytes)
+            return part, started, outcome
+
+        parts = Parts(len(problems), jobs, trace)
+        if jobs == 1:
+            yield from map(run, parts)
+            return
         with ThreadPoolExecutor(jobs) as pool:
-            outcomes = list(
-                pool.map(
-                    lambda part: self.method.run(problems.rows(part), starts[part], seed, trace),
-                    parts,
-                )
-            )
-        return _joined(outcomes)
+            ahead: deque[Future[tuple[slice, int, Outcome]]] = deque()
+            for part in parts:
+                ahead.append(pool.submit(run, part))
+                if len(ahead) > jobs:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
@@ -184,51 +202,18 @@ class Engine:
         status[unreachable] = Status.UNREACHABLE
         return replace(batch, status=status, diagnoses=diagnoses)
 
-    def _record(
-        self,
-        recorder: Recorder,
-        problems: Problems,
-        batch: BatchSolution,
-        outcome: Outcome,
-        seed: int,
-        started: int,
-    ) -> None:
-        form = self.method.trace_format
-        elapsed = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])
-        names = batch.status_names
-        for row in range(len(batch)):
-            summary = SolveSummary(
-                solve_id=row,
-                method=self.method.name,
-                robot=self.robot.name,
-                seed=seed,
-                started=started + int(elapsed[row] * 1e9),
-                time=float(batch.time[row]),
-                status=str(names[row]),
-                success=bool(batch.success[row]),
-                iterations=int(batch.iterations[row]),
-                restarts=int(batch.restarts[row]),
-                phase_iterations={name: int(n[row]) for name, n in batch.phases.items()},
-                q=batch.q[row],
-                fingers=self.robot.fingers,
-                position_error=batch.position_error[row],
-                angle_error=batch.angle_error[row],
-                ok=batch.ok[row],
-                target_points=problems.points[row],
-                target_normals=problems.normals[row],
-            )
-            recorder.record(SolveRecord(summary, form.layout, outcome.trace[row], form.labels))
-
-
-def _joined(parts: list[Outcome]) -> Outcome:
-    return Outcome(
-        q=np.concatenate([part.q for part in parts]),
-        status=np.concatenate([part.status for part in parts]),
-        iterations=np.concatenate([part.iterations for part in parts]),
-        restarts=np.concatenate([part.restarts for part in parts]),
-        time=np.concatenate([part.time for part in parts]),
-        phases={
-            name: np.concatenate([part.phases[name] for part in parts]) for name in parts[0].phases
-        },
-        trace=tuple(trace for part in parts for trace in part.trace),
-    )
+    def _block(
+        self, problems: Problems, batch: BatchSolution, rows: NDArray[Any], started: int
+    ) -> SolveBlock:
+        before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
+        return SolveBlock(
+            method=self.method.name,
+            robot=self.robot.name,
+            fingers=self.robot.fingers,
+            format=self.method.trace_format,
+            first=problems.first_row,
+            problems=problems,
+            batch=batch,
+            rows=rows,
+            started=started + (before * 1e9).astype(np.int64),
+        )

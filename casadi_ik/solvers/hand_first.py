@@ -88,7 +88,7 @@ class HandFirstMethod:
         del seed
         options, layouts = self.options, self.step.layouts
         count = len(problems)
-        outcome = _Collected(count, len(self._robot.actuators), trace)
+        outcome = _Collected(count, len(self._robot.actuators), layouts.record.dtype)
         waiting = np.arange(count)
         for number in range(options.rounds if count else 0):
             begin = time.perf_counter()
@@ -109,7 +109,7 @@ class HandFirstMethod:
             restarts=outcome.restarts,
             time=outcome.time,
             phases={stage.label: outcome.counts[:, i] for i, stage in enumerate(STAGES)},
-            trace=tuple(np.concatenate(rows) for rows in outcome.traces),
+            rows=outcome.rows if trace else None,
         )
 
     def rows(self, problems: Problems, q0: Array, number: int = 0) -> tuple[Array, Array]:
@@ -169,13 +169,14 @@ class HandFirstMethod:
 class _Collected:
     """Results of a batch whose rows may take several rounds; the best of a row is kept."""
 
-    def __init__(self, count: int, n: int, trace: bool) -> None:
+    def __init__(self, count: int, n: int, record: np.dtype[Any]) -> None:
         self.q = np.zeros((count, n))
         self.status = np.full(count, int(Status.STALLED), dtype=np.int64)
         self.restarts = np.zeros(count, dtype=np.int64)
         self.counts = np.zeros((count, len(STAGES)), dtype=np.int64)
         self.time = np.zeros(count)
-        self.traces: list[list[NDArray[Any]]] = [[] for _ in range(count if trace else 0)]
+        self._rounds = [np.zeros(0, record)]
+        self._targets = [np.zeros(0, np.intp)]
         self._cost = np.full(count, np.inf)
 
     def take(
@@ -194,9 +195,18 @@ class _Collected:
         self.restarts[rows] = before + np.minimum(candidate, layouts.candidates - 1)
         self.counts[rows] += result.states[:, state.slice("counts")].astype(np.int64)
         self.time[rows] += result.time
-        for row, records in zip(rows, result.trace, strict=False):
-            records["candidate"] += before
-            self.traces[row].append(records)
+        if result.rows is not None:
+            result.rows["candidate"] += before
+            self._rounds.append(result.rows)
+            self._targets.append(np.repeat(rows, result.iterations))
+
+    @property
+    def rows(self) -> NDArray[Any]:
+        """The records of all rounds, target by target."""
+        if len(self._rounds) == 2:
+            return self._rounds[1]
+        order = np.argsort(np.concatenate(self._targets), kind="stable")
+        return np.concatenate(self._rounds)[order]
 
 
 def _closed_form(robot: RobotDescription) -> SrsArm | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Layout
+from casadi_ik.kernels.rows import split_rows
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.status import Phase, Status
@@ -26,7 +28,8 @@ class Outcome:
         restarts: (k,) how often it began anew.
         time: (k,) seconds per solve.
         phases: (k,) iterations by phase name, in the order of the phases.
-        trace: A structured array of rows per solve if asked for, else empty.
+        rows: The records of all iterations, one solve after the other, (sum of iterations,); None
+            if no trace was asked for.
     """
 
     q: Array
@@ -35,7 +38,29 @@ class Outcome:
     restarts: NDArray[np.int64]
     time: Array
     phases: Mapping[str, NDArray[np.int64]]
-    trace: tuple[NDArray[Any], ...] = ()
+    rows: NDArray[Any] | None = None
+
+    @property
+    def trace(self) -> tuple[NDArray[Any], ...]:
+        """The rows of each solve, views into `rows`; empty if no trace was asked for."""
+        return () if self.rows is None else split_rows(self.rows, self.iterations)
+
+
+@dataclass(frozen=True)
+class Jacobian:
+    """A Jacobian whose singular values a method records.
+
+    Attributes:
+        joints: Actuators whose motion it maps.
+        singular: Smallest singular value below which it counts as near singular, in the unit of
+            its field ``sigma_<name>``.
+        condition: Condition number above which it counts as ill-conditioned, for its field
+            ``condition_<name>``.
+    """
+
+    joints: tuple[str, ...] = ()
+    singular: float = 0.0
+    condition: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +69,16 @@ class TraceFormat:
 
     Attributes:
         layout: Fields of a row.
-        labels: Names of codes, bits and elements by field, as in `SolveRecord.labels`.
+        labels: Names that make a field readable: of the codes 0, 1, ... of an integer scalar
+            ("phase"; "" for a code not used), of the bits of a field ending in "_mask", of the
+            elements along the first axis of any other field ("q": actuator names).
+        jacobians: What there is to know of the Jacobians in fields ``sigma_<name>`` and
+            ``condition_<name>``, by name. One that is not named here is never near singular.
     """
 
     layout: Layout
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    jacobians: Mapping[str, Jacobian] = field(default_factory=dict)
 
 
 def trace_format(layout: Layout, robot: RobotDescription) -> TraceFormat:

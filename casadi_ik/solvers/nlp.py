@@ -90,7 +90,7 @@ class IpoptMethod:
         q = np.zeros((count, len(robot.actuators)))
         status, iterations, restarts = (np.zeros(count, dtype=np.int64) for _ in range(3))
         elapsed = np.zeros(count)
-        traces: list[NDArray[Any]] = []
+        traces = [np.zeros(0, self.record.dtype)]
         targets = self._targets(problems)
         starts = np.clip(q0, robot.lower, robot.upper) if problems.enforce_limits else q0
         for row in range(count):
@@ -112,7 +112,7 @@ class IpoptMethod:
             restarts=restarts,
             time=elapsed,
             phases={Phase.WHOLE_SYSTEM.label: iterations.copy()},
-            trace=tuple(traces),
+            rows=np.concatenate(traces) if trace else None,
         )
 
     def _runs(

@@ -118,7 +118,7 @@ class QiuMethod:
                     result.states, result.iterations
                 ).items()
             },
-            trace=result.trace,
+            rows=result.rows,
         )
 
     def _check(self, problems: Problems) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +88,21 @@ class BatchSolution:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @classmethod
+    def joined(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
+        """One batch after the other, at least one."""
+        first = parts[0]
+        arrays = {
+            item.name: np.concatenate([getattr(part, item.name) for part in parts])
+            for item in fields(cls)
+            if isinstance(getattr(first, item.name), np.ndarray)
+        }
+        phases = {
+            name: np.concatenate([part.phases[name] for part in parts]) for name in first.phases
+        }
+        diagnoses = tuple(chain.from_iterable(part.diagnoses for part in parts))
+        return replace(first, **arrays, phases=phases, diagnoses=diagnoses)
 
     @property
     def status_names(self) -> NDArray[np.str_]:

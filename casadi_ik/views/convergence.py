@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError
-from casadi_ik.logs import Iterations
+from casadi_ik.logs import Table
 from casadi_ik.solvers import Tolerance
 from casadi_ik.views.picture import DPI, FAINT, INK, new_figure, save_picture
 
@@ -53,7 +53,7 @@ class Panel:
 
 
 def draw_convergence(
-    iterations: Iterations,
+    iterations: Table,
     path: str | PathLike[str] | None = None,
     *,
     tolerance: Tolerance | None = None,
@@ -63,7 +63,7 @@ def draw_convergence(
     """Draw one solve.
 
     Args:
-        iterations: Of one solve, e.g. ``open_log(path).iterations(method, solve_id)``.
+        iterations: Of one solve, e.g. ``log.iterations(method="hand-first", solve=3)``.
         path: PNG file to write, if any.
         tolerance: What counts as reached; `Tolerance()` unless said.
         title: Above the picture; method, number of iterations and ending unless said.
@@ -79,7 +79,7 @@ def draw_convergence(
     if len(iterations.rows) == 0:
         raise InputError("iterations: none to draw")
     if len(np.unique(iterations.solve_id)) > 1:
-        raise InputError("iterations: of several solves, expected one (give a solve_id)")
+        raise InputError("iterations: of several solves, expected one (give a solve)")
     panels = _panels(iterations, tolerance or Tolerance())
     limits = _at_limits(iterations)
     heights = [1.0] * len(panels) + ([0.12 + 0.11 * len(limits)] if limits else [])
@@ -104,8 +104,8 @@ def draw_convergence(
     return figure
 
 
-def _panels(iterations: Iterations, tolerance: Tolerance) -> list[Panel]:
-    names = iterations.layout.names
+def _panels(iterations: Table, tolerance: Tolerance) -> list[Panel]:
+    names = iterations.names
     bounds = {
         "position_error": 1e3 * tolerance.position,
         "angle_error": float(np.rad2deg(tolerance.angle)),
@@ -124,7 +124,7 @@ def _panels(iterations: Iterations, tolerance: Tolerance) -> list[Panel]:
     return [panel for panel in panels if panel.lines]
 
 
-def _lines(iterations: Iterations, name: str, factor: float, smallest: float) -> dict[str, Array]:
+def _lines(iterations: Table, name: str, factor: float, smallest: float) -> dict[str, Array]:
     """The columns of a field by name, without those that never are a number."""
     values = iterations.rows[name].reshape(len(iterations.rows), -1).astype(float) * factor
     labels = iterations.labels.get(name, ())
@@ -137,9 +137,9 @@ def _lines(iterations: Iterations, name: str, factor: float, smallest: float) ->
     return lines
 
 
-def _at_limits(iterations: Iterations) -> dict[str, NDArray[np.bool_]]:
+def _at_limits(iterations: Table) -> dict[str, NDArray[np.bool_]]:
     """(k,) whether it is at a limit, for every actuator that ever is."""
-    if "limit_mask" not in iterations.layout.names:
+    if "limit_mask" not in iterations.names:
         return {}
     mask = iterations.rows["limit_mask"].astype(np.uint64)
     names = iterations.labels.get("limit_mask", ())
@@ -202,9 +202,9 @@ def _draw_limits(axes: Axes, limits: dict[str, NDArray[np.bool_]]) -> None:
     axes.set_title("at a limit", loc="left", size=10, color=INK, pad=4)
 
 
-def _dress(axes: Axes, iterations: Iterations) -> None:
+def _dress(axes: Axes, iterations: Table) -> None:
     """Phases as shades, a faint grid, no box."""
-    if "phase" in iterations.layout.names:
+    if "phase" in iterations.names:
         codes = iterations.rows["phase"].astype(np.int64)
         for first, last in _runs(codes):
             color = PHASE_COLORS[codes[first] % len(PHASE_COLORS)]
@@ -216,17 +216,17 @@ def _dress(axes: Axes, iterations: Iterations) -> None:
         side.set_visible(False)
 
 
-def _head(figure: Figure, iterations: Iterations, title: str) -> None:
+def _head(figure: Figure, iterations: Table, title: str) -> None:
     rows, labels = iterations.rows, iterations.labels
     if not title:
         title = f"{iterations.method} · {len(rows)} iterations"
-        status = int(rows["status"][-1]) if "status" in iterations.layout.names else 0
+        status = int(rows["status"][-1]) if "status" in iterations.names else 0
         known = labels.get("status", ())
         if 0 < status < len(known):
             title += f" · {known[status]}"
     top = 1 - 0.3 / float(figure.get_size_inches()[1])
     figure.text(0.015, top, title, size=13, weight="bold", color=INK, va="center")
-    if "phase" not in iterations.layout.names:
+    if "phase" not in iterations.names:
         return
     names = labels.get("phase", ())
     handles = [

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +12,14 @@ import numpy as np
 import polars as pl
 
 import casadi_ik as ik
+from casadi_ik.logs import Keep
 from runner.study import Block, Study, robot_of
 
 PART = ".part"
 """Ending of a file that is not complete."""
 
 
-def solve_block(study: Study, block: Block, folder: Path, keep: Any = None) -> None:
+def solve_block(study: Study, block: Block, folder: Path, keep: Keep | None = None) -> None:
     """Solve a block and write its results, with its log if asked for.
 
     Results appear under their name when they are complete, and after the log: a block that is
@@ -26,7 +29,7 @@ def solve_block(study: Study, block: Block, folder: Path, keep: Any = None) -> N
         study: The study.
         block: The block.
         folder: The study's folder.
-        keep: What to log (`casadi_ik.logs.Keep`); None: no log.
+        keep: What to log, in one file per block; None: no log.
     """
     solver = study.solver(block.setting)
     q = study.configurations(block.targets, block.number)
@@ -34,12 +37,16 @@ def solve_block(study: Study, block: Block, folder: Path, keep: Any = None) -> N
     path = folder / block.path
     path.parent.mkdir(parents=True, exist_ok=True)
     logging: dict[str, Any] = {}
-    part, log = path.with_name(f"{path.stem}-{os.getpid()}{PART}"), path.with_suffix(".mcap")
+    part = path.with_name(f"{path.stem}-{os.getpid()}{PART}")
     if keep is not None:
-        logging = {"log": log, "keep": keep}
+        # Solves are numbered from 0 in every log; with one seed all would keep the same numbers.
+        own = zlib.crc32(str(block.path).encode())
+        logging = {"log": part, "keep": dataclasses.replace(keep, seed=own)}
     batch = solver.solve_batch(
         points, normals, q0=study.start(block.setting), seed=study.seed, **logging
     )
+    if keep is not None:
+        part.replace(path.with_suffix(".mcap"))
     _frame(study, block, batch, solver.robot.fingers).write_parquet(part)
     part.replace(path)
 

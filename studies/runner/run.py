@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import joblib
 from rich.console import Console
@@ -13,13 +12,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import TimeRemainingColumn as TimeRemaining
 from rich.text import Text
 
+from casadi_ik.logs import Keep
 from runner.block import solve_block
 from runner.results import claim, missing
 from runner.study import Study
 
 
 def run(
-    study: Study, folder: Path, jobs: int = 1, dask: str | None = None, keep: Any = None
+    study: Study, folder: Path, jobs: int = 1, dask: str | None = None, keep: Keep | None = None
 ) -> None:
     """Solve what is missing.
 
@@ -30,7 +30,7 @@ def run(
         jobs: Processes on this machine.
         dask: Address of a Dask scheduler whose workers solve instead; they need this folder and
             `studies` on their path.
-        keep: What to log (`casadi_ik.logs.Keep`), one file per block; None: no logs.
+        keep: What to log, in one file per block; None: no logs.
 
     Raises:
         InputError: The folder holds results that were made otherwise.

@@ -35,7 +35,7 @@ def test_all_solved(
         }
         assert data["status"].tolist() == ["SOLVED"] * 3
         assert data["success"].dtype == bool
-    assert len(ik.logs.open_log(log).solves()) == 3
+    assert len(ik.logs.open(log).solves()) == 3
     assert len(list(tmp_path.iterdir())) == 3
 
 

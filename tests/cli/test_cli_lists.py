@@ -53,8 +53,7 @@ def test_log_info(run: Command, grasp_file: Callable[..., Path], tmp_path: Path)
     run("solve", grasp_file(), *FAST, "--log", log, "--seed", 42)
     done = run("log", "info", log, log)
     assert (done.exit, done.err) == (0, "")
-    shown = ik.logs.open_log(log)
-    iterations = shown.info.counts["enhanced-dls"]["iteration"]
+    iterations = ik.logs.open(log).info().counts["enhanced-dls"]["iteration"]
     words = done.out.split()
     for word in ("enhanced-dls", "kuka_lwr_barrett", str(iterations), "SOLVED", "PHASE_CHANGE"):
         assert word in words

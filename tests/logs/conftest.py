@@ -10,19 +10,19 @@ import pytest
 from made_up_solves import T0
 
 from casadi_ik.logs import LogClock, McapRecorder
-from casadi_ik.solvers.recorder import SolveRecord
+from casadi_ik.solvers.recorder import SolveBlock
 
 
 @pytest.fixture
 def write(tmp_path: Path) -> Callable[..., Path]:
     """Writes solves to a log and gives its path."""
 
-    def run(*solves: SolveRecord, name: str = "cup.mcap", **options: Any) -> Path:
+    def run(*blocks: SolveBlock, name: str = "cup.mcap", **options: Any) -> Path:
         path = tmp_path / name
         settings: Mapping[str, Any] = {"robot_name": "made_up", "clock": LogClock(T0), **options}
         with McapRecorder(path, **settings) as recorder:
-            for solve in solves:
-                recorder.record(solve)
+            for block in blocks:
+                recorder.record(block)
         return path
 
     return run

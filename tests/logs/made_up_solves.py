@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.solvers.recorder import Event, EventKind, SolveRecord, SolveSummary
+from casadi_ik.solvers import BatchSolution, Problems, Status, Tolerance
+from casadi_ik.solvers.method import Jacobian, TraceFormat
+from casadi_ik.solvers.recorder import SolveBlock
 
 FINGERS = ("thumb", "finger_2", "finger_3")
 PHASES = ("thumb reaching", "hand alignment", "refinement")
+JOINTS = tuple(f"joint_{i}" for i in range(14))
 T0 = 1_700_000_000_000_000_000
 
 LAYOUT = Layout.record(
@@ -23,54 +28,75 @@ LAYOUT = Layout.record(
     Field("restart", dtype="i4"),
     Field("flags", (5,), "u1"),
 )
-LABELS = {
-    "phase": PHASES,
-    "q": tuple(f"joint_{i}" for i in range(14)),
-    "position_error": FINGERS,
-}
+LABELS = {"phase": PHASES, "q": JOINTS, "position_error": FINGERS}
+FORMAT = TraceFormat(LAYOUT, LABELS, {"closed_chain": Jacobian(JOINTS[:3], singular=1e-3)})
 
 
-def make_solve(
-    solve_id: int = 0, method: str = "enhanced-dls", rows: int = 50, layout: Layout = LAYOUT
-) -> SolveRecord:
-    """A solve whose trace is random bytes made valid: NaN, infinities and all."""
-    rng = np.random.default_rng(solve_id)
-    trace = np.zeros(rows, layout.dtype)
+def make_rows(seed: int, count: int, layout: Layout = LAYOUT) -> np.ndarray:
+    """The trace of one solve: random bytes made valid, NaN, infinities and all."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros(count, layout.dtype)
     for item in layout:
-        shape = (rows, *item.shape)
+        shape = (count, *item.shape)
         if item.dtype[0] == "f":
-            trace[item.name] = rng.normal(size=shape) * 10.0 ** rng.integers(-9, 9, shape)
+            rows[item.name] = rng.normal(size=shape) * 10.0 ** rng.integers(-9, 9, shape)
         else:
             limits = np.iinfo(item.dtype)
-            trace[item.name] = rng.integers(limits.min, limits.max, shape, endpoint=True)
+            rows[item.name] = rng.integers(limits.min, limits.max, shape, endpoint=True)
     for name in ("limit_mask", "restart"):
         if name in layout.names:
-            trace[name] = trace[name][np.arange(rows) // 25 * 25]
-    if "cost" in layout.names and rows > 3:
-        trace["cost"][:4] = np.nan, np.inf, -np.inf, -0.0
+            rows[name] = rows[name][np.arange(count) // 25 * 25]
+    if "cost" in layout.names and count > 3:
+        rows["cost"][:4] = np.nan, np.inf, -np.inf, -0.0
     if "phase" in layout.names:
-        trace["phase"] = np.minimum(np.arange(rows) * 3 // max(rows, 1), 2)
-    normals = rng.normal(size=(3, 3))
-    normals[1] = np.nan
-    summary = SolveSummary(
-        solve_id=solve_id,
+        rows["phase"] = np.minimum(np.arange(count) * 3 // max(count, 1), 2)
+    return rows
+
+
+def make_block(
+    *counts: int, first: int = 0, method: str = "enhanced-dls", form: TraceFormat = FORMAT
+) -> SolveBlock:
+    """Solves with so many iterations each; those of odd numbers stalled."""
+    numbers = first + np.arange(len(counts))
+    rng, k = np.random.default_rng(first), len(counts)
+    normals = rng.normal(size=(k, 3, 3))
+    normals[:, 1] = np.nan
+    solved = numbers % 2 == 0
+    iterations = np.array(counts, dtype=np.int64)
+    batch = BatchSolution(
+        success=solved,
+        status=np.where(solved, Status.SOLVED, Status.STALLED).astype(np.int64),
+        q=rng.normal(size=(k, 14)),
+        iterations=iterations,
+        restarts=np.full(k, 3),
+        time=np.full(k, 0.25),
+        position_error=rng.random((k, 3)),
+        angle_error=rng.random((k, 3)),
+        ok=np.tile([True, False, True], (k, 1)),
+        limits_ok=np.ones(k, dtype=bool),
+        tolerances=(Tolerance(),) * 3,
+        phases={PHASES[0]: iterations // 2, PHASES[1]: iterations - iterations // 2},
+    )
+    rows = [
+        make_rows(number, count, form.layout) for number, count in zip(numbers, counts, strict=True)
+    ]
+    return SolveBlock(
         method=method,
         robot="made_up",
-        seed=42,
-        started=T0 + 123_456_789 * (solve_id + 1),
-        time=0.25,
-        status="SOLVED" if solve_id % 2 == 0 else "STALLED",
-        success=solve_id % 2 == 0,
-        iterations=rows,
-        restarts=3,
-        phase_iterations={"thumb reaching": 20, "hand alignment": 10, "refinement": 20},
-        q=rng.normal(size=14),
         fingers=FINGERS,
-        position_error=rng.random(3),
-        angle_error=rng.random(3),
-        ok=np.array([True, False, True]),
-        target_points=rng.normal(size=(3, 3)),
-        target_normals=normals,
+        format=form,
+        first=first,
+        problems=Problems(rng.normal(size=(k, 3, 3)), normals, Tolerance(), True),
+        batch=batch,
+        rows=np.concatenate(rows),
+        started=T0 + 123_456_789 * (1 + numbers),
     )
-    events = (Event(2, EventKind.RESTART, "größer als π", 1.0, 0.0),) if rows > 2 else ()
-    return SolveRecord(summary, layout, trace, LABELS, events)
+
+
+def changed(block: SolveBlock, **fields: object) -> SolveBlock:
+    """The block with other fields; those of its batch too."""
+    names = {item.name for item in dataclasses.fields(BatchSolution)}
+    of_batch = {name: value for name, value in fields.items() if name in names}
+    rest = {name: value for name, value in fields.items() if name not in names}
+    batch = dataclasses.replace(block.batch, **of_batch)  # type: ignore[arg-type]
+    return dataclasses.replace(block, batch=batch, **rest)  # type: ignore[arg-type]

@@ -1,80 +1,86 @@
-"""What goes wrong with files: one `LogError` with path and reason, nothing half-written."""
+"""What goes wrong with files: one `LogError` with path and reason, what is there stays readable."""
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pytest
-from made_up_solves import LAYOUT, T0, make_solve
+from made_up_solves import LABELS, T0, changed, make_block
 from mcap.writer import Writer
 
-from casadi_ik.errors import LogError, UnknownNameError
+import casadi_ik as ik
+from casadi_ik.errors import InputError, LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs import EventRules, LogClock, McapRecorder, open_log
-from casadi_ik.logs.cdr import Codec
-from casadi_ik.solvers.recorder import Event, EventKind, Recorder, SolveRecord
+from casadi_ik.logs import EventRules, Keep, LogClock, McapRecorder
+from casadi_ik.solvers.method import TraceFormat
+from casadi_ik.solvers.recorder import Recorder
 
 Write = Callable[..., Path]
 
 
-class FullDisk:
-    """A file on a disk that has room for so many bytes."""
+def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+    """From now on a disk has room for so many bytes; what fits is written, as a disk does it."""
+    write = os.write
+    left = [room]
 
-    def __init__(self, stream: IO[bytes], room: int) -> None:
-        self._stream = stream
-        self._room = room
-
-    def write(self, data: Any) -> int:
-        self._room -= len(data)
-        if self._room < 0:
+    def limited(descriptor: int, data: Any) -> int:
+        if left[0] == 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return self._stream.write(data)
+        done = write(descriptor, data[: left[0]])
+        left[0] -= done
+        return done
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
+    monkeypatch.setattr("casadi_ik.logs.mcap_file.os.write", limited)
 
 
-@pytest.mark.parametrize("room", [0, 100, 1500, 20_000, 200_000])
-def test_disk_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int) -> None:
-    """The disk fills while opening, in a chunk or while finishing; the old log stays."""
+def record_many(path: Path, blocks: int) -> None:
+    """Six solves of 1000 iterations each make a chunk and a bit."""
+    with McapRecorder(path, robot_name="made_up", compression="none") as recorder:
+        for i in range(blocks):
+            recorder.record(make_block(*[1000] * 6, first=6 * i))
+
+
+@pytest.mark.parametrize(
+    ("room", "solves"), [(0, 0), (100, 0), (20_000, 0), (3_000_000, 6), (7_300_000, 18)]
+)
+def test_disk_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, solves: int) -> None:
+    """In the first chunk: nothing is left. Later: every chunk that fitted can be read."""
     path = tmp_path / "cup.mcap"
-    path.write_bytes(b"an older log")
-    opened = McapRecorder._open_part
-    monkeypatch.setattr(McapRecorder, "_open_part", lambda self: FullDisk(opened(self), room))
-
-    def run() -> None:
-        with McapRecorder(path, robot_name="made_up", compression="none") as recorder:
-            for i in range(5):
-                recorder.record(make_solve(i, rows=1000))
-
+    full_disk(monkeypatch, room)
     with pytest.raises(LogError, match=r"cup\.mcap: cannot write the log: No space left") as caught:
-        run()
+        record_many(path, 4)
     assert isinstance(caught.value.__cause__, OSError)
-    assert [p.name for p in tmp_path.iterdir()] == ["cup.mcap"]
-    assert path.read_bytes() == b"an older log"
+    if not solves:
+        assert list(tmp_path.iterdir()) == []
+        return
+    log = ik.logs.open(path)
+    assert log.info().unfinished == (path,)
+    assert len(log.solves()) >= solves
+    found = log.iterations(solve=0)
+    assert found.rows.tobytes() == make_block(1000).rows.tobytes()
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_disk_full_as_the_system_says_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A buffered file whose write fails late, when it is flushed or closed."""
-
-    def open_full(self: McapRecorder) -> IO[bytes]:
-        self._part.symlink_to("/dev/full")
-        return self._part.open("wb")
-
-    monkeypatch.setattr(McapRecorder, "_open_part", open_full)
-    recorder = McapRecorder(tmp_path / "cup.mcap", robot_name="made_up")
-    recorder.record(make_solve(0, rows=10))
+def test_disk_full_at_the_very_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every chunk is written, but there is no room for the summary."""
+    record_many(tmp_path / "whole.mcap", 2)
+    size = (tmp_path / "whole.mcap").stat().st_size
+    full_disk(monkeypatch, size - 100)
+    path = tmp_path / "cup.mcap"
     with pytest.raises(LogError, match="No space left"):
-        recorder.close()
-    assert list(tmp_path.iterdir()) == []
-    recorder.close()
+        record_many(path, 2)
+    log = ik.logs.open(path)
+    assert len(log.solves()) == 12
+    assert (
+        log.iterations().rows.tobytes()
+        == ik.logs.open(tmp_path / "whole.mcap").iterations().rows.tobytes()
+    )
 
 
 def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
@@ -101,34 +107,70 @@ def test_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     folder.mkdir(mode=0o500)
     if os.access(folder, os.W_OK):
 
-        def refuse(self: McapRecorder) -> IO[bytes]:
+        def refuse(*_: object) -> int:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-        monkeypatch.setattr(McapRecorder, "_open_part", refuse)
+        monkeypatch.setattr("casadi_ik.logs.mcap_file.os.open", refuse)
     with pytest.raises(LogError, match="Permission denied"):
         McapRecorder(folder / "cup.mcap", robot_name="made_up")
     assert list(folder.iterdir()) == []
 
 
-def test_nothing_is_there_before_close_nor_after_a_failure(tmp_path: Path) -> None:
+def test_two_writers_on_one_path(tmp_path: Path) -> None:
+    """Refused in the same process and in another; the log of the first is not touched."""
     path = tmp_path / "cup.mcap"
-    recorder: Recorder
+    program = (
+        "import sys\nfrom casadi_ik.logs import McapRecorder\n"
+        "from casadi_ik.errors import LogError\n"
+        "try: McapRecorder(sys.argv[1], robot_name='r')\n"
+        "except LogError as error: print(error)\n"
+    )
     with McapRecorder(path, robot_name="made_up") as recorder:
-        recorder.record(make_solve(0))
-        assert not path.exists()
-        assert len(list(tmp_path.glob(".cup.mcap.*.part"))) == 1
-    assert [p.name for p in tmp_path.iterdir()] == ["cup.mcap"]
-    before = path.read_bytes()
+        with pytest.raises(LogError, match=r"cup\.mcap: cannot write the log: another writer"):
+            McapRecorder(path, robot_name="made_up")
+        other = subprocess.run(
+            [sys.executable, "-c", program, path], capture_output=True, text=True, check=True
+        )
+        assert "another writer" in other.stdout
+        recorder.record(make_block(10))
+    assert len(ik.logs.open(path).solves()) == 1
+    with McapRecorder(path, robot_name="made_up"):
+        pass
+    assert len(ik.logs.open(path).solves()) == 0
+
+
+def test_what_was_there_stays_until_the_first_chunk(tmp_path: Path) -> None:
+    path = tmp_path / "cup.mcap"
+    path.write_bytes(b"an older log")
 
     def fail() -> None:
         with McapRecorder(path, robot_name="made_up") as recorder:
-            recorder.record(make_solve(1))
+            recorder.record(make_block(10))
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         fail()
-    assert [p.name for p in tmp_path.iterdir()] == ["cup.mcap"]
-    assert path.read_bytes() == before
+    assert path.read_bytes() == b"an older log"
+    path.unlink()
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_log_keeps_its_chunks(tmp_path: Path) -> None:
+    path = tmp_path / "cup.mcap"
+
+    def fail() -> None:
+        recorder: Recorder
+        with McapRecorder(path, robot_name="made_up", compression="none") as recorder:
+            recorder.record(make_block(*[1000] * 10))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    log = ik.logs.open(path)
+    assert log.info().unfinished == ()
+    assert 0 < len(log.solves()) < 10
 
 
 def test_a_link_is_followed(tmp_path: Path) -> None:
@@ -136,44 +178,38 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
     link = tmp_path / "link.mcap"
     link.symlink_to(tmp_path / "real" / "cup.mcap")
     with McapRecorder(link, robot_name="made_up") as recorder:
-        recorder.record(make_solve(0))
+        recorder.record(make_block(5))
     assert link.is_symlink()
-    assert len(open_log(link).solves()) == 1
+    assert len(ik.logs.open(link).solves()) == 1
 
 
-def test_records_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
+def test_blocks_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
     path = tmp_path / "cup.mcap"
-    good = make_solve(0)
-    other = Layout.record(Field("q", (3,)))
-    wild = make_solve(5).summary
-
-    def of_number(solve_id: int) -> SolveRecord:
-        return dataclasses.replace(good, summary=dataclasses.replace(wild, solve_id=solve_id))
-
+    good = make_block(5, 5)
+    other = TraceFormat(Layout.record(Field("q", (3,))), LABELS)
     bad = {
-        "already in the log": good,
-        "not of its layout": dataclasses.replace(make_solve(8), layout=other),
-        "layout differs": make_solve(1, layout=other),
-        "outside the trace": dataclasses.replace(
-            make_solve(2), events=(Event(50, EventKind.RESTART, "", 0.0, 0.0),)
+        "solve 1 is already in the log": make_block(5, 5, first=1),
+        "the rows are not of their layout": changed(make_block(3, first=8), format=other),
+        "or not 4": changed(make_block(3, first=8), iterations=np.array([4])),
+        "layout or labels differ": make_block(1, first=2, form=other),
+        "lower_snake_case": make_block(
+            1, method="new", form=TraceFormat(Layout.record(Field("J")))
         ),
-        "lower_snake_case": make_solve(3, "new", layout=Layout.record(Field("J"))),
-        "room for 60000": make_solve(4, rows=60_001, layout=LAYOUT),
-        "no time for a solve": of_number(2**32),
-        "solve -1": of_number(-1),
-        "'seed'": dataclasses.replace(good, summary=dataclasses.replace(wild, seed=2**63)),
+        "room for 60000": make_block(60_001, first=4),
+        "no time for a solve": make_block(1, first=2**32),
+        "solve -1": changed(make_block(1), first=-1),
     }
     with McapRecorder(path, robot_name="made_up", clock=LogClock(T0)) as recorder:
         recorder.record(good)
-        for reason, record in bad.items():
+        for reason, block in bad.items():
             with pytest.raises(LogError, match=reason):
-                recorder.record(record)
-        recorder.record(make_solve(6))
-    log = open_log(path)
-    assert [solve.solve_id for solve in log.solves()] == [0, 6]
+                recorder.record(block)
+        recorder.record(make_block(5, first=6))
+    log = ik.logs.open(path)
+    assert log.solves().solve_id.tolist() == [0, 1, 6]
     assert log.methods == ("enhanced-dls",)
     with pytest.raises(LogError, match="closed"):
-        recorder.record(make_solve(7))
+        recorder.record(make_block(5, first=7))
 
 
 def test_unknown_compression(tmp_path: Path) -> None:
@@ -181,7 +217,15 @@ def test_unknown_compression(tmp_path: Path) -> None:
         McapRecorder(tmp_path / "a", robot_name="r", compression="gzip")  # type: ignore[arg-type]
 
 
-def test_files_that_are_no_log(tmp_path: Path, write: Write) -> None:
+@pytest.mark.parametrize(
+    "options", [{"sample": 1.5}, {"sample": float("nan")}, {"seed": -1}, {"seed": 0.5}]
+)
+def test_bad_policies_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=rf"keep\.{next(iter(options))}: found"):
+        Keep(**options)
+
+
+def test_files_that_are_no_log(tmp_path: Path) -> None:
     foreign = tmp_path / "foreign.mcap"
     with foreign.open("wb") as stream:
         writer = Writer(stream)
@@ -190,49 +234,18 @@ def test_files_that_are_no_log(tmp_path: Path, write: Write) -> None:
         writer.finish()
     (tmp_path / "empty").write_bytes(b"")
     (tmp_path / "text").write_text("robot: ar10\n")
+    (tmp_path / "folder").mkdir()
     cases = {
         tmp_path / "missing": "No such file",
-        tmp_path: "Is a directory",
+        tmp_path / "folder": "no log in this folder",
         tmp_path / "empty": "not an MCAP file: it is empty",
         tmp_path / "text": "not an MCAP file: it begins with b'robot: a'",
         foreign: r"not a log of casadi_ik: no metadata 'casadi_ik' \(found: somebody\)",
     }
     for path, reason in cases.items():
         with pytest.raises(LogError, match=reason) as caught:
-            open_log(path)
+            ik.logs.open(path)
         assert str(caught.value).startswith(f"{path}: ")
-
-
-def test_truncated_files(tmp_path: Path, write: Write) -> None:
-    whole = write(make_solve(0)).read_bytes()
-    path = tmp_path / "torn.mcap"
-    rng = np.random.default_rng(0)
-    for length in [8, 9, len(whole) - 1, *rng.integers(10, len(whole) - 1, 30)]:
-        path.write_bytes(whole[:length])
-        with pytest.raises(LogError, match=rf"torn\.mcap: the log is truncated.* {length} bytes"):
-            open_log(path)
-
-
-def test_flipped_bits_never_escape_as_another_error(tmp_path: Path, write: Write) -> None:
-    """Whatever a flipped bit does, it gives a `LogError` or leaves the iterations as they were."""
-    solve = make_solve(0)
-    whole = bytearray(write(solve, compression="none").read_bytes())
-    path = tmp_path / "flipped.mcap"
-    rng = np.random.default_rng(1)
-    for position in rng.integers(0, len(whole), 100):
-        bit = 1 << int(rng.integers(8))
-        whole[position] ^= bit
-        path.write_bytes(whole)
-        try:
-            log = open_log(path)
-            rows = log.iterations().rows
-            log.solves()
-            log.events()
-        except (LogError, UnknownNameError):
-            pass
-        else:
-            assert rows.tobytes() == solve.trace.tobytes() or rows.dtype != solve.trace.dtype
-        whole[position] ^= bit
 
 
 def test_metadata_is_complete(write: Write) -> None:
@@ -243,18 +256,20 @@ def test_metadata_is_complete(write: Write) -> None:
         "path": Path("x"),
     }
     path = write(
-        make_solve(1),
-        make_solve(3, rows=10),
+        make_block(50, first=1),
+        make_block(10, first=3),
         urdf="<robot name='é'/>",
         parameters=parameters,
         seed=7,
+        keep=Keep(sample=0.5, seed=3),
         rules=EventRules(singular={"arm": 0.02}),
     )
-    log = open_log(path)
-    info = log.info
+    log = ik.logs.open(path)
+    info = log.info()
     metadata = info.metadata
     assert metadata["robot"] == info.robot == "made_up"
-    assert (metadata["seed"], metadata["keep"], metadata["format"]) == ("7", "all", "1")
+    assert (metadata["seed"], metadata["format"]) == ("7", "2")
+    assert metadata["keep"] == {"failed": True, "singular": True, "sample": 0.5, "seed": 3}
     assert (metadata["t0_ns"], metadata["slot_ns"]) == (str(T0), "60000000000")
     assert metadata["iteration_ns"] == "1000000"
     assert {"casadi", "numpy", "mcap"} <= set(metadata["packages"])
@@ -270,8 +285,6 @@ def test_metadata_is_complete(write: Write) -> None:
     assert log.attachment("robot.urdf").decode() == "<robot name='é'/>"
     with pytest.raises(UnknownNameError, match=r"no attachment 'x'; attached: robot\.urdf"):
         log.attachment("x")
-    assert info.start == T0 + 60_000_000_000
-    assert info.end == T0 + 3 * 60_000_000_000 + 9_000_000
     assert info.size == path.stat().st_size
     assert (info.compression, info.chunks) == ("zstd", 1)
     assert 0 < info.compressed < info.uncompressed
@@ -279,15 +292,17 @@ def test_metadata_is_complete(write: Write) -> None:
 
 def test_log_times_are_arithmetic() -> None:
     clock = LogClock(1000, slot=5_000_000)
-    np.testing.assert_array_equal(clock.times(3, 2), [15_001_000, 16_001_000])
-    solve, iteration = clock.locate(np.concatenate([clock.times(3, 5), clock.times(4, 1)]))
-    assert solve.tolist() == [3, 3, 3, 3, 3, 4]
-    assert iteration.tolist() == [0, 1, 2, 3, 4, 0]
-    with pytest.raises(LogError, match="solve 3: 6 iterations, the log has room for 5"):
-        clock.times(3, 6)
-    assert LogClock.now().t0 % 1_000_000_000 == 0
+    solve, iteration = np.array([3, 3, 4]), np.array([0, 4, 0])
+    times = clock.times(solve, iteration)
+    np.testing.assert_array_equal(times, [15_001_000, 19_001_000, 20_001_000])
+    for found, expected in zip(clock.locate(times), (solve, iteration), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    clock.check(3, np.array([5, 5]))
+    with pytest.raises(LogError, match="solve 4: 6 iterations, the log has room for 5"):
+        clock.check(3, np.array([5, 6]))
 
 
-def test_a_message_of_another_encoding_is_refused() -> None:
-    with pytest.raises(LogError, match="starts with 00 00 00 00"):
-        Codec("uint8 a\n").decode(bytes(5))
+def test_two_logs_share_one_time(tmp_path: Path, write: Write) -> None:
+    """So that shards can be joined as they are."""
+    clocks = {McapRecorder(tmp_path / name, robot_name="r").clock for name in "ab"}
+    assert len(clocks) == 1

@@ -15,7 +15,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from casadi_ik.errors import LogError
 from casadi_ik.kernels.layout import STORAGE, Field, Layout
 from casadi_ik.logs import schema
-from casadi_ik.logs.cdr import HEADER, NUMPY_TYPES, Codec, parse_members
+from casadi_ik.logs.cdr import NUMPY_TYPES, Codec, parse_members
+from casadi_ik.logs.message import CDR_HEADER
 
 NAME = "casadi_ik/msg/Random"
 names = st.from_regex(r"[a-z]([a-z0-9]|_[a-z0-9]){0,12}", fullmatch=True)
@@ -51,8 +52,8 @@ def test_a_row_is_its_own_message(layout: Layout, data: st.DataObject) -> None:
         data.draw(st.binary(min_size=layout.dtype.itemsize, max_size=layout.dtype.itemsize)),
         layout.dtype,
     )[0]
-    text = schema.iteration_schema(layout, dict.fromkeys(layout.names, ("a", "b c")))
-    payload = HEADER + row.tobytes()
+    text = schema.schema_text(layout, dict.fromkeys(layout.names, ("a", "b c")))
+    payload = CDR_HEADER + row.tobytes()
     ours = Codec(text).decode(payload)
     theirs = generate_dynamic(NAME, text)[NAME](payload)
     store = get_typestore(Stores.EMPTY)
@@ -64,16 +65,12 @@ def test_a_row_is_its_own_message(layout: Layout, data: st.DataObject) -> None:
         np.testing.assert_array_equal(flat(getattr(theirs, item.name)), expected)
         third_name = item.name if hasattr(third, item.name) else item.name + "_"
         np.testing.assert_array_equal(flat(getattr(third, third_name)), expected)
-    assert (
-        Codec(text).encode(ours) == payload
-        or np.isnan(np.concatenate([flat(value).astype(float) for value in ours.values()])).any()
-    )
 
 
 @settings(max_examples=100, deadline=None)
 @given(layout=layouts())
 def test_the_layout_comes_back_from_the_schema(layout: Layout) -> None:
-    assert schema.parse_layout(schema.iteration_schema(layout)) == layout
+    assert schema.parse_layout(schema.schema_text(layout)) == layout
 
 
 @st.composite
@@ -111,8 +108,7 @@ def as_lists(value: Any) -> Any:
 @given(message=messages())
 def test_codec_agrees_with_mcap_ros2(message: tuple[str, dict[str, Any]]) -> None:
     text, values = message
-    data = Codec(text).encode(values)
-    assert data == serialize_dynamic(NAME, text)[NAME](values)
+    data = serialize_dynamic(NAME, text)[NAME](values)
     decoded = Codec(text).decode(data)
     theirs = generate_dynamic(NAME, text)[NAME](data)
     for name, value in values.items():
@@ -126,7 +122,7 @@ def test_a_cut_message_is_an_error(
     message: tuple[str, dict[str, Any]], data: st.DataObject
 ) -> None:
     text, values = message
-    whole = Codec(text).encode(values)
+    whole = serialize_dynamic(NAME, text)[NAME](values)
     cut = data.draw(st.integers(0, len(whole) - 1))
     with pytest.raises(LogError):
         Codec(text).decode(whole[:cut])
@@ -134,35 +130,15 @@ def test_a_cut_message_is_an_error(
 
 def test_empty_sequences() -> None:
     text = "uint32[] a\nstring[] b\nbool[] c\nfloat64[] d\n"
-    data = Codec(text).encode({"a": [], "b": [], "c": (), "d": np.zeros(0)})
-    assert data == HEADER + bytes(16)
-    assert as_lists(Codec(text).decode(data)["d"]) == []
+    decoded = Codec(text).decode(CDR_HEADER + bytes(16))
+    assert {name: as_lists(value) for name, value in decoded.items()} == {
+        name: [] for name in "abcd"
+    }
 
 
-@pytest.mark.parametrize(
-    ("line", "value"),
-    [
-        ("uint8 a", 256),
-        ("uint32 a", -1),
-        ("uint32 a", 1.5),
-        ("int64 a", 2**63),
-        ("int64 a", 2**80),
-        ("float64[2] a", [1.0]),
-        ("float64 a", [1.0]),
-        ("float64 a", "1"),
-        ("float64 a", None),
-        ("string a", 3),
-        ("string a", "\ud800"),
-    ],
-)
-def test_what_does_not_fit_is_refused(line: str, value: Any) -> None:
-    with pytest.raises(LogError, match="'a'"):
-        Codec(line).encode({"a": value})
-
-
-def test_a_missing_field_is_named() -> None:
-    with pytest.raises(LogError, match="'b' is missing"):
-        Codec("uint8 a\nuint8 b\n").encode({"a": 1})
+def test_a_message_of_another_encoding_is_refused() -> None:
+    with pytest.raises(LogError, match="starts with 00 00 00 00"):
+        Codec("uint8 a\n").decode(bytes(5))
 
 
 @pytest.mark.parametrize("text", ["float64\n", "geometry_msgs/Pose pose\n", "float64[<=3] q\n"])
@@ -178,14 +154,14 @@ def test_the_schema_is_for_people_too() -> None:
         Field("limit_mask", dtype="u4"),
     )
     labels = {"phase": ("", "thumb reaching", "hand-alignment"), "limit_mask": ("a",)}
-    assert schema.iteration_schema(layout, labels) == (
+    assert schema.schema_text(layout, labels) == (
         "float64[12] pose # (3, 4) [m]\n"
         "uint32 limit_mask # []\n"
         "uint8 PHASE_THUMB_REACHING=1\n"
         "uint8 PHASE_HAND_ALIGNMENT=2\n"
         "uint8 phase # [] phase of the method\n"
     )
-    assert schema.iteration_name("hand-first", layout, 3) == (
+    assert schema.schema_name("iteration", "hand-first", layout, 3) == (
         "casadi_ik/msg/IterationHandFirstQ0F3J0"
     )
 
@@ -202,4 +178,4 @@ def test_the_schema_is_for_people_too() -> None:
 )
 def test_layouts_that_are_no_message(layout: Layout) -> None:
     with pytest.raises(LogError):
-        schema.iteration_schema(layout)
+        schema.schema_text(layout)

@@ -200,15 +200,14 @@ def test_a_log_changes_no_number(case, tmp_path):
     plain = solver.solve_batch(case.points, case.normals, seed=4)
     logged = solver.solve_batch(case.points, case.normals, seed=4, log=path)
     fields_equal(plain, logged)
-    log = ik.logs.open_log(path)
-    solves = log.solves()
-    assert [solve.solve_id for solve in solves] == list(range(len(case.points)))
-    for row, solve in enumerate(solves):
-        np.testing.assert_array_equal(solve.q, plain.q[row])
-        assert solve.iterations == plain.iterations[row]
-        assert solve.status == plain.status_names[row]
-        assert solve.success == plain.success[row]
-        np.testing.assert_array_equal(solve.target_points, case.points[row])
+    log = ik.logs.open(path)
+    solves = log.solves().rows
+    np.testing.assert_array_equal(solves["solve_id"], np.arange(len(case.points)))
+    np.testing.assert_array_equal(solves["q"], plain.q)
+    np.testing.assert_array_equal(solves["iterations"], plain.iterations)
+    np.testing.assert_array_equal(solves["success"], plain.success)
+    np.testing.assert_array_equal(solves["target_points"], case.points)
+    assert [row["status"] for row in log.solves().records()] == plain.status_names.tolist()
     found = log.iterations()
     np.testing.assert_array_equal(np.bincount(found.solve_id), plain.iterations)
     assert log.attachment("robot.urdf").decode() == case.robot.urdf()

@@ -8,6 +8,7 @@ import pytest
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.solvers import Engine, Problems, Status, Tolerance
 from casadi_ik.solvers.method import Outcome, TraceFormat
+from casadi_ik.solvers.parts import FIRST_PART, Parts
 
 LAYOUT = Layout.record(Field("row", (), "f8"))
 
@@ -36,7 +37,8 @@ class Answering:
     def run(self, problems, q0, seed, trace):
         self.calls.append((len(problems), seed, trace))
         k = len(problems)
-        rows = np.zeros(1, LAYOUT.dtype)
+        rows = np.zeros(k, LAYOUT.dtype)
+        rows["row"] = problems.first_row + np.arange(k)
         return Outcome(
             q=q0,
             status=np.full(k, int(self.status)),
@@ -44,7 +46,7 @@ class Answering:
             restarts=np.zeros(k, dtype=np.int64),
             time=np.full(k, 0.5),
             phases={"only": np.ones(k, dtype=np.int64)},
-            trace=tuple(rows for _ in range(k)) if trace else (),
+            rows=rows if trace else None,
         )
 
 
@@ -52,10 +54,10 @@ class Keeping:
     """A recorder that keeps what it is given."""
 
     def __init__(self):
-        self.solves = []
+        self.blocks = []
 
-    def record(self, solve):
-        self.solves.append(solve)
+    def record(self, block):
+        self.blocks.append(block)
 
 
 def targets(robot, q, enforce=True):
@@ -97,20 +99,47 @@ def test_threads_share_a_batch_in_order(robot, rng):
     np.testing.assert_array_equal(batch.phases["only"], np.ones(11))
 
 
-def test_every_solve_is_recorded_once(robot, rng):
-    q = robot.random(rng, 6)
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
+    """In parts, the first of a fixed size, the others as large as the memory set aside for them."""
+    q = robot.random(rng, 300)
     keeping = Keeping()
     problems = targets(robot, q)
-    batch = Engine(robot, Answering()).solve(problems, q, 9, jobs=2, recorder=keeping)
-    assert [solve.summary.solve_id for solve in keeping.solves] == list(range(6))
-    starts = [solve.summary.started for solve in keeping.solves]
-    np.testing.assert_array_equal(np.diff(starts), 500_000_000)
-    for row, solve in enumerate(keeping.solves):
-        summary = solve.summary
-        assert (summary.method, summary.robot, summary.seed) == ("answering", robot.name, 9)
-        assert (summary.status, summary.success) == ("SOLVED", True)
-        assert summary.phase_iterations == {"only": 1}
-        assert solve.labels == {"row": ("a",)}
-        np.testing.assert_array_equal(summary.q, batch.q[row])
-        np.testing.assert_array_equal(summary.target_points, problems.points[row])
-        assert len(solve.trace) == 1
+    method = Answering()
+    batch = Engine(robot, method).solve(problems, q, 9, jobs=jobs, recorder=keeping)
+    assert method.prepared == 1
+    assert len(keeping.blocks) > 1
+    assert keeping.blocks[0].first == 0
+    assert sum(len(block) for block in keeping.blocks) == 300
+    for block in keeping.blocks:
+        rows = slice(block.first, block.first + len(block))
+        assert (block.method, block.robot, block.fingers) == (
+            "answering",
+            robot.name,
+            robot.fingers,
+        )
+        assert block.batch.success.all()
+        assert block.format.labels == {"row": ("a",)}
+        np.testing.assert_array_equal(np.diff(block.started), 500_000_000)
+        np.testing.assert_array_equal(block.batch.q, batch.q[rows])
+        np.testing.assert_array_equal(block.problems.points, problems.points[rows])
+        np.testing.assert_array_equal(block.rows["row"], np.arange(rows.start, rows.stop))
+
+
+@pytest.mark.parametrize(("bytes_per_solve", "size"), [(2**12, 2**10), (2**30, 1), (1, 10**6)])
+def test_parts_are_as_large_as_their_iterations_allow(bytes_per_solve, size):
+    parts = Parts(10**6, 1, trace=True)
+    found = []
+    for part in parts:
+        found.append(part)
+        parts.learn(part.stop - part.start, bytes_per_solve * (part.stop - part.start))
+        if len(found) == 3:
+            break
+    assert found[0] == slice(0, FIRST_PART)
+    assert found[1].stop - found[1].start == min(size, 10**6 - FIRST_PART)
+
+
+@pytest.mark.parametrize(("count", "jobs", "sizes"), [(0, 2, [0]), (5, 2, [3, 2]), (1, 4, [1])])
+def test_without_a_trace_there_is_a_part_for_each_thread(count, jobs, sizes):
+    parts = list(Parts(count, jobs, trace=False))
+    assert [part.stop - part.start for part in parts] == sizes

@@ -19,7 +19,9 @@ import small_study
 from runner import interval_text, mean_metric, median_metric, rate_metric, read_results, run
 from runner.results import STUDY_FILE, claim, missing
 
+import casadi_ik as ik
 from casadi_ik.errors import InputError
+from casadi_ik.logs import Keep
 
 STUDY = small_study.STUDY
 FOLDERS = os.pathsep.join((str(Path(small_study.__file__).parent), *sys.path))
@@ -76,7 +78,7 @@ def test_a_dask_cluster_changes_nothing(done, tmp_path):
     assert contents(tmp_path).equals(contents(done))
 
 
-def test_not_before_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
+def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
     """Two workers and their parent are killed again and again until the study is through."""
     rng = random.Random(3)
     kills = 0
@@ -110,6 +112,21 @@ def test_a_study_grows(done, tmp_path):
     assert len(contents(tmp_path, small)) == 2 * STUDY.block
     run(STUDY, tmp_path)
     assert contents(tmp_path).equals(contents(done))
+
+
+def test_a_log_per_block_keeps_what_is_asked_for(done, tmp_path):
+    study = dataclasses.replace(STUDY, settings=STUDY.settings[:1])
+    run(study, tmp_path, keep=Keep(failed=True, singular=False, sample=0.25))
+    assert contents(tmp_path, study).equals(contents(done, study))
+    logs = sorted(tmp_path.rglob("*.mcap"))
+    assert len(logs) == len(list(tmp_path.rglob("*.parquet"))) == len(list(study.blocks()))
+    rows = 0
+    for path in logs:
+        log = ik.logs.open(path)
+        assert len(log.solves()) == study.block, "totals of all"
+        rows += len(log.iterations())
+    iterations = contents(tmp_path, study)["iterations"].sum()
+    assert 0 < rows < 0.5 * iterations, "iterations of a sample"
 
 
 @pytest.mark.parametrize(

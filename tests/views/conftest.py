@@ -25,10 +25,10 @@ def solver(robot: ik.ArmHand) -> ik.Solver:
 @pytest.fixture(scope="session")
 def log(
     solver: ik.Solver, grasp: ik.Grasp, tmp_path_factory: pytest.TempPathFactory
-) -> ik.logs.LogFile:
+) -> ik.logs.Log:
     path = tmp_path_factory.mktemp("log") / "cup.mcap"
     solver.solve(grasp, log=path)
-    return ik.logs.open_log(path)
+    return ik.logs.open(path)
 
 
 @pytest.fixture(scope="session")

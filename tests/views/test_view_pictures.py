@@ -17,6 +17,7 @@ from matplotlib.image import imread
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, PictureError
+from casadi_ik.logs import Table
 from casadi_ik.views import draw_convergence, draw_solution
 from casadi_ik.views.captions import MET_COLOR, MISSED_COLOR, OBJECT_COLOR, TARGET_COLOR
 from casadi_ik.views.picture import new_figure, save_picture
@@ -189,15 +190,15 @@ def test_convergence_takes_a_tolerance_and_a_title(log) -> None:
 
 
 def test_convergence_wants_one_solve(log) -> None:
-    one = log.iterations()
+    part = log.iterations().part
     none = dataclasses.replace(
-        one, rows=one.rows[:0], solve_id=one.solve_id[:0], iteration=one.iteration[:0]
+        part, rows=part.rows[:0], solve_id=part.solve_id[:0], iteration=part.iteration[:0]
     )
     with pytest.raises(InputError, match="none to draw"):
-        draw_convergence(none)
-    two = dataclasses.replace(one, solve_id=np.arange(len(one.rows)) % 2)
+        draw_convergence(Table("iteration", (none,)))
+    two = dataclasses.replace(part, solve_id=np.arange(len(part)) % 2)
     with pytest.raises(InputError, match="several solves"):
-        draw_convergence(two)
+        draw_convergence(Table("iteration", (two,)))
 
 
 def test_headless_pictures_say_nothing_and_leave_pyplot_alone() -> None:

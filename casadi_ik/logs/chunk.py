@@ -1,0 +1,97 @@
+"""A chunk of an MCAP file with its message indexes, as the bytes that go to the disk at once."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Schema
+
+COMPRESSORS: Mapping[str, tuple[str, Callable[[memoryview], bytes | memoryview]]] = {
+    "none": ("", lambda data: data),
+    "lz4": ("lz4", lz4.frame.compress),
+    "zstd": ("zstd", lambda data: zstandard.ZstdCompressor(level=1).compress(data)),
+}
+"""How a compression is called in the file, and what does it. Higher levels of zstd were measured:
+they take twice the time for one percent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Messages of one channel that stand one after the other in a chunk.
+
+    Attributes:
+        channel: Channel id.
+        log_time: (k,) uint64 [ns].
+        offsets: (k,) uint64, where each begins in the chunk.
+    """
+
+    channel: int
+    log_time: np.ndarray
+    offsets: np.ndarray
+
+
+def chunk_bytes(
+    data: memoryview, runs: Sequence[Run], compression: str, position: int
+) -> tuple[list[bytes | memoryview], ChunkIndex]:
+    """A Chunk record and its MessageIndex records.
+
+    Args:
+        data: Schemas, channels and messages, uncompressed.
+        runs: Where in it which messages are; none of them empty, at least one, a channel once.
+        compression: A key of `COMPRESSORS`.
+        position: Where in the file the chunk will stand.
+
+    Returns:
+        The bytes in pieces, and the ChunkIndex record for the summary.
+    """
+    name, compress = COMPRESSORS[compression]
+    packed = compress(data)
+    start = min(int(run.log_time.min()) for run in runs)
+    end = max(int(run.log_time.max()) for run in runs)
+    head = RecordBuilder()
+    head.write1(Opcode.CHUNK)
+    head.write8(8 + 8 + 8 + 4 + 4 + len(name) + 8 + len(packed))
+    head.write8(start)
+    head.write8(end)
+    head.write8(len(data))
+    head.write4(zlib.crc32(data))
+    head.write_prefixed_string(name)
+    head.write8(len(packed))
+    length = head.count + len(packed)
+    tail, places = RecordBuilder(), {}
+    for run in runs:
+        places[run.channel] = position + length + tail.count
+        entries = np.stack([run.log_time, run.offsets], axis=1, dtype="<u8", casting="unsafe")
+        # Not `mcap.records.MessageIndex.write`: it takes the pairs one by one.
+        tail.start_record(Opcode.MESSAGE_INDEX)
+        tail.write2(run.channel)
+        tail.write4(entries.nbytes)
+        tail.write(entries.tobytes())
+        tail.finish_record()
+    index = ChunkIndex(
+        chunk_length=length,
+        chunk_start_offset=position,
+        compression=name,
+        compressed_size=len(packed),
+        message_end_time=end,
+        message_index_length=tail.count,
+        message_index_offsets=places,
+        message_start_time=start,
+        uncompressed_size=len(data),
+    )
+    return [head.end(), packed, tail.end()], index
+
+
+def definitions(schemas: Sequence[Schema], channels: Sequence[Channel]) -> bytes:
+    """Schema and channel records, as they stand before the first messages that need them."""
+    builder = RecordBuilder()
+    for record in (*schemas, *channels):
+        record.write(builder)
+    return builder.end()

@@ -1,0 +1,42 @@
+"""How a batch is cut: a part per thread, or so that the iterations of a part fit into memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+PART_BYTES = 2**22
+"""About how many bytes of iterations a part may have if they are to be kept."""
+
+FIRST_PART = 64
+"""Solves of the first parts of a traced batch, from which the others' size is learned."""
+
+
+class Parts:
+    """The parts of a batch in order; iterating may go on while finished parts are learned from."""
+
+    def __init__(self, count: int, jobs: int, trace: bool) -> None:
+        """Cut.
+
+        Args:
+            count: Targets.
+            jobs: Threads.
+            trace: Whether all iterations are kept.
+        """
+        self._count = count
+        self._largest = max(1, -(-count // jobs))
+        self._size = min(FIRST_PART, self._largest) if trace else self._largest
+
+    def __iter__(self) -> Iterator[slice]:
+        """The parts; a single empty one if there are no targets."""
+        start = 0
+        while True:
+            stop = min(start + self._size, self._count)
+            yield slice(start, stop)
+            start = stop
+            if start == self._count:
+                return
+
+    def learn(self, solves: int, size: int) -> None:
+        """Take note of how many bytes of iterations so many solves had."""
+        fitting = PART_BYTES * solves // max(size, 1)
+        self._size = max(1, min(fitting, self._largest))
