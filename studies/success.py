@@ -86,7 +86,7 @@ def write_report(whole: Study, results: Path, folder: Path) -> None:
     for setting in whole.settings:
         parts += [f"## {setting.key}", _table(whole, setting, table, metrics)]
     parts += ["## Misses", _misses(whole, table), "## Where this comes from"]
-    parts += [provenance(code_of(results)), f"Seed {whole.seed}."]
+    parts += [provenance({whole.name: code_of(results)}), f"Seed {whole.seed}."]
     write_page("Success of hand-first on targets that can be reached", parts, folder)
     write_metrics(metrics, folder / "metrics.json")
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-import polars as pl
 from runner import Metric, Study, code_of, provenance, read_results, write_metrics, write_page
 
 from casadi_ik.errors import InputError
 from qiu_table.figures import draw_convergence, draw_iterations, draw_success
-from qiu_table.tables import by_object, by_setting, endings, summary
+from qiu_table.tables import by_object, by_setting, endings, readings, summary
 
+NOT_RUN = "*Not run yet.*"
 TITLE = "Table I of Qiu & Kermani 2021, measured again"
 
 INTRODUCTION = """
@@ -64,7 +64,7 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path) -> None:
     Raises:
         InputError: There are no results of the table.
     """
-    table, ablation, readings = (read_results(study, results / study.name) for study in studies)
+    table, ablation, found = (read_results(study, results / study.name) for study in studies)
     if not len(table):
         raise InputError(f"{results}: found no results of the table, expected some")
     folder.mkdir(parents=True, exist_ok=True)
@@ -92,25 +92,16 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path) -> None:
         endings(table),
         "## The paper's open choices: enhanced methods",
         ABLATION,
-        _settings(studies[1], ablation, kept),
+        kept(by_setting(ablation, studies[1])) if len(ablation) else NOT_RUN,
         "## Readings of the original methods",
         DIFFERENCES,
-        _settings(studies[2], readings, kept),
+        kept(readings(found, studies[2])) if len(found) else NOT_RUN,
         "## Every object",
         kept(by_object(table)),
         "## Where this comes from",
-        provenance(code_of(results / studies[0].name)),
+        provenance({study.name: code_of(results / study.name) for study in studies}),
         f"Seed {studies[0].seed}. To go on where this stopped: "
         "`python studies/table_one.py --full --jobs 2`.",
     ]
     write_page(TITLE, parts, folder)
     write_metrics(metrics, folder / "metrics.json")
-
-
-def _settings(
-    study: Study, table: pl.DataFrame, kept: Callable[[tuple[str, list[Metric]]], str]
-) -> str:
-    if not len(table):
-        return "*Not run yet.*"
-    keys = [setting.key for setting in study.settings]
-    return kept(by_setting(table, keys, study.name))

@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+
 import polars as pl
-from runner import Metric, interval_text, markdown_table, mean_metric, rate_metric
+from runner import (
+    Metric,
+    Setting,
+    Study,
+    interval_text,
+    markdown_table,
+    mean_metric,
+    rate_metric,
+)
 
 from qiu_table.paper import TABLE_I, Printed, printed_mean
 from qiu_table.settings import LIMITS, METHODS
@@ -67,18 +78,47 @@ def by_object(table: pl.DataFrame) -> tuple[str, list[Metric]]:
     return markdown_table(heads, rows), metrics
 
 
-def by_setting(table: pl.DataFrame, keys: list[str], study: str) -> tuple[str, list[Metric]]:
+def by_setting(table: pl.DataFrame, study: Study) -> tuple[str, list[Metric]]:
     """One line per setting that has results."""
     rows, metrics = [], []
-    for key in keys:
-        part = table.filter(pl.col("setting") == key)
-        if len(part):
-            found = figures_of(f"{study}/{key}", part)
-            metrics += found
-            rows.append(
-                [key, interval_text(found[0]), interval_text(found[1], 0), f"{len(part):,}"]
-            )
+    for setting, part, found in _found(table, study):
+        metrics += found
+        rows.append([setting.key, *_cells(found), f"{len(part):,}"])
     return markdown_table(["choice", "solved %", "iterations", "n"], rows), metrics
+
+
+def readings(table: pl.DataFrame, study: Study) -> tuple[str, list[Metric]]:
+    """One line per reading of the original methods, with its distance from the printed means.
+
+    The distance is |ln(rate / printed rate)| + |ln(iterations / printed iterations)|; none if
+    nothing was solved.
+    """
+    rows, metrics = [], []
+    for setting, part, found in _found(table, study):
+        metrics += found
+        printed = printed_mean(setting.method)
+        distance = "-"
+        if found[0].value > 0:
+            ratios = (found[0].value / printed.success, found[1].value / printed.iterations)
+            distance = f"{sum(abs(math.log(ratio)) for ratio in ratios):.2f}"
+        rows.append([setting.key, *_cells(found), distance, f"{len(part):,}"])
+    for method in ("original-dls", "original-sdls"):
+        printed = printed_mean(method)
+        rows.append([f"{method}, printed", *_printed(printed)[:2], "0", ""])
+    return markdown_table(["reading", "solved %", "iterations", "distance", "n"], rows), metrics
+
+
+def _found(
+    table: pl.DataFrame, study: Study
+) -> Iterator[tuple[Setting, pl.DataFrame, tuple[Metric, Metric, Metric]]]:
+    for setting in study.settings:
+        part = table.filter(pl.col("setting") == setting.key)
+        if len(part):
+            yield setting, part, figures_of(f"{study.name}/{setting.key}", part)
+
+
+def _cells(found: tuple[Metric, Metric, Metric]) -> list[str]:
+    return [interval_text(found[0]), interval_text(found[1], 0)]
 
 
 def endings(table: pl.DataFrame) -> str:

@@ -96,15 +96,11 @@ def read_results(study: Study, folder: Path) -> pl.DataFrame:
     return pl.read_parquet(paths) if paths else pl.DataFrame()
 
 
-def code_of(folder: Path) -> str:
-    """Version of the code a folder's results were made with.
-
-    Raises:
-        InputError: There are none.
-    """
+def code_of(folder: Path) -> str | None:
+    """Version of the code a folder's results were made with, if there are any."""
     path = folder / STUDY_FILE
     if not path.exists():
-        raise InputError(f"{folder}: found no results, expected some")
+        return None
     return json.loads(path.read_text(encoding="utf-8"))["code"]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import polars as pl
@@ -13,6 +14,7 @@ import table_one
 from qiu_table import figures
 from qiu_table.paper import METHODS, TABLE_I, printed_mean
 from qiu_table.settings import ablation_study, readings_study, table_study
+from qiu_table.tables import readings
 from runner import Setting, read_results, run
 
 import casadi_ik as ik
@@ -92,6 +94,22 @@ def test_one_ablation_changes_the_outcome(tmp_path):
     table = read_results(study, tmp_path / "results")
     solved = dict(table.group_by("setting").agg(pl.col("success").sum()).rows())
     assert solved[wanted[0]] > solved[wanted[1]]
+
+
+def test_distance_of_a_reading():
+    """Twice the printed rate at half the printed iterations is 2 ln 2 away."""
+    study = readings_study(1, 0, 1)
+    printed = printed_mean("original-dls")
+    count = round(100 / printed.success * 500)  # 1000 solved of so many are twice the rate
+    rows = {
+        "setting": [study.settings[0].key] * count,
+        "success": [i < 1000 for i in range(count)],
+        "iterations": [printed.iterations / 2] * count,
+        "time": [1.0] * count,
+    }
+    text, metrics = readings(pl.DataFrame(rows), study)
+    assert f"| {2 * math.log(2):.2f} | {count:,} |" in text
+    assert len(metrics) == 3
 
 
 def test_table_has_every_method_both_ways():
