@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -79,21 +80,22 @@ def draw_iterations(table: pl.DataFrame, path: Path) -> None:
     _save(figure, path)
 
 
-def draw_convergence(study: Study, table: pl.DataFrame, path: Path) -> None:
+def draw_convergence(studies: Sequence[Study], table: pl.DataFrame, path: Path) -> None:
     """The worst error over the iterations, of solved and of failed runs, limits ignored.
 
     The runs are the first solved and the first failed ones; they are stepped through once more,
     from targets whose last bit may differ, and drawn as what they are then.
     """
     settings = [
-        setting
+        (study, setting)
+        for study in studies
         for setting in study.settings
         if setting.limits == "ignore" and setting.method.startswith(("enhanced", "original"))
     ]
     figure, panels = plt.subplots(
         2, 2, figsize=(11, 7), sharex=True, sharey=True, layout="constrained"
     )
-    for panel, setting in zip(panels.flat, settings, strict=True):
+    for panel, (study, setting) in zip(panels.flat, settings, strict=True):
         rows = table.filter(pl.col("setting") == setting.key).sort("target", "targets")
         for solved in (False, True):
             for row in rows.filter(pl.col("success") == solved).head(CURVES).iter_rows(named=True):

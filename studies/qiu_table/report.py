@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import polars as pl
 from runner import Metric, Study, code_of, provenance, read_results, write_metrics, write_page
 
 from casadi_ik.errors import InputError
@@ -62,20 +63,21 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path) -> None:
     """Write `report.md`, `report.html`, figures and `metrics.json`.
 
     Args:
-        studies: The table, the ablation and the readings.
+        studies: The table, its part by the original methods, the ablation and the readings.
         results: Folder with a folder per study.
         folder: Where the report goes.
 
     Raises:
         InputError: There are no results of the table.
     """
-    table, ablation, found = (read_results(study, results / study.name) for study in studies)
+    fast, slow, ablation, found = (read_results(study, results / study.name) for study in studies)
+    table = pl.concat([fast, slow], how="diagonal")
     if not len(table):
         raise InputError(f"{results}: found no results of the table, expected some")
     folder.mkdir(parents=True, exist_ok=True)
     draw_success(table, folder / "success.png")
     draw_iterations(table, folder / "iterations.png")
-    draw_convergence(studies[0], table, folder / "convergence.png")
+    draw_convergence(studies[:2], table, folder / "convergence.png")
     metrics: list[Metric] = []
 
     def kept(made: tuple[str, list[Metric]]) -> str:
@@ -97,10 +99,10 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path) -> None:
         endings(table),
         "## The paper's open choices: enhanced methods",
         ABLATION,
-        kept(by_setting(ablation, studies[1])) if len(ablation) else NOT_RUN,
+        kept(by_setting(ablation, studies[2])) if len(ablation) else NOT_RUN,
         "## Readings of the original methods",
         DIFFERENCES,
-        kept(readings(found, studies[2])) if len(found) else NOT_RUN,
+        kept(readings(found, studies[3])) if len(found) else NOT_RUN,
         "## Every object",
         kept(by_object(table)),
         "## Where this comes from",

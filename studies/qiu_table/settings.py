@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -44,7 +44,7 @@ def targets() -> tuple[TargetSet, ...]:
     )
 
 
-def table_study(methods: tuple[str, ...], count: int, seed: int, block: int) -> Study:
+def table_study(name: str, methods: Sequence[str], count: int, seed: int, block: int) -> Study:
     """Table I: methods with limits ignored and enforced."""
     settings = tuple(
         Setting(
@@ -56,7 +56,7 @@ def table_study(methods: tuple[str, ...], count: int, seed: int, block: int) -> 
         for method in methods
         for limits in LIMITS
     )
-    return Study("table", ROBOT, targets(), settings, count, seed, block)
+    return Study(name, ROBOT, targets(), settings, count, seed, block)
 
 
 def readings_study(count: int, seed: int, block: int) -> Study:

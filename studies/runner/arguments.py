@@ -40,5 +40,5 @@ def run_from(options: argparse.Namespace, *studies: Study) -> None:
     """Run studies as the arguments say, each in a folder of its own below ``--out``."""
     keep = None if options.log is None else Keep(sample=options.log)
     for study in studies:
-        if study.count > 0:
+        if study.count > 0 and study.settings:
             run(study, options.out / study.name, options.jobs, options.dask, keep)

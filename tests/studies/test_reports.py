@@ -113,7 +113,7 @@ def test_distance_of_a_reading():
 
 
 def test_table_has_every_method_both_ways():
-    study = table_study(("enhanced-dls", "hand-first"), 3, 0, 1)
+    study = table_study("table", ("enhanced-dls", "hand-first"), 3, 0, 1)
     assert [setting.limits for setting in study.settings] == ["ignore", "enforce"] * 2
     assert study.settings[0].options == {"finger_step": "closed-form"}
     assert len(list(study.blocks())) == 3 * 4 * 12
