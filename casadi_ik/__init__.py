@@ -5,7 +5,7 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
-from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp
+from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
 from casadi_ik.solvers import (
     METHODS,
     Alternative,
@@ -43,5 +43,6 @@ __all__ = [
     "load_grasp",
     "load_robot",
     "logs",
+    "shipped_grasps",
     "shipped_names",
 ]

@@ -14,7 +14,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
 from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.couplings import joint_positions
+from casadi_ik.symbolic.couplings import joint_positions, toggle_margins
 from casadi_ik.symbolic.kinematics import Pose
 
 Array = NDArray[np.float64]
@@ -105,10 +105,28 @@ class ArmHand:
             InputError: See `configuration`.
         """
         (theta,) = self._joints(self.configuration(q))
-        names = self.description.joint_names
-        if theta.ndim == 1:
-            return {name: float(value) for name, value in zip(names, theta, strict=True)}
-        return dict(zip(names, theta.T, strict=True))
+        return _by_name(self.description.joint_names, theta)
+
+    def toggle_margins(self, q: ArrayLike) -> dict[str, Any]:
+        """How far every lead screw and four-bar is from its singular (toggle) position.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            By joint the squared sine of its transmission angle, a float or (k,) for a batch: 1 at
+            best, 0 at the toggle, negative where the mechanism cannot be assembled. Empty if the
+            robot has no such couplings.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        configuration = self.configuration(q)
+        names, kernel = self._toggle_margins
+        if not names:
+            return {}
+        (margins,) = kernel(configuration)
+        return _by_name(names, margins.reshape(*configuration.shape[:-1], len(names)))
 
     def contacts(self, q: ArrayLike) -> tuple[Array, Array]:
         """Where the fingertips are and which way they face.
@@ -125,6 +143,34 @@ class ArmHand:
         """
         points, normals = self._contacts(self.configuration(q))
         return points, normals
+
+    def errors(self, q: ArrayLike, points: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
+        """How far the fingertips are from contacts.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+            points: (f, 3) or (k, f, 3) [m], base frame; NaN where free.
+            normals: (f, 3) or (k, f, 3), unit; NaN where free.
+
+        Returns:
+            Distances [m] and angles [rad], (f,) or (k, f); NaN where free.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        position, angle = self._errors(self.configuration(q), points, normals)
+        return position, angle
+
+    def beyond_limits(self, q: ArrayLike) -> Array:
+        """By how much the worst actuator or joint is beyond its limits [rad or m], () or (k,).
+
+        Negative within limits.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        (beyond,) = self._beyond(self.configuration(q))
+        return beyond
 
     def palm(self, q: ArrayLike) -> Array:
         """(4, 4) or (k, 4, 4) pose of the palm frame in the base frame.
@@ -163,7 +209,14 @@ class ArmHand:
     @cached_property
     def _joints(self) -> FunctionKernel:
         q = self._symbols()
-        return self._kernel("joints", q, [joint_positions(self.description, q)])
+        return self._kernel("joints", [q], [joint_positions(self.description, q)])
+
+    @cached_property
+    def _toggle_margins(self) -> tuple[tuple[str, ...], FunctionKernel]:
+        q = self._symbols()
+        margins = toggle_margins(self.description, q)
+        values = ca.vertcat(ca.SX(0, 1), *margins.values())
+        return tuple(margins), self._kernel("toggle_margins", [q], [values])
 
     @cached_property
     def _contacts(self) -> FunctionKernel:
@@ -172,27 +225,55 @@ class ArmHand:
         pairs = [kinematics.contact(name) for name in self.fingers]
         points = ca.horzcat(*(point for point, _ in pairs)).T
         normals = ca.horzcat(*(normal for _, normal in pairs)).T
-        return self._kernel("contacts", q, [points, normals])
+        return self._kernel("contacts", [q], [points, normals])
+
+    @cached_property
+    def _errors(self) -> FunctionKernel:
+        q, f = self._symbols(), len(self.fingers)
+        points, normals = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3)
+        kinematics = actuated(self.description, q).kinematics
+        positions, angles = [], []
+        for i, name in enumerate(self.fingers):
+            point, normal = kinematics.contact(name)
+            positions.append(ca.norm_2(point - points[i, :].T))
+            # Kahan's angle: exact at zero and at a half turn, where arc cosine loses half the
+            # digits.
+            apart, together = normal - normals[i, :].T, normal + normals[i, :].T
+            angles.append(2 * ca.atan2(ca.norm_2(apart), ca.norm_2(together)))
+        outputs = [ca.vertcat(*positions), ca.vertcat(*angles)]
+        return self._kernel("errors", [q, points, normals], outputs)
+
+    @cached_property
+    def _beyond(self) -> FunctionKernel:
+        q, description = self._symbols(), self.description
+        theta = joint_positions(description, q)
+        both = ca.vertcat(q, theta)
+        lower = ca.DM(np.concatenate([self.lower, description.joint_lower]))
+        upper = ca.DM(np.concatenate([self.upper, description.joint_upper]))
+        beyond = ca.mmax(ca.fmax(lower - both, both - upper))
+        return self._kernel("beyond_limits", [q], [beyond])
 
     @cached_property
     def _palm(self) -> FunctionKernel:
         q = self._symbols()
-        return self._kernel("palm", q, [_matrix(actuated(self.description, q).kinematics.palm)])
+        return self._kernel("palm", [q], [_matrix(actuated(self.description, q).kinematics.palm)])
 
     @cached_property
     def _links(self) -> FunctionKernel:
         q = self._symbols()
         links = actuated(self.description, q).kinematics.links
         poses = [_matrix(links[name]) for name in self.description.links]
-        return self._kernel("links", q, [ca.vertcat(*poses)])
+        return self._kernel("links", [q], [ca.vertcat(*poses)])
 
     def _symbols(self) -> ca.SX:
         return ca.SX.sym("q", len(self.actuators))
 
-    def _kernel(self, name: str, q: ca.SX, outputs: list[ca.SX]) -> FunctionKernel:
+    def _kernel(self, name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> FunctionKernel:
         dense = [ca.densify(output) for output in outputs]
         # A robot's name may be anything; a function's may not.
-        return FunctionKernel(ca.Function(ca.Function.fix_name(f"{self.name}_{name}"), [q], dense))
+        return FunctionKernel(
+            ca.Function(ca.Function.fix_name(f"{self.name}_{name}"), inputs, dense)
+        )
 
 
 def load_robot(name_or_path: str | Path) -> ArmHand:
@@ -206,6 +287,13 @@ def load_robot(name_or_path: str | Path) -> ArmHand:
         DescriptionError: The file is missing or malformed; the message names file and key.
     """
     return ArmHand(load_description(name_or_path))
+
+
+def _by_name(names: tuple[str, ...], values: Array) -> dict[str, Any]:
+    """Values (m,) or (k, m) by name: floats, or (k,) for a batch."""
+    if values.ndim == 1:
+        return {name: float(value) for name, value in zip(names, values, strict=True)}
+    return dict(zip(names, values.T, strict=True))
 
 
 def _matrix(pose: Pose) -> ca.SX:

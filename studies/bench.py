@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     robot = ik.load_robot("kuka_lwr_barrett")
     rng = np.random.default_rng(0)
-    names = ik.shipped_names("grasps")
+    names = ik.shipped_grasps(robot.name)
     grasps = random_arm_targets(robot, names, options.count // len(names), rng)
     hands = robot.contacts(robot.random(rng, options.count))
     table = Table("what", "time", "ratio", title="kuka_lwr_barrett, 5 mm / 3 deg, one thread")

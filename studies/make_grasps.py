@@ -25,7 +25,7 @@ from grasp_synthesis.placement import Placement, place
 from grasp_synthesis.posture import Pinch, PinchProblem
 from grasp_synthesis.recipes import RECIPES, Recipe
 from grasp_synthesis.verify import BETWEEN_GAP, FINGER_GAP, PALM_GAP, problems
-from grasp_synthesis.writing import grasp_text
+from grasp_synthesis.writing import barrett_text
 
 import casadi_ik as ik
 from casadi_ik.files.shipped import models_folder
@@ -80,7 +80,7 @@ def make(
         placement = scene(hand, item, recipe, pinch, rng)
         if placement is not None:
             report(pinch, placement, gaps)
-            return grasp_text(hand, recipe, pinch, placement, gaps, seed)
+            return barrett_text(hand, recipe, pinch, placement, gaps, seed)
     return None
 
 

@@ -72,7 +72,7 @@ def study(count: int, seed: int, block: int) -> Study:
     """The study."""
     sets = [
         TargetSet(name, partial(targets.grasp_arms, grasp=name))
-        for name in ik.shipped_names("grasps")
+        for name in ik.shipped_grasps("kuka_lwr_barrett")
     ]
     sets += [TargetSet(name, made) for name, made in HARD.items()]
     robot = "kuka_lwr_barrett"

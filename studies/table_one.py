@@ -26,7 +26,7 @@ from qiu_table.settings import METHODS, ablation_study, readings_study, table_st
 from runner import Study, add_run_arguments, run_from
 
 FULL = 10_000
-SMALL_BLOCK = 25  # of the original methods, which count to 10,000 nearly always
+SMALL_BLOCK = 10  # of the original methods, which count to 10,000 nearly always
 ABLATION_BLOCK = 10
 
 

@@ -70,7 +70,7 @@ def singular(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
 
 def shipped_hands(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
     """Hands of the shipped grasps, one after the other, on random arms."""
-    names = ik.shipped_names("grasps")
+    names = ik.shipped_grasps(robot.name)
     parts = [grasp_arms(robot, rng, -(-count // len(names)), name) for name in names]
     return np.stack(parts, axis=1).reshape(-1, len(robot.actuators))[:count]
 

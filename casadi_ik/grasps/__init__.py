@@ -1,7 +1,7 @@
 """What is to be touched: contacts, grasps and objects, numpy only."""
 
 from casadi_ik.grasps.grasp import Contact, Grasp
-from casadi_ik.grasps.load import load_grasp
+from casadi_ik.grasps.load import load_grasp, shipped_grasps
 from casadi_ik.grasps.objects import GraspObject, load_object
 from casadi_ik.grasps.shapes import (
     BentCapsule,
@@ -26,4 +26,5 @@ __all__ = [
     "Tolerance",
     "load_grasp",
     "load_object",
+    "shipped_grasps",
 ]

@@ -10,7 +10,7 @@ import msgspec
 
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.reading import Frame, Struct, Vector, convert, frame_matrix, read_yaml
-from casadi_ik.files.shipped import resolve
+from casadi_ik.files.shipped import resolve, shipped_names
 from casadi_ik.grasps.grasp import Contact, Grasp
 from casadi_ik.grasps.tolerance import Tolerance
 
@@ -86,6 +86,18 @@ def _contact(entry: ContactEntry) -> Contact:
         return Contact(entry.point, entry.normal)
     tolerance = Tolerance(entry.tolerance.position, entry.tolerance.angle)
     return Contact(entry.point, entry.normal, tolerance)
+
+
+def shipped_grasps(robot: str) -> tuple[str, ...]:
+    """Names of the shipped grasps that were made for a robot.
+
+    Args:
+        robot: Name of the robot.
+
+    Raises:
+        DescriptionError: A shipped file is damaged.
+    """
+    return tuple(name for name in shipped_names("grasps") if load_grasp(name).robot == robot)
 
 
 def _loose_numbers(entry: GraspFile) -> Iterator[tuple[str, float]]:

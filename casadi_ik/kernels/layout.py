@@ -7,6 +7,7 @@ stores a row, which is byte for byte the row's CDR payload in the log.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -42,7 +43,7 @@ class Field:
     @property
     def size(self) -> int:
         """Number of doubles in the vector."""
-        return int(np.prod(self.shape, dtype=int))
+        return math.prod(self.shape)
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Layout:
         """A layout whose fields are sorted by falling storage width (stable)."""
         return cls(tuple(sorted(fields, key=lambda item: -np.dtype(item.dtype).itemsize)))
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Length of the vector."""
         return sum(item.size for item in self.fields)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -19,7 +20,8 @@ def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: P
         path: The file they stand in.
 
     Raises:
-        DescriptionError: See above; or a coupling follows something of another unit.
+        DescriptionError: See above; or a coupling follows something of another unit, or a slider
+            leaves its triangle.
     """
     units = {joint.name: "m" if joint.type == "prismatic" else "rad" for joint in joints.values()}
     units |= {actuator.name: actuator.unit for actuator in actuators}
@@ -37,6 +39,22 @@ def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: P
             raise DescriptionError(
                 f"{path}: joint {joint.name!r}: coupling.of: {joint.coupling.of!r} is in "
                 f"{units[joint.coupling.of]}, expected something in {expected}"
+            )
+        if isinstance(joint.coupling, LeadScrew):
+            _check_triangle(joint, {actuator.name: actuator for actuator in actuators}, path)
+
+
+def _check_triangle(joint: Joint, actuators: dict[str, Actuator], path: Path) -> None:
+    """Whether a slider closes its triangle over the whole stroke."""
+    coupling = joint.coupling
+    if isinstance(coupling, LeadScrew) and coupling.of in actuators:
+        slider = actuators[coupling.of]
+        low, high = abs(coupling.b - coupling.c), coupling.b + coupling.c
+        if not low <= slider.lower < slider.upper <= high:
+            raise DescriptionError(
+                f"{path}: joint {joint.name!r}: coupling: {slider.name!r} goes from "
+                f"{slider.lower:.6g} to {slider.upper:.6g} m, expected within |b - c| = {low:.6g} "
+                f"and b + c = {high:.6g} m"
             )
 
 
@@ -76,8 +94,15 @@ def check_numbers(coupling: Coupling | None, where: str) -> None:
         return
     for length in "bc" if isinstance(coupling, LeadScrew) else "pqgh":
         positive(getattr(coupling, length), f"{where}.{length}")
-    if isinstance(coupling, FourBar) and coupling.branch not in (-1, 1):
-        raise DescriptionError(f"{where}.branch: found {coupling.branch}, expected -1 or 1")
+    if isinstance(coupling, FourBar):
+        # Rod and coupler have to span the distance from the crank's pin to the rod's pivot.
+        p, q, g, h = coupling.p, coupling.q, coupling.g, coupling.h
+        span = math.sqrt(max(p * p + g * g - 2 * p * g * math.cos(coupling.phi_0), 0.0))
+        if not abs(q - h) < span < q + h:
+            raise DescriptionError(
+                f"{where}.phi_0: at {coupling.phi_0:.6g} rad q and h cannot span {span:.6g} m, "
+                f"expected a pose in which the linkage closes, not stretched or folded"
+            )
 
 
 def unique(names: Iterable[str], where: str) -> None:

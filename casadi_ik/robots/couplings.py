@@ -49,7 +49,8 @@ class FourBar(
 ):
     """A planar four-bar between two joints; Chandra et al. 2019, eqs. (9) to (11).
 
-    With ``phi = phi_0 + source`` the joint reads ``theta_3(phi) - theta_3_0``.
+    With ``phi = phi_0 + source`` the joint reads ``theta_3(phi) - theta_3_0``. The linkage closes
+    in two ways; it is taken to be assembled as in the pose (phi_0, theta_3_0), and to stay so.
 
     Attributes:
         of: Name of the joint that drives the crank.
@@ -58,8 +59,8 @@ class FourBar(
         g: Ground link [m].
         h: Coupler [m].
         phi_0: Crank angle at which the source reads zero [rad].
-        theta_3_0: Angle theta_3 at which this joint reads zero [rad].
-        branch: Assembly mode, -1 or +1 (sign before the arc cosine).
+        theta_3_0: Angle theta_3 at which this joint reads zero [rad]; a measured one need not close
+            the loop to the last digit.
     """
 
     of: str
@@ -69,7 +70,6 @@ class FourBar(
     h: float
     phi_0: float
     theta_3_0: float
-    branch: int = -1
 
 
 Coupling = Linear | LeadScrew | FourBar

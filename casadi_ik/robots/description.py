@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import UnknownNameError
-from casadi_ik.robots.couplings import Coupling
+from casadi_ik.robots.couplings import Coupling, LeadScrew
 
 Array = NDArray[np.float64]
 
@@ -143,6 +143,21 @@ class RobotDescription:
     def upper(self) -> Array:
         """(n,) upper limits of the actuators."""
         return _frozen([actuator.upper for actuator in self.actuators])
+
+    @cached_property
+    def mechanical(self) -> tuple[Array, Array]:
+        """(n,) ends that the mechanisms set by themselves: where a slider's triangle is flat.
+
+        Infinite for all other actuators.
+        """
+        lower = dict.fromkeys(self.actuator_names, -np.inf)
+        upper = dict.fromkeys(self.actuator_names, np.inf)
+        for joint in self.movable:
+            screw = joint.coupling
+            if isinstance(screw, LeadScrew) and screw.of in lower:
+                lower[screw.of] = max(lower[screw.of], abs(screw.b - screw.c))
+                upper[screw.of] = min(upper[screw.of], screw.b + screw.c)
+        return _frozen(list(lower.values())), _frozen(list(upper.values()))
 
     @cached_property
     def joint_lower(self) -> Array:

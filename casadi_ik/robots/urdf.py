@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from casadi_ik.robots.couplings import Linear
+from casadi_ik.robots.couplings import FourBar, LeadScrew, Linear
 from casadi_ik.robots.description import Array, RobotDescription
 
 LINK_RADIUS = {"arm": 0.055, "mount": 0.03, "hand": 0.009}
@@ -21,8 +21,8 @@ def to_urdf(robot: RobotDescription) -> str:
 
     Every link gets simple cylinders from its frame to its children, and every finger a fixed
     link ``<finger>_contact`` whose frame is the contact frame. A joint that follows an actuator
-    or joint linearly becomes a mimic joint; lead-screw and four-bar couplings have no URDF form
-    and stay independent joints (set them from `ArmHand.joints`).
+    or joint linearly becomes a mimic joint; lead-screw and four-bar couplings have no URDF form:
+    their joints stay independent (set them from `ArmHand.joints`), with the coupling as a comment.
 
     Args:
         robot: The description.
@@ -45,6 +45,8 @@ def to_urdf(robot: RobotDescription) -> str:
         if joint.type == "fixed":
             continue
         ElementTree.SubElement(element, "axis", xyz=_numbers(joint.axis))
+        if isinstance(joint.coupling, LeadScrew | FourBar):
+            element.append(ElementTree.Comment(f" {joint.coupling} "))
         velocity = joint.velocity if math.isfinite(joint.velocity) else 10.0
         ElementTree.SubElement(
             element,

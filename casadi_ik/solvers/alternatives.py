@@ -133,7 +133,7 @@ class AlternativeFinder:
         trials, method = self._trials, self._trials.method
         options = method.options
         postures = np.concatenate(
-            [method.postures(problems, number)[0] for number in range(options.rounds)]
+            [method.postures(problems, q0[None], number)[0] for number in range(options.rounds)]
         )
         starts = np.tile(limits.clip(q0), (len(postures), 1))
         states, parameters = method.rows(repeated(problems, len(postures)), starts)

@@ -90,15 +90,19 @@ class HandFirstMethod:
         count = len(problems)
         outcome = _Collected(count, len(self._robot.actuators), layouts.record.dtype)
         waiting = np.arange(count)
+        states = self._states(q0)
+        passed = layouts.state.slice("passed")
         for number in range(options.rounds if count else 0):
             begin = time.perf_counter()
             first = number * options.candidates
             chosen = problems.rows(waiting)
-            lookup = self.postures(chosen, number)
+            lookup = self.postures(chosen, q0[waiting], number)
             parameters = self._parameters(chosen, q0[waiting], lookup)
             outcome.time[waiting] += (time.perf_counter() - begin) / max(len(waiting), 1)
-            result = self.kernel.run(self._states(q0[waiting]), parameters, MAX_ITERATIONS, trace)
+            result = self.kernel.run(states[waiting], parameters, MAX_ITERATIONS, trace)
             outcome.take(layouts, waiting, result, first)
+            # The next round goes on where this one stopped in the numeric arm's list of starts.
+            states[waiting, passed] = result.states[:, passed]
             waiting = waiting[result.status != Status.SOLVED]
             if not len(waiting):
                 break
@@ -114,47 +118,56 @@ class HandFirstMethod:
 
     def rows(self, problems: Problems, q0: Array, number: int = 0) -> tuple[Array, Array]:
         """States and parameters of a round, a row per target, to be changed before `run_rows`."""
-        lookup = self.postures(problems, number)
+        lookup = self.postures(problems, q0, number)
         return self._states(q0), self._parameters(problems, q0, lookup)
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
-    def postures(self, problems: Problems, number: int) -> Array:
-        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one."""
+    def postures(self, problems: Problems, q0: Array, number: int) -> Array:
+        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
+
+        What moves free fingers only stays as in q0.
+        """
         count = self.options.candidates
         if number == 0:
-            return self.table.nearest(problems.points, problems.normals, count)
-        found = self.wide_table.nearest(problems.points, problems.normals, number * count)
-        return found[:, -count:]
+            found = self.table.nearest(problems.points, problems.normals, count)
+        else:
+            found = self.wide_table.nearest(problems.points, problems.normals, number * count)
+        needed = ~np.isnan(problems.points[..., 0]) @ self._moves
+        here = q0[:, None, self.step.layouts.hand]
+        return np.where(needed[:, None], found[:, -count:], here)
 
     def _parameters(self, problems: Problems, q0: Array, postures: Array) -> Array:
         layout = self.step.layouts.parameters
         count = len(problems)
-        lower, upper = problems.bounds(self._robot.lower, self._robot.upper, UNBOUNDED)
+        lower, upper = problems.bounds(self._robot, UNBOUNDED)
         hand = list(self.step.layouts.hand)
+        free_points, free_normals = np.isnan(problems.points), np.isnan(problems.normals)
+        counted = ~np.stack([free_points[..., 0], free_normals[..., 0]], axis=2)
         values: dict[str, Any] = {
-            "points": np.nan_to_num(problems.points),
-            "normals": np.nan_to_num(problems.normals),
-            "weights": np.stack(
-                [~np.isnan(problems.points[..., 0]), ~np.isnan(problems.normals[..., 0])], axis=2
-            ),
+            "points": np.where(free_points, 0.0, problems.points).reshape(count, -1),
+            "normals": np.where(free_normals, 0.0, problems.normals).reshape(count, -1),
+            "weights": counted.reshape(count, -1),
             "position_tolerance": problems.position_tolerance,
             "angle_tolerance": problems.angle_tolerance,
             "lower": lower,
             "upper": upper,
-            "postures": np.clip(postures, lower[hand], upper[hand]),
+            "postures": np.clip(postures, lower[hand], upper[hand]).reshape(count, -1),
             "reach": 1.0,
             "start": np.clip(q0, lower, upper),
         }
-        parameters = np.zeros((count, layout.size))
+        parameters = np.empty((count, layout.size))
         for name, value in values.items():
-            array = np.asarray(value, dtype=float)
-            parameters[:, layout.slice(name)] = (
-                array.reshape(count, -1) if array.ndim > 1 and len(array) == count else array
-            )
+            parameters[:, layout.slice(name)] = value
         return parameters
+
+    @cached_property
+    def _moves(self) -> NDArray[np.bool_]:
+        """(f, hand) whether a motor of the hand moves a finger."""
+        robot, hand = self._robot, self.step.layouts.hand
+        return np.array([np.isin(hand, robot.finger_actuators(f)) for f in robot.finger_names])
 
     def _states(self, q0: Array) -> Array:
         layout = self.step.layouts.state

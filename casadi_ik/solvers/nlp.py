@@ -120,7 +120,7 @@ class IpoptMethod:
     ) -> list[NlpRun]:
         """One run after the other, until the contacts are met or the starts are used up."""
         robot, runs = self._robot, []
-        lower, upper = problems.bounds(robot.lower, robot.upper, np.inf)
+        lower, upper = problems.bounds(robot, np.inf)
         for _ in range(self.options.restarts + 1):
             runs.append(self.program.solve(start, targets, lower, upper))
             if _ending(runs[-1], problems) is Status.SOLVED:

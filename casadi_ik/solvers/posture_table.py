@@ -7,12 +7,15 @@ stage starts from postures that nearly fit, wherever the palm may be.
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import combinations, permutations
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.kernels import FunctionKernel
 from casadi_ik.solvers.problem import Array
 from casadi_ik.steps.even_spread import evenly
 
@@ -99,22 +102,27 @@ def shape(points: Array, normals: Array) -> tuple[Array, NDArray[np.bool_]]:
     Returns:
         (k, s) values, 0 where something is free, and (k, s) which of them are known.
     """
-    f = points.shape[1]
-    columns = []
-    for i, j in combinations(range(f), 2):
-        columns.append(np.linalg.norm(points[:, i] - points[:, j], axis=1) / LENGTH)
-        columns.append(np.einsum("ki,ki->k", normals[:, i], normals[:, j]))
-    for i, j in permutations(range(f), 2):
-        line = (points[:, j] - points[:, i]) / LENGTH
-        columns.append(np.einsum("ki,ki->k", line, normals[:, i]))
-    for i, j, m in combinations(range(f), 3):
-        across = np.cross(points[:, j] - points[:, i], points[:, m] - points[:, i]) / LENGTH**2
-        columns += [np.einsum("ki,ki->k", across, normals[:, k]) for k in (i, j, m)]
-    if not columns:
-        return np.zeros((len(points), 1)), np.zeros((len(points), 1), dtype=bool)
-    values = np.stack(columns, axis=1)
+    (values,) = _invariants(points.shape[1])(points, normals)
+    values = values.reshape(len(points), -1)  # also a single value
     known = ~np.isnan(values)
     return np.where(known, values, 0.0), known
+
+
+@cache
+def _invariants(f: int) -> FunctionKernel:
+    """Points and normals (f, 3) -> values (s,), NaN where something is free (and for f = 1)."""
+    points, normals = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3)
+    values = []
+    for i, j in combinations(range(f), 2):
+        values.append(ca.norm_2(points[i, :] - points[j, :]) / LENGTH)
+        values.append(ca.dot(normals[i, :], normals[j, :]))
+    for i, j in permutations(range(f), 2):
+        values.append(ca.dot(points[j, :] - points[i, :], normals[i, :]) / LENGTH)
+    for i, j, m in combinations(range(f), 3):
+        across = ca.cross(points[j, :] - points[i, :], points[m, :] - points[i, :])
+        values += [ca.dot(across, normals[k, :]) / LENGTH**2 for k in (i, j, m)]
+    outputs = [ca.vertcat(*values) if values else ca.SX(float("nan"))]
+    return FunctionKernel(ca.Function(f"contact_shape_{f}", [points, normals], outputs))
 
 
 def _rounded(values: Array) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Tolerance
+from casadi_ik.robots.description import RobotDescription
 
 Array = NDArray[np.float64]
 
@@ -76,16 +77,16 @@ class Problems:
         points, normals = self.points[rows], self.normals[rows]
         return replace(self, points=points, normals=normals, first_row=first_row)
 
-    def bounds(self, lower: Array, upper: Array, unbounded: float) -> tuple[Array, Array]:
-        """Bounds (n,) that a method has to keep to.
+    def bounds(self, robot: RobotDescription, unbounded: float) -> tuple[Array, Array]:
+        """Bounds (n,) that a method has to keep to: limits, or what the mechanisms permit.
 
         Args:
-            lower: (n,) limits of the robot's actuators.
-            upper: (n,).
+            robot: The robot.
             unbounded: What stands for no limit [rad or m].
         """
+        lower, upper = robot.lower, robot.upper
         if not self.enforce_limits:
-            lower, upper = np.full_like(lower, -unbounded), np.full_like(upper, unbounded)
+            lower, upper = (np.clip(ends, -unbounded, unbounded) for ends in robot.mechanical)
         if self.fixed is None:
             return lower, upper
         free = np.isnan(self.fixed)
@@ -149,6 +150,9 @@ def target_arrays(points: ArrayLike, normals: ArrayLike, f: int) -> tuple[Array,
             raise InputError(f"{name}: expected an array of numbers") from error
         if array.ndim != 3 or array.shape[1:] != (f, 3):
             raise InputError(f"{name}: found shape {array.shape}, expected (k, {f}, 3)")
+        if np.isfinite(array).all():
+            arrays.append(array)
+            continue
         free = np.isnan(array)
         partly = np.any(free, axis=2) & ~np.all(free, axis=2)
         _refuse(partly, f"{name}: is partly NaN, expected three numbers or three NaN")
@@ -157,7 +161,7 @@ def target_arrays(points: ArrayLike, normals: ArrayLike, f: int) -> tuple[Array,
     p, n = arrays
     if len(p) != len(n):
         raise InputError(f"points and normals: found {len(p)} and {len(n)} rows, expected as many")
-    length = np.linalg.norm(n, axis=2)
+    length = np.sqrt(np.einsum("kfi,kfi->kf", n, n))
     _refuse(length < 1e-9, "normals: is zero, expected a direction")
     free_point = np.isnan(p[..., 0])
     _refuse(free_point & ~np.isnan(length), "normals: is given for a finger without a point")

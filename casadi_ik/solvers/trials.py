@@ -66,7 +66,7 @@ class Trials:
 
     def limits(self, problems: Problems) -> Bounds:
         """The bounds (n,) that a solution has to keep."""
-        return Bounds(*problems.bounds(self.robot.lower, self.robot.upper, UNBOUNDED))
+        return Bounds(*problems.bounds(self.robot.description, UNBOUNDED))
 
     def search(self, problems: Problems, start: Array, bounds: Bounds) -> Array:
         """The first round of hand-first for each of k targets.

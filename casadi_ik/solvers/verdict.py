@@ -32,16 +32,13 @@ def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
 
     Args:
         robot: The robot.
-        problems: k targets.
+        problems: k targets, or one that all configurations are compared with.
         q: (k, n) configurations.
     """
-    points, normals = robot.contacts(q)
-    position = np.linalg.norm(points - problems.points, axis=2)
-    # Kahan's angle: exact at zero and at a half turn, where arc cosine loses half the digits.
-    angle = 2 * np.arctan2(
-        np.linalg.norm(normals - problems.normals, axis=2),
-        np.linalg.norm(normals + problems.normals, axis=2),
-    )
+    points, normals = problems.points, problems.normals
+    if len(problems) == 1:
+        points, normals = points[0], normals[0]
+    position, angle = robot.errors(q, points, normals)
     slack = 1 + TOLERANCE_SLACK
     # Free is what the target leaves out; an error that is NaN for another reason is no success.
     met = (position <= problems.position_tolerance * slack) | np.isnan(problems.points[..., 0])
@@ -51,10 +48,4 @@ def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
 
 def within_limits(robot: ArmHand, q: Array) -> NDArray[np.bool_]:
     """(k,) whether every actuator and every joint of (k, n) configurations is within its limits."""
-    theta = np.stack(list(robot.joints(q).values()), axis=1)
-    description = robot.description
-    inside = (q >= robot.lower - LIMIT_SLACK) & (q <= robot.upper + LIMIT_SLACK)
-    joints_inside = (theta >= description.joint_lower - LIMIT_SLACK) & (
-        theta <= description.joint_upper + LIMIT_SLACK
-    )
-    return np.all(inside, axis=1) & np.all(joints_inside, axis=1)
+    return robot.beyond_limits(q) <= LIMIT_SLACK

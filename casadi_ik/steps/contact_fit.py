@@ -45,6 +45,9 @@ PERSISTENCE = 10
 EXACT = 1e-8
 """Root of the cost at which contacts count as met exactly (0.1 nm per 100 mm, or rad)."""
 
+FINE = 1e-3
+"""Part of the tolerance that is as good as exact."""
+
 
 @dataclass(frozen=True, eq=False)
 class Tried:
@@ -79,7 +82,9 @@ class Judged:
 def judge_contacts(s: dict[str, Expr], p: dict[str, Expr], tried: Tried, f: int) -> Judged:
     """Judge a step by the contacts of f fingers; see `judge`."""
     residual = ca.if_else(gains(tried), tried.there, tried.before)
-    return judge(s, tried, within_tolerance(*errors(residual, f), p))
+    positions, chords = errors(residual, f)
+    exact = within_tolerance(positions / FINE, chords / FINE, p)
+    return judge(s, tried, within_tolerance(positions, chords, p), exact)
 
 
 def gains(tried: Tried) -> Expr:
@@ -87,13 +92,15 @@ def gains(tried: Tried) -> Expr:
     return ca.sumsqr(tried.there) < ca.sumsqr(tried.before)
 
 
-def judge(s: dict[str, Expr], tried: Tried, within: Expr) -> Judged:
+def judge(s: dict[str, Expr], tried: Tried, within: Expr, exact: Expr) -> Judged:
     """Accept a step that lowers the cost, and decide whether the fit is at its end.
 
     Args:
         s: State.
         tried: The step.
-        within: Whether what is left of the residual after it is good enough to stop at.
+        within: Whether what is left of the residual after it is good enough to stop at, should
+            it fall slowly.
+        exact: Whether it is so good that nothing more is to be gained.
     """
     cost_before, cost_there = ca.sumsqr(tried.before), ca.sumsqr(tried.there)
     accepted = gains(tried)
@@ -109,7 +116,7 @@ def judge(s: dict[str, Expr], tried: Tried, within: Expr) -> Judged:
     kept = (cost_before - cost_there) / ca.fmax(tried.promised, 1e-300)
     bent = 2 * kept - 1
     factor = ca.if_else(accepted, ca.fmax(DAMPING_DOWN, 1 - bent * bent * bent), s["growth"])
-    settled = ca.logic_or(cost < EXACT * EXACT, ca.logic_or(over, slowing))
+    settled = ca.logic_or(ca.logic_or(exact, cost < EXACT * EXACT), ca.logic_or(over, slowing))
     fit = fresh_fit() | {
         "damping": ca.fmax(s["damping"] * factor, DAMPING_FLOOR),
         "growth": ca.if_else(accepted, GROWTH_START, 2 * s["growth"]),

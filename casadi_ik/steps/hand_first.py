@@ -57,13 +57,10 @@ class HandFirstStep:
         layouts = self.layouts
         state = ca.MX.sym("state", layouts.state.size)
         parameters = ca.MX.sym("parameters", layouts.parameters.size)
-        stages = {
-            Phase.CANDIDATE: self._candidate(),
-            Phase.HAND_FIT: self._hand_fit(),
-            Phase.ARM_PLACEMENT: self._placement() if self.arm else self._numeric_placement(),
-            Phase.REFINEMENT: self._refinement(),
-        }
-        cases = [stages[phase] for phase in STAGES]
+        cases = [self._refinement(), self._candidate()]  # in the order of STAGES
+        if self.robot.arm_actuators:
+            placement = self._placement() if self.arm else self._numeric_placement()
+            cases += [self._hand_fit(), placement]
         choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
         phase = state[layouts.state.slice("phase")]
         outputs = choose(phase - float(STAGES[0]), state, parameters)
@@ -180,7 +177,7 @@ class HandFirstStep:
         inside = ca.fmin(ca.fmax(arm, p["lower"][rows]), p["upper"][rows])
         palm = Pose(s["palm_rotation"], s["palm_origin"])
         tried = pose_step(self.robot, inside, palm, s["damping"], p)
-        judged = judge(s, tried, ca.sumsqr(tried.there) < EXACT * EXACT)
+        judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
         now = ca.if_else(judged.accepted, tried.reached, inside)
         margin = -ca.sqrt(judged.cost)
         better = margin > s["margin"]

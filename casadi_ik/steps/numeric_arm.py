@@ -19,11 +19,11 @@ from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.so3 import skew
 
-TABLE = 256
+TABLE = 1024
 """Configurations of the arm to start from."""
 
-STARTS = 16
-"""Of these, how many are tried for a palm pose."""
+STARTS = 22
+"""Of these, how many are tried for a palm pose; all rounds of a solve together try them all."""
 
 FAR = 1e30
 """Farther than any palm."""
@@ -48,30 +48,23 @@ def nearest_start(robot: RobotDescription) -> ca.Function:
     table = np.array(features(arms.T)).T
     rotation, origin = ca.MX.sym("rotation", 3, 3), ca.MX.sym("origin", 3)
     passed = ca.MX.sym("passed")
-    # |table - wanted|^2 without what all rows share, so it may be negative.
     wanted = _features(rotation, origin)
     distances = ca.DM((table**2).sum(axis=1)) - 2 * ca.DM(table) @ wanted
-    index, distance = _next_nearest()(distances + ca.sumsqr(wanted), passed)
+    index, distance = _next_nearest(distances + ca.sumsqr(wanted), passed)
     arm = ca.MX(ca.DM(arms.T))[:, index]
     return ca.Function("nearest_start", [rotation, origin, passed], [ca.densify(arm), distance])
 
 
-def _next_nearest() -> ca.Function:
-    """``(distances, passed) -> (index, distance)`` of the next one; the nearest after the last."""
-    distances, passed = ca.SX.sym("distances", TABLE), ca.SX.sym("passed")
+def _next_nearest(distances: Expr, passed: Expr) -> tuple[Expr, Expr]:
+    """Index and distance of the nearest row beyond `passed`; of the nearest of all after the last.
 
-    def search(least: Expr) -> tuple[Expr, Expr]:
-        best, index = ca.SX(FAR), ca.SX(0.0)
-        for i in range(TABLE):
-            nearer = ca.logic_and(distances[i] > least, distances[i] < best)
-            best = ca.if_else(nearer, distances[i], best)
-            index = ca.if_else(nearer, float(i), index)
-        return index, best
-
-    (index, best), (first, nearest) = search(passed), search(ca.SX(-1.0))
-    over = best >= FAR
-    outputs = [ca.if_else(over, first, index), ca.if_else(over, nearest, best)]
-    return ca.Function("next_nearest", [distances, passed], outputs)
+    As operations on whole vectors, since unrolled they would be most of the method's code.
+    """
+    beyond = distances > passed
+    over = 1 - ca.norm_inf(beyond)
+    masked = ca.if_else(ca.logic_or(beyond, ca.repmat(over, TABLE, 1)), distances, FAR)
+    nearest = ca.mmin(masked)
+    return ca.find(masked <= nearest), nearest
 
 
 def pose_step(

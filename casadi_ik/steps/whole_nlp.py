@@ -112,6 +112,7 @@ class WholeNlp:
             )
         )
         self._n, self._rows = n, 6 * f
+        self._lower = robot.lower
         # Sliders of millimetres and joints of radians move the contacts alike once scaled.
         metres = np.array([actuator.unit == "m" for actuator in robot.actuators])
         self._scale = np.where(metres, robot.upper - robot.lower, 1.0)
@@ -170,10 +171,10 @@ class WholeNlp:
         Args:
             start: (n,) where to begin.
             parameters: Targets and weights, see `parameters`.
-            lower: (n,) bounds of q; -inf to ignore limits, then those of joints are as well.
+            lower: (n,) bounds of q; below the robot's, limits are ignored, those of joints as well.
             upper: (n,) bounds of q.
         """
-        enforced = bool(np.all(np.isfinite(lower)))
+        enforced = bool(np.all(lower >= self._lower))
         joints = (self._joint_lower, self._joint_upper)
         if not enforced:
             joints = (np.full_like(joints[0], -np.inf), np.full_like(joints[1], np.inf))

@@ -43,6 +43,15 @@ def angle_rate(s: Expr, b: Expr, c: Expr) -> Expr:
     return 2 * s / ca.sqrt(low * high)
 
 
+def toggle(s: Expr, b: Expr, c: Expr) -> Expr:
+    """Distance from the flat triangle: sin^2(theta).
+
+    1 where the slider pushes at right angles to the crank, 0 where the triangle is flat and the
+    rate blows up, negative where there is no triangle. Smooth.
+    """
+    return ((s * s - (b - c) * (b - c)) * ((b + c) * (b + c) - s * s)) / (4 * b * b * c * c)
+
+
 def _slacks(s: Expr, b: Expr, c: Expr) -> tuple[Expr, Expr]:
     """s^2 - (b - c)^2 = 4 b c sin^2(theta/2) and (b + c)^2 - s^2 = 4 b c cos^2(theta/2)."""
     short, long, flat = b - c, b + c, FLAT * b * c

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from casadi_ik.grasps import GraspObject
 from grasp_synthesis.hand import FRAME_W, ArmHand
-from grasp_synthesis.posture import OPTIONS, Pinch
+from grasp_synthesis.posture import Pinch
+from grasp_synthesis.programme import OPTIONS
 from grasp_synthesis.recipes import Recipe
 
 Array = NDArray[np.float64]

@@ -22,20 +22,13 @@ from casadi_ik.grasps import BentCapsule, Cylinder, GraspObject, Sphere
 from casadi_ik.symbolic.kinematics import Pose
 from grasp_synthesis.hand import ArmHand, full_posture
 from grasp_synthesis.patches import Patch
+from grasp_synthesis.programme import Programme
 from grasp_synthesis.recipes import Recipe
 
 Array = NDArray[np.float64]
 LIMIT_MARGIN = np.deg2rad(3.0)
 UNIT_MARGIN = np.deg2rad(5.0)
 MAX_DISTAL = np.deg2rad(45.0)
-OPTIONS = {
-    "print_time": False,
-    "ipopt.print_level": 0,
-    "ipopt.sb": "yes",
-    "ipopt.tol": 1e-10,
-    "ipopt.constr_viol_tol": 1e-11,
-    "ipopt.max_iter": 500,
-}
 
 
 @dataclass(frozen=True)
@@ -91,13 +84,7 @@ class PinchProblem:
         margin = ca.fmin(flexion - low, high - flexion)
         apart = (flexion[:2] - flexion[2:]) / np.deg2rad(20.0)
         cost = squeeze[0] + 0.1 * ca.sumsqr(UNIT_MARGIN / margin) + 0.02 * ca.sumsqr(apart)
-        problem = {"x": x, "f": cost, "g": ca.vertcat(equalities, inequalities)}
-        self.solver = ca.nlpsol("pinch", "ipopt", problem, OPTIONS)
-        self.residual = ca.Function("residual", [x], [equalities])
-        self.jacobian = ca.Function("jacobian", [x], [ca.jacobian(equalities, x)])
         self.pose = ca.Function("pose", [x], [rotation, origin])
-        self.count = equalities.numel()
-        self.slack = inequalities.numel()
         spread = np.array([0.0, np.pi / 2] if spreads else [0.0, 0.0])
         spread = np.full(2, recipe.spread) if recipe.spread is not None else spread
         turn_bound = 0.0 if isinstance(item.shape, (Sphere, Cylinder)) else 1.0
@@ -105,50 +92,24 @@ class PinchProblem:
         (t_low, t_high), (f_low, f_high) = thumb.bounds(), finger.bounds()
         t_low, t_high = (np.where(np.isnan(middle), b, middle) for b in (t_low, t_high))
         high = np.minimum(high - LIMIT_MARGIN, [np.pi, MAX_DISTAL, np.pi, MAX_DISTAL])
-        self.low = np.concatenate(
+        lower = np.concatenate(
             [spread[:1], low + LIMIT_MARGIN, [-0.1, 0.08, -turn_bound], t_low, f_low, [0.0, -4.0]]
         )
-        self.high = np.concatenate(
+        upper = np.concatenate(
             [spread[1:], high, [0.15, 0.30, turn_bound], t_high, f_high, [3.0, 4.0]]
         )
+        self.programme = Programme(x, cost, equalities, inequalities, lower, upper)
 
     def solve(self, rng: np.random.Generator, starts: int) -> list[Pinch]:
         """Every distinct local minimum found from random starts, best first."""
         found: list[Pinch] = []
-        for _ in range(starts):
-            result = self.solver(
-                x0=rng.uniform(self.low, self.high),
-                lbx=self.low,
-                ubx=self.high,
-                lbg=np.zeros(self.count + self.slack),
-                ubg=np.concatenate([np.zeros(self.count), np.full(self.slack, np.inf)]),
-            )
-            if not self.solver.stats()["success"]:
-                continue
-            x = self._polish(np.array(result["x"])[:, 0])
+        for x, measure, residual in self.programme.minima(rng, starts):
             rotation, origin = self.pose(x)
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = np.array(rotation), np.array(origin)[:, 0]
-            found.append(
-                Pinch(
-                    posture=full_posture(x[:5]),
-                    object_in_palm=pose,
-                    friction=float(x[-2]),
-                    measure=float(result["f"]),
-                    residual=float(np.abs(np.array(self.residual(x))).max()),
-                )
-            )
+            posture = full_posture(x[:5])
+            found.append(Pinch(posture, pose, float(x[-2]), measure, residual))
         return sorted(found, key=lambda pinch: pinch.measure)
-
-    def _polish(self, x: Array) -> Array:
-        """Newton on the contacts alone, by least squares, to rounding; fixed unknowns stay."""
-        free = (self.high - self.low > 0) & (x - self.low > 1e-6) & (self.high - x > 1e-6)
-        for _ in range(4):
-            jacobian = np.array(self.jacobian(x))[:, free]
-            step = np.linalg.lstsq(jacobian, np.array(self.residual(x))[:, 0], rcond=1e-9)[0]
-            x = x.copy()
-            x[free] -= step
-        return x
 
 
 def _cones(contacts: dict[str, Pose], squeeze: ca.SX) -> list[ca.SX]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,43 +17,84 @@ from grasp_synthesis.recipes import Recipe
 Array = NDArray[np.float64]
 
 
-def grasp_text(
+def barrett_text(
     hand: ArmHand, recipe: Recipe, pinch: Pinch, placement: Placement, gaps: Clearance, seed: int
 ) -> str:
-    """The file's text; twelve decimals, so that the contacts stay exact."""
+    """The file's text for a Barrett grasp."""
     palm, points, normals, _, _ = hand.evaluate(placement.arm, pinch.posture)
-    pose = palm @ pinch.object_in_palm
-    degrees = np.rad2deg(placement.arm)
     header = [
-        f"Made by studies/make_grasps.py --seed {seed} from models/objects/{recipe.name}.yaml and "
-        f"the robot {ROBOT}. Rerun it instead of editing.",
+        made_by("make_grasps.py", seed, recipe.name, ROBOT),
         f"Pinched: {recipe.part}.",
         f"Scene: {recipe.scene}; the home configuration of the arm looks to -x, and so does this.",
         "The place is the first of several drawn at random that enhanced-dls solves from home, if "
         "any: an example, not a measurement.",
-        "Placed with the arm at " + ", ".join(f"{d:.2f}" for d in degrees.round(2) + 0.0) + " deg.",
+        placed_at(placement.arm),
         f"Friction coefficient needed for the squeeze: {abs(pinch.friction):.3f}. Gaps: palm "
         f"{1e3 * gaps.palm:.1f} mm, phalanges {1e3 * gaps.fingers:.1f} mm, finger to finger "
         f"{1e3 * gaps.between:.1f} mm.",
     ]
+    posture = [
+        f"  {name}: {_number(value)}  # {np.rad2deg(value):.3f} deg"
+        for name, value in zip(hand.hand_names, pinch.posture, strict=True)
+    ]
+    contacts: dict[str, tuple[Array, Array]] = {
+        finger: (points[i], normals[i]) for i, finger in enumerate(FINGERS)
+    }
+    pose = palm @ pinch.object_in_palm
+    return grasp_text(header, ROBOT, recipe.name, recipe.scene, pose, posture, contacts)
+
+
+def made_by(script: str, seed: int, item: str, robot: str) -> str:
+    """The first line of a file."""
+    return (
+        f"Made by studies/{script} --seed {seed} from models/objects/{item}.yaml and "
+        f"the robot {robot}. Rerun it instead of editing."
+    )
+
+
+def placed_at(arm: Array) -> str:
+    """The line about the arm [rad]."""
+    degrees = np.rad2deg(arm).round(2) + 0.0
+    return "Placed with the arm at " + ", ".join(f"{d:.2f}" for d in degrees) + " deg."
+
+
+def grasp_text(
+    header: Iterable[str],
+    robot: str,
+    item: str,
+    scene: str,
+    pose: Array,
+    posture: Iterable[str],
+    contacts: Mapping[str, tuple[Array, Array]],
+) -> str:
+    """The file's text; twelve decimals, so that the contacts stay exact.
+
+    Args:
+        header: Comments.
+        robot: Name of the robot.
+        item: Name of the object.
+        scene: How it is held, in words.
+        pose: (4, 4) the object in the base frame.
+        posture: Lines, one per actuator of the hand.
+        contacts: By finger point (3,) [m] and normal (3,).
+    """
     lines = [
         line
         for text in header
         for line in textwrap.wrap(text, 98, initial_indent="# ", subsequent_indent="#   ")
     ]
     lines += [
-        f"robot: {ROBOT}",
-        f'description: "{recipe.name.replace("_", " ").capitalize()}, {recipe.scene}."',
+        f"robot: {robot}",
+        f'description: "{item.replace("_", " ").capitalize()}, {scene}."',
         "object:",
-        f"  name: {recipe.name}",
+        f"  name: {item}",
         f"  pose: {{xyz: {_row(pose[:3, 3])},",
         f"         rpy: {_row(rpy(pose[:3, :3]))}}}",
         "posture:",
+        *posture,
+        "contacts:",
     ]
-    for name, value in zip(hand.hand_names, pinch.posture, strict=True):
-        lines.append(f"  {name}: {_number(value)}  # {np.rad2deg(value):.3f} deg")
-    lines.append("contacts:")
-    for finger, point, normal in zip(FINGERS, points, normals, strict=True):
+    for finger, (point, normal) in contacts.items():
         lines += [f"  {finger}:", f"    point: {_row(point)}", f"    normal: {_row(normal)}"]
     return "\n".join(lines) + "\n"
 

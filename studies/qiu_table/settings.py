@@ -40,7 +40,7 @@ LAMBDA_150 = float(np.sqrt(150.0))
 def targets() -> tuple[TargetSet, ...]:
     """The twelve grasps."""
     return tuple(
-        TargetSet(name, partial(grasp_arms, grasp=name)) for name in ik.shipped_names("grasps")
+        TargetSet(name, partial(grasp_arms, grasp=name)) for name in ik.shipped_grasps(ROBOT)
     )
 
 

@@ -44,7 +44,7 @@ def test_grasps(run: Command) -> None:
     done = run("grasps")
     assert (done.exit, done.err) == (0, "")
     words = done.out.split()
-    for name in (*ik.shipped_names("grasps"), "kuka_lwr_barrett"):
+    for name in (*ik.shipped_names("grasps"), "kuka_lwr_barrett", "baxter_ar10"):
         assert name in words
 
 

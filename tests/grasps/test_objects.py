@@ -63,8 +63,8 @@ def shape_id(shape: Shape) -> str:
     return type(shape).__name__
 
 
-def test_the_twelve_objects_are_shipped() -> None:
-    assert shipped_names("objects") == NAMES
+def test_the_twelve_objects_and_a_golf_ball_are_shipped() -> None:
+    assert set(shipped_names("objects")) == {*NAMES, "golf_ball"}
 
 
 @pytest.mark.parametrize("name", NAMES)

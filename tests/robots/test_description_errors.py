@@ -293,7 +293,18 @@ COUPLINGS = {
     "four-bar of a slider": ("of: left_2, p", "of: screw_2, p", "'left_3': coupling.of", "is in m"),
     "lead-screw side": ("b: 52.2 mm", "b: -1", "'left_1': coupling.b", "expected > 0"),
     "four-bar side": ("g: 0.84 cm", "g: 0", "'left_3': coupling.g", "expected > 0"),
-    "branch": ("phi_0:", "branch: 2, phi_0:", "'left_3': coupling.branch", "expected -1 or 1"),
+    "four-bar that does not close": (
+        "p: 2.97 cm",
+        "p: 5 cm",
+        "'left_3': coupling.phi_0",
+        "at 3.32939 rad q and h cannot span 0.0582734 m",
+    ),
+    "slider beyond its triangle": (
+        "b: 52.2 mm",
+        "b: 35 mm",
+        "'left_1': coupling",
+        "'screw_1' goes from 0.042 to 0.06 m, expected within |b - c| = 0.022 and b + c = 0.048 m",
+    ),
 }
 
 

@@ -8,11 +8,18 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 import pytest
+from pinocchio_oracle import PinocchioRobot
+
+import casadi_ik as ik
+from casadi_ik.robots import FourBar, LeadScrew, Linear
 
 
-@pytest.fixture(params=["shipped", "coupled"])
-def pair(request, robot, oracle, coupled_robot, coupled_oracle):
-    return (robot, oracle) if request.param == "shipped" else (coupled_robot, coupled_oracle)
+@pytest.fixture(params=["every coupling", *ik.shipped_names("arm_hands")])
+def pair(request, coupled_robot, coupled_oracle):
+    if request.param == "every coupling":
+        return coupled_robot, coupled_oracle
+    robot = ik.load_robot(request.param)
+    return robot, PinocchioRobot(robot)
 
 
 def test_frames_and_contacts(pair, rng):
@@ -43,8 +50,12 @@ def test_mimic_joints_stand_for_the_linear_couplings(pair, rng):
     robot, _ = pair
     model = pin.buildModelFromXML(robot.urdf(), mimic=True)
     data = model.createData()
-    shared = {"left_4", "right_1", "right_spread", "bh_finger_3_spread"}
-    followers = shared & set(robot.description.joint_names)
+    leaders = {"bh_finger_2_spread", "left_spread"}  # the first joint of a shared motor
+    followers = {
+        joint.name
+        for joint in robot.description.movable
+        if isinstance(joint.coupling, Linear) and joint.name not in leaders
+    }
     assert model.nq == len(robot.description.joint_names) - len(followers)
     for q in robot.random(rng, 20):
         values = np.zeros(model.nq)
@@ -62,3 +73,11 @@ def test_something_is_drawn_of_every_part(robot):
     lengths = [float(node.get("length")) for node in tree.iter("cylinder")]
     assert len(lengths) > 15
     assert all(0.005 < length < 0.5 for length in lengths)
+
+
+def test_couplings_without_a_urdf_form_are_said(pair):
+    robot, _ = pair
+    text = robot.urdf()
+    for joint in robot.description.movable:
+        said = f"<!-- {joint.coupling} -->" in text
+        assert said == isinstance(joint.coupling, LeadScrew | FourBar)

@@ -47,7 +47,7 @@ def test_agrees_with_hand_first(name):
     np.testing.assert_allclose(ours[1], theirs[1], atol=2e-6)
 
 
-@pytest.mark.parametrize("name", ik.shipped_names("grasps"))
+@pytest.mark.parametrize("name", ik.shipped_grasps("kuka_lwr_barrett"))
 def test_shipped_grasps(name, solver):
     solution = solver.solve(ik.load_grasp(name))
     assert solution.success, solution.status

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.hand_first_state import LENGTH, HandFirstLayouts, errors, within_tolerance
 from casadi_ik.steps.hand_fit import (
     PalmAndHand,
@@ -15,7 +16,7 @@ from casadi_ik.steps.hand_fit import (
     hand_contacts,
     reach_row,
 )
-from casadi_ik.steps.numeric_arm import nearest_start, pose_jacobian, pose_step
+from casadi_ik.steps.numeric_arm import STARTS, TABLE, nearest_start, pose_jacobian, pose_step
 from casadi_ik.steps.whole_fit import whole_jacobian, whole_residual
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import compose, exp_se3
@@ -149,12 +150,12 @@ def test_starts_of_the_numeric_arm_come_in_the_order_of_their_distance(robot):
     start = nearest_start(robot.description)
     palm = robot.palm(robot.home)
     passed, distances, arms = -1.0, [], []
-    for _ in range(256):
+    for _ in range(TABLE):
         arm, passed = start(palm[:3, :3], palm[:3, 3], passed)
         distances.append(float(passed))
         arms.append(np.array(arm).ravel())
     assert np.all(np.diff(distances) > 0)
-    assert len(np.unique(np.round(arms, 9), axis=0)) == 256
+    assert len(np.unique(np.round(arms, 9), axis=0)) == TABLE
     # After the last one they begin anew.
     assert float(start(palm[:3, :3], palm[:3, 3], passed)[1]) == distances[0]
     q = np.tile(robot.home, (1, 1))
@@ -162,6 +163,11 @@ def test_starts_of_the_numeric_arm_come_in_the_order_of_their_distance(robot):
     there = robot.palm(q[0])
     off = np.sum(((there - palm)[:3, 3] / LENGTH) ** 2) + np.sum((there - palm)[:3, :3] ** 2)
     assert distances[0] == pytest.approx(off, abs=1e-9)
+
+
+def test_a_solve_tries_all_starts_of_the_numeric_arm():
+    options = HandFirstParameters()
+    assert options.rounds * options.candidates * STARTS >= TABLE
 
 
 def test_a_step_of_the_numeric_arm_lowers_what_it_promises(robot, rng):

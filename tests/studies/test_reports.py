@@ -28,7 +28,7 @@ def test_printed_table():
     """The abstract: an average success of 96 %, against 12 % by the original methods."""
     assert round(printed_mean("enhanced-dls").success) == 96
     assert 11 < printed_mean("original-dls").success < 12
-    assert set(TABLE_I) < set(ik.shipped_names("grasps"))
+    assert set(TABLE_I) < set(ik.shipped_grasps("kuka_lwr_barrett"))
     assert all(set(cells) == set(METHODS) for cells in TABLE_I.values())
     assert printed_mean("enhanced-sdls").iterations == pytest.approx(236.6, abs=0.1)
 

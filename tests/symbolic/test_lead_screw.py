@@ -12,6 +12,7 @@ S = (1, 1)
 angle = graph(lead_screw.angle_from_slider, S, S, S)
 slider = graph(lead_screw.slider_from_angle, S, S, S)
 rate = graph(lead_screw.angle_rate, S, S, S)
+toggle = graph(lead_screw.toggle, S, S, S)
 angle_gradient = gradient(lead_screw.angle_from_slider, S, S, S)
 
 # b, c, shortest and longest slider [mm]; angle there [rad], facts/robots.md section 3.
@@ -59,3 +60,15 @@ def test_outside_the_triangle_nothing_is_nan():
         assert rate(s, b, c).is_regular()
     assert float(angle(0.01, b, c)) == pytest.approx(0, abs=1e-7)
     assert float(angle(0.1, b, c)) == pytest.approx(np.pi, abs=1e-7)
+
+
+def test_toggle_is_the_squared_sine_and_turns_negative_without_a_triangle():
+    b, c = 0.0522, 0.013
+    for s in np.linspace(0.0395, 0.065, 30):
+        assert float(toggle(s, b, c)) == pytest.approx(
+            np.sin(float(angle(s, b, c))) ** 2, abs=1e-12
+        )
+    for s in (b - c, b + c):
+        assert float(toggle(s, b, c)) == pytest.approx(0, abs=1e-12)
+    assert float(toggle(0.03, b, c)) < 0
+    assert float(toggle(0.07, b, c)) < 0

@@ -1,0 +1,212 @@
+"""The AR10: sliders to joints by triangles and four-bars, over the whole stroke."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import casadi_ik as ik
+from casadi_ik.robots import FourBar, LeadScrew
+from casadi_ik.symbolic import four_bar, lead_screw
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.couplings import linkage
+
+FINGERS = ("index", "middle", "ring", "little")
+SLIDERS = (
+    "thumb_slider_1",
+    "thumb_slider_2",
+    *(f"{finger}_{phalanx}_slider" for finger in FINGERS for phalanx in ("proximal", "middle")),
+)
+
+
+@pytest.fixture(scope="module")
+def ar10() -> ik.ArmHand:
+    return ik.load_robot("ar10")
+
+
+def strokes(robot: ik.ArmHand, rows: int = 200) -> np.ndarray:
+    """All sliders from shortest to longest."""
+    return robot.lower + np.linspace(0, 1, rows)[:, None] * (robot.upper - robot.lower)
+
+
+def test_ten_sliders_and_five_fingers(ar10):
+    assert ar10.actuators == SLIDERS
+    assert {actuator.unit for actuator in ar10.description.actuators} == {"m"}
+    assert ar10.fingers == ("thumb", *FINGERS)
+    assert ar10.thumb == "thumb"
+    assert ar10.description.arm_actuators == ()
+    for finger in FINGERS:
+        assert len(ar10.description.finger_actuators(finger)) == 2
+        assert len(ar10.description.finger(finger).joints) == 3
+
+
+def test_published_reference_pose(ar10):
+    """Chandra's code gives axes and tips with the sliders shortest; here that is at 4 mrad."""
+    points, _ = ar10.contacts(ar10.lower)
+    np.testing.assert_allclose(points[0], [-0.0927, 0.0702, 0.1023], atol=5e-5)
+    np.testing.assert_allclose(points[1], [-0.0465, 0.04929, 0.22703], atol=4e-4)
+    thumb = ar10.description.finger("thumb")
+    pose = ar10.links(ar10.lower)[thumb.link] @ thumb.placement
+    w, x, y, z = 0.905343, 0.204069, 0.187212, 0.321964
+    axis_x = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    np.testing.assert_allclose(pose[:3, 0], axis_x, atol=1e-5)
+    # The published dual part: twice its product with the conjugate is the tip.
+    dual = np.array([-0.0135809, -0.0402491, 0.0571297, 0.0304804])
+    tip = 2 * (w * dual[1:] - dual[0] * np.array([x, y, z]) + np.cross([x, y, z], dual[1:]))
+    np.testing.assert_allclose(pose[:3, 3], tip, atol=1e-6)
+
+
+def test_pads_face_where_the_fingers_flex(ar10):
+    """A pad's normal is the direction in which flexing its last joint moves the tip."""
+    for finger in ar10.description.fingers:
+        rows = list(ar10.description.finger_actuators(finger.name))
+        q = ar10.home.copy()
+        normal = ar10.contacts(q)[1][ar10.fingers.index(finger.name)]
+        last = {joint.name: joint for joint in ar10.description.movable}[finger.joints[-1]]
+        link = ar10.links(q)[last.child]
+        moved = np.cross(link[:3, :3] @ last.axis, ar10.contacts(q)[0][rows[0] // 2] - link[:3, 3])
+        np.testing.assert_allclose(moved / np.linalg.norm(moved), normal, atol=2e-3)
+
+
+def test_triangles_obey_the_cosine_rule(ar10):
+    q = strokes(ar10)
+    joints = ar10.joints(q)
+    seen = 0
+    for joint in ar10.description.movable:
+        if isinstance(coupling := joint.coupling, LeadScrew):
+            s, b, c = q[:, ar10.actuators.index(coupling.of)], coupling.b, coupling.c
+            theta = joints[joint.name] + coupling.theta_0
+            np.testing.assert_allclose(s**2, b**2 + c**2 - 2 * b * c * np.cos(theta), atol=1e-16)
+            seen += 1
+    assert seen == 10
+
+
+def test_four_bars_close(ar10):
+    """Closure from the positions of the pins alone; and one branch throughout."""
+    joints = ar10.joints(strokes(ar10))
+    seen = 0
+    for joint in ar10.description.movable:
+        if isinstance(bar := joint.coupling, FourBar):
+            phi = bar.phi_0 + joints[bar.of]
+            beta = phi + joints[joint.name] + bar.theta_3_0
+            pin = bar.p * np.exp(1j * phi) + bar.h * np.exp(1j * beta)
+            np.testing.assert_allclose(np.abs(pin - bar.g), bar.q, atol=1e-15)
+            side = np.sign(np.imag((pin - bar.g).conj() * (bar.h * np.exp(1j * beta))))
+            assert set(side) == {-1.0}
+            assert np.abs(np.diff(joints[joint.name])).max() < 0.02
+            assert linkage(bar).branch == -1
+            seen += 1
+    assert seen == 4
+
+
+def test_published_ranges(ar10):
+    """What Chandra's code gives: 1.531 and 1.222 rad, distal 0 to 0.606; thumb 1.623, 0.848."""
+    ends = ar10.joints(np.stack([ar10.lower, ar10.upper]))
+    spans = {name: values[1] - values[0] for name, values in ends.items()}
+    for finger in FINGERS:
+        assert spans[f"{finger}_proximal"] == pytest.approx(1.531, abs=1e-3)
+        assert spans[f"{finger}_middle"] == pytest.approx(1.222, abs=1e-3)
+        assert ends[f"{finger}_distal"] == pytest.approx([0, 0.606], abs=1e-3)
+    assert spans["thumb_1"] == pytest.approx(1.623, abs=1e-3)
+    assert spans["thumb_2"] == pytest.approx(0.848, abs=1e-3)
+
+
+def test_the_strokes_imply_the_joint_limits(ar10):
+    joints = ar10.joints(strokes(ar10, 2000))
+    for joint in ar10.description.movable:
+        values = joints[joint.name]
+        assert joint.lower <= values.min() < joint.lower + 2.1e-3
+        assert joint.upper - 2.1e-3 < values.max() <= joint.upper
+
+
+def test_slider_to_joint_and_back(ar10):
+    q = strokes(ar10)
+    joints = ar10.joints(q)
+    for joint in ar10.description.movable:
+        coupling, values = joint.coupling, joints[joint.name]
+        if isinstance(coupling, LeadScrew):
+            back = lead_screw.slider_from_angle(
+                ca.DM(values + coupling.theta_0), coupling.b, coupling.c
+            )
+            expected = q[:, ar10.actuators.index(coupling.of)]
+            np.testing.assert_allclose(np.array(back).ravel(), expected, atol=1e-15)
+        elif isinstance(coupling, FourBar):
+            phi = coupling.phi_0 + joints[coupling.of]
+            bar, middle = linkage(coupling), phi.mean()
+            for value, expected in zip(values[20:], phi[20:], strict=True):
+                side = four_bar.inverse_branch_from_pose(bar, expected)
+                back = four_bar.phi_from_theta3(
+                    ca.DM(value + coupling.theta_3_0), bar, side, middle
+                )
+                assert float(back) == pytest.approx(expected, abs=1e-9)
+
+
+def test_jacobians_against_central_differences(ar10, rng):
+    q = ca.SX.sym("q", 10)
+    body = actuated(ar10.description, q)
+    pairs = [body.contact_jacobian(finger, range(10)) for finger in ar10.fingers]
+    linear = ca.Function("linear", [q], [ca.vertcat(*(pair[0] for pair in pairs))])
+    angular = ca.Function("angular", [q], [ca.vertcat(*(pair[1] for pair in pairs))])
+    step = 1e-7
+    for x in ar10.lower + rng.uniform(0.01, 0.99, (20, 10)) * (ar10.upper - ar10.lower):
+        _, normals = ar10.contacts(x)
+        slopes, turns = [], []
+        for i in range(10):
+            shift = step * np.eye(10)[i]
+            (p1, n1), (p0, n0) = ar10.contacts(x + shift), ar10.contacts(x - shift)
+            slopes.append((p1 - p0).ravel() / (2 * step))
+            turns.append((n1 - n0).ravel() / (2 * step))
+        np.testing.assert_allclose(np.array(linear(x)), np.transpose(slopes), atol=2e-6)
+        spin = np.array(angular(x)).reshape(5, 3, 10)
+        found = np.cross(spin, normals[:, :, None], axis=1).reshape(15, 10)
+        np.testing.assert_allclose(found, np.transpose(turns), atol=2e-4)
+
+
+def test_toggle_margins(ar10):
+    """The squared sine of the transmission angle, from angles alone; far from zero everywhere."""
+    q = strokes(ar10)
+    joints, margins = ar10.joints(q), ar10.toggle_margins(q)
+    assert set(margins) == set(joints)
+    for joint in ar10.description.movable:
+        if isinstance(coupling := joint.coupling, LeadScrew):
+            sine = np.sin(joints[joint.name] + coupling.theta_0)
+        elif isinstance(coupling, FourBar):
+            phi = coupling.phi_0 + joints[coupling.of]
+            beta = phi + joints[joint.name] + coupling.theta_3_0
+            pin = coupling.p * np.exp(1j * phi) + coupling.h * np.exp(1j * beta)
+            sine = np.sin(beta - np.angle(pin - coupling.g))
+        np.testing.assert_allclose(margins[joint.name], sine**2, atol=1e-12)
+        assert margins[joint.name].min() > (0.7 if joint.name.endswith("distal") else 0.2)
+    assert isinstance(ar10.toggle_margins(ar10.home)["index_distal"], float)
+    assert ik.load_robot("kuka_lwr_barrett").toggle_margins(np.zeros(14)) == {}
+
+
+def test_nothing_is_nan_beyond_the_toggles(ar10):
+    """Sliders far beyond their strokes: flat triangles, four-bars that cannot be assembled."""
+    q = ca.SX.sym("q", 10)
+    body = actuated(ar10.description, q)
+    graph = ca.Function("graph", [q], [body.coupling, body.kinematics.contact("index")[0]])
+    for s in (0.0, 0.01, 0.0358, 0.0392, 0.0638, 0.0652, 0.1):
+        coupling, point = graph(np.full(10, s))
+        assert coupling.is_regular()
+        assert point.is_regular()
+    margins = ar10.toggle_margins(np.full(10, 0.0392))  # b - c of the index's first triangle
+    assert abs(margins["index_proximal"]) < 1e-15
+    assert ar10.toggle_margins(np.full(10, 0.03))["index_proximal"] < 0
+
+
+def test_the_four_bar_keeps_its_branch_to_the_toggle(ar10):
+    """On the way to the toggle position the measure falls to zero and the joint never jumps."""
+    index = next(j for j in ar10.description.movable if j.name == "index_distal")
+    bar = index.coupling
+    assert isinstance(bar, FourBar)
+    linked = linkage(bar)
+    end = brentq(lambda phi: float(four_bar.toggle(ca.DM(phi), linked)), 3.33, 6.2)
+    phi = np.linspace(bar.phi_0, end, 2000)
+    values = [float(four_bar.theta3(ca.DM(x), linked, bar.theta_3_0)) for x in phi]
+    assert np.isfinite(values).all()
+    assert np.abs(np.diff(values)).max() < 0.08
+    rates = [abs(float(four_bar.theta3_rate(ca.DM(x), linked))) for x in phi[[0, 1000, -2]]]
+    assert rates[0] < rates[1] < rates[2]

@@ -1,0 +1,92 @@
+"""The AR10's reachable targets: a slice of the study, and what is special about sliders."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import UnsupportedError
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
+
+import ar10_success as study
+
+EXACT = ik.Tolerance(1e-6, 1e-6)
+
+
+@pytest.fixture(scope="module", params=["ar10", "baxter_ar10"])
+def robot(request) -> ik.ArmHand:
+    return ik.load_robot(request.param)
+
+
+@pytest.mark.parametrize("tolerance", [ik.Tolerance(), EXACT], ids=["usual", "exact"])
+@pytest.mark.parametrize("targets", study.SETS)
+def test_reachable_targets_are_solved(robot, targets, tolerance):
+    made, fingers = study.SETS[targets]
+    rng = np.random.default_rng(2019)
+    points, normals = study.contacts(robot, made(robot, rng, 300), fingers)
+    assert np.isnan(points[:, :, 0]).sum(axis=1).tolist() == [5 - len(fingers)] * 300
+    batch = ik.Solver(robot, tolerance=tolerance).solve_batch(points, normals)
+    assert np.flatnonzero(~batch.success).tolist() == []
+    assert batch.limits_ok.all()
+    assert np.isnan(batch.position_error).sum() == 300 * (5 - len(fingers))
+
+
+def test_joints_keep_to_their_own_limits(robot, rng):
+    points, normals = study.contacts(robot, study.near_limits(robot, rng, 200), study.FINGERS)
+    batch = ik.Solver(robot).solve_batch(points, normals)
+    theta = np.stack(list(robot.joints(batch.q).values()), axis=1)
+    assert np.all(theta >= robot.description.joint_lower)
+    assert np.all(theta <= robot.description.joint_upper)
+
+
+def test_free_fingers_stay(robot, rng):
+    q0 = robot.random(rng, 20)
+    points, normals = study.contacts(robot, robot.random(rng, 20), ["thumb", "middle"])
+    batch = ik.Solver(robot).solve_batch(points, normals, q0=q0)
+    for finger in ("index", "ring", "little"):
+        columns = list(robot.description.finger_actuators(finger))
+        np.testing.assert_array_equal(batch.q[:, columns], q0[:, columns])
+
+
+def test_ipopt_agrees(robot, rng):
+    points, normals = study.contacts(robot, robot.random(rng, 6), study.FINGERS)
+    batch = ik.Solver(robot, "ipopt", EXACT).solve_batch(points, normals)
+    assert batch.success.all(), batch.status_names
+    found, facing = robot.contacts(batch.q)
+    np.testing.assert_allclose(found[:, :3], points[:, :3], atol=1e-6)
+    np.testing.assert_allclose(facing[:, :3], normals[:, :3], atol=2e-6)
+
+
+@pytest.mark.parametrize("method", ["hand-first", "ipopt"])
+def test_without_limits_a_slider_keeps_to_its_triangle(robot, method, rng):
+    """Beyond it there is no such mechanism, limits or not."""
+    points, normals = robot.contacts(robot.random(rng, 2))
+    points[:, 1:] += rng.uniform(-0.03, 0.03, (2, 4, 3))
+    batch = ik.Solver(robot, method, limits="ignore").solve_batch(points, normals)
+    lower, upper = robot.description.mechanical
+    assert np.isfinite(lower[-10:]).all()
+    assert np.all(batch.q >= lower)
+    assert np.all(batch.q <= upper)
+    assert np.any((batch.q < robot.lower) | (batch.q > robot.upper))
+    assert np.all(np.isfinite(batch.q))
+
+
+@pytest.mark.parametrize("method", ["enhanced-dls", "enhanced-sdls"])
+def test_the_papers_methods_say_why_not(robot, method):
+    """They spread fingers and distribute flexion; the AR10's fingers do neither."""
+    with pytest.raises(UnsupportedError, match=f"robot '{robot.name}': "):
+        ik.Solver(robot, method)
+
+
+def test_out_of_reach_is_a_status(robot):
+    """And the sliders stay within their limits, everything finite."""
+    points, normals = study.contacts(robot, robot.home[None], study.FINGERS)
+    solution = ik.Solver(robot).solve_batch(points + 3.0, normals)
+    assert not solution.success[0]
+    assert solution.limits_ok[0]
+    assert np.isfinite(solution.q).all()
