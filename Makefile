@@ -45,6 +45,7 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
 
+# Where the other solvers are installed (pip install -e ".[peers]") they are measured too.
 bench: $(VENV)/demo.stamp
 	$(BIN)/python studies/bench.py
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
 from typing import Any
@@ -25,8 +25,10 @@ from casadi_ik.solvers import (
     Problems,
     Recorder,
     Solution,
+    SolvedBlock,
     SteppedMethod,
     Stepper,
+    Stream,
     Tolerance,
     Track,
     build_method,
@@ -185,11 +187,53 @@ class Solver:
             UnsupportedError: The method cannot keep actuators fixed.
             LogError: The log cannot be written.
         """
-        p, n = target_arrays(points, normals, len(self.robot.fingers))
-        tolerances = tuple(self.tolerances.values())
-        problems = Problems(p, n, tolerances, self._enforce, fixed=self._fixed(fixed))
+        problems = self._targets(points, normals, self._fixed(fixed))
         with self._recorder(log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
+
+    def solve_blocks(
+        self,
+        blocks: Iterable[tuple[ArrayLike, ArrayLike]],
+        q0: ArrayLike | None = None,
+        seed: int = 0,
+        jobs: int = 1,
+        log: str | PathLike[str] | None = None,
+        diagnose: bool = False,
+        fixed: Mapping[str, float] | None = None,
+    ) -> Generator[SolvedBlock, None, None]:
+        """Solve targets that come block by block, in the memory that one block takes.
+
+        A target's answer does not depend on how the targets are cut into blocks. A malformed
+        target does not stop the others: it is among the faults of its block.
+
+        Args:
+            blocks: Points and normals of some targets each, as for `solve_batch`.
+            q0: (n,) start of all; None is `robot.home`.
+            seed: Of all random numbers, an integer >= 0.
+            jobs: Threads, at least 1; a few thousand targets a block keep them busy.
+            log: Path of an MCAP file to write every iteration to; complete after the last block,
+                and given up if the iterator is closed before.
+            diagnose: Whether to find out why, for every target that is not solved.
+            fixed: Positions of actuators that are not to move, by name [rad or m].
+
+        Yields:
+            The blocks, solved.
+
+        Raises:
+            InputError: Bad q0, seed or jobs, or a block of the wrong shape.
+            UnknownNameError: A fixed actuator that the robot does not have.
+            UnsupportedError: The method cannot keep actuators fixed.
+            LogError: The log cannot be written.
+        """
+        held = self._fixed(fixed)
+
+        def ask(points: ArrayLike, normals: ArrayLike, first_row: int) -> Problems:
+            return self._targets(points, normals, held, first_row)
+
+        with self._recorder(log, seed) as recorder:
+            tolerances = tuple(self.tolerances.values())
+            stream = Stream(self._engine, ask, tolerances, q0, seed, jobs, recorder, diagnose)
+            yield from stream.solve(blocks)
 
     def solve_all(
         self,
@@ -293,6 +337,13 @@ class Solver:
     def _fixed(self, fixed: Mapping[str, float] | None) -> Array | None:
         robot = self.robot
         return fixed_array(fixed or {}, robot.actuators, robot.lower, robot.upper)
+
+    def _targets(
+        self, points: ArrayLike, normals: ArrayLike, fixed: Array | None, first_row: int = 0
+    ) -> Problems:
+        p, n = target_arrays(points, normals, len(self.robot.fingers), first_row)
+        tolerances = tuple(self.tolerances.values())
+        return Problems(p, n, tolerances, self._enforce, first_row, fixed)
 
     def _problems(self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None) -> Problems:
         """Grasps that share the tolerances of the first."""

@@ -24,6 +24,18 @@ class InputError(CasadiIKError):
     """An argument has the wrong shape, type or value (non-finite, zero normal, ...)."""
 
 
+class RowError(InputError):
+    """One target of many is malformed or not for the method; the message says which.
+
+    Attributes:
+        row: Number of the target.
+    """
+
+    def __init__(self, message: str, row: int) -> None:
+        super().__init__(message)
+        self.row = row
+
+
 class UnsupportedError(CasadiIKError):
     """The method cannot be used with this robot; the message says which property is missing."""
 

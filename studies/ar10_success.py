@@ -91,6 +91,8 @@ def main(arguments: list[str] | None = None) -> None:
         for label, tolerance in TOLERANCES.items():
             solver = ik.Solver(robot, "hand-first", tolerance)
             for index, (key, (made, fingers)) in enumerate(SETS.items()):
+                if made is pinches and not robot.description.arm_actuators:
+                    continue  # without an arm they are six targets only
                 rng = np.random.default_rng([options.seed, index])
                 targets = contacts(robot, made(robot, rng, options.count), fingers)
                 batch = solver.solve_batch(*targets, jobs=options.jobs)

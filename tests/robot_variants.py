@@ -40,3 +40,45 @@ def derived_robot(
         whole["mount"] = {"xyz": mount[0], "rpy": mount[1]}
         path.write_text(yaml.safe_dump(whole))
     return ik.load_robot(path)
+
+
+def thumb_of(folder: Path, joints: int) -> ik.ArmHand:
+    """The shipped arm-hand with a thumb of one to four joints.
+
+    The distal joint is fixed for one; a turning base comes first for three, a rolling link
+    besides for four.
+    """
+    path = copy_shipped_robot(folder)
+    hand = yaml.safe_load((folder / "hand.yaml").read_text())
+    proximal, distal = hand["joints"][:2]
+    if joints == 1:
+        distal |= {"type": "fixed", "limits": [0, 0]}
+        del hand["actuators"][distal["name"]]
+        whole = yaml.safe_load(path.read_text())
+        del whole["home"][distal["name"]]
+        path.write_text(yaml.safe_dump(whole))
+    more = []
+    if joints >= 3:
+        place = {"xyz": proximal["origin"]["xyz"], "rpy": [0, 0, 0]}
+        more.append(_revolute("thumb_turn", proximal["parent"], "thumb_base", [0, 0, 1], place))
+        proximal["parent"] = "thumb_base"
+        proximal["origin"]["xyz"] = [0, 0, 0]
+    if joints == 4:
+        place = {"xyz": [0.03, 0, 0], "rpy": [0, 0, 0]}
+        more.append(_revolute("thumb_roll", distal["parent"], "thumb_rolling", [1, 0, 0], place))
+        distal["parent"] = "thumb_rolling"
+        distal["origin"]["xyz"] = [0.04, 0, 0]
+    hand["joints"] = sorted(more + hand["joints"], key=lambda joint: joint["name"] != "thumb_turn")
+    if joints == 4:
+        roll = hand["joints"].index(more[1])
+        hand["joints"].insert(2, hand["joints"].pop(roll))
+    hand["actuators"] = {joint["name"]: {} for joint in more} | hand["actuators"]
+    (folder / "hand.yaml").write_text(yaml.safe_dump(hand, sort_keys=False))
+    return ik.load_robot(path)
+
+
+def _revolute(name: str, parent: str, child: str, axis: list[int], origin: dict) -> dict:
+    """A joint of plus and minus 40 deg."""
+    limits = ["-40 deg", "40 deg"]
+    entry = {"name": name, "parent": parent, "child": child, "axis": axis, "origin": origin}
+    return entry | {"limits": limits, "source": "assumed", "velocity": "2 rad/s"}

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 from casadi_ik.cli.answer import Exit
 from casadi_ik.cli.outputs import OutputError
-from casadi_ik.cli.parser import PROGRAM, build_parser
+from casadi_ik.cli.parser import build_parser
+from casadi_ik.cli.say import say
 from casadi_ik.errors import CasadiIKError
 
 if TYPE_CHECKING:
@@ -33,10 +34,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return _run(argv)
         except CasadiIKError as error:
-            _say("error", str(error))
+            say("error", str(error))
             return Exit.BAD_INPUT
         except KeyboardInterrupt:
-            _say("error", "interrupted")
+            say("error", "interrupted")
             return Exit.INTERRUPTED
         except BrokenPipeError:
             _abandon_stdout()
@@ -78,13 +79,9 @@ def _show(report: RenderableType) -> None:
     sys.stdout.flush()
 
 
-def _say(kind: str, text: str) -> None:
-    print(f"{PROGRAM}: {kind}: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
-
-
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """A warning as one line, without the place in the code that Python adds."""
-    _say("warning", str(message))
+    say("warning", str(message))
 
 
 def _abandon_stdout() -> None:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import secrets
 import stat
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from casadi_ik.errors import CasadiIKError
@@ -57,13 +57,34 @@ def write_output(path: Path, option: str, write: Callable[[Path], object]) -> No
     target = _target(path)
     part = _part(target)
     try:
-        write(part)
-        part.replace(target)
-    except OSError as error:
-        raise OutputError(f"{path}: {option}: cannot be written: {_reason(error)}") from error
+        with writing(path, option):
+            write(part)
+            part.replace(target)
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
+
+
+@contextlib.contextmanager
+def writing(path: Path, option: str) -> Iterator[None]:
+    """Say of what the system refuses which output it concerns.
+
+    Args:
+        path: Where the output shall stand.
+        option: The option that asked for it.
+
+    Raises:
+        OutputError: The system refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: {option}: cannot be written: {_reason(error)}") from error
+
+
+def folder_of(path: Path) -> Path:
+    """The folder an output will stand in, whatever links lead there."""
+    return _target(path).parent
 
 
 def _target(path: Path) -> Path:

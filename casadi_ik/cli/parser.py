@@ -56,6 +56,11 @@ TARGETS.npz holds, for k targets and the f fingers in the robot's order (`casadi
 OUT.npz then holds:
   q (k, n), success (k,), status (k,), position_error (k, f) [m], angle_error (k, f) [rad],
   iterations, restarts (k,), time (k,) [s]
+and with --diagnose, where a target is not solved (else "" and NaN):
+  reason (k,), nearest_q (k, n) closest to the contacts, enough_position (k,) [m] and
+  enough_angle (k,) [rad]: the tolerances with which it would be solved
+A row that is no target (partly NaN, infinite, a zero normal) gets the status INVALID and NaN; it
+is named on stderr and does not stop the rest.
 
 exit codes: 0 all solved, 1 not all solved, 2 bad input
 """
@@ -126,6 +131,7 @@ def _add_solve(commands: Any) -> None:
         type=file_name(".png"),
         help="draw the grasp (needs casadi-ik[plots])",
     )
+    _add_diagnose(parser, default=True)
     parser.set_defaults(run=_solve)
 
 
@@ -145,6 +151,7 @@ def _add_batch(commands: Any) -> None:
     parser.add_argument(
         "--out", metavar="OUT.npz", type=file_name(), required=True, help="write the solutions"
     )
+    _add_diagnose(parser, default=False)
     parser.set_defaults(run=_batch)
 
 
@@ -199,6 +206,15 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--log", metavar="FILE.mcap", type=file_name(), help="write every iteration to a log"
+    )
+
+
+def _add_diagnose(parser: argparse.ArgumentParser, default: bool) -> None:
+    parser.add_argument(
+        "--diagnose",
+        action=argparse.BooleanOptionalAction,
+        default=default,
+        help=f"find out why what is not solved is not (default: {'yes' if default else 'no'})",
     )
 
 

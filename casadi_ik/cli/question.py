@@ -35,7 +35,8 @@ def located(
     try:
         yield
     except kinds as error:
-        raise type(error)(f"{where}: {error}") from error
+        error.args = (f"{where}: {error}",)
+        raise
 
 
 def the_grasp(arguments: argparse.Namespace) -> tuple[Path, Grasp]:

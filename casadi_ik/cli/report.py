@@ -13,13 +13,11 @@ from rich.table import Table
 from rich.text import Text
 
 from casadi_ik.api import Solver
-from casadi_ik.solvers import BatchSolution, Solution, Status
+from casadi_ik.cli.batch_totals import BatchTotals
+from casadi_ik.solvers import Solution, Status
 
 AT_LIMIT = 1e-6
 """How near to a limit counts as at it [rad or m]."""
-
-ROWS_SHOWN = 12
-"""How many unsolved rows of a batch are named."""
 
 _SCALE = {"rad": (math.degrees(1.0), "deg"), "m": (1e3, "mm")}
 
@@ -121,24 +119,26 @@ def reasons(solver: Solver, solution: Solution) -> list[str]:
 
 
 def batch_report(
-    name: str, solver: Solver, batch: BatchSolution, written: Iterable[tuple[str, object]]
+    name: str, solver: Solver, batch: BatchTotals, written: Iterable[tuple[str, object]]
 ) -> Group:
     """The summary of `batch`; arguments as in `solution_report`."""
-    count, solved = len(batch), int(batch.success.sum())
-    names, counts = np.unique(batch.status_names, return_counts=True)
+    count, solved, times = batch.count, batch.solved, batch.times
     share = f"{solved} of {count} targets ({100 * solved / count:.1f} %)"
     pairs = {
-        "status": ", ".join(f"{n} {status}" for status, n in zip(names, counts, strict=True)),
-        "iterations": f"mean {batch.iterations.mean():.1f}, most {batch.iterations.max()}",
-        "time": f"mean {duration(float(batch.time.mean()))}, 99th percentile "
-        + duration(float(np.percentile(batch.time, 99))),
+        "status": ", ".join(f"{n} {status}" for status, n in sorted(batch.statuses.items())),
+        "iterations": f"mean {batch.iterations / count:.1f}, most {batch.most_iterations}",
+        "time": f"mean {duration(float(times.mean()))}, 99th percentile "
+        + duration(float(np.percentile(times, 99))),
     }
-    if batch.restarts.any():
-        pairs["restarts"] = f"mean {batch.restarts.mean():.2f}, most {batch.restarts.max()}"
+    if batch.restarts:
+        pairs["restarts"] = f"mean {batch.restarts / count:.2f}, most {batch.most_restarts}"
     if solved < count:
-        rows = np.flatnonzero(~batch.success)
-        more = f" and {len(rows) - ROWS_SHOWN} more" if len(rows) > ROWS_SHOWN else ""
-        pairs["not solved"] = f"rows {', '.join(map(str, rows[:ROWS_SHOWN]))}{more} (from 0)"
+        more = count - solved - len(batch.missed)
+        rest = f" and {more} more" if more else ""
+        pairs["not solved"] = f"rows {', '.join(map(str, batch.missed))}{rest} (from 0)"
+    if batch.reasons:
+        found = sorted(batch.reasons.items())
+        pairs["reasons"] = ", ".join(f"{n} {reason}" for reason, n in found)
     return Group(
         headline(
             solved == count,

@@ -10,6 +10,7 @@ from casadi_ik.solvers.recorder import Recorder
 from casadi_ik.solvers.registry import METHODS, build_method, method_options, method_summary
 from casadi_ik.solvers.solution import BatchSolution, Solution
 from casadi_ik.solvers.stepper import SteppedMethod, Stepper
+from casadi_ik.solvers.stream import SolvedBlock, Stream
 from casadi_ik.solvers.tracking import Jump, Track, travel_limits
 from casadi_ik.steps.qiu_parameters import FINGER_STEPS
 from casadi_ik.steps.status import Phase, Status
@@ -31,9 +32,11 @@ __all__ = [
     "Reason",
     "Recorder",
     "Solution",
+    "SolvedBlock",
     "Status",
     "SteppedMethod",
     "Stepper",
+    "Stream",
     "Tolerance",
     "Track",
     "build_method",

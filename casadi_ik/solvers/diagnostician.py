@@ -6,12 +6,13 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.grasps import Tolerance
 from casadi_ik.solvers.diagnosis import ArmReach, Diagnosis, Freed, HandFit, NearContact, Reason
 from casadi_ik.solvers.hand_first import HandFirstMethod
-from casadi_ik.solvers.minimax import closest
+from casadi_ik.solvers.minimax import MARGIN, Closest, closest
 from casadi_ik.solvers.palm_free import palm_free
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.reliefs import Lift, lifts, relieve
@@ -24,14 +25,15 @@ ROUNDS = 2
 RANDOM_STARTS = 24
 """Random configurations the last search starts from, besides those found on the way."""
 
+NEAR = 8.0
+"""If the contacts are missed by less than this factor, the search starts from more than what hand-
+first came to, whatever hand and reach say."""
+
 CLOSE, CLOSE_STARTS = 2.0, 256
-"""If the contacts are missed by less than this factor, the search starts from many more."""
+"""If they are missed by less than this, from many more."""
 
 FOLLOWED = 8
 """Local minima that are followed to the end."""
-
-MARGIN = 1.02
-"""By which factor the contacts have to be missed for a grasp to count as unreachable."""
 
 AT_LIMIT = 1e-6
 """How near to a limit counts as at it [rad or m]."""
@@ -81,10 +83,14 @@ class Diagnostician:
     def _why(self, problems: Problems, q0: Array, nearest: Array, begin: float) -> Diagnosis:
         hand, reach, ends = self._hand(problems, q0)
         limits = self._trials.limits(problems)
-        relaxed, freed, pool = self._relaxations(problems, q0, nearest, limits, hand)
-        pool = np.concatenate([nearest[None], ends, pool])
-        pool = self._search(problems, limits, pool, RANDOM_STARTS)
+        pool = np.concatenate([nearest[None], ends])
         best = closest(self._trials, problems, pool, limits, FOLLOWED)
+        relaxed, freed, relieved = self._relaxations(problems, q0, best, limits, hand)
+        # Where neither the hand nor the reach says no, only searching can.
+        if best.ratio < NEAR or _reason(hand, reach, False) is Reason.NOT_FOUND:
+            pool = np.concatenate([pool, relieved])
+            pool = self._search(problems, limits, pool, RANDOM_STARTS)
+            best = closest(self._trials, problems, pool, limits, FOLLOWED)
         if best.ratio < CLOSE and not self._solves(problems, best.fair):
             pool = np.concatenate([pool, best.fair[None]])
             pool = self._search(problems, limits, pool, CLOSE_STARTS)
@@ -129,9 +135,12 @@ class Diagnostician:
         return hand, fits.reach(arm, problems.enforce_limits), ends
 
     def _relaxations(
-        self, problems: Problems, q0: Array, nearest: Array, limits: Bounds, hand: HandFit | None
+        self, problems: Problems, q0: Array, best: Closest, limits: Bounds, hand: HandFit | None
     ) -> tuple[list[tuple[Lift, Array]], tuple[Freed, ...], Array]:
-        """Solve with limits lifted or something left free, all in two runs of the loop.
+        """Solve with limits lifted or something left free, all together.
+
+        Limits that nothing presses against in the nearest configurations would not help; where
+        little is missing they are lifted all the same, as further starts.
 
         Returns:
             The lifts that solve it with their solutions, what may be left free, and all
@@ -139,7 +148,10 @@ class Diagnostician:
         """
         hand_only = hand is not None and not hand.fits
         movable = limits.lower < limits.upper
-        tried = lifts(self.robot, movable, hand_only) if problems.enforce_limits else []
+        pressed = movable.copy()
+        if best.ratio > CLOSE:
+            pressed &= self._at_limit(best.q) | self._at_limit(best.fair)
+        tried = lifts(self.robot, movable, pressed, hand_only) if problems.enforce_limits else []
         freeings = self._freeings(problems)
         parts = [problems] * len(tried) + [item.problems for item in freeings]
         if not parts:
@@ -152,21 +164,21 @@ class Diagnostician:
         bounds = limits.tiled(len(parts))
         for i, lift in enumerate(tried):
             lift.widen(self.robot, bounds, i)
-        cold = self._trials.search(asked, q0, bounds)
-        warm = Descent(self._trials, asked).run(np.tile(nearest, (len(parts), 1)), bounds)
-        found = [
-            self._trials.solved(asked, q, limits=False) & (bounds.beyond(q) == 0).all(axis=1)
-            for q in (warm, cold)
-        ]
-        q = np.where(found[0][:, None], warm, cold)
-        ok = found[0] | found[1]
+        q = Descent(self._trials, asked).run(np.tile(best.q, (len(parts), 1)), bounds)
+        ok = self._trials.solved(asked, q, limits=False)
+        rest = np.flatnonzero(~ok)
+        if len(rest):
+            left = Bounds(bounds.lower[rest], bounds.upper[rest])
+            q[rest] = self._trials.search(asked.rows(rest), q0, left)
+            ok[rest] = self._trials.solved(asked.rows(rest), q[rest], limits=False)
+        ok &= (bounds.beyond(q) == 0).all(axis=1)
         relaxed = [(lift, q[i]) for i, lift in enumerate(tried) if ok[i]]
         free = [
             Freed(item.part, item.finger, q[i])
             for i, item in enumerate(freeings, start=len(tried))
             if ok[i]
         ]
-        return relaxed, tuple(free), np.concatenate([cold, warm])
+        return relaxed, tuple(free), q
 
     def _freeings(self, problems: Problems) -> list[_Freeing]:
         """The target with a finger, a normal or all normals left free."""
@@ -194,10 +206,12 @@ class Diagnostician:
         descent = Descent(self._trials, repeated(problems, len(starts)))
         return descent.run(descent.run(starts, limits), limits)
 
+    def _at_limit(self, q: Array) -> NDArray[np.bool_]:
+        return (q - self.robot.lower <= AT_LIMIT) | (self.robot.upper - q <= AT_LIMIT)
+
     def _active(self, q: Array) -> tuple[str, ...]:
-        robot = self.robot
-        at = (q - robot.lower <= AT_LIMIT) | (robot.upper - q <= AT_LIMIT)
-        return tuple(name for name, held in zip(robot.actuators, at, strict=True) if held)
+        pairs = zip(self.robot.actuators, self._at_limit(q), strict=True)
+        return tuple(name for name, held in pairs if held)
 
     def _contacts(self, problems: Problems, q: Array) -> dict[str, NearContact]:
         points, normals = self.robot.contacts(q)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -116,19 +116,48 @@ class HandFirstMethod:
             rows=outcome.rows if trace else None,
         )
 
-    def rows(self, problems: Problems, q0: Array, number: int = 0) -> tuple[Array, Array]:
-        """States and parameters of a round, a row per target, to be changed before `run_rows`."""
-        lookup = self.postures(problems, q0, number)
-        return self._states(q0), self._parameters(problems, q0, lookup)
+    def rows(
+        self, problems: Problems, q0: Array, numbers: Sequence[int] = (0,)
+    ) -> tuple[Array, Array]:
+        """States and parameters of rounds, to be changed before `run_rows`.
+
+        Args:
+            problems: k targets.
+            q0: (k, n).
+            numbers: m rounds; of none there is a row per target without hand postures, fit for
+                refinement only.
+
+        Returns:
+            (m k, ...) states and parameters, round by round.
+        """
+        count, hand = self.options.candidates, self.step.layouts.hand
+        if not numbers:
+            lookup = np.zeros((len(problems), count, len(hand)))
+            return self._states(q0), self._parameters(problems, q0, lookup)
+        wide = self.postures(problems, q0, max(numbers), all_wide=True) if any(numbers) else None
+        parts = []
+        for number in numbers:
+            if number and wide is not None:
+                lookup = wide[:, (number - 1) * count : number * count]
+            else:
+                lookup = self.postures(problems, q0, 0)
+            parts.append(self._parameters(problems, q0, lookup))
+        return np.tile(self._states(q0), (len(numbers), 1)), np.concatenate(parts)
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
-    def postures(self, problems: Problems, q0: Array, number: int) -> Array:
+    def postures(self, problems: Problems, q0: Array, number: int, all_wide: bool = False) -> Array:
         """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
 
         What moves free fingers only stays as in q0.
+
+        Args:
+            problems: k targets.
+            q0: (k, n).
+            number: The round.
+            all_wide: Whether those of the rounds 1, 2, ... before it are to stand before them.
         """
         count = self.options.candidates
         if number == 0:
@@ -137,7 +166,7 @@ class HandFirstMethod:
             found = self.wide_table.nearest(problems.points, problems.normals, number * count)
         needed = ~np.isnan(problems.points[..., 0]) @ self._moves
         here = q0[:, None, self.step.layouts.hand]
-        return np.where(needed[:, None], found[:, -count:], here)
+        return np.where(needed[:, None], found if all_wide else found[:, -count:], here)
 
     def _parameters(self, problems: Problems, q0: Array, postures: Array) -> Array:
         layout = self.step.layouts.parameters

@@ -129,6 +129,6 @@ class Method(Protocol):
             trace: Whether to keep every iteration.
 
         Raises:
-            InputError: The method cannot take these targets (for example a free finger).
+            RowError: The method cannot take a target (for example a free finger).
         """
         ...

@@ -16,7 +16,14 @@ from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.trials import Bounds, Descent, Trials, allowed, repeated
 
 ROUNDS = 16
-"""Adaptations of the weights."""
+"""Adaptations of the weights, at most."""
+
+SETTLED = 0.01
+"""The weights are adapted no further when the bound is this close to what was reached, or when it
+says no and a round gains less than this."""
+
+MARGIN = 1.02
+"""By which factor the contacts have to be missed for a grasp to count as unreachable."""
 
 LIGHTEST = 1e-4
 """Smallest weight."""
@@ -52,26 +59,35 @@ def closest(trials: Trials, problems: Problems, q: Array, limits: Bounds, follow
     cost = (trials.misses(repeated(problems, len(q)), q) ** 2).sum(axis=(1, 2))
     q = q[_distinct(cost, followed)]
     count = len(q)
-    asked = repeated(problems, count)
-    descent = Descent(trials, asked)
+    descent = Descent(trials, repeated(problems, count))
     total = float((tolerated**2).sum())
     weights = np.tile(counted.astype(float), (count, 1, 1))
     worst, bound = np.full(count, np.inf), np.zeros(count)
-    fair, plain = q.copy(), q
+    fair, plain = q.copy(), q.copy()
+    # Twice: the loop gives up where it gains little, which need not be at the minimum.
+    q = descent.run(descent.run(q, limits), limits)
+    rows, best = np.arange(count), np.inf
     for number in range(ROUNDS):
-        q = descent.run(q, limits, np.sqrt(weights))
-        misses = trials.misses(asked, q)
-        plain = q if number == 0 else plain
+        q[rows] = descent.run(q[rows], limits, np.sqrt(weights[rows]), rows)
+        misses = trials.misses(repeated(problems, len(rows)), q[rows])
+        if number == 0:
+            plain, cost = q.copy(), (misses**2).sum(axis=(1, 2))
         parts = np.where(counted, misses / np.where(counted, tolerated, 1.0), 0.0)
         largest = parts.max(axis=(1, 2))
-        fair = np.where((largest < worst)[:, None], q, fair)
-        worst = np.minimum(worst, largest)
-        if worst.min() <= 1:
+        better = rows[largest < worst[rows]]
+        fair[better] = q[better]
+        worst[rows] = np.minimum(worst[rows], largest)
+        squares = (weights[rows] * misses**2).sum(axis=(1, 2))
+        bound[rows] = np.maximum(bound[rows], np.sqrt(squares / total))
+        before, best = best, worst.min()
+        stuck = best > (1 - SETTLED) * before
+        if best <= 1 or (bound.min() > MARGIN and stuck) or bound.min() > (1 - SETTLED) * best:
             break
-        bound = np.maximum(bound, np.sqrt((weights * misses**2).sum(axis=(1, 2)) / total))
-        weights = np.where(counted, np.maximum(weights * parts, LIGHTEST), 0.0)
-        weights *= (total / (weights * tolerated**2).sum(axis=(1, 2)))[:, None, None]
-    cost = (trials.misses(asked, plain) ** 2).sum(axis=(1, 2))
+        # A minimum that cannot come closer than another one already has is followed no further.
+        going = bound[rows] < best
+        new = np.where(counted, np.maximum(weights[rows] * parts, LIGHTEST), 0.0)
+        weights[rows] = new * (total / (new * tolerated**2).sum(axis=(1, 2)))[:, None, None]
+        rows = rows[going]
     return Closest(plain[cost.argmin()], fair[worst.argmin()], float(bound.min()))
 
 

@@ -41,7 +41,12 @@ class PostureTable:
     """
 
     def __init__(
-        self, robot: ArmHand, hand: tuple[int, ...], size: int, at_limits: float = 0.0
+        self,
+        robot: ArmHand,
+        hand: tuple[int, ...],
+        size: int,
+        at_limits: float = 0.0,
+        pull: float = 0.0,
     ) -> None:
         """Spread the postures and note the shape of their contacts.
 
@@ -51,6 +56,8 @@ class PostureTable:
             size: Number of postures.
             at_limits: Part of the range [0, 1) that is moved to the limits, half to either: hands
                 stand at their limits more often than an even spread would.
+            pull: How much the distance from a given posture counts besides the contacts' shape:
+                different hands may have contacts of nearly the same shape.
         """
         columns = list(hand)
         q = np.tile(robot.home, (size, 1))
@@ -59,18 +66,26 @@ class PostureTable:
         q[:, columns] = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
         self.postures = q[:, columns]
         values, _ = shape(*robot.contacts(q))
+        self._pull: Array | None = None
+        if pull:
+            half_ranges = (robot.upper - robot.lower)[columns] / 2
+            scales: Array = np.sqrt(pull / len(columns)) / half_ranges
+            values, self._pull = np.hstack([values, self.postures * scales]), scales
         rounded = _rounded(values)
         # Squares last: one product gives |table - wanted|^2 without the part all postures share.
         self._columns = np.hstack([rounded, rounded**2]).T.copy()
         self._complete = np.hstack([rounded, (rounded**2).sum(axis=1, keepdims=True)]).T.copy()
 
-    def nearest(self, points: Array, normals: Array, count: int) -> Array:
+    def nearest(
+        self, points: Array, normals: Array, count: int, near: Array | None = None
+    ) -> Array:
         """The postures whose contacts are shaped most like the targets, best first.
 
         Args:
             points: (k, f, 3) [m], NaN where free.
             normals: (k, f, 3), NaN where free.
             count: How many, at most the size of the table.
+            near: (k, hand) postures they should be near; needed by a table with a pull.
 
         Returns:
             (k, count, hand) postures.
@@ -79,6 +94,10 @@ class PostureTable:
         for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
             values, known = shape(points[part], normals[part])
+            if self._pull is not None and near is not None:
+                pulled = near[part] * self._pull
+                values = np.hstack([values, pulled])
+                known = np.hstack([known, np.ones(pulled.shape, dtype=bool)])
             wanted = -2 * _rounded(values)
             if known.all():
                 ones = np.ones((len(wanted), 1), dtype=np.float32)
@@ -132,10 +151,18 @@ def _rounded(values: Array) -> NDArray[np.float32]:
 def _smallest(distance: NDArray[np.float32], count: int) -> NDArray[np.intp]:
     """Columns of the smallest entries of each row, in order; `distance` is used up."""
     if count > SEARCHES:
-        return distance.argsort(axis=1, kind="stable")[:, :count]
+        return np.stack([_smallest_of_row(row, count) for row in distance])
     found = np.empty((len(distance), count), dtype=np.intp)
     every = np.arange(len(distance))
     for i in range(count):
         found[:, i] = distance.argmin(axis=1)
         distance[every, found[:, i]] = np.inf
     return found
+
+
+def _smallest_of_row(distance: NDArray[np.float32], count: int) -> NDArray[np.intp]:
+    """The same for one row: only what is as small as the last one wanted has to be sorted."""
+    if count >= len(distance):
+        return distance.argsort(kind="stable")[:count]
+    places = np.flatnonzero(distance <= np.partition(distance, count - 1)[count - 1])
+    return places[distance[places].argsort(kind="stable")[:count]]

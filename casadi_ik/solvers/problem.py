@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.robots.description import RobotDescription
 
@@ -127,20 +127,24 @@ def fixed_array(
     return values
 
 
-def target_arrays(points: ArrayLike, normals: ArrayLike, f: int) -> tuple[Array, Array]:
+def target_arrays(
+    points: ArrayLike, normals: ArrayLike, f: int, first_row: int = 0
+) -> tuple[Array, Array]:
     """Checked batch targets.
 
     Args:
         points: (k, f, 3) [m].
         normals: (k, f, 3), any length but zero.
         f: Number of the robot's fingers.
+        first_row: Number of the first row, for messages.
 
     Returns:
         Points and unit normals, (k, f, 3).
 
     Raises:
-        InputError: Wrong shape, infinite numbers, partly NaN vectors, a zero normal, a normal
-            without a point, a row with no contact. The message names row and finger.
+        RowError: Infinite numbers, partly NaN vectors, a zero normal, a normal without a point, a
+            row with no contact. The message names row and finger.
+        InputError: Wrong shape, no numbers.
     """
     arrays = []
     for name, value in (("points", points), ("normals", normals)):
@@ -155,25 +159,27 @@ def target_arrays(points: ArrayLike, normals: ArrayLike, f: int) -> tuple[Array,
             continue
         free = np.isnan(array)
         partly = np.any(free, axis=2) & ~np.all(free, axis=2)
-        _refuse(partly, f"{name}: is partly NaN, expected three numbers or three NaN")
-        _refuse(np.any(np.isinf(array), axis=2), f"{name}: is infinite, expected finite numbers")
+        infinite = np.any(np.isinf(array), axis=2)
+        _refuse(partly, first_row, name, "is partly NaN, expected three numbers or three NaN")
+        _refuse(infinite, first_row, name, "is infinite, expected finite numbers")
         arrays.append(array)
     p, n = arrays
     if len(p) != len(n):
         raise InputError(f"points and normals: found {len(p)} and {len(n)} rows, expected as many")
     length = np.sqrt(np.einsum("kfi,kfi->kf", n, n))
-    _refuse(length < 1e-9, "normals: is zero, expected a direction")
+    _refuse(length < 1e-9, first_row, "normals", "is zero, expected a direction")
     free_point = np.isnan(p[..., 0])
-    _refuse(free_point & ~np.isnan(length), "normals: is given for a finger without a point")
+    lone = free_point & ~np.isnan(length)
+    _refuse(lone, first_row, "normals", "is given for a finger without a point")
     empty = np.flatnonzero(free_point.all(axis=1))
     if len(empty):
-        raise InputError(f"points: row {empty[0]} has no contact at all")
+        row = first_row + int(empty[0])
+        raise RowError(f"points: row {row} has no contact at all", row)
     return p, n / length[..., None]
 
 
-def _refuse(bad: NDArray[np.bool_], problem: str) -> None:
+def _refuse(bad: NDArray[np.bool_], first_row: int, name: str, problem: str) -> None:
     found = np.argwhere(bad)
     if len(found):
-        row, finger = found[0]
-        name, _, rest = problem.partition(": ")
-        raise InputError(f"{name}: row {row}, finger {finger} {rest}")
+        row, finger = first_row + int(found[0, 0]), found[0, 1]
+        raise RowError(f"{name}: row {row}, finger {finger} {problem}", row)

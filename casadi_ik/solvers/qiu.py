@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.errors import RowError, UnsupportedError
 from casadi_ik.kernels import REPEATED, LoopKernel
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
@@ -71,7 +71,7 @@ class QiuMethod:
                 moved to them.
 
         Raises:
-            InputError: A free finger or a free normal.
+            RowError: A free finger or a free normal.
             UnsupportedError: A fixed actuator.
         """
         self._check(problems)
@@ -127,8 +127,9 @@ class QiuMethod:
         for name, array in (("contact", problems.points), ("normal", problems.normals)):
             free = np.argwhere(np.isnan(array[..., 0]))
             if len(free):
-                row, finger = free[0]
-                raise InputError(
+                row, finger = problems.first_row + int(free[0, 0]), free[0, 1]
+                raise RowError(
                     f"method {self.name!r} needs a {name} for every finger; row {row} has none for "
-                    f"{self._robot.finger_names[finger]!r}"
+                    f"{self._robot.finger_names[finger]!r}",
+                    row,
                 )

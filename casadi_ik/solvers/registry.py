@@ -12,11 +12,13 @@ from casadi_ik.solvers.hand_first import HandFirstMethod
 from casadi_ik.solvers.method import Method
 from casadi_ik.solvers.nlp import IpoptMethod
 from casadi_ik.solvers.qiu import QiuMethod
+from casadi_ik.solvers.thumb_first import ThumbFirstMethod
 from casadi_ik.steps.enhanced import EnhancedStep
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.ipopt_parameters import IpoptParameters
 from casadi_ik.steps.original import OriginalStep
 from casadi_ik.steps.qiu_parameters import OriginalParameters, QiuParameters
+from casadi_ik.steps.thumb_first_parameters import ThumbFirstParameters
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,13 @@ def _hand_first(
     return HandFirstMethod(robot, record, compiled)
 
 
+def _thumb_first(
+    name: str, robot: RobotDescription, record: ThumbFirstParameters, compiled: bool
+) -> Method:
+    del name
+    return ThumbFirstMethod(robot, record, compiled)
+
+
 def _enhanced(name: str, robot: RobotDescription, record: QiuParameters, compiled: bool) -> Method:
     return QiuMethod(name, EnhancedStep(robot, record), compiled)
 
@@ -70,6 +79,12 @@ _ENTRIES: dict[str, _Entry] = {
         HandFirstParameters,
         {},
         _hand_first,
+    ),
+    "thumb-first": _Entry(
+        "the arm starts at the estimated palm, then moves along the arm-thumb closed chain (ours)",
+        ThumbFirstParameters,
+        {},
+        _thumb_first,
     ),
     "enhanced-dls": _Entry(
         f"thumb first, then the arm-thumb closed chain; damped least squares {_PAPER}",

@@ -41,18 +41,22 @@ class Lift:
             bounds.upper[row, i] += far
 
 
-def lifts(robot: ArmHand, movable: NDArray[np.bool_], hand_only: bool) -> list[Lift]:
+def lifts(
+    robot: ArmHand, movable: NDArray[np.bool_], pressed: NDArray[np.bool_], hand_only: bool
+) -> list[Lift]:
     """All lifts worth trying.
 
     Args:
         robot: The robot.
         movable: (n,) whether an actuator may move at all.
+        pressed: (n,) whether its limit alone may be what blocks.
         hand_only: Whether the arm cannot help, because the hand does not fit.
     """
     every = tuple(map(int, np.flatnonzero(movable)))
     arm = tuple(i for i in every if i in robot.description.arm_actuators)
     hand = tuple(i for i in every if i not in arm)
-    single = [Lift(robot.actuators[i], (i,)) for i in (hand if hand_only else every)]
+    asked = [i for i in (hand if hand_only else every) if pressed[i]]
+    single = [Lift(robot.actuators[i], (i,)) for i in asked]
     groups = {"hand": hand} if hand_only else {"arm": arm, "hand": hand, "all": every}
     return single + [Lift(name, columns) for name, columns in groups.items() if columns]
 

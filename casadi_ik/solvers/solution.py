@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from itertools import chain
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,28 +85,36 @@ class BatchSolution:
     tolerances: tuple[Tolerance, ...]
     diagnoses: tuple[Diagnosis | None, ...] = ()
 
+    @classmethod
+    def invalid(
+        cls, count: int, n: int, tolerances: tuple[Tolerance, ...], diagnosed: bool
+    ) -> BatchSolution:
+        """Rows for targets that could not be asked: status INVALID, NaN for every number."""
+        f = len(tolerances)
+        none = np.zeros(count, dtype=np.int64)
+        return cls(
+            success=np.zeros(count, dtype=bool),
+            status=np.full(count, int(Status.INVALID), dtype=np.int64),
+            q=np.full((count, n), np.nan),
+            iterations=none,
+            restarts=none,
+            time=np.zeros(count),
+            position_error=np.full((count, f), np.nan),
+            angle_error=np.full((count, f), np.nan),
+            ok=np.zeros((count, f), dtype=bool),
+            limits_ok=np.zeros(count, dtype=bool),
+            phases={},
+            tolerances=tolerances,
+            diagnoses=(None,) * count if diagnosed else (),
+        )
+
     def __len__(self) -> int:
         return len(self.q)
-
-    @classmethod
-    def joined(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
-        """One batch after the other, at least one."""
-        first = parts[0]
-        arrays = {
-            item.name: np.concatenate([getattr(part, item.name) for part in parts])
-            for item in fields(cls)
-            if isinstance(getattr(first, item.name), np.ndarray)
-        }
-        phases = {
-            name: np.concatenate([part.phases[name] for part in parts]) for name in first.phases
-        }
-        diagnoses = tuple(chain.from_iterable(part.diagnoses for part in parts))
-        return replace(first, **arrays, phases=phases, diagnoses=diagnoses)
 
     @property
     def status_names(self) -> NDArray[np.str_]:
         """(k,) names of the statuses."""
-        return np.array([Status(int(code)).name for code in self.status], dtype=str)
+        return np.array([status.name for status in sorted(Status)])[self.status - min(Status)]
 
     def solution(
         self,

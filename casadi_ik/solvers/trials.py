@@ -13,7 +13,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.solvers.hand_first import UNBOUNDED, HandFirstMethod
 from casadi_ik.solvers.problem import Array, Problems
-from casadi_ik.solvers.verdict import judge
+from casadi_ik.solvers.verdict import judge_contacts, within_limits
 from casadi_ik.steps.contact_fit import fresh_fit
 from casadi_ik.steps.hand_first_state import LENGTH
 from casadi_ik.steps.status import Phase
@@ -92,31 +92,32 @@ class Trials:
             Configurations (m, n) whose hands the hand stage went through, and those (k, n) the
             rounds ended with.
         """
-        parts = [self.method.rows(problems, bounds.clip(start)[None], i) for i in numbers]
-        states = np.concatenate([state for state, _ in parts] * 2)
-        parameters = np.concatenate([row for _, row in parts] * 2)
+        states, parameters = self.method.rows(problems, bounds.clip(start)[None], numbers)
+        states, parameters = np.tile(states, (2, 1)), np.tile(parameters, (2, 1))
         self.set_bounds(parameters, bounds)
-        parameters[: len(parts), self.parameters.slice("reach")] = 0.0
+        parameters[: len(numbers), self.parameters.slice("reach")] = 0.0
         result = self.method.run_rows(states, parameters, trace=True)
         rows = result.rows
         assert rows is not None
-        # A row holds what came before its step: what a fit ended with is in the row after it.
+        # A row holds what came before its step: what a fit ended with is in the row after it, or
+        # nowhere if that is the next candidate's; then its last two steps are as good.
         fitted = rows["phase"] == Phase.HAND_FIT
-        fitted[1:] |= fitted[:-1] & (rows["phase"][1:] != Phase.CANDIDATE)
+        after = fitted[:-1] & ~fitted[1:] & (rows["phase"][1:] != Phase.CANDIDATE)
+        fitted[:-2] &= ~(fitted[1:-1] & fitted[2:])
+        fitted[1:] |= after
         ends = result.states[:, self.state.slice("q")]
         return np.asarray(rows["q"][fitted], dtype=float), ends
 
     def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether configurations meet their targets, and if asked the robot's limits."""
-        verdict = judge(self.robot, problems, q)
-        ok = np.all(verdict.ok, axis=1)
-        return np.logical_and(ok, verdict.limits_ok) if limits else ok
+        _, _, met = judge_contacts(self.robot, problems, q)
+        ok = np.all(met, axis=1)
+        return np.logical_and(ok, within_limits(self.robot, q)) if limits else ok
 
     def misses(self, problems: Problems, q: Array) -> Array:
         """(k, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
-        verdict = judge(self.robot, problems, q)
-        chord = 2 * np.sin(verdict.angle_error / 2)
-        return np.nan_to_num(np.stack([verdict.position_error / LENGTH, chord], axis=2))
+        position, angle = self.robot.errors(q, problems.points, problems.normals)
+        return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
 
     def set_bounds(self, parameters: Array, bounds: Bounds) -> None:
         """Put bounds into rows of parameters."""
@@ -136,7 +137,13 @@ class Descent:
         self._trials = trials
         self._states, self._parameters = refinement_rows(trials, problems)
 
-    def run(self, q: Array, bounds: Bounds, weights: Array | None = None) -> Array:
+    def run(
+        self,
+        q: Array,
+        bounds: Bounds,
+        weights: Array | None = None,
+        rows: NDArray[np.intp] | None = None,
+    ) -> Array:
         """Refine.
 
         Args:
@@ -144,11 +151,13 @@ class Descent:
             bounds: (n,) or (k, n).
             weights: (k, f, 2) of points and normals; None counts all alike. With weights the loop
                 does not stop at the tolerance.
+            rows: (k,) which targets; None is all of them.
 
         Returns:
             (k, n) configurations.
         """
-        trials, states, parameters = self._trials, self._states, self._parameters.copy()
+        trials, chosen = self._trials, slice(None) if rows is None else rows
+        states, parameters = self._states[chosen].copy(), self._parameters[chosen].copy()
         start = bounds.clip(q)
         states[:, trials.state.slice("q")] = start
         states[:, trials.state.slice("best_q")] = start
@@ -164,7 +173,7 @@ class Descent:
 def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:
     """States and parameters of the loop that begin with the refinement of the whole arm-hand."""
     home = np.tile(trials.robot.home, (len(problems), 1))
-    states, parameters = trials.method.rows(problems, home)
+    states, parameters = trials.method.rows(problems, home, ())
     last = trials.method.options.candidates - 1
     for name, value in ({"phase": Phase.REFINEMENT, "candidate": last} | fresh_fit()).items():
         states[:, trials.state.slice(name)] = value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from os import PathLike
 
@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import UnknownNameError
+from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Grasp, load_object
-from casadi_ik.solvers import Solution
+from casadi_ik.solvers import Alternative, Solution
 from casadi_ik.views.captions import (
     MET_COLOR,
     MISSED_COLOR,
@@ -36,6 +36,9 @@ Array = NDArray[np.float64]
 
 SIZE = (12.0, 6.6)
 """Of the picture [inch]."""
+
+SMALL = (3.2, 3.4)
+"""Of one of several pictures [inch]."""
 
 WHOLE = (0.0, 0.06, 0.40, 0.82)
 CLOSE = (0.40, 0.06, 0.60, 0.82)
@@ -115,6 +118,69 @@ def draw_solution(
     if path is not None:
         save_picture(figure, path)
     return figure
+
+
+def draw_alternatives(
+    robot: ArmHand,
+    alternatives: Sequence[Alternative],
+    grasp: Grasp,
+    path: str | PathLike[str] | None = None,
+    *,
+    columns: int = 4,
+    view: View | None = None,
+    dpi: float = DPI,
+) -> Figure:
+    """Draw several solutions of a grasp side by side, all seen from the same place.
+
+    Args:
+        robot: The robot that was solved for.
+        alternatives: The solutions, at least one.
+        grasp: The question; if it names an object that has a description, that is drawn too.
+        path: PNG file to write, if any.
+        columns: Pictures in a row.
+        view: Azimuth and elevation [rad] of the camera; None: chosen for the first solution.
+        dpi: Dots per inch.
+
+    Returns:
+        The figure, which belongs to no pyplot window.
+
+    Raises:
+        PictureError: The file cannot be written, or there is no OpenGL to draw with.
+        DescriptionError: The description of the object is malformed.
+        InputError: No solution, or the grasp has a finger that the robot has not.
+    """
+    if not alternatives:
+        raise InputError("alternatives: found none, expected at least one")
+    rows = -(-len(alternatives) // columns)
+    figure = new_figure(SMALL[0] * columns, SMALL[1] * rows, dpi)
+    first = alternatives[0].q
+    target = robot.contacts(first)[0].mean(axis=0)
+    view = view or whole_view(target, close_view(robot, first))
+    bodies = [robot_body(robot, found.q) for found in alternatives]
+    everything = _points(*(part for body in bodies for part in body))
+    colors = dict.fromkeys(robot.fingers, MET_COLOR)
+    for number, found in enumerate(alternatives):
+        row, column = divmod(number, columns)
+        box = (column / columns, 1 - (row + 1) / rows, 1 / columns, 0.86 / rows)
+        with _one_at_a_time, closing(Stage()) as stage:
+            _fill(stage, robot, found.q, grasp, colors)
+            stage.aim(view, everything, _pixels(figure, box), (0.03, 0.03))
+            axes = _panel(figure, box, over(1.0, stage.shoot()))
+        axes.set_title(_bent(found), color=INK, fontsize=9)
+    if path is not None:
+        save_picture(figure, path)
+    return figure
+
+
+def _bent(found: Alternative) -> str:
+    """How the arm is bent, and how far its elbow may swing."""
+    branch = found.branch
+    if branch is None:
+        return f"hand posture {found.posture}"
+    pairs = (("shoulder", branch.shoulder), ("elbow", branch.elbow), ("wrist", branch.wrist))
+    signs = ", ".join(f"{name} {'+' if sign > 0 else '−'}" for name, sign in pairs)
+    start, end = branch.swivel
+    return f"{signs}\nelbow swings {np.rad2deg(end - start):.0f}°"
 
 
 def show(

@@ -40,17 +40,16 @@ as many targets as the paper prints; few they become only under an augmented pro
 damped pseudoinverses in the projectors and the palm first, or with exact ones finger by finger.
 Taken as `original-*` is the one that simply carries the paper's own hierarchy of thumb reaching on
 to the other fingers (palm, then point and normal finger by finger) with damped projectors: near the
-printed means of the DLS method in both figures. No reading gives both printed figures of the SDLS
-method: those as slow have other priorities than those that suit the DLS method.
+printed means of the DLS method in both figures. No one reading suits both methods: the distances
+say which comes closest for each.
 """
 
 CYCLES = """
 A solve of a paper's method ends early only if it provably repeats: its state has come back bit for
 bit, and since a step is a function of the state it will for ever (STALLED). All others that fail
-count to 10,000 (ITERATION_LIMIT). Within limits some do come back, since joints that stand at
-limits stand there exactly. Else few: where tasks conflict, what the lower ones ask leaks through
-the projectors and the original methods creep on, and a cycle closes only to rounding, not to the
-last bit. "Iterations saved" is the share of all iterations that the proofs spared.
+count to 10,000 (ITERATION_LIMIT): they creep on where tasks conflict, or go round a cycle that
+closes only to rounding, not to the last bit. "Iterations saved" is the share of all iterations that
+the proofs spared.
 """
 
 ABLATION = """

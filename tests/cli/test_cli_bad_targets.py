@@ -12,7 +12,7 @@ import pytest
 from command_line import Command
 
 NAN, INF = float("nan"), float("inf")
-METHOD = ("--method", "enhanced-dls")
+METHOD = ("--method", "enhanced-dls", "--finger-step", "closed-form")
 
 
 def _changed(array: np.ndarray, where: Any, value: float) -> np.ndarray:
@@ -29,19 +29,40 @@ ARRAYS: dict[str, tuple[Callable[[Any, Any], dict[str, Any]], str]] = {
     "two fingers": (lambda p, n: {"points": p[:, :2]}, "points: found shape (3, 2, 3)"),
     "rows": (lambda p, n: {"normals": n[:2]}, "found 3 and 2 rows"),
     "no rows": (lambda p, n: {"points": p[:0], "normals": n[:0]}, "points: found no targets"),
-    "objects": (lambda p, n: {"points": np.array([{}], dtype=object)}, "points: cannot be read"),
+    "objects": (
+        lambda p, n: {"points": np.array([{}], dtype=object)},
+        "points: found values of type object",
+    ),
     "text": (lambda p, n: {"points": p.astype(str)}, "points: found values of type <U32"),
     "complex": (lambda p, n: {"normals": n + 1j}, "normals: found values of type complex128"),
     "truth": (lambda p, n: {"normals": n > 0}, "normals: found values of type bool"),
-    "infinite": (lambda p, n: {"points": _changed(p, (2, 0, 1), INF)}, "points: row 2"),
-    "partly NaN": (lambda p, n: {"points": _changed(p, (1, 1, 0), NAN)}, "points: row 1"),
-    "zero normal": (lambda p, n: {"normals": _changed(n, (2, 1), 0)}, "normals: row 2"),
-    "no point": (lambda p, n: {"points": _changed(p, (2, 1), NAN)}, "normals: row 2"),
-    "no contact": (
-        lambda p, n: {"points": _changed(p, 1, NAN), "normals": _changed(n, 1, NAN)},
-        "points: row 1",
+}
+
+ROWS: dict[str, tuple[Callable[[Any, Any], dict[str, Any]], str]] = {
+    "infinite": (
+        lambda p, n: {"points": _changed(p, (2, 0, 1), INF)},
+        "points: row 2, finger 0 is infinite, expected finite numbers",
     ),
-    "free normal": (lambda p, n: {"normals": _changed(n, (2, 1), NAN)}, "finger_2"),
+    "partly NaN": (
+        lambda p, n: {"points": _changed(p, (2, 1, 0), NAN)},
+        "points: row 2, finger 1 is partly NaN, expected three numbers or three NaN",
+    ),
+    "zero normal": (
+        lambda p, n: {"normals": _changed(n, (2, 1), 0)},
+        "normals: row 2, finger 1 is zero, expected a direction",
+    ),
+    "no point": (
+        lambda p, n: {"points": _changed(p, (2, 1), NAN)},
+        "normals: row 2, finger 1 is given for a finger without a point",
+    ),
+    "no contact": (
+        lambda p, n: {"points": _changed(p, 2, NAN), "normals": _changed(n, 2, NAN)},
+        "points: row 2 has no contact at all",
+    ),
+    "free normal": (
+        lambda p, n: {"normals": _changed(n, (2, 1), NAN)},
+        "method 'enhanced-dls' needs a normal for every finger; row 2 has none for 'finger_2'",
+    ),
 }
 
 
@@ -56,6 +77,39 @@ def test_bad_targets(
     error = refused("batch", path, "--robot", "kuka_lwr_barrett", *METHOD)
     assert error.startswith(f"{path}: ")
     assert fragment in error
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_bad_row_is_named_and_does_not_stop_the_rest(
+    name: str, run: Command, target_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    change, fault = ROWS[name]
+    with np.load(target_file(count=5)) as data:
+        path = target_file(count=5, **change(data["points"], data["normals"]))
+    done = run("batch", path, "--robot", "kuka_lwr_barrett", *METHOD, "--out", tmp_path / "o.npz")
+    assert done.exit == 1
+    assert done.err.splitlines() == [
+        f"casadi-ik: bad row: {path}: {fault}",
+        f"casadi-ik: bad rows: {path}: 1 of 5; their status is INVALID",
+    ]
+    with np.load(tmp_path / "o.npz", allow_pickle=False) as data:
+        assert data["status"].tolist() == ["SOLVED", "SOLVED", "INVALID", "SOLVED", "SOLVED"]
+        assert np.isnan(data["q"]).all(axis=1).tolist() == [False, False, True, False, False]
+
+
+def test_ten_bad_rows_are_named_and_all_counted(
+    run: Command, target_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    with np.load(target_file(count=30)) as data:
+        points = _changed(data["points"], (slice(None, None, 2), 0, 0), INF)
+    path = target_file(count=30, points=points)
+    done = run("batch", path, "--robot", "kuka_lwr_barrett", *METHOD, "--out", tmp_path / "o.npz")
+    lines = done.err.splitlines()
+    assert (done.exit, len(lines)) == (1, 11)
+    for row, line in zip(range(0, 20, 2), lines, strict=False):
+        assert f"points: row {row}, finger 0 is infinite" in line
+    assert lines[-1].endswith("15 of 30; their status is INVALID")
+    assert "15 INVALID, 15 SOLVED" in done.out
 
 
 def _zipped(path: Path, members: dict[str, bytes]) -> None:

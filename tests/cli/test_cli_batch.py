@@ -6,9 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from command_line import FAST, Command
 
 import casadi_ik as ik
+from casadi_ik.cli import batch as batch_command
 
 TargetFile = Callable[..., Path]
 ROBOT = ("--robot", "kuka_lwr_barrett")
@@ -76,3 +78,86 @@ def test_whole_numbers_are_numbers_too(
     path = target_file(normals=normals)
     done = run("batch", path, *ROBOT, *FAST, "--out", tmp_path / "solved.npz")
     assert done.exit in (0, 1), done.err
+
+
+@pytest.fixture
+def hands(robot: ik.ArmHand, tmp_path: Path) -> Callable[[int], Path]:
+    """Writes random hands, every seventh out of reach and one malformed."""
+
+    def write(count: int) -> Path:
+        points, normals = robot.contacts(robot.random(np.random.default_rng(5), count))
+        points[::7] += 0.4
+        points[count // 2, 0, 0] = np.inf
+        path = tmp_path / "hands.npz"
+        np.savez_compressed(path, points=np.asfortranarray(points), normals=normals.astype("f4"))
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(("method", "count"), [("hand-first", 60), ("ipopt", 6)])
+def test_blocks_and_jobs_do_not_show(
+    run: Command,
+    hands: Callable[[int], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    method: str,
+    count: int,
+) -> None:
+    """Nor does it matter how the arrays lie in the file."""
+    found = []
+    for block, jobs in ((4096, 1), (5, 2), (1, 1)):
+        monkeypatch.setattr(batch_command, "BLOCK", block)
+        out = tmp_path / f"{block}.npz"
+        words = ("--method", method, "--jobs", jobs, "--seed", 3, "--out", out)
+        assert run("batch", hands(count), *ROBOT, *words).exit == 1
+        with np.load(out, allow_pickle=False) as data:
+            found.append({key: data[key] for key in data if key != "time"})
+    for other in found[1:]:
+        for key, value in found[0].items():
+            np.testing.assert_array_equal(other[key], value, err_msg=key)
+
+
+def test_log_of_blocks_numbers_the_rows_through(
+    run: Command,
+    hands: Callable[[int], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(batch_command, "BLOCK", 16)
+    out, log = tmp_path / "o.npz", tmp_path / "o.mcap"
+    run("batch", hands(60), *ROBOT, "--out", out, "--log", log)
+    solves = list(ik.logs.open_log(log).solves())
+    assert [solve.solve_id for solve in solves] == [row for row in range(60) if row != 30]
+    with np.load(out, allow_pickle=False) as data:
+        assert [solve.status for solve in solves] == np.delete(data["status"], 30).tolist()
+
+
+def test_diagnoses_are_written_if_asked_for(
+    run: Command, hands: Callable[[int], Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "o.npz"
+    done = run("batch", hands(30), *ROBOT, "--diagnose", "--out", out)
+    with np.load(out, allow_pickle=False) as data:
+        unreachable = data["status"] == "UNREACHABLE"
+        assert unreachable.sum() >= 2
+        assert set(data["reason"][unreachable]) <= {"HAND", "REACH", "LIMITS"}
+        assert not np.isnan(data["nearest_q"][unreachable]).any()
+        assert (data["reason"][data["success"]] == "").all()
+        assert np.isnan(data["enough_position"][data["success"]]).all()
+    assert "reasons" in done.out
+
+
+def test_process(run_process: Command, target_file: TargetFile, tmp_path: Path) -> None:
+    """A damaged end of the file is found before anything is solved, and nothing is left."""
+    path, out = target_file(count=50), tmp_path / "o.npz"
+    done = run_process("batch", path, *ROBOT, "--out", out)
+    assert (done.exit, done.err) == (0, "")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["o.npz", "targets.npz"]
+    out.unlink()
+    data = bytearray(path.read_bytes())
+    data[data.index(b"normals.npy") + 3000] ^= 1
+    path.write_bytes(data)
+    done = run_process("batch", path, *ROBOT, "--out", out)
+    assert "normals: cannot be read: Bad CRC-32" in done.error
+    assert [file.name for file in tmp_path.iterdir()] == ["targets.npz"]

@@ -18,7 +18,7 @@ from matplotlib.image import imread
 import casadi_ik as ik
 from casadi_ik.errors import InputError, PictureError
 from casadi_ik.logs import Table
-from casadi_ik.views import draw_convergence, draw_solution
+from casadi_ik.views import draw_alternatives, draw_convergence, draw_solution
 from casadi_ik.views.captions import MET_COLOR, MISSED_COLOR, OBJECT_COLOR, TARGET_COLOR
 from casadi_ik.views.picture import new_figure, save_picture
 
@@ -54,6 +54,20 @@ def test_the_picture_says_how_it_ended(robot, solution, grasp) -> None:
     for finger in robot.fingers:
         assert finger in text
     assert len(figure.axes) == 2
+
+
+def test_alternatives_are_drawn_side_by_side(robot, grasp) -> None:
+    found = ik.Solver(robot).solve_all(grasp, limit=2)
+    figure = draw_alternatives(robot, found, grasp, columns=2, dpi=COARSE)
+    assert len(figure.axes) == 2
+    for axes, each in zip(figure.axes, found, strict=True):
+        start, end = each.branch.swivel
+        assert f"elbow {'+' if each.branch.elbow > 0 else '−'}" in axes.get_title()
+        assert f"swings {np.rad2deg(end - start):.0f}°" in axes.get_title()
+    images = [axes.images[0].get_array() for axes in figure.axes]
+    assert np.abs(images[0] - images[1]).max() > 0.3
+    with pytest.raises(InputError, match="alternatives: found none"):
+        draw_alternatives(robot, (), grasp)
 
 
 def test_the_picture_shows_object_target_and_contacts(robot, solution, grasp) -> None:

@@ -1,0 +1,17 @@
+"""Lines on stderr."""
+
+from __future__ import annotations
+
+import sys
+
+from casadi_ik.cli.parser import PROGRAM
+
+
+def say(kind: str, text: str) -> None:
+    """Print one line behind the program's name.
+
+    Args:
+        kind: What it is about: "error", "warning".
+        text: The rest; line breaks in it become spaces.
+    """
+    print(f"{PROGRAM}: {kind}: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201

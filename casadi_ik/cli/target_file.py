@@ -1,0 +1,176 @@
+"""Files of targets: checked from end to end, then read block by block."""
+
+from __future__ import annotations
+
+import lzma
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.errors import InputError
+
+KEYS = ("points", "normals")
+
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+_UNREADABLE = (
+    ValueError,
+    EOFError,
+    MemoryError,
+    NotImplementedError,
+    OverflowError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+)
+"""What numpy and zipfile were seen to raise on a damaged or encrypted member."""
+
+
+@dataclass(frozen=True)
+class TargetFile:
+    """Points and normals of k targets in an npz file; nothing in it is ever executed.
+
+    Attributes:
+        path: The file.
+        fingers: How many contacts a target has.
+    """
+
+    path: Path
+    fingers: int
+
+    def check(self, size: int) -> int:
+        """Read all of it once, `size` targets at a time.
+
+        Returns:
+            How many targets there are.
+
+        Raises:
+            InputError: Missing, no npz, damaged, or other arrays than expected; the message names
+                file and key.
+        """
+        return sum(len(points) for points, _ in self.blocks(size))
+
+    def blocks(self, size: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """Points and normals (up to size, f, 3), one block after the other.
+
+        Raises:
+            InputError: As `check`.
+        """
+        with (
+            self._opened() as archive,
+            self._member(archive, "points") as points,
+            self._member(archive, "normals") as normals,
+        ):
+            if points.count != normals.count:
+                raise InputError(
+                    f"{self.path}: points and normals: found {points.count} and "
+                    f"{normals.count} rows, expected as many"
+                )
+            for start in range(0, points.count, size):
+                rows = min(size, points.count - start)
+                last = start + rows == points.count
+                yield points.read(rows, last), normals.read(rows, last)
+
+    @contextmanager
+    def _opened(self) -> Iterator[zipfile.ZipFile]:
+        try:
+            if self.path.is_file() and not zipfile.is_zipfile(self.path):
+                raise InputError(
+                    f"{self.path}: not an npz file, expected one with points and normals"
+                )
+            archive = zipfile.ZipFile(self.path)
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read: {error.strerror or error}") from error
+        except _UNREADABLE as error:
+            raise InputError(f"{self.path}: damaged: {error}") from error
+        with archive:
+            yield archive
+
+    @contextmanager
+    def _member(self, archive: zipfile.ZipFile, key: str) -> Iterator[_Member]:
+        name = f"{key}.npy"
+        if name not in archive.namelist():
+            found = ", ".join(n.removesuffix(".npy") for n in archive.namelist()) or "nothing"
+            raise InputError(
+                f"{self.path}: {key}: missing, expected {' and '.join(KEYS)}; found {found}"
+            )
+        where = f"{self.path}: {key}"
+        try:
+            stream = archive.open(name)
+            header = _HEADERS.get(np.lib.format.read_magic(stream))
+            if header is None:
+                raise ValueError("a version of the npy format that is not for numbers")
+            shape, column_major, dtype = header(stream)
+        except (*_UNREADABLE, OSError) as error:
+            raise InputError(f"{where}: cannot be read: {error}") from error
+        with stream:
+            if dtype.kind not in "fiu":
+                raise InputError(f"{where}: found values of type {dtype}, expected numbers")
+            expected = f"expected (k, {self.fingers}, 3)"
+            if len(shape) != 3 or shape[1:] != (self.fingers, 3):
+                raise InputError(f"{where}: found shape {shape}, {expected}")
+            if shape[0] == 0:
+                raise InputError(f"{where}: found no targets, {expected}")
+            yield _Member(where, stream, shape[0], self.fingers, dtype, column_major)
+
+
+class _Member:
+    """An array (k, f, 3) inside a zip file, read from its first row to its last."""
+
+    def __init__(
+        self,
+        where: str,
+        stream: IO[bytes],
+        count: int,
+        fingers: int,
+        dtype: np.dtype[np.generic],
+        column_major: bool,
+    ) -> None:
+        self.count = count
+        self._where = where
+        self._stream = stream
+        self._fingers = fingers
+        self._dtype = dtype
+        # Its first row is known only when its last is read: it has to be held as a whole.
+        self._whole = self._rows(count, "F") if column_major else None
+        self._read = 0
+
+    def read(self, rows: int, last: bool) -> NDArray[np.float64]:
+        """The next rows; at the last, the member has to end and its checksum to be right."""
+        if self._whole is not None:
+            block = self._whole[self._read : self._read + rows]
+        else:
+            block = self._rows(rows, "C")
+        self._read += rows
+        if last and self._bytes(1):
+            raise InputError(f"{self._where}: damaged: more bytes than its shape says")
+        return block
+
+    def _rows(self, rows: int, order: Literal["C", "F"]) -> NDArray[np.float64]:
+        size = rows * self._fingers * 3
+        data = self._bytes(size * self._dtype.itemsize)
+        if len(data) < size * self._dtype.itemsize:
+            raise InputError(f"{self._where}: damaged: fewer bytes than its shape says")
+        shape = (rows, self._fingers, 3)
+        values = np.frombuffer(data, self._dtype).reshape(shape, order=order)
+        return values.astype(np.float64)
+
+    def _bytes(self, size: int) -> bytes:
+        try:
+            return self._stream.read(size)
+        except (*_UNREADABLE, OSError) as error:
+            raise InputError(f"{self._where}: cannot be read: {error}") from error

@@ -1,0 +1,1 @@
+"""What the studies of the arm-thumb closed chain share."""

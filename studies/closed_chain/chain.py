@@ -1,0 +1,112 @@
+"""The closed chain in numbers: constraint, palm poses with the thumb held, arms that follow."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+import casadi_ik as ik
+from casadi_ik.kernels import FunctionKernel
+from casadi_ik.steps.arm_placement import ALLOWED, ITERATIONS, place_arm
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.closed_chain import closed_chain, split
+from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.srs_arm import reach, srs_arm
+
+Array = NDArray[np.float64]
+
+LENGTH = 0.1
+"""Unit of the constraint's linear rows [m]: about the size of a hand."""
+
+
+def constraints(robot: ik.ArmHand, q: Array) -> Array:
+    """C of eq. (6), (k, 6, c), over `split(robot).columns`, at (k, n) configurations."""
+    description = robot.description
+    x = ca.SX.sym("q", len(robot.actuators))
+    chain = closed_chain(actuated(description, x), split(description), LENGTH)
+    kernel = FunctionKernel(ca.Function("chain_constraint", [x], [ca.densify(chain.constraint)]))
+    (found,) = kernel(q)
+    return found
+
+
+class HeldThumb:
+    """Palm poses with the thumb's contact held, and whether the arm can follow."""
+
+    def __init__(self, robot: ik.ArmHand) -> None:
+        """Build the arm's closed form.
+
+        Args:
+            robot: With an S-R-S arm.
+        """
+        self.robot = robot
+        self.arm = list(robot.description.arm_actuators)
+        self.thumb = robot.fingers.index(robot.thumb)
+        rotation, origin, trial = ca.MX.sym("R", 3, 3), ca.MX.sym("p", 3), ca.MX.sym("trial")
+        palm: Any = Pose(cast(Any, rotation), cast(Any, origin))
+        lower, upper = (ca.MX(ca.DM(x[self.arm].tolist())) for x in (robot.lower, robot.upper))
+        self._srs = arm = srs_arm(robot.description)
+        elbow = self.arm[3]
+        self._reach = [float(x) for x in reach(arm, robot.lower[elbow], robot.upper[elbow])]
+        _, margin = place_arm(arm, palm, lower, upper, trial)
+        self._margin = FunctionKernel(ca.Function("margin", [rotation, origin, trial], [margin]))
+
+    def palms(self, q: Array, contact: tuple[Array, Array], turn: Array) -> tuple[Array, Array]:
+        """Palms that put the thumb of each hand on a contact.
+
+        Args:
+            q: (k, n) configurations; only the hand's part matters, and where the palm of the
+                first stands: it is the zero of the turn.
+            contact: Point (3,) [m] and unit normal (3,), or (k, 3) each.
+            turn: (k,) virtual joint [rad].
+
+        Returns:
+            Rotations (k, 3, 3) and origins (k, 3) [m].
+        """
+        points, normals = (part[:, self.thumb] for part in self.robot.contacts(q))
+        palm = self.robot.palm(q)
+        point, normal = contact
+        brought = between(normals, np.broadcast_to(normal, normals.shape)) @ palm[:, :3, :3]
+        rotation = about(np.broadcast_to(normal, normals.shape), turn) @ brought
+        lever = np.einsum("kji,kj->ki", palm[:, :3, :3], points - palm[:, :3, 3])
+        return rotation, point - np.einsum("kij,kj->ki", rotation, lever)
+
+    def followed(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:
+        """(k,) whether some arm configuration within limits has its palm there."""
+        found = np.zeros(len(origin), dtype=bool)
+        for trial in range(ITERATIONS):
+            rest = np.flatnonzero(~found)
+            if len(rest):
+                (margin,) = self._margin(rotation[rest], origin[rest], float(trial))
+                found[rest] = margin >= ALLOWED
+        return found
+
+    def in_reach(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:
+        """(k,) whether the elbow can bring the wrist there, the other joints aside."""
+        wrist = origin + rotation @ self._srs.wrist_in_palm
+        distance = np.linalg.norm(wrist - self._srs.shoulder, axis=1)
+        near, far = self._reach
+        return (distance >= near) & (distance <= far)
+
+
+def about(axis: Array, angle: Array) -> Array:
+    """Rotations (k, 3, 3) about unit axes (k, 3) by angles (k,)."""
+    x, y, z = axis.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.eye(3) + s * cross + (1 - c) * cross @ cross
+
+
+def between(a: Array, b: Array) -> Array:
+    """Shortest rotations (k, 3, 3) that turn unit vectors a into b, (k, 3) each, not opposite."""
+    u = a + b
+    scaled = 2 / np.sum(u * u, axis=1)[:, None, None]
+    return np.eye(3) - scaled * u[:, :, None] * u[:, None, :] + 2 * b[:, :, None] * a[:, None, :]
+
+
+def cylinder(origin: Array) -> tuple[Array, Array]:
+    """Distance from the base's axis and height [m] of points (k, 3)."""
+    return np.hypot(origin[:, 0], origin[:, 1]), origin[:, 2]

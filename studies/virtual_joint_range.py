@@ -1,0 +1,122 @@
+"""How far the virtual joint at the thumb's tip can be turned, by arm configuration.
+
+The thumb rests on its contact and the hand keeps its posture; the virtual joint turns the palm
+about the contact's normal, and the arm follows within its limits or cannot. Counted are the turns
+that some arm configuration follows, and those in one piece with the start::
+
+    python studies/virtual_joint_range.py
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from closed_chain.chain import HeldThumb, cylinder
+from closed_chain.report import OURS, field, figure, options, title, write
+from numpy.typing import NDArray
+
+import casadi_ik as ik
+
+STEPS = 72
+"""Turns tried in a full circle."""
+
+
+def usable(robot: ik.ArmHand, held: HeldThumb, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which turns the arm follows, (k, STEPS), from -pi on."""
+    turns = 2 * np.pi * (np.arange(STEPS) / STEPS - 0.5)
+    points, normals = (part[:, held.thumb] for part in robot.contacts(q))
+    follows = np.empty((len(q), STEPS), dtype=bool)
+    for i, turn in enumerate(turns):
+        palms = held.palms(q, (points, normals), np.full(len(q), turn))
+        follows[:, i] = held.followed(*palms)
+    return follows
+
+
+def connected(follows: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Width [deg] of the usable turns in one piece with turn zero, (k,)."""
+    zero = STEPS // 2
+    onwards = np.roll(follows, -zero, axis=1)
+    up = np.cumprod(onwards, axis=1).sum(axis=1)
+    down = np.cumprod(onwards[:, ::-1], axis=1).sum(axis=1)
+    width = np.where(follows.all(axis=1), STEPS, up + down)
+    return np.where(follows[:, zero], width, 0) * 360.0 / STEPS
+
+
+def main() -> None:
+    """Run the study and write its page."""
+    given = options("Usable range of the virtual joint.", 3000)
+    robot = ik.load_robot("kuka_lwr_barrett")
+    held = HeldThumb(robot)
+    q = robot.random(np.random.default_rng(given.seed), given.count)
+    hand = [i for i in range(len(robot.actuators)) if i not in held.arm]
+    q[:, hand] = robot.home[hand]
+    follows = usable(robot, held, q)
+    at_rest = follows[:, STEPS // 2].mean()
+    width, whole = connected(follows), 360.0 * follows.mean(axis=1)
+
+    drawn, grid = figure(2, 2, 5.4, 4.0)
+    order = np.argsort(whole)[:: max(len(q) // 300, 1)]
+    grid[0, 0].imshow(
+        follows[order],
+        aspect="auto",
+        cmap="Blues",
+        extent=(-180, 180, 100, 0),
+        interpolation="nearest",
+    )
+    title(
+        grid[0, 0],
+        "blue: turns the arm follows, one row per arm",
+        "turn of the virtual joint [deg]",
+        "arm configurations [%]",
+    )
+    grid[0, 1].hist(width, bins=np.linspace(0, 360, 37).tolist(), color=OURS)
+    title(grid[0, 1], "how wide the range is", "usable range [deg]", "arm configurations")
+    r, z = cylinder(robot.palm(q)[:, :3, 3])
+    mesh = field(grid[1, 0], r, z, width, 16, 0, 360, "viridis")
+    title(
+        grid[1, 0],
+        "median range in one piece [deg]",
+        "palm from the base's axis [m]",
+        "palm's height [m]",
+    )
+    drawn.colorbar(mesh, ax=grid[1, 0])
+    elbow, wrist = (np.abs(np.rad2deg(q[:, held.arm[i]])) for i in (3, 5))
+    mesh = field(grid[1, 1], elbow, wrist, width, 16, 0, 360, "viridis")
+    title(
+        grid[1, 1],
+        "the same over elbow and wrist",
+        "|arm joint 4| [deg]",
+        "|arm joint 6| [deg]",
+    )
+    drawn.colorbar(mesh, ax=grid[1, 1])
+
+    def quartiles(values: NDArray[np.float64]) -> str:
+        return " | ".join(f"{v:.0f}" for v in np.percentile(values, [5, 25, 50, 75, 95]))
+
+    far = r > np.quantile(r, 0.75)
+    text = f"""
+# How far the virtual joint can be turned
+
+`python studies/virtual_joint_range.py --count {given.count} --seed {given.seed}`:
+{given.count} arms of `{robot.name}` uniform within limits, the hand at home; the palm is turned
+about the thumb's contact normal in steps of {360 // STEPS} deg, the arm follows in closed form over
+all its swivels, within limits. (At turn zero an arm is found for {100 * at_rest:.2f} %: the one
+that was drawn, or another.)
+
+| usable range [deg] | 5 % | 25 % | median | 75 % | 95 % |
+|---|---|---|---|---|---|
+| in one piece with the start | {quartiles(width)} |
+
+The virtual joint has no limits of its own; the arm gives it some.
+{100 * np.mean(width >= 360):.0f} % of the arms can turn it all the way round, half of them at least
+{np.median(width):.0f} deg without leaving the range, and {100 * np.mean(width < 60):.0f} % less
+than 60 deg. It narrows where the palm
+is far from the base: in the farthest quarter the median is {np.median(width[far]):.0f} deg, in the
+rest {np.median(width[~far]):.0f} deg. Beyond a gap there is more to be had for
+{100 * np.mean(whole > width + 1):.1f} % of the arms: elsewhere the usable turns are one piece,
+though the arm may have to change its branch within it.
+"""
+    write(given.out, "virtual_joint_range", drawn, text)
+
+
+if __name__ == "__main__":
+    main()
