@@ -73,7 +73,7 @@ def event_format(form: TraceFormat) -> TraceFormat:
     )
     labels = {
         "kind": tuple(kind.name for kind in EventKind),
-        "jacobian": ("", *jacobian_names(form)),
+        "jacobian": ("none", *jacobian_names(form)),
         "joint_mask": joints,
         "phase": form.labels.get("phase", ()),
     }

@@ -15,7 +15,7 @@ class EventRules:
     Attributes:
         singular: Smallest singular value below which a Jacobian is near singular, by the name
             behind ``sigma_``, in the unit of that field. One not named here has the threshold
-            that its method states (`Jacobian.singular`).
+            that its method states (`RecordedJacobian.singular`).
         condition: Condition number above which it is ill-conditioned, by the name behind
             ``condition_``; likewise.
         release: A Jacobian has to rise above this multiple of its threshold (a condition number

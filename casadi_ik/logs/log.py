@@ -4,56 +4,21 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError, UnknownNameError
-from casadi_ik.logs.event_kinds import EventKind
+from casadi_ik.logs import filters
+from casadi_ik.logs.filters import Names, Solves
+from casadi_ik.logs.log_info import LogInfo
 from casadi_ik.logs.shard import Shard
 from casadi_ik.logs.table import Part, Table
 
 logger = logging.getLogger(__name__)
-
-Names = str | Iterable[str] | None
-Solves = int | Iterable[int] | None
-
-
-@dataclass(frozen=True)
-class LogInfo:
-    """What is in a log, without reading its messages.
-
-    Attributes:
-        paths: The files.
-        size: Their size [bytes].
-        robot: Name of the robot.
-        counts: Messages by method and kind: {"enhanced-dls": {"iteration": 120, ...}}.
-        compression: Of the chunks.
-        chunks: How many chunks there are.
-        uncompressed: Size of the chunks' contents [bytes].
-        compressed: Size of the chunks as stored [bytes].
-        metadata: Where the log comes from (seed, versions, parameters, ...), of the first file.
-        attachments: Attached files and their sizes [bytes], of the first file.
-        unfinished: Files without a footer: their writer was killed or is still at it. What is
-            after their last complete chunk is lost.
-    """
-
-    paths: tuple[Path, ...]
-    size: int
-    robot: str
-    counts: Mapping[str, Mapping[str, int]]
-    compression: str
-    chunks: int
-    uncompressed: int
-    compressed: int
-    metadata: Mapping[str, Any]
-    attachments: Mapping[str, int]
-    unfinished: tuple[Path, ...]
 
 
 def open_log(path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> Log:
@@ -166,7 +131,7 @@ class Log:
             UnknownNameError: No such method, status, event or phase.
             LogError: The log is damaged, or a solve is in it twice.
         """
-        wanted = _numbers(solve)
+        wanted = filters.numbers(solve)
         parts = [self._solves(name) for name in self._methods(method)]
         self._known("status", status, parts, "status")
         self._known("event", event, parts, "events")
@@ -177,11 +142,11 @@ class Log:
             if wanted is not None:
                 keep &= np.isin(part.solve_id, wanted)
             if status is not None:
-                keep &= np.isin(part.rows["status"], _codes(part, "status", status))
+                keep &= np.isin(part.rows["status"], filters.codes(part, "status", status))
             for name, values in (("events", event), ("phase_iterations", phase)):
                 if values is not None:
-                    keep &= part.rows[name][:, _codes(part, name, values)].any(axis=1)
-            found.append(_chosen(part, keep))
+                    keep &= part.rows[name][:, filters.codes(part, name, values)].any(axis=1)
+            found.append(filters.chosen(part, keep))
         return Table("solve", tuple(found))
 
     def iterations(
@@ -239,7 +204,7 @@ class Log:
     ) -> Table:
         numbers: dict[str, NDArray[np.int64] | None] = {}
         if status is None and event is None and phase is None:
-            chosen = _numbers(solve)
+            chosen = filters.numbers(solve)
             numbers = dict.fromkeys(self._methods(method), chosen)
         else:
             table = self.solves(method=method, solve=solve, status=status, event=event, phase=phase)
@@ -252,10 +217,10 @@ class Log:
             part = self._joined(name, kind, wanted, asked)
             keep = np.ones(len(part), dtype=bool)
             if phase is not None and "phase" in (part.rows.dtype.names or ()):
-                keep &= np.isin(part.rows["phase"], _codes(part, "phase", phase))
+                keep &= np.isin(part.rows["phase"], filters.codes(part, "phase", phase))
             if kind == "event" and event is not None:
-                keep &= np.isin(part.rows["kind"], _codes(part, "kind", event))
-            parts.append(_chosen(part, keep))
+                keep &= np.isin(part.rows["kind"], filters.codes(part, "kind", event))
+            parts.append(filters.chosen(part, keep))
         return Table(kind, tuple(parts))
 
     @cached_property
@@ -311,7 +276,7 @@ class Log:
     def _methods(self, method: Names) -> tuple[str, ...]:
         if method is None:
             return self.methods
-        names = (method,) if isinstance(method, str) else tuple(method)
+        names = tuple(filters.names(method))
         for name in names:
             if name not in self.methods:
                 known = ", ".join(self.methods) or "none"
@@ -329,38 +294,9 @@ class Log:
         if values is None:
             return
         known = dict.fromkeys(label for part in parts for label in part.labels.get(field, ()))
-        for value in (values,) if isinstance(values, str) else values:
-            name = value.name if isinstance(value, EventKind) else value
+        for name in filters.names(values):
             if name not in known or not name:
                 raise UnknownNameError(
                     f"{self.shards[0].path}: no {what} {name!r}; there are: "
                     f"{', '.join(filter(None, known))}"
                 )
-
-
-def _numbers(solve: Solves) -> NDArray[np.int64] | None:
-    if solve is None:
-        return None
-    numbers = [solve] if isinstance(solve, int | np.integer) else list(solve)
-    return np.unique(np.array(numbers, dtype=np.int64))
-
-
-def _codes(part: Part, field: str, values: Names) -> list[int]:
-    """The codes of names; of those the method does not know none."""
-    labels = part.labels.get(field, ())
-    names = [values] if isinstance(values, str | EventKind) else list(values or ())
-    plain = [name.name if isinstance(name, EventKind) else name for name in names]
-    return [labels.index(name) for name in plain if name in labels]
-
-
-def _chosen(part: Part, keep: NDArray[np.bool_]) -> Part:
-    if keep.all():
-        return part
-    return Part(
-        part.method,
-        part.rows[keep],
-        part.solve_id[keep],
-        part.iteration[keep],
-        part.labels,
-        part.units,
-    )

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from casadi_ik.logs.event_kinds import EventKind, jacobian_names
 from casadi_ik.logs.event_rules import EventRules
 from casadi_ik.logs.traces import Rows, Traces, entries
-from casadi_ik.solvers.method import Jacobian, TraceFormat
+from casadi_ik.solvers.method import TraceFormat
+from casadi_ik.steps.recorded_jacobian import RecordedJacobian
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ def jacobians(form: TraceFormat, rules: EventRules) -> list[Measured]:
         kind, _, name = item.name.partition("_")
         if kind not in ("sigma", "condition"):
             continue
-        known = form.jacobians.get(name, Jacobian())
+        known = form.jacobians.get(name, RecordedJacobian())
         one = TraceFormat(type(form.layout)((item,)), form.labels)
         for column, label in enumerate(jacobian_names(one)):
             measured = found.setdefault(

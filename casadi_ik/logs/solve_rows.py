@@ -100,5 +100,7 @@ def _lowest(block: SolveBlock) -> NDArray[np.float32]:
             one = TraceFormat(Layout((item,)), block.format.labels)
             columns = [names.index(name) for name in jacobian_names(one)]
             values = as_matrix(block.rows[item.name])
-            lowest[np.ix_(some, columns)] = np.fmin.reduceat(values, starts, axis=0)
+            lowest[np.flatnonzero(some)[:, None], columns] = np.fmin.reduceat(
+                values, starts, axis=0
+            )
     return lowest

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -140,7 +141,7 @@ class Table:
         """
         frame = self.frame()
         try:
-            frame.write_parquet(path)
+            frame.write_parquet(Path(path))
         except OSError as error:
             raise LogError(f"{path}: cannot be written: {error.strerror or error}") from error
 
@@ -189,13 +190,12 @@ def _element_names(shape: tuple[int, ...], labels: Sequence[str]) -> list[str]:
     """Names of the elements of a field, row by row."""
     names: list[str] = []
     for index in np.ndindex(shape):
-        first = labels[index[0]] if index[0] < len(labels) else str(index[0])
         rest = (_AXES[i] if shape[-1] == len(_AXES) else str(i) for i in index[1:])
-        names.append(".".join((first, *rest)))
+        names.append(".".join((element_name(labels, index[0]), *rest)))
     return names
 
 
-def _readable(part: Part, name: str) -> Sequence[Any]:
+def _readable(part: Part, name: str) -> list[Any]:
     """A field as a person would have it: names for codes and bits."""
     values, labels = part.rows[name], part.labels.get(name, ())
     if name.endswith("_mask") and values.dtype.kind == "u":
@@ -205,7 +205,12 @@ def _readable(part: Part, name: str) -> Sequence[Any]:
         ]
     if values.ndim == 1 and values.dtype.kind in "iu" and labels:
         return [label_of(labels, code) for code in values.tolist()]
-    return values.tolist() if values.ndim == 1 else values
+    return values.tolist() if values.ndim == 1 else list(values)
+
+
+def element_name(labels: Sequence[str], index: int) -> str:
+    """The name of an element, or its number."""
+    return labels[index] if index < len(labels) else str(index)
 
 
 def label_of(labels: Sequence[str], code: int) -> str:
@@ -217,7 +222,7 @@ def _subjects(part: Part) -> list[str]:
     """What each event is about: the Jacobian, the joints, the phases."""
     kinds = _readable(part, "kind")
     joints = [", ".join(names) for names in _readable(part, "joint_mask")]
-    jacobian = [names or "" for names in _jacobian_names(part)]
+    jacobian = _readable(part, "jacobian")
     phases = part.labels.get("phase", ())
     subjects = []
     for i, kind in enumerate(kinds):
@@ -235,11 +240,6 @@ def _subjects(part: Part) -> list[str]:
             subject = joints[i]
         subjects.append(subject)
     return subjects
-
-
-def _jacobian_names(part: Part) -> list[str]:
-    names = part.labels.get("jacobian", ())
-    return [names[code] if code < len(names) else str(code) for code in part.rows["jacobian"]]
 
 
 def _polars() -> Any:

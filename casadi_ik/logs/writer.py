@@ -136,9 +136,8 @@ class McapRecorder:
         cell = events["solve_id"].astype(np.int64) * kinds + events["kind"]
         tally = np.bincount(cell, minlength=len(block) * kinds).reshape(-1, kinds)
         solves = solve_rows(block, tally, method.formats["solve"].layout)
-        solves["kept"] = self.keep(
-            block.first, block.batch.success, tally[:, list(SINGULAR)].any(axis=1)
-        )
+        singular = tally[:, list(SINGULAR)].sum(axis=1) > 0
+        solves["kept"] = self.keep(block.first, block.batch.success, singular)
         self._note(block)
         self._chunks.add(block_messages(block, events, solves, method.channels, self.clock))
 

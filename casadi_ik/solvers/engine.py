@@ -19,7 +19,6 @@ from casadi_ik.solvers.alternatives import AlternativeFinder
 from casadi_ik.solvers.diagnosis import Diagnosis, Reason
 from casadi_ik.solvers.diagnostician import Diagnostician
 from casadi_ik.solvers.hand_first import HandFirstMethod
-from casadi_ik.solvers.joining import joined
 from casadi_ik.solvers.method import Method, Outcome
 from casadi_ik.solvers.parts import Parts
 from casadi_ik.solvers.problem import Array, Problems
@@ -120,7 +119,7 @@ class Engine:
             if recorder is not None and outcome.rows is not None:
                 recorder.record(self._block(asked, batch, outcome.rows, started))
             batches.append(batch)
-        return joined(batches)
+        return BatchSolution.joined(batches)
 
     def _starts(self, q0: ArrayLike | None, count: int) -> Array:
         start = self.robot.configuration(q0, "q0")

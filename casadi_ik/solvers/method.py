@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -14,6 +13,7 @@ from casadi_ik.kernels.layout import Layout
 from casadi_ik.kernels.rows import split_rows
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.problem import Array, Problems
+from casadi_ik.steps.recorded_jacobian import RecordedJacobian
 from casadi_ik.steps.status import Phase, Status
 
 
@@ -46,23 +46,6 @@ class Outcome:
         return () if self.rows is None else split_rows(self.rows, self.iterations)
 
 
-@dataclass(frozen=True)
-class Jacobian:
-    """A Jacobian whose singular values a method records.
-
-    Attributes:
-        joints: Actuators whose motion it maps.
-        singular: Smallest singular value below which it counts as near singular, in the unit of
-            its field ``sigma_<name>``.
-        condition: Condition number above which it counts as ill-conditioned, for its field
-            ``condition_<name>``.
-    """
-
-    joints: tuple[str, ...] = ()
-    singular: float = 0.0
-    condition: float = math.inf
-
-
 @dataclass(frozen=True, eq=False)
 class TraceFormat:
     """How to read a trace.
@@ -78,16 +61,21 @@ class TraceFormat:
 
     layout: Layout
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    jacobians: Mapping[str, Jacobian] = field(default_factory=dict)
+    jacobians: Mapping[str, RecordedJacobian] = field(default_factory=dict)
 
 
-def trace_format(layout: Layout, robot: RobotDescription) -> TraceFormat:
+def trace_format(
+    layout: Layout,
+    robot: RobotDescription,
+    jacobians: Mapping[str, RecordedJacobian] | None = None,
+) -> TraceFormat:
     """How to read a trace whose fields have the names all methods use.
 
     Args:
         layout: Fields of a row: "q", "position_error", "angle_error", "limit_mask", "phase" and
             "status", and whatever else needs no names.
         robot: The robot.
+        jacobians: As in `TraceFormat`.
     """
     labels = {
         "q": robot.actuator_names,
@@ -97,7 +85,7 @@ def trace_format(layout: Layout, robot: RobotDescription) -> TraceFormat:
         "phase": Phase.labels(),
         "status": Status.labels(),
     }
-    return TraceFormat(layout, labels)
+    return TraceFormat(layout, labels, jacobians or {})
 
 
 class Method(Protocol):

@@ -51,7 +51,7 @@ class QiuMethod:
     @property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        return trace_format(self.step.record, self._robot)
+        return trace_format(self.step.record, self._robot, self.step.jacobians)
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +111,31 @@ class BatchSolution:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @classmethod
+    def joined(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
+        """One batch after the other, at least one.
+
+        A phase that a part does not know counts 0 iterations there.
+        """
+        first = parts[0]
+        if len(parts) == 1:
+            return first
+        arrays = {
+            item.name: np.concatenate([getattr(part, item.name) for part in parts])
+            for item in fields(cls)
+            if isinstance(getattr(first, item.name), np.ndarray)
+        }
+        none = [np.zeros(len(part), dtype=np.int64) for part in parts]
+        names = dict.fromkeys(chain.from_iterable(part.phases for part in parts))
+        phases = {
+            name: np.concatenate(
+                [part.phases.get(name, no) for part, no in zip(parts, none, strict=True)]
+            )
+            for name in names
+        }
+        diagnoses = tuple(chain.from_iterable(part.diagnoses for part in parts))
+        return replace(first, **arrays, phases=phases, diagnoses=diagnoses)
 
     @property
     def status_names(self) -> NDArray[np.str_]:

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from casadi_ik.errors import InputError, RowError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.solvers.engine import Engine
-from casadi_ik.solvers.joining import joined
 from casadi_ik.solvers.problem import Problems
 from casadi_ik.solvers.recorder import Recorder
 from casadi_ik.solvers.solution import BatchSolution
@@ -94,7 +93,7 @@ class Stream:
                 faults[error.row] = str(error)
                 parts[row] = BatchSolution.invalid(1, n, self.tolerances, self.diagnose)
                 waiting += [part for part in ((row + 1, stop), (start, row)) if part[0] < part[1]]
-        solution = joined([parts[start] for start in sorted(parts)])
+        solution = BatchSolution.joined([parts[start] for start in sorted(parts)])
         return SolvedBlock(first_row, solution, dict(sorted(faults.items())))
 
     def _solved(self, points: np.ndarray, normals: np.ndarray, first_row: int) -> BatchSolution:

@@ -25,6 +25,7 @@ from casadi_ik.steps.limits import kept_within
 from casadi_ik.steps.palm_estimate import palm_orientation
 from casadi_ik.steps.palm_motion import palm_motion
 from casadi_ik.steps.qiu_parameters import QiuParameters
+from casadi_ik.steps.recorded_jacobian import RecordedJacobian
 from casadi_ik.steps.status import Phase, Status
 from casadi_ik.steps.targets import contact_errors, target_fields, targets, within_tolerance
 from casadi_ik.steps.tasks import (
@@ -92,6 +93,25 @@ class EnhancedStep:
             )
         )
         self.record = enhanced_record(robot)
+
+    @property
+    def jacobians(self) -> dict[str, RecordedJacobian]:
+        """The Jacobians in the record.
+
+        The paper names no thresholds; these are ours. A metre of the thumb's tip asks for more
+        than 20 rad of some joint, a rad of the palm for more than 2 rad, the platform for passive
+        joints that move 100 times as far as it turns. H_p has lengths in millimetres: its condition
+        number is above 400 everywhere.
+        """
+        names = self.robot.actuator_names
+        arm = tuple(names[i] for i in self.robot.arm_actuators)
+        thumb = tuple(names[i] for i in self.robot.finger_actuators(self.robot.thumb))
+        passive = tuple(names[i] for i in self.chain.passive if i != VIRTUAL)
+        return {
+            "thumb": RecordedJacobian(arm + thumb, singular=0.05),
+            "palm": RecordedJacobian(arm, singular=0.5),
+            "closed_chain": RecordedJacobian(passive, singular=0.01, condition=1e5),
+        }
 
     def graph(self) -> StepGraph:
         """The whole iteration; compilable unless the finger step calls Ipopt."""

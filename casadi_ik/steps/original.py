@@ -13,6 +13,7 @@ from casadi_ik.steps.hierarchy import combine
 from casadi_ik.steps.limits import kept_within, limit_mask
 from casadi_ik.steps.palm_estimate import palm_orientation, thumb_first
 from casadi_ik.steps.qiu_parameters import OriginalParameters
+from casadi_ik.steps.recorded_jacobian import RecordedJacobian
 from casadi_ik.steps.status import Phase, Status
 from casadi_ik.steps.targets import contact_errors, target_fields, targets, within_tolerance
 from casadi_ik.steps.tasks import (
@@ -63,6 +64,11 @@ class OriginalStep:
             Field("phase", (), "u1"),
             Field("status", (), "u1", "", "0 running, else the final status"),
         )
+
+    @property
+    def jacobians(self) -> dict[str, RecordedJacobian]:
+        """The Jacobians in the record: none."""
+        return {}
 
     def graph(self) -> StepGraph:
         """The whole iteration.

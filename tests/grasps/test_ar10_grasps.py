@@ -110,10 +110,10 @@ def test_from_the_command_line_with_a_log(tmp_path: Path, baxter: ik.ArmHand) ->
     answer = json.loads(out.read_text())
     assert answer["success"]
     assert answer["actuators"] == list(baxter.actuators)
-    found = ik.logs.open_log(log)
-    (solve,) = found.solves()
-    np.testing.assert_array_equal(solve.q, answer["q"])
-    assert solve.iterations == len(found.iterations().rows) == answer["iterations"]
+    found = ik.logs.open(log)
+    (solve,) = found.solves().rows
+    np.testing.assert_array_equal(solve["q"], answer["q"])
+    assert solve["iterations"] == len(found.iterations()) == answer["iterations"]
     assert found.attachment("robot.urdf").decode() == baxter.urdf()
 
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.solvers import BatchSolution, Problems, Status, Tolerance
-from casadi_ik.solvers.method import Jacobian, TraceFormat
+from casadi_ik.solvers.method import TraceFormat
 from casadi_ik.solvers.recorder import SolveBlock
+from casadi_ik.steps.recorded_jacobian import RecordedJacobian
 
 FINGERS = ("thumb", "finger_2", "finger_3")
 PHASES = ("thumb reaching", "hand alignment", "refinement")
@@ -29,7 +30,7 @@ LAYOUT = Layout.record(
     Field("flags", (5,), "u1"),
 )
 LABELS = {"phase": PHASES, "q": JOINTS, "position_error": FINGERS}
-FORMAT = TraceFormat(LAYOUT, LABELS, {"closed_chain": Jacobian(JOINTS[:3], singular=1e-3)})
+FORMAT = TraceFormat(LAYOUT, LABELS, {"closed_chain": RecordedJacobian(JOINTS[:3], singular=1e-3)})
 
 
 def make_rows(seed: int, count: int, layout: Layout = LAYOUT) -> np.ndarray:
@@ -75,7 +76,11 @@ def make_block(
         ok=np.tile([True, False, True], (k, 1)),
         limits_ok=np.ones(k, dtype=bool),
         tolerances=(Tolerance(),) * 3,
-        phases={PHASES[0]: iterations // 2, PHASES[1]: iterations - iterations // 2},
+        phases={
+            # As in `make_rows`: a third each, rounded up.
+            phase: -(-iterations * (i + 1) // 3) - -(-iterations * i // 3)
+            for i, phase in enumerate(PHASES)
+        },
     )
     rows = [
         make_rows(number, count, form.layout) for number, count in zip(numbers, counts, strict=True)

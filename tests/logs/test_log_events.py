@@ -16,7 +16,8 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs import EventKind, EventRules, detect_events
 from casadi_ik.logs.event_kinds import event_format
 from casadi_ik.logs.table import Part, Table
-from casadi_ik.solvers.method import Jacobian, TraceFormat
+from casadi_ik.solvers.method import TraceFormat
+from casadi_ik.steps.recorded_jacobian import RecordedJacobian
 
 STORAGE = {"phase": "u1", "restart": "u4", "limit_mask": "u4", "active_mask": "u4"}
 Names = tuple[str, ...]
@@ -52,7 +53,7 @@ def found_in(
     layout: Layout,
     trace: np.ndarray,
     labels: Mapping[str, Names] | None = None,
-    jacobians: Mapping[str, Jacobian] | None = None,
+    jacobians: Mapping[str, RecordedJacobian] | None = None,
     rules: EventRules | None = None,
     counts: Sequence[int] | None = None,
 ) -> tuple[Event, ...]:
@@ -69,7 +70,7 @@ def found_in(
             record["value"],
             record["threshold"],
             record["joint_mask"],
-            record["jacobian"].removeprefix("0"),
+            record["jacobian"].removeprefix("none"),
             record["solve_id"],
         )
         for record in Table("event", (part,)).records()
@@ -154,7 +155,7 @@ def test_near_singular_on_entry_only() -> None:
     nan = np.nan
     sigma = [0.5, 0.05, 0.01, 0.12, 0.05, 0.2, 0.09, nan, 0.09, 0.5]
     layout, trace = trace_of(sigma_closed_chain=sigma)
-    chain = {"closed_chain": Jacobian(("b", "c"), singular=0.1)}
+    chain = {"closed_chain": RecordedJacobian(("b", "c"), singular=0.1)}
     events = found_in(layout, trace, {"q": ("a", "b", "c")}, chain)
     assert [(e.iteration, e.value) for e in events] == [(1, 0.05), (6, 0.09), (8, 0.09)]
     assert {e.subject for e in events} == {e.jacobian for e in events} == {"closed_chain"}
@@ -170,7 +171,7 @@ def test_near_singular_on_entry_only() -> None:
 def test_ill_conditioned_by_its_own_threshold() -> None:
     condition = [10.0, 400.0, 300.0, 150.0, 400.0, np.nan, 201.0]
     layout, trace = trace_of(condition_arm=condition, sigma_arm=np.ones(7))
-    arm = {"arm": Jacobian(("a",), singular=0.1, condition=200.0)}
+    arm = {"arm": RecordedJacobian(("a",), singular=0.1, condition=200.0)}
     events = found_in(layout, trace, {"q": ("a",)}, arm)
     assert {e.kind for e in events} == {EventKind.ILL_CONDITIONED}
     # 150 is no release: it would have to fall below 200 / 1.5.
@@ -180,7 +181,7 @@ def test_ill_conditioned_by_its_own_threshold() -> None:
 
 def test_near_singular_from_the_start_and_per_finger() -> None:
     layout, trace = trace_of(sigma_finger=[[0.001, 1.0], [0.001, 1.0], [1.0, 0.001]])
-    fingers = {"finger": Jacobian(singular=0.01)}
+    fingers = {"finger": RecordedJacobian(singular=0.01)}
     events = found_in(layout, trace, {"sigma_finger": ("thumb", "index")}, fingers)
     assert [(e.iteration, e.subject) for e in events] == [
         (0, "finger[thumb]"),
@@ -205,7 +206,7 @@ def test_a_singular_row_of_a_known_jacobian() -> None:
         sigma.append(values[-1])
         condition.append(min(values[0] / values[-1] if values[-1] else np.inf, 1e12))
     layout, trace = trace_of(sigma_arm=sigma, condition_arm=condition)
-    arm = {"arm": Jacobian(("shoulder", "elbow"), singular=0.03, condition=100.0)}
+    arm = {"arm": RecordedJacobian(("shoulder", "elbow"), singular=0.03, condition=100.0)}
     events = found_in(layout, trace, {"q": ("shoulder", "elbow")}, arm)
     assert [(e.iteration, e.kind) for e in events] == [
         (5, EventKind.NEAR_SINGULAR),
@@ -218,7 +219,7 @@ def test_no_events_while_converging() -> None:
     decay = 0.5 ** np.arange(40)
     q = np.stack([1 - decay, decay], axis=1)
     layout, trace = trace_of(q=q, cost=decay, sigma_arm=np.full(40, 0.3))
-    assert found_in(layout, trace, jacobians={"arm": Jacobian(singular=0.1)}) == ()
+    assert found_in(layout, trace, jacobians={"arm": RecordedJacobian(singular=0.1)}) == ()
 
 
 def test_stall_once_per_standstill() -> None:
@@ -269,7 +270,7 @@ def test_a_standstill_names_the_singularity_and_the_limits_it_is_at() -> None:
     layout, trace = trace_of(
         q=0.1 * (-1.0) ** k[:, None], cost=np.ones(30), sigma_arm=sigma, limit_mask=np.full(30, 2)
     )
-    arm = {"arm": Jacobian(singular=0.1)}
+    arm = {"arm": RecordedJacobian(singular=0.1)}
     labels = {"q": ("a", "b"), "sigma_arm": ("point", "normal")}
     events = found_in(layout, trace, labels, arm)
     still = [e for e in events if e.kind in (EventKind.STALL, EventKind.OSCILLATION)]
@@ -277,7 +278,7 @@ def test_a_standstill_names_the_singularity_and_the_limits_it_is_at() -> None:
         (EventKind.OSCILLATION, "arm[point]", ("a",)),
         (EventKind.STALL, "arm[point]", ("b",)),
     ]
-    far = found_in(layout, trace, labels, {"arm": Jacobian(singular=0.01)})
+    far = found_in(layout, trace, labels, {"arm": RecordedJacobian(singular=0.01)})
     assert {e.jacobian for e in far} == {""}
 
 
@@ -332,7 +333,7 @@ def test_solves_do_not_see_each_other(seed: int, counts: list[int]) -> None:
         active_mask=rng.integers(0, 4, m),
         sigma_arm=np.where(rng.random(m) < 0.2, np.nan, 10 ** rng.uniform(-2, 1, m)),
     )
-    arm = {"arm": Jacobian(singular=0.1)}
+    arm = {"arm": RecordedJacobian(singular=0.1)}
     together = found_in(layout, trace, None, arm, counts=counts)
     ends = np.cumsum(counts)
     alone = [

@@ -99,7 +99,7 @@ def test_limits_are_never_left(robot, tmp_path, targets):
     """Neither by the answer nor by any iterate; ignored, they are no bounds."""
     path = tmp_path / "log.mcap"
     batch = ik.Solver(robot, "ipopt").solve_batch(*targets, log=path)
-    q = ik.logs.open_log(path).iterations().rows["q"]
+    q = ik.logs.open(path).iterations().rows["q"]
     assert len(q) == batch.iterations.sum()
     assert np.all((q >= robot.lower) & (q <= robot.upper))
     assert np.all((batch.q >= robot.lower) & (batch.q <= robot.upper))

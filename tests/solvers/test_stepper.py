@@ -18,7 +18,7 @@ def stepped_solver() -> ik.Solver:
 def test_steps_are_those_of_the_log(stepped_solver: ik.Solver, tmp_path) -> None:
     grasp = ik.load_grasp("sugar_box")
     solution = stepped_solver.solve(grasp, log=tmp_path / "x.mcap")
-    rows = ik.logs.open_log(tmp_path / "x.mcap").iterations().rows
+    rows = ik.logs.open(tmp_path / "x.mcap").iterations().rows
     stepper = stepped_solver.stepper(grasp)
     records = list(stepper)
     assert stepper.status == solution.status
