@@ -20,7 +20,7 @@ import numpy as np
 from bench_first_use import first_use
 from bench_report import Section, write_report
 from peers import installed, kinds, measured
-from random_arms import random_arm_targets
+from targets import random_arm_targets
 
 import casadi_ik as ik
 

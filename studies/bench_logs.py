@@ -18,9 +18,9 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from random_arms import random_arm_targets
 from rich.console import Console
 from rich.table import Table
+from targets import random_arm_targets
 
 import casadi_ik as ik
 from casadi_ik.solvers.recorder import SolveBlock

@@ -21,7 +21,7 @@ from bench_report import Section
 from numpy.typing import NDArray
 from peer_qp import Mink, Pink, Placo
 from peer_steps import Peer, Scipy
-from random_arms import random_arm_targets
+from targets import random_arm_targets
 
 import casadi_ik as ik
 from casadi_ik.solvers import Problems

@@ -4,12 +4,13 @@ from casadi_ik.kernels.cache import cache_directory
 from casadi_ik.kernels.compiler import NoCompilerWarning
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.kernels.loop import FAILED, NON_FINITE, LoopKernel, LoopResult
+from casadi_ik.kernels.loop import FAILED, NON_FINITE, REPEATED, LoopKernel, LoopResult
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
 __all__ = [
     "FAILED",
     "NON_FINITE",
+    "REPEATED",
     "RUNNING",
     "Field",
     "FunctionKernel",

@@ -25,6 +25,9 @@ NON_FINITE = -1
 FAILED = -2
 """Status of a solve whose step reported a failure; the state before that step stays."""
 
+REPEATED = -3
+"""Status of a solve that came back to an earlier state bit for bit, and so would for ever."""
+
 FIRST_ROWS = 256
 """Rows a trace starts with; it doubles when they are full."""
 
@@ -41,8 +44,8 @@ class LoopResult:
     Attributes:
         states: Last states, shape (k, ns).
         iterations: Steps made, shape (k,); the one that became non-finite counts.
-        status: Shape (k,): the step's status, `RUNNING` if the iterations ran out, `NON_FINITE`
-            or `FAILED`.
+        status: Shape (k,): the step's status, `RUNNING` if the iterations ran out, `NON_FINITE`,
+            `FAILED` or `REPEATED`.
         time: Seconds inside the loop, shape (k,).
         rows: The records of all iterations of all solves, one after the other, shape
             (sum of iterations,), of the record layout's dtype; None if no trace was asked for.
@@ -92,6 +95,7 @@ class LoopKernel:
             "RUNNING": RUNNING,
             "NON_FINITE": NON_FINITE,
             "FAILED": FAILED,
+            "REPEATED": REPEATED,
             "CODE_LIMIT": CODE_LIMIT,
         }
         driver = define(constants) + row_driver(self.step.record) + driver_text("loop")
@@ -103,8 +107,9 @@ class LoopKernel:
         """Solve a batch.
 
         A solve ends when the step's status is not `RUNNING`, when the new state or the status is
-        not finite, or after `max_iterations`. Neither the first state nor the parameters are
-        looked at: a step may take NaN there to mean something.
+        not finite, when the new state is an earlier one once more (drivers/loop.c), or after
+        `max_iterations`. Neither the first state nor the parameters are looked at: a step may
+        take NaN there to mean something.
 
         Args:
             states: First states, shape (k, ns); not changed.
@@ -152,6 +157,7 @@ class LoopKernel:
     def _run_compiled(
         self, result: LoopResult, parameters: NDArray[np.float64], max_iterations: int
     ) -> None:
+        mark = np.empty(self.step.state.size)
         job = _Job(
             states=memory(result.states),
             parameters=memory(parameters),
@@ -159,6 +165,7 @@ class LoopKernel:
             iterations=memory(result.iterations),
             status=memory(result.status),
             seconds=memory(result.time),
+            mark=memory(mark),
             count=len(result.states),
             max_iterations=max_iterations,
             slice=SLICE,
@@ -182,7 +189,7 @@ class LoopKernel:
             started = perf_counter()
             state[:] = result.states[i]
             constants[:] = row
-            status, iteration = RUNNING, 0
+            status, iteration, mark = RUNNING, 0, b""
             while status == RUNNING and iteration < max_iterations:
                 if not call():
                     status = FAILED
@@ -195,6 +202,11 @@ class LoopKernel:
                 else:
                     state[:] = new_state
                     status = int(code[0])
+                    now = state.tobytes()
+                    if status == RUNNING and now == mark:
+                        status = REPEATED
+                    if iteration & (iteration - 1) == 0:
+                        mark = now
             result.states[i] = state
             result.iterations[i] = iteration
             result.status[i] = status
@@ -213,6 +225,7 @@ class _Job(ctypes.Structure):
         ("iterations", ctypes.c_void_p),
         ("status", ctypes.c_void_p),
         ("seconds", ctypes.c_void_p),
+        ("mark", ctypes.c_void_p),
         ("rows", ctypes.c_void_p),
         ("capacity", ctypes.c_int64),
         ("used", ctypes.c_int64),

@@ -7,7 +7,7 @@ import math
 import os
 import platform
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -50,15 +50,9 @@ def log_metadata(
         "iteration_ns": str(ITERATION),
         "compression": compression,
         "code_version": _version("casadi-ik"),
-        "packages": json.dumps({name: _version(name) for name in PACKAGES}),
+        "packages": json.dumps(package_versions(PACKAGES)),
         "python": platform.python_version(),
-        "machine": json.dumps(
-            {
-                "system": platform.platform(),
-                "processor": _processor(),
-                "cores": os.cpu_count(),
-            }
-        ),
+        "machine": json.dumps(machine()),
         "parameters": json.dumps(plain(parameters)),
     }
     return {**record, CHECKSUM: checksum(record)}
@@ -68,6 +62,16 @@ def checksum(record: Mapping[str, str]) -> str:
     """CRC-32 of the entries but itself: MCAP has no checksum for metadata."""
     entries = sorted((key, text) for key, text in record.items() if key != CHECKSUM)
     return f"{zlib.crc32(json.dumps(entries).encode()):08x}"
+
+
+def machine() -> dict[str, Any]:
+    """What it runs on: system, processor, cores."""
+    return {"system": platform.platform(), "processor": _processor(), "cores": os.cpu_count()}
+
+
+def package_versions(names: Iterable[str]) -> dict[str, str]:
+    """Versions of installed packages by name."""
+    return {name: _version(name) for name in names}
 
 
 def plain(value: Any) -> Any:

@@ -15,7 +15,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import LoopKernel, LoopResult
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solvers.method import Outcome, TraceFormat
+from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
 from casadi_ik.solvers.posture_table import PostureTable
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.hand_first import HandFirstStep
@@ -76,16 +76,7 @@ class HandFirstMethod:
     @property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        robot = self._robot
-        labels = {
-            "q": robot.actuator_names,
-            "position_error": robot.finger_names,
-            "angle_error": robot.finger_names,
-            "limit_mask": robot.actuator_names,
-            "phase": Phase.labels(),
-            "status": Status.labels(),
-        }
-        return TraceFormat(self.step.layouts.record, labels)
+        return trace_format(self.step.layouts.record, self._robot)
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.kernels.rows import split_rows
+from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.recorded_jacobian import RecordedJacobian
+from casadi_ik.steps.status import Phase, Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,30 @@ class TraceFormat:
     layout: Layout
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     jacobians: Mapping[str, RecordedJacobian] = field(default_factory=dict)
+
+
+def trace_format(
+    layout: Layout,
+    robot: RobotDescription,
+    jacobians: Mapping[str, RecordedJacobian] | None = None,
+) -> TraceFormat:
+    """How to read a trace whose fields have the names all methods use.
+
+    Args:
+        layout: Fields of a row: "q", "position_error", "angle_error", "limit_mask", "phase" and
+            "status", and whatever else needs no names.
+        robot: The robot.
+        jacobians: As in `TraceFormat`.
+    """
+    labels = {
+        "q": robot.actuator_names,
+        "position_error": robot.finger_names,
+        "angle_error": robot.finger_names,
+        "limit_mask": robot.actuator_names,
+        "phase": Phase.labels(),
+        "status": Status.labels(),
+    }
+    return TraceFormat(layout, labels, jacobians or {})
 
 
 class Method(Protocol):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solvers.method import Outcome, TraceFormat
+from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.ipopt_parameters import IpoptParameters
 from casadi_ik.steps.status import Phase, Status
@@ -73,16 +73,7 @@ class IpoptMethod:
     @property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        robot = self._robot
-        labels = {
-            "q": robot.actuator_names,
-            "position_error": robot.finger_names,
-            "angle_error": robot.finger_names,
-            "limit_mask": robot.actuator_names,
-            "phase": Phase.labels(),
-            "status": Status.labels(),
-        }
-        return TraceFormat(self.record, labels)
+        return trace_format(self.record, self._robot)
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.errors import RowError, UnsupportedError
-from casadi_ik.kernels import LoopKernel
+from casadi_ik.kernels import REPEATED, LoopKernel
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solvers.method import Outcome, TraceFormat
+from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.enhanced import EnhancedStep
 from casadi_ik.steps.original import OriginalStep
 from casadi_ik.steps.qiu_parameters import OriginalParameters, QiuParameters
-from casadi_ik.steps.status import Phase, Status
+from casadi_ik.steps.status import Status
 
 
 class QiuMethod:
@@ -51,16 +51,7 @@ class QiuMethod:
     @property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        robot = self._robot
-        labels = {
-            "q": robot.actuator_names,
-            "position_error": robot.finger_names,
-            "angle_error": robot.finger_names,
-            "limit_mask": robot.actuator_names,
-            "phase": Phase.labels(),
-            "status": Status.labels(),
-        }
-        return TraceFormat(self.step.record, labels, self.step.jacobians)
+        return trace_format(self.step.record, self._robot, self.step.jacobians)
 
     @property
     def parameters(self) -> Mapping[str, Any]:
@@ -114,6 +105,7 @@ class QiuMethod:
         status = result.status.astype(np.int64)
         status[result.status == Status.RUNNING] = Status.ITERATION_LIMIT
         status[result.status < 0] = Status.INVALID
+        status[result.status == REPEATED] = Status.STALLED
         return Outcome(
             q=result.states[:, self.step.state.slice("q")],
             status=status,

@@ -14,7 +14,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import LoopKernel, LoopResult
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solvers.method import Outcome, TraceFormat
+from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
 from casadi_ik.solvers.posture_table import PostureTable
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.status import Phase, Status
@@ -69,17 +69,10 @@ class ThumbFirstMethod:
     @property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        robot = self._robot
-        labels = {
-            "q": robot.actuator_names,
-            "position_error": robot.finger_names,
-            "angle_error": robot.finger_names,
-            "held_mask": robot.actuator_names,
-            "limit_mask": robot.actuator_names,
-            "phase": Phase.labels(),
-            "status": Status.labels(),
-        }
-        return TraceFormat(self.step.record, labels)
+        form = trace_format(self.step.record, self._robot)
+        return dataclasses.replace(
+            form, labels={**form.labels, "held_mask": self._robot.actuator_names}
+        )
 
     @property
     def parameters(self) -> Mapping[str, Any]:

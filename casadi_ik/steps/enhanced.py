@@ -9,6 +9,8 @@ starts from, in phase 2 the one after the fingers' step, which is where the meth
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +18,10 @@ from numpy.typing import NDArray
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.robots.description import Array, RobotDescription
+from casadi_ik.steps.enhanced_record import enhanced_record, enhanced_row
 from casadi_ik.steps.finger_step import finger_step_function, planar_fingers
 from casadi_ik.steps.hierarchy import combine
-from casadi_ik.steps.limits import kept_within, limit_mask
+from casadi_ik.steps.limits import kept_within
 from casadi_ik.steps.palm_estimate import palm_orientation
 from casadi_ik.steps.palm_motion import palm_motion
 from casadi_ik.steps.qiu_parameters import QiuParameters
@@ -36,13 +39,11 @@ from casadi_ik.steps.tasks import (
     weighted,
     weighted_damped,
 )
-from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated
+from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
 from casadi_ik.symbolic.measures import condition_number, singular_values
-from casadi_ik.symbolic.smooth import Expr, safe_norm
+from casadi_ik.symbolic.smooth import safe_norm
 from casadi_ik.symbolic.subexpressions import shared
-
-NOT_MEASURED = float("nan")
 
 Counts = NDArray[np.int64]
 
@@ -60,7 +61,7 @@ class EnhancedStep:
         Raises:
             UnsupportedError: The robot is not of the kind the method needs.
         """
-        n, f = len(robot.actuators), len(robot.fingers)
+        n = len(robot.actuators)
         self.robot = robot
         self.options = options
         self.chain = split(robot, options.borrowed)
@@ -70,7 +71,7 @@ class EnhancedStep:
                 Field("q", (n,)),
                 Field("phase"),
                 Field("best", doc="smallest summed error of thumb reaching so far"),
-                Field("waited", doc="iterations since `best` fell, or since the last motion"),
+                Field("waited", doc="iterations since `best` fell"),
                 Field("reached", doc="iterations spent in thumb reaching"),
             )
         )
@@ -80,6 +81,7 @@ class EnhancedStep:
                 Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not"),
                 Field("reaching_damping"),
                 Field("chain_damping"),
+                Field("chain_lever", unit="mm"),
                 Field("reaching_gamma"),
                 Field("chain_gamma"),
                 Field("longest_error", unit="mm"),
@@ -88,25 +90,9 @@ class EnhancedStep:
                 Field("reaching_patience"),
                 Field("reaching_iterations"),
                 Field("step_cap"),
-                Field("stall_step"),
-                Field("stall_patience"),
             )
         )
-        self.record = Layout.record(
-            Field("q", (n,), "f8", "rad or m", "actuator positions"),
-            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
-            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
-            Field("palm_error", (), "f4", "rad", "palm orientation task error (phase 1)"),
-            Field("palm_motion", (2,), "f4", "mm, rad", "palm motion demanded (phase 2)"),
-            Field("step_size", (), "f4", "rad or m", "largest motor change of this iteration"),
-            Field("sigma_thumb", (), "f4", "m", "smallest singular value, thumb point Jacobian"),
-            Field("sigma_palm", (), "f4", "", "smallest singular value, palm task (phase 1)"),
-            Field("sigma_closed_chain", (), "f4", "", "smallest singular value of H_p (phase 2)"),
-            Field("condition_closed_chain", (), "f4", "", "condition number of H_p (phase 2)"),
-            Field("limit_mask", (), "u4", "", "bit i: actuator i at or beyond a limit"),
-            Field("phase", (), "u1", "", "1 thumb reaching, 2 hand alignment"),
-            Field("status", (), "u1", "", "0 running, else the final status"),
-        )
+        self.record = enhanced_record(robot)
 
     @property
     def jacobians(self) -> dict[str, RecordedJacobian]:
@@ -150,27 +136,17 @@ class EnhancedStep:
     ) -> dict[str, float | list[float] | Array]:
         """Values of all parameter fields but the targets."""
         options = self.options
-        weights = [
-            options.virtual_weight if column == VIRTUAL else options.joint_weight
-            for column in self.chain.active
-        ]
-        return {
+        given = {
             "position_tolerance": position_tolerance,
             "angle_tolerance": angle_tolerance,
             "enforce_limits": float(enforce_limits),
-            "reaching_damping": options.reaching_damping,
-            "chain_damping": options.chain_damping,
-            "reaching_gamma": options.reaching_gamma,
-            "chain_gamma": options.chain_gamma,
-            "longest_error": options.longest_error,
-            "widest_error": options.widest_error,
-            "weights": weights,
-            "reaching_patience": float(options.reaching_patience),
-            "reaching_iterations": float(options.reaching_iterations),
-            "step_cap": options.step_cap,
-            "stall_step": options.stall_step,
-            "stall_patience": float(options.stall_patience),
+            "weights": [
+                options.virtual_weight if column == VIRTUAL else options.joint_weight
+                for column in self.chain.active
+            ],
         }
+        named = (name for name in self.parameters.names if hasattr(options, name))
+        return given | {name: float(getattr(options, name)) for name in named}
 
     def first_state(self) -> dict[str, float]:
         """Values of all state fields but q."""
@@ -208,20 +184,20 @@ class EnhancedStep:
             body, palm_orientation(robot, goals), columns, self.options.palm_error == "euler"
         )
         position, normal = contact_tasks(body, robot.thumb, goals[robot.thumb], columns)
-        tasks = [palm, position, normal]
-        step = self._spread(combine(tasks, self._reaching(p), "successive"), columns)
+        tasks = [palm, position, normal] if self.options.palm_task else [position, normal]
+        step = self._spread(self._combined(tasks, self._reaching(p)), columns)
         q_next = self._moved(s["q"], step, p)
 
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
         thumb = robot.finger_names.index(robot.thumb)
-        # The three errors in units of the thumb's tolerances, so that they can be summed.
-        parts = (
-            safe_norm(palm.error) / p["angle_tolerance"][thumb],
+        # In units of the thumb's tolerances, so that they can be summed.
+        errors = ca.vertcat(
             positions[thumb] / p["position_tolerance"][thumb],
             angles[thumb] / p["angle_tolerance"][thumb],
         )
-        within = ca.mmax(ca.vertcat(*parts)) <= 1
-        summed = sum(parts)
+        if self.options.palm_task:
+            errors = ca.vertcat(errors, safe_norm(palm.error) / p["angle_tolerance"][thumb])
+        within, summed = ca.mmax(errors) <= 1, ca.sum1(errors)
         better = summed < 0.99 * s["best"]
         waited = ca.if_else(better, 0.0, s["waited"] + 1)
         enough = ca.logic_or(
@@ -238,8 +214,9 @@ class EnhancedStep:
             }
         )
         status = ca.SX(float(Status.RUNNING))
-        record = self._row(
-            body,
+        record = enhanced_row(
+            self.record,
+            robot,
             s["q"],
             positions,
             angles,
@@ -263,42 +240,28 @@ class EnhancedStep:
         others = {name: goal for name, goal in goals.items() if name != robot.thumb}
         translation, rotation = palm_motion(body, others)
         chain = closed_chain(body, self.chain, MILLIMETRE, self.options.platform)
-        motion = [
-            Task(chain.J_cc[:3, :], translation, is_position=True),
-            Task(chain.J_cc[3:, :], rotation, is_position=False),
-        ]
-        active = combine(motion, self._chain_solver(p), "successive")
-        moved = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
+        moved = closed
+        if self.options.closed_chain:
+            motion = self._palm_tasks(chain.J_cc, translation, rotation, p)
+            active = self._combined(motion, self._chain_solver(p))
+            moved = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
 
         columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
         keep = contact_tasks(actuated(robot, moved), robot.thumb, goals[robot.thumb], columns)
-        step = self._spread(combine(keep, self._reaching(p), "successive"), columns)
+        step = self._spread(self._combined(keep, self._reaching(p)), columns)
         q_next = self._moved(moved, step, p)
 
-        size = _largest(q_next - s["q"])
-        waited = ca.if_else(size < p["stall_step"], s["waited"] + 1, 0.0)
-        status = ca.if_else(
-            solved,
-            float(Status.SOLVED),
-            ca.if_else(waited >= p["stall_patience"], float(Status.STALLED), float(Status.RUNNING)),
-        )
-        after = self.state.pack(
-            {
-                "q": ca.if_else(status == Status.RUNNING, q_next, closed),
-                "phase": s["phase"],
-                "best": s["best"],
-                "waited": waited,
-                "reached": s["reached"],
-            }
-        )
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        after = self.state.pack(s | {"q": ca.if_else(solved, closed, q_next)})
         thumb_linear, _ = body.contact_jacobian(robot.thumb, columns)
         spectrum = singular_values(chain.H_p)
-        record = self._row(
-            body,
+        record = enhanced_row(
+            self.record,
+            robot,
             closed,
             positions,
             angles,
-            step_size=size,
+            step_size=_largest(q_next - s["q"]),
             status=status,
             phase=Phase.HAND_ALIGNMENT,
             palm_motion=ca.vertcat(safe_norm(translation), safe_norm(rotation)),
@@ -307,6 +270,23 @@ class EnhancedStep:
             condition_closed_chain=condition_number(spectrum),
         )
         return ca.Function("align_rest", [state, parameters, closed], shared(after, record, status))
+
+    def _palm_tasks(
+        self, J_cc: ca.SX, translation: ca.SX, rotation: ca.SX, p: dict[str, ca.SX]
+    ) -> list[Task]:
+        """What the closed chain is to do: position, then orientation, or both as one."""
+        if self.options.chain_tasks == "successive":
+            return [
+                Task(J_cc[:3, :], translation, is_position=True),
+                Task(J_cc[3:, :], rotation, is_position=False),
+            ]
+        lever = p["chain_lever"]
+        stacked = ca.vertcat(J_cc[:3, :], lever * J_cc[3:, :])
+        return [Task(stacked, ca.vertcat(translation, lever * rotation), is_position=True)]
+
+    def _combined(self, tasks: Sequence[Task], solve: TaskSolver) -> ca.SX:
+        """One step for all tasks, the highest first, as in the paper by successive projection."""
+        return combine(tasks, [solve(task) for task in tasks], "successive")
 
     def _reaching(self, p: dict[str, ca.SX]) -> TaskSolver:
         """Solves the tasks of the serial chain."""
@@ -332,30 +312,6 @@ class EnhancedStep:
         """Take a step from q: capped, and kept within limits if they are enforced."""
         q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(_largest(step), 1e-12))
         return kept_within(self.robot, q_next, p["enforce_limits"])
-
-    def _row(
-        self,
-        body: ActuatedKinematics,
-        q: ca.SX,
-        positions: ca.SX,
-        angles: ca.SX,
-        *,
-        phase: Phase,
-        **measured: Expr,
-    ) -> ca.SX:
-        values: dict[str, Expr] = {
-            "q": q,
-            "position_error": positions,
-            "angle_error": angles,
-            "palm_error": NOT_MEASURED,
-            "palm_motion": [NOT_MEASURED, NOT_MEASURED],
-            "sigma_palm": NOT_MEASURED,
-            "sigma_closed_chain": NOT_MEASURED,
-            "condition_closed_chain": NOT_MEASURED,
-            "limit_mask": limit_mask(body.robot, q),
-            "phase": float(phase),
-        }
-        return self.record.pack(values | measured)
 
 
 def _smallest(jacobian: ca.SX) -> ca.SX:

@@ -24,7 +24,8 @@ from casadi_ik.steps.tasks import (
     palm_orientation_task,
     selective,
 )
-from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.linear_algebra import damped_pinv_times
 from casadi_ik.symbolic.subexpressions import shared
 
 
@@ -43,7 +44,7 @@ class OriginalStep:
         n, f = len(robot.actuators), len(robot.fingers)
         self.robot = robot
         self.options = options
-        self.state = Layout((Field("q", (n,)), Field("waited", doc="iterations standing still")))
+        self.state = Layout((Field("q", (n,)),))
         self.parameters = Layout(
             (
                 *target_fields(robot),
@@ -52,8 +53,6 @@ class OriginalStep:
                 Field("gamma"),
                 Field("longest_error", unit="mm"),
                 Field("widest_error", unit="rad"),
-                Field("stall_step"),
-                Field("stall_patience"),
             )
         )
         self.record = Layout.record(
@@ -72,59 +71,43 @@ class OriginalStep:
         return {}
 
     def graph(self) -> StepGraph:
-        """The whole iteration."""
-        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
-        s, p = self.state.unpack(state), self.parameters.unpack(parameters)
-        robot, q = self.robot, s["q"]
-        body, goals = actuated(robot, q), targets(robot, p)
-        positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
-        solved = within_tolerance(positions, angles, p)
-        step = combine(self._tasks(body, p), self._solver(p), self.options.projection)
-        q_next = kept_within(robot, q + step, p["enforce_limits"])
-        size = ca.mmax(ca.fabs(q_next - q))
-        waited = ca.if_else(size < p["stall_step"], s["waited"] + 1, 0.0)
-        still = ca.if_else(
-            waited >= p["stall_patience"], float(Status.STALLED), float(Status.RUNNING)
-        )
-        status = ca.if_else(solved, float(Status.SOLVED), still)
-        after = self.state.pack(
-            {"q": ca.if_else(status == Status.RUNNING, q_next, q), "waited": waited}
-        )
-        record = self.record.pack(
-            {
-                "q": q,
-                "position_error": positions,
-                "angle_error": angles,
-                "step_size": size,
-                "limit_mask": limit_mask(robot, q),
-                "phase": float(Phase.HIERARCHY),
-                "status": status,
-            }
-        )
-        name = ca.Function.fix_name(f"original_{self.options.steps}_{robot.name}")
-        function = ca.Function(name, [state, parameters], shared(after, record, status))
+        """The whole iteration.
+
+        What repeats, the solving of a task, is a function that is called: written out once per
+        task it made the C compiler slow.
+        """
+        state = ca.MX.sym("state", self.state.size)
+        parameters = ca.MX.sym("parameters", self.parameters.size)
+        errors, *pairs = self._view()(state, parameters)
+        if self.options.projection == "stacked":
+            step = self._stacked()(parameters, *pairs)
+        else:
+            solve = {kind: self._solve(kind) for kind in (True, False)}
+            steps = [
+                solve[kind](parameters, pair)
+                for kind, pair in zip(self._kinds(), pairs, strict=True)
+            ]
+            step = self._combined()(*pairs, *steps)
+        name = ca.Function.fix_name(f"original_{self.options.steps}_{self.robot.name}")
+        outputs = self._ending()(state, parameters, errors, step)
+        function = ca.Function(name, [state, parameters], list(outputs))
         return StepGraph(name, function, self.state, self.parameters, self.record)
 
     def parameter_values(
         self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool
     ) -> dict[str, float | Array]:
         """Values of all parameter fields but the targets."""
-        options = self.options
-        return {
+        given = {
             "position_tolerance": position_tolerance,
             "angle_tolerance": angle_tolerance,
             "enforce_limits": float(enforce_limits),
-            "damping": options.damping,
-            "gamma": options.gamma,
-            "longest_error": options.longest_error,
-            "widest_error": options.widest_error,
-            "stall_step": options.stall_step,
-            "stall_patience": float(options.stall_patience),
         }
+        named = (name for name in self.parameters.names if hasattr(self.options, name))
+        return given | {name: float(getattr(self.options, name)) for name in named}
 
     def first_state(self) -> dict[str, float]:
         """Values of all state fields but q."""
-        return {"waited": 0.0}
+        return {}
 
     def phase_counts(
         self, states: Array, iterations: NDArray[np.int64]
@@ -133,9 +116,26 @@ class OriginalStep:
         del states
         return {Phase.HIERARCHY: iterations}
 
-    def _tasks(self, body: ActuatedKinematics, p: dict[str, ca.SX]) -> list[Task]:
-        """From the highest priority to the lowest."""
-        robot, goals = self.robot, targets(self.robot, p)
+    def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
+        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
+        return state, parameters, self.state.unpack(state), self.parameters.unpack(parameters)
+
+    def _kinds(self) -> list[bool]:
+        """Of every task, whether it is a position."""
+        fingers = len(self.robot.fingers)
+        if self.options.order == "per-finger":
+            kinds = [True, False] * fingers
+        else:
+            kinds = [True] * fingers + [False] * fingers
+        return [False, *kinds] if self.options.palm_task else kinds
+
+    def _view(self) -> ca.Function:
+        """Errors (f, 2) of all fingers in point and normal, then all tasks by priority.
+
+        A task is its Jacobian and its error, [J, e] (3, n + 1).
+        """
+        state, parameters, s, p = self._inputs()
+        robot, goals, body = self.robot, targets(self.robot, p), actuated(self.robot, s["q"])
         every = tuple(range(len(robot.actuators)))
         pairs = [contact_tasks(body, name, goals[name], every) for name in thumb_first(robot)]
         if self.options.order == "per-finger":
@@ -146,7 +146,64 @@ class OriginalStep:
             euler = self.options.palm_error == "euler"
             desired = palm_orientation(robot, goals)
             tasks.insert(0, palm_orientation_task(body, desired, every, euler))
-        return tasks
+        errors = ca.horzcat(*contact_errors(body.kinematics, goals, robot.finger_names))
+        seen = [ca.densify(ca.horzcat(task.jacobian, task.error)) for task in tasks]
+        return ca.Function("view", [state, parameters], shared(errors, *seen))
+
+    def _task(self, pair: ca.SX, is_position: bool) -> Task:
+        return Task(pair[:, :-1], pair[:, -1], is_position)
+
+    def _solve(self, is_position: bool) -> ca.Function:
+        """The step of one task alone."""
+        _, parameters, _, p = self._inputs()
+        pair = ca.SX.sym("pair", 3, len(self.robot.actuators) + 1)
+        step = self._solver(p)(self._task(pair, is_position))
+        name = "solve_position" if is_position else "solve_orientation"
+        return ca.Function(name, [parameters, pair], shared(step))
+
+    def _stacked(self) -> ca.Function:
+        """One step for all tasks as one, without priorities."""
+        _, parameters, _, p = self._inputs()
+        columns = len(self.robot.actuators) + 1
+        pairs = [ca.SX.sym(f"pair_{i}", 3, columns) for i in range(len(self._kinds()))]
+        stacked = ca.vertcat(*pairs)
+        step = damped_pinv_times(stacked[:, :-1], stacked[:, -1], p["damping"])
+        return ca.Function("stacked", [parameters, *pairs], shared(step))
+
+    def _combined(self) -> ca.Function:
+        """One step from those of all tasks."""
+        n, kinds = len(self.robot.actuators), self._kinds()
+        pairs = [ca.SX.sym(f"pair_{i}", 3, n + 1) for i in range(len(kinds))]
+        steps = [ca.SX.sym(f"step_{i}", n) for i in range(len(kinds))]
+        tasks = [self._task(pair, kind) for pair, kind in zip(pairs, kinds, strict=True)]
+        damping = self.options.damping if self.options.projectors == "damped" else None
+        step = combine(tasks, steps, self.options.projection, damping)
+        return ca.Function("combined", [*pairs, *steps], shared(step))
+
+    def _ending(self) -> ca.Function:
+        """Take the step, or end."""
+        state, parameters, s, p = self._inputs()
+        errors = ca.SX.sym("errors", len(self.robot.fingers), 2)
+        step = ca.SX.sym("step", len(self.robot.actuators))
+        robot, q, positions, angles = self.robot, s["q"], errors[:, 0], errors[:, 1]
+        solved = within_tolerance(positions, angles, p)
+        q_next = kept_within(robot, q + step, p["enforce_limits"])
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        after = self.state.pack({"q": ca.if_else(solved, q, q_next)})
+        record = self.record.pack(
+            {
+                "q": q,
+                "position_error": positions,
+                "angle_error": angles,
+                "step_size": ca.mmax(ca.fabs(q_next - q)),
+                "limit_mask": limit_mask(robot, q),
+                "phase": float(Phase.HIERARCHY),
+                "status": status,
+            }
+        )
+        return ca.Function(
+            "ending", [state, parameters, errors, step], shared(after, record, status)
+        )
 
     def _solver(self, p: dict[str, ca.SX]) -> TaskSolver:
         if self.options.steps == "dls":

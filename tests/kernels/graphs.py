@@ -97,3 +97,11 @@ def counting_step(name: str = "counting", offset: float = 0.0) -> StepGraph:
     status = ca.if_else(new >= p, DONE, RUNNING)
     function = ca.Function(name, [x, p], [new, new + offset, status])
     return step_of(name, function, COUNT)
+
+
+def circling_step(name: str = "circling") -> StepGraph:
+    """Counts from 0 up to the parameter, then backwards by three, and so on; it never ends."""
+    x, p = ca.SX.sym("x"), ca.SX.sym("p")
+    new = ca.if_else(x >= p, x - 3, x + 1)
+    function = ca.Function(name, [x, p], [new, new, ca.SX(RUNNING)])
+    return step_of(name, function, COUNT)

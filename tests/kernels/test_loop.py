@@ -16,6 +16,7 @@ from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels import (
     FAILED,
     NON_FINITE,
+    REPEATED,
     RUNNING,
     Field,
     Layout,
@@ -25,7 +26,16 @@ from casadi_ik.kernels import (
 )
 from casadi_ik.kernels.loop import FIRST_ROWS
 
-from .graphs import COUNT, DONE, branching_step, counting_step, needs_compiler, random_step, step_of
+from .graphs import (
+    COUNT,
+    DONE,
+    branching_step,
+    circling_step,
+    counting_step,
+    needs_compiler,
+    random_step,
+    step_of,
+)
 
 BOTH = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
 
@@ -85,6 +95,18 @@ def test_ends_by_status_or_by_budget(compiled: bool) -> None:
     assert result.iterations.tolist() == [4, 10, 10]
     assert result.status.tolist() == [DONE, DONE, RUNNING]
     assert result.states[:, 0].tolist() == [4, 10, 10]
+
+
+@BOTH
+def test_a_state_that_comes_back_ends_the_solve(compiled: bool) -> None:
+    """Counting to 20 and then round in fours: the first mark in the circle is the 32nd state."""
+    kernel = LoopKernel(circling_step(), compiled=compiled)
+    result = kernel.run([[0.0], [20.0], [1e9]], [20], 100)
+    assert result.status.tolist() == [REPEATED, REPEATED, RUNNING]
+    assert result.iterations.tolist() == [36, 8, 100]
+    # Cut into pieces by the clock or by a full trace it is the same.
+    traced = kernel.run(np.zeros((3, 1)), [[3], [300], [900]], 10_000, trace=True)
+    assert traced.iterations.tolist() == [8, 516, 1028]
 
 
 @BOTH

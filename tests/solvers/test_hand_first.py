@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hand_first_targets import EXACT, HARD, near_limits
 from robot_variants import derived_robot
+from targets import HARD, near_limits
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnknownNameError
@@ -18,6 +18,7 @@ from casadi_ik.solvers.problem import Problems, fixed_array, target_arrays
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.status import Phase, Status
 
+EXACT = ik.Tolerance(1e-6, 1e-6)
 TOLERANCES = {"usual": ik.Tolerance(), "exact": EXACT}
 
 

@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hand_first_targets import shipped_hands
 from robot_variants import derived_robot, thumb_of
+from targets import shipped_hands
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError

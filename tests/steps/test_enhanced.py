@@ -208,21 +208,6 @@ def test_step_cap(robot, rng):
     assert record["step_size"] == pytest.approx(0.01, rel=1e-12)
 
 
-def test_standstill_is_noticed(robot, stepper):
-    """Where nothing moves any more the step says so after its patience."""
-    points, normals = robot.contacts(robot.home)
-    state = stepper.state(robot.home, Phase.HAND_ALIGNMENT)
-    parameters = stepper.parameters(points, normals)
-    parameters[stepper.step.parameters.slice("position_tolerance")] = -1.0
-    parameters[stepper.step.parameters.slice("stall_step")] = 10.0
-    seen = []
-    for _ in range(5):
-        after, _, status = stepper(state, parameters)
-        seen.append(status)
-        state = stepper.step.state.pack(after)
-    assert seen == [Status.RUNNING] * 4 + [Status.STALLED]
-
-
 def test_graph_sizes_and_name(robot, stepper):
     graph = stepper.graph
     assert graph.compilable

@@ -50,4 +50,4 @@ def test_impossible_values(options, says):
 
 
 def test_zero_where_it_means_something():
-    assert QiuParameters(stall_step=0.0, borrowed=0).stall_step == 0.0
+    assert QiuParameters(borrowed=0).borrowed == 0

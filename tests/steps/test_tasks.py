@@ -79,27 +79,45 @@ def test_euler_differences_are_wrapped(robot, tasks):
     np.testing.assert_allclose(np.degrees(error), [0, 0, 16], atol=1e-9)
 
 
-def step_function(count, damping):
+def step_function(count, damping, projection="successive"):
     J = [ca.SX.sym(f"J{i}", 3, 9) for i in range(count)]
     e = [ca.SX.sym(f"e{i}", 3) for i in range(count)]
 
     tasks = [Task(a, b, is_position=False) for a, b in zip(J, e, strict=True)]
-    total = combine(tasks, damped(damping), "successive")
+    solve = damped(damping)
+    total = combine(tasks, [solve(task) for task in tasks], projection)
     return ca.Function("f", [*J, *e], [total])
+
+
+def damped_steps(rng, damping):
+    """Three random tasks and numpy's damped solution of each."""
+    J, e = rng.normal(size=(3, 3, 9)), rng.normal(size=(3, 3))
+    solved = [
+        A.T @ np.linalg.solve(A @ A.T + damping**2 * np.eye(3), b)
+        for A, b in zip(J, e, strict=True)
+    ]
+    return J, e, solved
 
 
 def test_hierarchy_is_the_successive_projection(rng):
     """dq_1 + N_1 dq_2 + N_1 N_2 dq_3 with numpy's own pseudoinverse."""
-    J, e = rng.normal(size=(3, 3, 9)), rng.normal(size=(3, 3))
-    damping = 0.1
-    steps = [
-        A.T @ np.linalg.solve(A @ A.T + damping**2 * np.eye(3), b)
-        for A, b in zip(J, e, strict=True)
-    ]
+    J, e, steps = damped_steps(rng, 0.1)
     N = [np.eye(9) - np.linalg.pinv(A) @ A for A in J]
     expected = steps[0] + N[0] @ steps[1] + N[0] @ N[1] @ steps[2]
-    found = np.array(step_function(3, damping).call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
+    found = np.array(step_function(3, 0.1).call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
     np.testing.assert_allclose(found, expected, atol=1e-10)
+
+
+def test_augmented_projection_keeps_every_higher_task(rng):
+    """dq_1 + N_1 dq_2 + N_12 dq_3 with numpy's own pseudoinverse of the stacked tasks."""
+    J, e, steps = damped_steps(rng, 0.1)
+    stacked = [np.concatenate(J[: i + 1]) for i in range(2)]
+    N = [np.eye(9) - np.linalg.pinv(A) @ A for A in stacked]
+    expected = steps[0] + N[0] @ steps[1] + N[1] @ steps[2]
+    f = step_function(3, 0.1, "augmented")
+    found = np.array(f.call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
+    # RANK_FLOOR damps the projector a little.
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_lower_tasks_leave_the_first_alone(robot, tasks, rng):

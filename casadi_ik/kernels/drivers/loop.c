@@ -1,6 +1,12 @@
 /* A step run to its end for each solve of a batch.
  *
- * Expects the macros N_STATE, N_RECORD, ROW_BYTES, RUNNING, NON_FINITE, FAILED, CODE_LIMIT
+ * A step is a function of state and parameters alone, so a state that comes back bit for bit comes
+ * back for ever, and so does everything between: such a solve would run to its budget and ends as
+ * REPEATED instead. Noticed as by Brent (1980): every state is compared with that of the last
+ * iteration whose number is a power of two, so a cycle is found within its length after the first
+ * such iteration in it that is no smaller than its length.
+ *
+ * Expects the macros N_STATE, N_RECORD, ROW_BYTES, RUNNING, NON_FINITE, FAILED, REPEATED, CODE_LIMIT
  * and the function store_row(record, row). Everything that must survive a pause lives in the job's arrays, so a
  * call that returns SLICE_OVER or ROWS_FULL is taken up again by calling once more.
  */
@@ -12,6 +18,7 @@ typedef struct {
   int64_t *iterations;         /* (count), zeros at the start */
   int32_t *status;             /* (count), RUNNING at the start */
   double *seconds;             /* (count), zeros at the start */
+  double *mark;                /* (N_STATE), the state later ones are compared with */
   unsigned char *rows;         /* (capacity) rows, or NULL: no trace */
   int64_t capacity;
   int64_t used;                /* rows written so far */
@@ -75,6 +82,9 @@ EXPORT int casadi_ik_loop(loop_job *job) {
         now = next;
         next = last;
         status = (int32_t) code;
+        if (status == RUNNING && iteration > 1
+            && !memcmp(now, job->mark, N_STATE * sizeof(double))) status = REPEATED;
+        if (!(iteration & (iteration - 1))) memcpy(job->mark, now, N_STATE * sizeof(double));
       }
     }
     memcpy(job->states + i * N_STATE, now, N_STATE * sizeof(double));

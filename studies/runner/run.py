@@ -1,0 +1,69 @@
+"""Runs what is missing of a study, here or on a Dask cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import joblib
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.progress import TimeRemainingColumn as TimeRemaining
+from rich.text import Text
+
+from casadi_ik.logs import Keep
+from runner.block import solve_block
+from runner.results import claim, missing
+from runner.study import Study
+
+
+def run(
+    study: Study, folder: Path, jobs: int = 1, dask: str | None = None, keep: Keep | None = None
+) -> None:
+    """Solve what is missing.
+
+    Args:
+        study: The study.
+        folder: Where its results are and go: one file per block. A run that is killed loses the
+            blocks being solved and nothing else; the next one goes on.
+        jobs: Processes on this machine.
+        dask: Address of a Dask scheduler whose workers solve instead; they need this folder and
+            `studies` on their path.
+        keep: What to log, in one file per block; None: no logs.
+
+    Raises:
+        InputError: The folder holds results that were made otherwise.
+    """
+    claim(study, folder)
+    todo = missing(study, folder)
+    with _backend(jobs, dask), _progress() as progress:
+        task = progress.add_task(study.name, total=len(todo) * study.block)
+        parallel = joblib.Parallel(return_as="generator_unordered")
+        calls = (joblib.delayed(solve_block)(study, block, folder, keep) for block in todo)
+        for _ in parallel(calls):
+            progress.advance(task, study.block)
+
+
+@contextmanager
+def _backend(jobs: int, dask: str | None) -> Iterator[None]:
+    if dask is None:
+        with joblib.parallel_config(backend="loky", n_jobs=jobs):
+            yield
+        return
+    from dask.distributed import Client
+
+    with Client(dask), joblib.parallel_config(backend="dask"):
+        yield
+
+
+class _Rate(ProgressColumn):
+    """Solves per second."""
+
+    def render(self, task: Task) -> Text:
+        return Text("" if task.speed is None else f"{task.speed:.0f} solves/s")
+
+
+def _progress() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate())
+    return Progress(*columns, TimeRemaining(), console=Console(stderr=True))

@@ -1,0 +1,22 @@
+"""A study small enough for the tests, to be run as a program as well."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from runner import Setting, Study, TargetSet, run
+from targets import any_configuration, near_limits
+
+CHANGED = Setting("loose", "hand-first", tolerance=(2e-3, 0.05))
+STUDY = Study(
+    "small",
+    "kuka_lwr_barrett",
+    (TargetSet("random hands", any_configuration), TargetSet("near limits", near_limits)),
+    (Setting("loose", "hand-first"), Setting("exact", "hand-first", tolerance=(1e-6, 1e-6))),
+    count=40,
+    block=4,
+)
+
+if __name__ == "__main__":
+    run(STUDY, Path(sys.argv[1]), jobs=2)

@@ -1,0 +1,147 @@
+"""A small seeded slice of each study, through its command, to its report."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import polars as pl
+import pytest
+import success
+import table_one
+from qiu_table import figures
+from qiu_table.paper import METHODS, TABLE_I, printed_mean
+from qiu_table.settings import ablation_study, readings_study, table_study
+from qiu_table.tables import readings
+from runner import Setting, read_results, run
+
+import casadi_ik as ik
+
+
+def metrics(folder) -> dict[str, dict]:
+    return {entry["name"]: entry for entry in json.loads((folder / "metrics.json").read_text())}
+
+
+def test_printed_table():
+    """The abstract: an average success of 96 %, against 12 % by the original methods."""
+    assert round(printed_mean("enhanced-dls").success) == 96
+    assert 11 < printed_mean("original-dls").success < 12
+    assert set(TABLE_I) < set(ik.shipped_grasps("kuka_lwr_barrett"))
+    assert all(set(cells) == set(METHODS) for cells in TABLE_I.values())
+    assert printed_mean("enhanced-sdls").iterations == pytest.approx(236.6, abs=0.1)
+
+
+def test_table_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "CURVES", 1)
+    monkeypatch.setattr(figures, "LONGEST", 20)
+    out, report = tmp_path / "results", tmp_path / "report"
+    common = ["--out", str(out), "--report", str(report), "--block", "2"]
+    table_one.main(["--count", "2", "--methods", "hand-first", "enhanced-dls", *common])
+    text = (report / "report.md").read_text()
+    found = metrics(report)
+    assert found["table-one/hand-first/enforce/success"]["value"] == 100
+    enhanced = found["table-one/enhanced-dls/ignore/success"]
+    assert enhanced["n"] == 24
+    assert enhanced["low"] < enhanced["value"] <= enhanced["high"] <= 100
+    assert found["table-one/original-dls/ignore/success"]["n"] == 0
+    assert "| `enhanced-dls` | 95.9 | 181 | 343 |" in text
+    assert text.count("*Not run yet.*") == 2
+    assert "<table>" in (report / "report.html").read_text()
+    for name in ("success", "iterations", "convergence"):
+        assert f"({name}.png)" in text
+        assert (report / f"{name}.png").stat().st_size > 10_000
+    table_one.main(["--count", "0", *common])
+    assert (report / "report.md").read_text() == text, "the report alone changes nothing"
+
+
+def test_every_choice_can_be_built(tmp_path):
+    """Each changed setting makes another solver, and each reading another method."""
+    studies = (ablation_study(tmp_path, 1, 0, 1), readings_study(1, 0, 1))
+    for study in studies:
+        keys = [setting.key for setting in study.settings]
+        assert len(set(keys)) == len(keys)
+        made = [
+            (study.solver(setting).parameters, study.start(setting).tolist(), setting.robot)
+            for setting in study.settings
+        ]
+        for i, one in enumerate(made):
+            assert one not in made[:i], keys[i]
+
+
+def test_the_mounting_face_is_another_palm_frame(tmp_path):
+    study = ablation_study(tmp_path, 1, 0, 1)
+    setting = next(item for item in study.settings if "mounting face" in item.key)
+    robot = ik.load_robot("kuka_lwr_barrett")
+    moved = study.solver(setting).robot
+    offset = np.linalg.inv(moved.palm(robot.home)) @ robot.palm(robot.home)
+    np.testing.assert_allclose(offset[:3, 3], [0, 0, 0.08], atol=1e-12)
+
+
+def test_one_ablation_changes_the_outcome(tmp_path):
+    """Without the closed chain less is solved: on the same targets."""
+    study = ablation_study(tmp_path / "robots", 4, 2021, 4)
+    wanted = ("enhanced-dls, as in the table", "enhanced-dls, no closed chain")
+    budget = {"max_iterations": 400}
+    settings = tuple(
+        dataclasses.replace(setting, options={**setting.options, **budget})
+        for setting in study.settings
+        if setting.key in wanted
+    )
+    study = dataclasses.replace(study, settings=settings, sets=study.sets[:4])
+    run(study, tmp_path / "results")
+    table = read_results(study, tmp_path / "results")
+    solved = dict(table.group_by("setting").agg(pl.col("success").sum()).rows())
+    assert solved[wanted[0]] > solved[wanted[1]]
+
+
+def test_distance_of_a_reading():
+    """Twice the printed rate at half the printed iterations is 2 ln 2 away."""
+    study = readings_study(1, 0, 1)
+    printed = printed_mean("original-dls")
+    count = round(100 / printed.success * 500)  # 1000 solved of so many are twice the rate
+    rows = {
+        "setting": [study.settings[0].key] * count,
+        "success": [i < 1000 for i in range(count)],
+        "iterations": [printed.iterations / 2] * count,
+        "time": [1.0] * count,
+    }
+    text, metrics = readings(pl.DataFrame(rows), study)
+    assert f"| {2 * math.log(2):.2f} | {count:,} |" in text
+    assert len(metrics) == 3
+
+
+def test_table_has_every_method_both_ways():
+    study = table_study("table", ("enhanced-dls", "hand-first"), 3, 0, 1)
+    assert [setting.limits for setting in study.settings] == ["ignore", "enforce"] * 2
+    assert study.settings[0].options == {"finger_step": "closed-form"}
+    assert len(list(study.blocks())) == 3 * 4 * 12
+
+
+def test_success(tmp_path, capsys):
+    out, report = tmp_path / "results", tmp_path / "report"
+    common = ["--out", str(out), "--report", str(report), "--block", "4"]
+    success.main(["--count", "4", *common])
+    text = (report / "report.md").read_text()
+    assert "## Misses\n\nNone." in text
+    found = metrics(report)
+    for key in ("5 mm, 3 deg", "1e-6 m, 1e-6 rad"):
+        assert found[f"success/{key}/all/success"]["value"] == 100
+        assert found[f"success/{key}/all/success"]["n"] == 4 * 17
+    capsys.readouterr()
+    success.main(["--rerun", "near limits", "3", *common])
+    assert capsys.readouterr().out.count("SOLVED") == 2
+
+
+def test_misses_are_listed(tmp_path):
+    """A tolerance nothing can meet: every row is there, with the command that solves it again."""
+    impossible = Setting("impossible", "hand-first", tolerance=(1e-18, 1e-18))
+    whole = success.study(1, 5, 1)
+    whole = dataclasses.replace(whole, settings=(impossible,), sets=whole.sets[-2:])
+    run(whole, tmp_path / "results")
+    success.write_report(whole, tmp_path / "results", tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    again = '`python studies/success.py --seed 5 --rerun "near limits on near-singular arms" 0`'
+    assert again in text
+    assert "| all | 2 | 2 | 0.000" in text

@@ -1,0 +1,174 @@
+"""The study runner: resumable whatever happens, the same whoever solves."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import small_study
+from runner import interval_text, mean_metric, median_metric, rate_metric, read_results, run
+from runner.results import STUDY_FILE, claim, missing
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError
+from casadi_ik.logs import Keep
+
+STUDY = small_study.STUDY
+FOLDERS = os.pathsep.join((str(Path(small_study.__file__).parent), *sys.path))
+
+
+def contents(folder: Path, study=STUDY) -> pl.DataFrame:
+    """All results but the time, in order."""
+    return read_results(study, folder).drop("time").sort("setting", "targets", "target")
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("done")
+    run(STUDY, folder)
+    return folder
+
+
+def test_a_row_per_target_and_setting(done):
+    table = contents(done)
+    assert len(table) == 2 * 2 * STUDY.count
+    keys = table.select("setting", "targets", "target")
+    assert keys.is_duplicated().sum() == 0
+    assert table["target"].n_unique() == STUDY.count
+    assert table["success"].all()
+    assert table["position_error_thumb"].max() < 5e-3
+    assert set(table["status"]) == {"SOLVED"}
+    assert set(table["limits"]) == {"enforce"}
+    assert not list(done.rglob("*.part"))
+
+
+def test_targets_of_a_block_are_its_own(done):
+    """Blocks differ, sets differ, and settings share their targets."""
+    first, second = STUDY.sets
+    q = STUDY.configurations(first, 0)
+    np.testing.assert_array_equal(q, STUDY.configurations(first, 0))
+    assert not np.array_equal(q, STUDY.configurations(first, 1))
+    assert not np.array_equal(q, STUDY.configurations(second, 0))
+    again = dataclasses.replace(STUDY, count=5 * STUDY.count)
+    np.testing.assert_array_equal(q, again.configurations(first, 0))
+
+
+def test_jobs_change_nothing(done, tmp_path):
+    run(STUDY, tmp_path, jobs=2)
+    assert contents(tmp_path).equals(contents(done))
+
+
+def test_a_dask_cluster_changes_nothing(done, tmp_path):
+    from dask.distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=40
+    ) as cluster:
+        run(STUDY, tmp_path, dask=cluster.scheduler_address)
+    assert contents(tmp_path).equals(contents(done))
+
+
+def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
+    """Two workers and their parent are killed again and again until the study is through."""
+    rng = random.Random(3)
+    kills = 0
+    command = [sys.executable, str(Path(small_study.__file__)), str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": FOLDERS}
+    while not (tmp_path / STUDY_FILE).exists() or missing(STUDY, tmp_path):
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*.parquet")}
+        process = subprocess.Popen(
+            command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        not_before = time.monotonic() + rng.uniform(0.0, 2.0)
+        while kills < 4 and process.poll() is None:
+            # Not before it has begun to work: a process that only imports shows nothing.
+            there = len(list(tmp_path.rglob("*.parquet")))
+            if time.monotonic() > not_before and there > len(before):
+                os.killpg(process.pid, signal.SIGKILL)
+                kills += 1
+            time.sleep(0.002)
+        process.wait()
+        for path, content in before.items():
+            assert path.read_bytes() == content, "what is done is not done again"
+    assert kills > 0
+    assert contents(tmp_path).equals(contents(done))
+    claim(STUDY, tmp_path)
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_a_study_grows(done, tmp_path):
+    small = dataclasses.replace(STUDY, count=STUDY.block, settings=STUDY.settings[:1])
+    run(small, tmp_path)
+    assert len(contents(tmp_path, small)) == 2 * STUDY.block
+    run(STUDY, tmp_path)
+    assert contents(tmp_path).equals(contents(done))
+
+
+def test_a_log_per_block_keeps_what_is_asked_for(done, tmp_path):
+    study = dataclasses.replace(STUDY, settings=STUDY.settings[:1])
+    run(study, tmp_path, keep=Keep(failed=True, singular=False, sample=0.25))
+    assert contents(tmp_path, study).equals(contents(done, study))
+    logs = sorted(tmp_path.rglob("*.mcap"))
+    assert len(logs) == len(list(tmp_path.rglob("*.parquet"))) == len(list(study.blocks()))
+    rows = 0
+    for path in logs:
+        log = ik.logs.open(path)
+        assert len(log.solves()) == study.block, "totals of all"
+        rows += len(log.iterations())
+    iterations = contents(tmp_path, study)["iterations"].sum()
+    assert 0 < rows < 0.5 * iterations, "iterations of a sample"
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"seed": 8}, "seed: results made with 0 are here, this study has 8; use another folder"),
+        ({"block": 3}, "block: results made with 4 are here"),
+        ({"settings": (small_study.CHANGED,)}, "settings.loose: results made with"),
+        ({"robot": "kuka_lwr_barrett_coupled"}, "robot: results made with"),
+    ],
+)
+def test_different_settings_do_not_mix(done, change, says):
+    before = (done / STUDY_FILE).read_bytes()
+    with pytest.raises(InputError) as caught:
+        run(dataclasses.replace(STUDY, **change), done)
+    assert says in str(caught.value)
+    assert (done / STUDY_FILE).read_bytes() == before
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds files but no study"):
+        run(STUDY, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_wilson_interval():
+    """Against the closed form's well-known example: 8 of 10 gives 49.0 % to 94.3 %."""
+    metric = rate_metric("x", 8, 10)
+    assert (metric.value, metric.n, metric.better) == (80.0, 10, "higher")
+    assert (round(metric.low, 1), round(metric.high, 1)) == (49.0, 94.3)
+    assert rate_metric("x", 10, 10).high == 100
+    assert rate_metric("x", 0, 10).low == 0
+    assert 99.9 < rate_metric("x", 10_000, 10_000).low < 100
+    assert math.isnan(rate_metric("x", 0, 0).value)
+
+
+def test_means_and_medians(rng):
+    values = rng.normal(5.0, 2.0, 400)
+    mean, median = mean_metric("x", values, "ms"), median_metric("x", values, "ms")
+    assert mean.value == pytest.approx(values.mean())
+    assert mean.high - mean.low == pytest.approx(2 * 1.96 * 2 / 20, rel=0.1)
+    assert median.low < median.value == np.median(values) < median.high
+    assert interval_text(mean_metric("x", [], "ms")) == "-"
+    assert interval_text(mean_metric("x", [2.0], "ms")) == "2.0"
