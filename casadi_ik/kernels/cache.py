@@ -13,9 +13,11 @@ import ctypes
 import hashlib
 import os
 import platform
+import re
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import casadi as ca
@@ -26,6 +28,8 @@ from casadi_ik.kernels.compiler import Compiler, find_compiler, warn_no_compiler
 
 FORMAT = 1
 """Part of the key; to be raised when the way libraries are built changes otherwise unseen."""
+
+KEY = re.compile("[0-9a-f]{32}")
 
 _lock = threading.Lock()
 _loaded: dict[str, ctypes.CDLL] = {}
@@ -51,13 +55,18 @@ def cache_directory() -> Path:
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "casadi_ik"
 
 
-def load_library(function: ca.Function, driver: str, symbol: str) -> ctypes.CDLL | None:
+def load_library(
+    name: str, build: Callable[[], ca.Function], driver: str, symbol: str, recipe: str = ""
+) -> ctypes.CDLL | None:
     """The compiled library of a function and a driver: from this process, from disk, or built.
 
     Args:
-        function: Dense and row-major (`codegen.row_major`).
+        name: The function's.
+        build: Gives the function, dense and row-major (`codegen.row_major`).
         driver: C text of the driver, with its constants.
         symbol: The function the driver exports.
+        recipe: What the function follows from (`recipe`), "" if that is not known. Where a
+            library of that recipe is at hand, the function is not built.
 
     Returns:
         The library, or None where there is no compiler (a `NoCompilerWarning` says so once).
@@ -69,16 +78,48 @@ def load_library(function: ca.Function, driver: str, symbol: str) -> ctypes.CDLL
     if compiler is None:
         warn_no_compiler()
         return None
-    key = library_key(function, driver, compiler)
+    directory = cache_directory()
     with _lock:
+        brief = _hash(*_surroundings(compiler, driver), recipe) if recipe else ""
+        library = _recognised(directory, name, brief, symbol) if brief else None
+        if library is not None:
+            return library
+        function = build()
+        key = library_key(function, driver, compiler)
         library = _loaded.get(key)
         if library is None:
-            directory, stem = cache_directory(), f"{function.name()}-{key}"
+            stem = f"{name}-{key}"
             library = _find(directory, stem, symbol)
             if library is None:
                 library = _build(directory, stem, library_source(function, driver), compiler)
             _loaded[key] = library
+        if brief:
+            _note(directory / f"{name}-{brief}.key", key)
         return library
+
+
+def _recognised(directory: Path, name: str, brief: str, symbol: str) -> ctypes.CDLL | None:
+    """The library that a recipe led to before, or None."""
+    try:
+        key = (directory / f"{name}-{brief}.key").read_text(encoding="ascii")
+    except (OSError, ValueError):
+        return None
+    if not KEY.fullmatch(key):
+        return None
+    library = _loaded.get(key) or _find(directory, f"{name}-{key}", symbol)
+    if library is not None:
+        _loaded[key] = library
+    return library
+
+
+def _note(path: Path, key: str) -> None:
+    """Remember what a recipe led to; that it cannot be written costs time only."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(key, encoding="ascii")
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
 
 
 def library_key(function: ca.Function, driver: str, compiler: Compiler) -> str:
@@ -92,16 +133,18 @@ def library_key(function: ca.Function, driver: str, compiler: Compiler) -> str:
     except RuntimeError as error:
         # Python callbacks, for one, can be neither written down nor generated.
         raise KernelError(f"kernel {function.name()!r}: no C code: {error}") from error
+    return _hash(*_surroundings(compiler, driver), graph)
+
+
+def _surroundings(compiler: Compiler, driver: str) -> tuple[str, ...]:
+    """What a library is built from besides its graph."""
+    system = (platform.system(), platform.machine())
+    return (str(FORMAT), ca.CasadiMeta.version(), *system, compiler.identity, driver)
+
+
+def _hash(*parts: str) -> str:
     digest = hashlib.sha256()
-    for part in (
-        str(FORMAT),
-        ca.CasadiMeta.version(),
-        platform.system(),
-        platform.machine(),
-        compiler.identity,
-        driver,
-        graph,
-    ):
+    for part in parts:
         # The length keeps the parts apart.
         digest.update(f"{len(part)}:".encode())
         digest.update(part.encode())

@@ -68,7 +68,9 @@ class FunctionKernel:
 
     def _load(self) -> ctypes.CDLL | None:
         counts = {"N_IN": len(self.input_shapes), "N_OUT": len(self.output_shapes)}
-        return load_library(self._function, define(counts) + driver_text("map"), SYMBOL)
+        return load_library(
+            self.name, lambda: self._function, define(counts) + driver_text("map"), SYMBOL
+        )
 
     def __call__(self, *inputs: Any) -> tuple[NDArray[np.float64], ...]:
         """Evaluate one sample or a batch.

@@ -8,6 +8,7 @@ from functools import cached_property
 from time import perf_counter
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -84,7 +85,6 @@ class LoopKernel:
                 refused it.
         """
         self.step = step
-        self._function = row_major(step.function)
         library = self._load() if compiled and step.compilable else None
         self.compiled = library is not None
         self._loop: Any = None if library is None else library[SYMBOL]
@@ -99,7 +99,13 @@ class LoopKernel:
             "CODE_LIMIT": CODE_LIMIT,
         }
         driver = define(constants) + row_driver(self.step.record) + driver_text("loop")
-        return load_library(self._function, driver, SYMBOL)
+        return load_library(
+            self.step.name, lambda: self._function, driver, SYMBOL, self.step.recipe
+        )
+
+    @cached_property
+    def _function(self) -> ca.Function:
+        return row_major(self.step.function)
 
     def run(
         self, states: Any, parameters: Any, max_iterations: int, trace: bool = False

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 
@@ -19,27 +21,41 @@ class StepGraph:
 
     Attributes:
         name: Identifier (letters, digits, underscores), also the kernel's file name.
-        function: ``(state, parameters) -> (state', record, status)``; all dense column vectors,
-            status a scalar: `RUNNING` or the code with which the loop ends.
+        source: The function ``(state, parameters) -> (state', record, status)``, or what builds
+            it when it is needed; all dense column vectors, status a scalar: `RUNNING` or the code
+            with which the loop ends.
         state: Layout of the state, what an iteration hands to the next.
         parameters: Layout of the parameters, constant during one solve (targets, tolerances,
             gains), so that one kernel serves every target.
         record: Layout of what is logged of each iteration.
         compilable: False if the graph holds a node that has no C code (an Ipopt call); such a
             graph runs in CasADi's virtual machine.
+        recipe: See `recipe`; a library of the same recipe is taken without building the function.
     """
 
     name: str
-    function: ca.Function
+    source: ca.Function | Callable[[], ca.Function]
     state: Layout
     parameters: Layout
     record: Layout
     compilable: bool = True
+    recipe: str = ""
 
     def __post_init__(self) -> None:
+        if isinstance(self.source, ca.Function):
+            _ = self.function
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """The function, checked against the layouts.
+
+        Raises:
+            InputError: Its sizes are others.
+        """
+        function = self.source if isinstance(self.source, ca.Function) else self.source()
         found = (
-            [self.function.numel_in(i) for i in range(self.function.n_in())],
-            [self.function.numel_out(i) for i in range(self.function.n_out())],
+            [function.numel_in(i) for i in range(function.n_in())],
+            [function.numel_out(i) for i in range(function.n_out())],
         )
         expected = (
             [self.state.size, self.parameters.size],
@@ -47,3 +63,4 @@ class StepGraph:
         )
         if found != expected:
             raise InputError(f"step graph {self.name!r}: sizes {found}, layouts say {expected}")
+        return function

@@ -70,8 +70,8 @@ class HandFirstMethod:
         return PostureTable(robot, self.step.layouts.hand, options.wide_table, AT_LIMITS)
 
     def prepare(self) -> None:
-        """Build and compile the loop, and fill the tables."""
-        _ = self.kernel, self.table, self.wide_table
+        """Build and compile the loop, and fill the table of the first round."""
+        _ = self.kernel, self.table
 
     @property
     def trace_format(self) -> TraceFormat:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.robots.description import Array, RobotDescription
 from casadi_ik.steps.enhanced_record import enhanced_record, enhanced_row
@@ -115,6 +116,21 @@ class EnhancedStep:
 
     def graph(self) -> StepGraph:
         """The whole iteration; compilable unless the finger step calls Ipopt."""
+        return StepGraph(
+            self._name,
+            self._iteration,
+            self.state,
+            self.parameters,
+            self.record,
+            self.options.finger_step != "ipopt",
+            recipe=recipe(self._name, self.robot, self.options),
+        )
+
+    @property
+    def _name(self) -> str:
+        return ca.Function.fix_name(f"enhanced_{self.options.steps}_{self.robot.name}")
+
+    def _iteration(self) -> ca.Function:
         state = ca.MX.sym("state", self.state.size)
         parameters = ca.MX.sym("parameters", self.parameters.size)
         fingers = finger_step_function(self.robot, self.options.finger_step)
@@ -126,10 +142,7 @@ class EnhancedStep:
         choose = ca.Function.if_else("phase", self._reach(), align)
         in_reaching = state[self.state.slice("phase")] < Phase.HAND_ALIGNMENT
         outputs = choose(in_reaching, state, parameters)
-        compilable = self.options.finger_step != "ipopt"
-        name = ca.Function.fix_name(f"enhanced_{self.options.steps}_{self.robot.name}")
-        function = ca.Function(name, [state, parameters], list(outputs))
-        return StepGraph(name, function, self.state, self.parameters, self.record, compilable)
+        return ca.Function(self._name, [state, parameters], list(outputs))
 
     def parameter_values(
         self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
+from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.arm_placement import ALLOWED, ITERATIONS, place_arm
@@ -55,6 +56,21 @@ class HandFirstStep:
     def graph(self) -> StepGraph:
         """The whole iteration."""
         layouts = self.layouts
+        return StepGraph(
+            self._name,
+            self._iteration,
+            layouts.state,
+            layouts.parameters,
+            layouts.record,
+            recipe=recipe(self._name, self.robot, layouts.candidates),
+        )
+
+    @property
+    def _name(self) -> str:
+        return ca.Function.fix_name(f"hand_first_{self.robot.name}")
+
+    def _iteration(self) -> ca.Function:
+        layouts = self.layouts
         state = ca.MX.sym("state", layouts.state.size)
         parameters = ca.MX.sym("parameters", layouts.parameters.size)
         cases = [self._refinement(), self._candidate()]  # in the order of STAGES
@@ -64,9 +80,7 @@ class HandFirstStep:
         choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
         phase = state[layouts.state.slice("phase")]
         outputs = choose(phase - float(STAGES[0]), state, parameters)
-        name = f"hand_first_{self.robot.name}"
-        function = ca.Function(name, [state, parameters], list(outputs))
-        return StepGraph(name, function, layouts.state, layouts.parameters, layouts.record)
+        return ca.Function(self._name, [state, parameters], list(outputs))
 
     def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
         state = self.layouts.state.symbols("state")

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.robots.description import Array, RobotDescription
 from casadi_ik.steps.hierarchy import combine
@@ -76,6 +77,20 @@ class OriginalStep:
         What repeats, the solving of a task, is a function that is called: written out once per
         task it made the C compiler slow.
         """
+        return StepGraph(
+            self._name,
+            self._iteration,
+            self.state,
+            self.parameters,
+            self.record,
+            recipe=recipe(self._name, self.robot, self.options),
+        )
+
+    @property
+    def _name(self) -> str:
+        return ca.Function.fix_name(f"original_{self.options.steps}_{self.robot.name}")
+
+    def _iteration(self) -> ca.Function:
         state = ca.MX.sym("state", self.state.size)
         parameters = ca.MX.sym("parameters", self.parameters.size)
         errors, *pairs = self._view()(state, parameters)
@@ -88,10 +103,8 @@ class OriginalStep:
                 for kind, pair in zip(self._kinds(), pairs, strict=True)
             ]
             step = self._combined()(*pairs, *steps)
-        name = ca.Function.fix_name(f"original_{self.options.steps}_{self.robot.name}")
         outputs = self._ending()(state, parameters, errors, step)
-        function = ca.Function(name, [state, parameters], list(outputs))
-        return StepGraph(name, function, self.state, self.parameters, self.record)
+        return ca.Function(self._name, [state, parameters], list(outputs))
 
     def parameter_values(
         self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool

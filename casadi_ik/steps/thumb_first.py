@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.steps.arm_placement import place_arm
 from casadi_ik.steps.closed_chain_step import (
@@ -72,6 +73,21 @@ class ThumbFirstStep(ThumbFirstLayouts):
 
     def graph(self) -> StepGraph:
         """The whole iteration; compilable unless the step is ProxQP's."""
+        return StepGraph(
+            self._name,
+            self._iteration,
+            self.state,
+            self.parameters,
+            self.record,
+            self.options.step != "proxqp",
+            recipe=recipe(self._name, self.robot, self.options),
+        )
+
+    @property
+    def _name(self) -> str:
+        return ca.Function.fix_name(f"thumb_first_{self.robot.name}")
+
+    def _iteration(self) -> ca.Function:
         state = ca.MX.sym("state", self.state.size)
         parameters = ca.MX.sym("parameters", self.parameters.size)
         stages = {Phase.CANDIDATE: self._candidate(), Phase.HAND_ALIGNMENT: self._alignment()}
@@ -88,10 +104,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         )
         choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
         outputs = choose(stage, state, parameters)
-        name = ca.Function.fix_name(f"thumb_first_{self.robot.name}")
-        function = ca.Function(name, [state, parameters], list(outputs))
-        compilable = self.options.step != "proxqp"
-        return StepGraph(name, function, self.state, self.parameters, self.record, compilable)
+        return ca.Function(self._name, [state, parameters], list(outputs))
 
     def _vectors(self, kind: type[ca.SX] | type[ca.MX]) -> tuple[Expr, Expr, dict, dict]:
         state = kind.sym("state", self.state.size)

@@ -8,12 +8,14 @@ import subprocess
 import sys
 import textwrap
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
+import casadi_ik as ik
 from casadi_ik.errors import KernelError
 from casadi_ik.kernels import (
     FunctionKernel,
@@ -23,6 +25,7 @@ from casadi_ik.kernels import (
     cache_directory,
     compiler,
 )
+from casadi_ik.kernels.recipe import recipe as recipe_of
 
 from .graphs import counting_step, needs_compiler
 
@@ -209,3 +212,56 @@ def test_function_named_like_one_of_libc(directory: Path) -> None:
     assert kernel(1)[0] == 2
     (path,) = libraries(directory)
     assert not hasattr(ctypes.CDLL(str(path)), "casadi_ik_loop")
+
+
+def remembered(source: object, *parts: object) -> LoopKernel:
+    """A loop whose graph is known by what it follows from."""
+    step = counting_step("remembered")
+    recipe = recipe_of("remembered", *parts)
+    return LoopKernel(replace(step, source=source or step.source, recipe=recipe))
+
+
+def never_built() -> ca.Function:
+    raise AssertionError("the graph was built")
+
+
+@needs_compiler
+def test_a_graph_of_a_known_recipe_is_not_built(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = remembered(None, 1).run([[0]], [5], 9).states
+    for loaded_before in (True, False):
+        if not loaded_before:
+            forget(monkeypatch)
+        kernel = remembered(never_built, 1)
+        assert kernel.compiled
+        np.testing.assert_array_equal(kernel.run([[0]], [5], 9).states, first)
+    with pytest.raises(AssertionError, match="the graph was built"):
+        remembered(never_built, 2)
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["torn note", "no library", "note of another key"])
+def test_what_a_recipe_led_to_may_be_gone(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    remembered(None, 1)
+    (note,) = directory.glob("*.key")
+    if damage == "torn note":
+        note.write_text(note.read_text()[:7])
+    elif damage == "no library":
+        libraries(directory)[0].unlink()
+    else:
+        note.write_text("0" * 32)
+    forget(monkeypatch)
+    assert remembered(None, 1).compiled
+    assert len(libraries(directory)) == 1
+    forget(monkeypatch)
+    assert remembered(never_built, 1).compiled
+
+
+def test_recipes_differ_where_their_data_do() -> None:
+    robot = ik.load_robot("kuka_lwr_barrett").description
+    moved = replace(robot, home=robot.home + 1e-15)
+    assert recipe_of(robot, 8) == recipe_of(ik.load_robot("kuka_lwr_barrett").description, 8)
+    assert len({recipe_of(robot, 8), recipe_of(robot, 9), recipe_of(moved, 8)}) == 3

@@ -59,7 +59,7 @@ def test_loop_conversion(compiled: bool) -> None:
     """Every storage type, every awkward double, at offsets that are not aligned."""
     layout = Layout.record(*LAYOUT, Field("odd", (2,), "u1"))
     x, p = ca.SX.sym("x"), ca.SX.sym("p", len(CASES))
-    function = ca.Function("awkward", [x, p], [x, ca.vertcat(*[p] * 5, 1, 2), 0])
+    function = ca.Function("awkward", [x, p], [x + 1, ca.vertcat(*[p] * 5, 1, 2), 0])
     step = StepGraph(
         "awkward", function, Layout((Field("x"),)), Layout((Field("p", (len(CASES),)),)), layout
     )
