@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError
-from casadi_ik.kernels import FunctionKernel, LoopKernel
+from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
 from casadi_ik.logs import McapRecorder
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers import BatchSolution, Problems, Stepper, Tolerance
@@ -143,8 +143,8 @@ class ScrewControl:
             target: By name: "pose" as a (4, 4) matrix or an (8,) unit dual quaternion, "point"
                 (3,) [m], "normal" (3,), "distance" [m], as the task needs them; in the base frame,
                 or in the contact frame of the task's `relative_to`.
-            steps: How many steps to make at most.
-            tolerance: Error norm at which the run ends; 0 makes all steps.
+            steps: How many steps to make at most; a run that comes to stand still for ever ends.
+            tolerance: Error norm at which the run ends; 0: none.
             log: Path of an MCAP file to write every step to.
 
         Raises:
@@ -166,7 +166,8 @@ class ScrewControl:
         )
         rows = result.trace[0]
         code = int(result.status[0])
-        status = Status.INVALID if code < 0 else Status(code or Status.ITERATION_LIMIT)
+        ended = {RUNNING: Status.ITERATION_LIMIT, REPEATED: Status.STALLED}
+        status = ended.get(code) or (Status.INVALID if code < 0 else Status(code))
         trajectory = Trajectory(
             times=self.period * np.arange(len(rows), dtype=np.float64),
             q=rows["q"],

@@ -299,6 +299,8 @@ class HandFirstStep:
         if tried is not None:
             positions, chords = errors(tried.before, f)
             angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
+            positions = ca.if_else(p["weights"][:, 0] > 0, positions, NOTHING)
+            angles = ca.if_else(p["weights"][:, 1] > 0, angles, NOTHING)
         at_limit = ca.logic_or(q <= p["lower"], q >= p["upper"])
         bits = ca.DM([2.0**i for i in range(q.numel())])
         return self.layouts.record.pack(

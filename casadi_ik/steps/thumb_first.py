@@ -316,8 +316,8 @@ class ThumbFirstStep(ThumbFirstLayouts):
         values: dict[str, Expr] = {
             "q": q,
             "cost": there.cost,
-            "position_error": there.positions,
-            "angle_error": there.angles,
+            "position_error": ca.if_else(p["weights"][:, 0] > 0, there.positions, NOTHING),
+            "angle_error": ca.if_else(p["weights"][:, 1] > 0, there.angles, NOTHING),
             "damping": NOTHING,
             "step_size": NOTHING,
             "manipulability": NOTHING,

@@ -173,6 +173,9 @@ class WholeNlp:
             parameters: Targets and weights, see `parameters`.
             lower: (n,) bounds of q; below the robot's, limits are ignored, those of joints as well.
             upper: (n,) bounds of q.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C while Ipopt was at work.
         """
         enforced = bool(np.all(lower >= self._lower))
         joints = (self._joint_lower, self._joint_upper)
@@ -197,6 +200,8 @@ class WholeNlp:
             )
             path, rows = self._watch.end()
             stats: dict[str, Any] = solver.stats()
+            if stats["return_status"] == "User_Requested_Stop" and not self._watch.stopped:
+                raise KeyboardInterrupt  # CasADi has taken it for itself
         if not len(path):  # Ipopt could not evaluate the start
             return self._unmoved(start, first, Status.INVALID)
         path = path[:, : self._n] * self._scale

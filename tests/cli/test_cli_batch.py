@@ -127,10 +127,10 @@ def test_log_of_blocks_numbers_the_rows_through(
     monkeypatch.setattr(batch_command, "BLOCK", 16)
     out, log = tmp_path / "o.npz", tmp_path / "o.mcap"
     run("batch", hands(60), *ROBOT, "--out", out, "--log", log)
-    solves = list(ik.logs.open_log(log).solves())
-    assert [solve.solve_id for solve in solves] == [row for row in range(60) if row != 30]
+    solves = list(ik.logs.open(log).solves().records())
+    assert [solve["solve_id"] for solve in solves] == [row for row in range(60) if row != 30]
     with np.load(out, allow_pickle=False) as data:
-        assert [solve.status for solve in solves] == np.delete(data["status"], 30).tolist()
+        assert [solve["status"] for solve in solves] == np.delete(data["status"], 30).tolist()
 
 
 def test_diagnoses_are_written_if_asked_for(

@@ -11,9 +11,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import FAST, Command, Run
 
+import casadi_ik as ik
 from casadi_ik.cli import main as entry
 
 PROGRAM = [sys.executable, "-m", "casadi_ik"]
@@ -61,16 +63,21 @@ def test_poor_terminal(run_process: Command) -> None:
     assert done.out.isascii()
 
 
-def test_interrupted(far_away: Path, tmp_path: Path) -> None:
+def test_interrupted(tmp_path: Path) -> None:
+    """In the middle of a long batch: one line, the exit code of an interrupt, no half file."""
+    robot = ik.load_robot("kuka_lwr_barrett")
+    points, normals = robot.contacts(robot.random(np.random.default_rng(0), 3000))
+    targets, out = tmp_path / "targets.npz", tmp_path / "out.npz"
+    np.savez(targets, points=points, normals=normals)
     process = subprocess.Popen(
-        [*PROGRAM, "solve", far_away, "--method", "enhanced-dls", "--log", tmp_path / "new.mcap"],
+        [*PROGRAM, "batch", targets, "--robot", robot.name, "--method", "ipopt", "--out", out],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     deadline = time.monotonic() + 60
-    while not list(tmp_path.glob(".new.mcap.*")) and time.monotonic() < deadline:
+    while not list(tmp_path.glob(".batch-*")) and time.monotonic() < deadline:
         time.sleep(0.05)
     time.sleep(0.5)
     # Ipopt was seen to lose an interrupt now and then (about one in fifty): press again.
@@ -79,10 +86,10 @@ def test_interrupted(far_away: Path, tmp_path: Path) -> None:
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(5)
     process.kill()
-    out, error = process.communicate()
+    said, error = process.communicate()
     assert process.returncode == 130
-    assert (out, error.splitlines()[-1]) == ("", "casadi-ik: error: interrupted")
-    assert list(tmp_path.iterdir()) == [far_away]
+    assert (said, error.splitlines()[-1]) == ("", "casadi-ik: error: interrupted")
+    assert list(tmp_path.iterdir()) == [targets]
 
 
 def test_bugs_are_not_hidden(run: Command, monkeypatch: pytest.MonkeyPatch) -> None:

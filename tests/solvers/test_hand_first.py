@@ -225,3 +225,19 @@ def test_parameters_are_checked():
     with pytest.raises(InputError, match="table: found 4, expected at least"):
         HandFirstParameters(table=4)
     assert dataclasses.asdict(HandFirstParameters())["rounds"] >= 1
+
+
+@pytest.mark.parametrize("name", ["hand-first", "thumb-first"])
+def test_the_trace_leaves_open_what_is_free(robot, rng, name):
+    points, normals = robot.contacts(robot.random(rng, 1))
+    normals[:, 1] = np.nan
+    points[:, 2] = normals[:, 2] = np.nan
+    method = ik.Solver(robot, name)._engine.method
+    asked = Problems(*target_arrays(points, normals, 3), ik.Tolerance(), True)
+    (rows,) = method.run(asked, robot.home[None], 0, True).trace
+    measured = rows[np.isfinite(rows["position_error"][:, 0])]
+    assert len(measured)
+    assert np.isfinite(measured["position_error"]).all(axis=0).tolist() == [True, True, False]
+    assert np.isfinite(measured["angle_error"]).all(axis=0).tolist() == [True, False, False]
+    assert np.isnan(measured["position_error"][:, 2]).all()
+    assert np.isnan(measured["angle_error"][:, 1:]).all()

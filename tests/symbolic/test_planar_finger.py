@@ -91,7 +91,7 @@ REFUSED = {
     ),
     "spread": (
         "coupling: {kind: linear, of: bh_spread}",
-        "coupling: {kind: lead-screw, of: bh_spread, b: 2, c: 1}",
+        "coupling: {kind: lead-screw, of: bh_spread, b: 2, c: 2}",
         "bh_finger_2_spread does not follow a motor linearly",
     ),
 }
