@@ -46,7 +46,7 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/lint-imports
 
 # Where the other solvers are installed (pip install -e ".[peers]") they are measured too.
-bench: $(VENV)/demo.stamp
+bench: $(VENV)/dev.stamp
 	$(BIN)/python studies/bench.py
 
 notebooks: $(VENV)/dev.stamp

@@ -22,6 +22,7 @@ from casadi_ik.solvers import BatchSolution, Problems, Stepper, Tolerance
 from casadi_ik.solvers.method import TraceFormat
 from casadi_ik.solvers.recorder import SolveBlock
 from casadi_ik.solvers.trajectory import Trajectory
+from casadi_ik.steps.coupling_record import coupling_jacobian
 from casadi_ik.steps.screw_control import ScrewControlStep
 from casadi_ik.steps.screw_objectives import ScrewTask
 from casadi_ik.steps.status import Status
@@ -255,7 +256,9 @@ class ScrewControl:
             method="screw-control",
             robot=self.robot.name,
             fingers=self.robot.fingers,
-            format=TraceFormat(self._step.record, labels),
+            format=TraceFormat(
+                self._step.record, labels, coupling_jacobian(self.robot.description)
+            ),
             first=0,
             problems=Problems(free, free, Tolerance(), enforce_limits=True),
             batch=batch,

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import bench_logs
 import numpy as np
 from bench_first_use import first_use
 from bench_report import Section, write_report
@@ -245,6 +246,7 @@ MEASUREMENTS: dict[str, Callable[[ik.ArmHand, Sizes], Section]] = {
     "threads": threads,
     "first-use": lambda _, sizes: first_use(ik.METHODS, sizes.later),
     "iterations": iterations,
+    "logs": lambda _, sizes: Section(*bench_logs.report(sizes.batch, sizes.repeats)),
     "peers": lambda _, sizes: measured(sizes.peers, 0, installed()),
 }
 

@@ -18,6 +18,7 @@ from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
 from casadi_ik.solvers.posture_table import PostureTable
 from casadi_ik.solvers.problem import Array, Problems
+from casadi_ik.steps.coupling_record import coupling_jacobian
 from casadi_ik.steps.hand_first import HandFirstStep
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.hand_first_state import STAGES, HandFirstLayouts
@@ -76,7 +77,7 @@ class HandFirstMethod:
     @property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        return trace_format(self.step.layouts.record, self._robot)
+        return trace_format(self.step.layouts.record, self._robot, coupling_jacobian(self._robot))
 
     @property
     def parameters(self) -> Mapping[str, Any]:

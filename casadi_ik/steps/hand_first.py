@@ -21,6 +21,7 @@ from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.arm_placement import ALLOWED, ITERATIONS, place_arm
 from casadi_ik.steps.contact_fit import EXACT, Judged, Tried, fresh_fit, judge, judge_contacts
+from casadi_ik.steps.coupling_record import coupling_values
 from casadi_ik.steps.hand_first_state import STAGES, HandFirstLayouts, errors
 from casadi_ik.steps.hand_fit import PalmAndHand, best_palm, fit_step, hand_contacts
 from casadi_ik.steps.numeric_arm import STARTS, nearest_start, pose_step
@@ -312,6 +313,7 @@ class HandFirstStep:
                 "damping": s["damping"],
                 "step_size": tried.size if tried else NOTHING,
                 "margin": margin,
+                **coupling_values(self.robot, q),
                 "limit_mask": ca.dot(at_limit, bits),
                 "candidate": s["candidate"],
                 "accepted": judged.accepted if judged else 0.0,

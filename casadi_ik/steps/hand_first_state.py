@@ -10,6 +10,7 @@ import casadi as ca
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.bounded_step import Bounded
+from casadi_ik.steps.coupling_record import coupling_fields
 from casadi_ik.steps.status import Phase
 from casadi_ik.symbolic.smooth import Expr
 
@@ -97,6 +98,7 @@ class HandFirstLayouts:
             Field("damping", (), "f4", "", "Levenberg-Marquardt damping of the step"),
             Field("step_size", (), "f4", "rad or m", "largest motor change of the step tried"),
             Field("margin", (), "f4", "", "best arm margin found (arm placement)"),
+            *coupling_fields(self.robot),
             Field("limit_mask", (), "u4", "", "bit i: actuator i at a limit"),
             Field("candidate", (), "u1", "", "hand posture started from"),
             Field("accepted", (), "u1", "", "1 if the step lowered the cost"),

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from casadi_ik.kernels import Field, Layout, StepGraph
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.bounded_step import Bounded, damped_step
+from casadi_ik.steps.coupling_record import coupling_fields, coupling_values
 from casadi_ik.steps.limits import kept_within, limit_mask
 from casadi_ik.steps.screw_objectives import ScrewTask, rows, tip, values
 from casadi_ik.steps.status import Status
@@ -77,6 +78,7 @@ class ScrewControlStep:
             Field("error_norm", (), "f8", "", "norm of the rows; of a pose Chandra eq. (17)"),
             Field("step_size", (), "f4", "rad or m", "largest actuator change of this step"),
             Field("sigma_task", (), "f4", "", "smallest singular value of the scaled Jacobian"),
+            *coupling_fields(self.robot),
             Field("limit_mask", (), "u4", "", "bit i: actuator i at or beyond a limit"),
             Field("status", (), "u1", "", "0 running, else the final status"),
         )
@@ -141,6 +143,7 @@ class ScrewControlStep:
                 "error_norm": error_norm,
                 "step_size": ca.mmax(ca.fabs(q_next - q)),
                 "sigma_task": ca.mmin(singular_values(jacobian)),
+                **coupling_values(self.robot, q),
                 "limit_mask": limit_mask(self.robot, q),
                 "status": status,
             }
