@@ -4,7 +4,7 @@ Index finger pose (their Figs. 2, 3 and Table I), relative pose of index and thu
 the same relative tasks with task-specific Jacobians. One command writes report and figures::
 
     python studies/ar10_gains.py                   # studies/results/ar10_gains/
-    python studies/ar10_gains.py --out /tmp/gains --goals 50
+    python studies/ar10_gains.py --out out/gains --goals 50
 """
 
 from __future__ import annotations

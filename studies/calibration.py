@@ -4,7 +4,7 @@ Hands are drawn from the priors about the described AR10, measured with noise an
 calibrated; the truth is known, so the estimates and their intervals can be judged. One command::
 
     python studies/calibration.py                # studies/results/calibration/
-    python studies/calibration.py --hands 20 --out /tmp/calibration
+    python studies/calibration.py --hands 20 --out out/calibration
 """
 
 from __future__ import annotations
