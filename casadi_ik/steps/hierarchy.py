@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from casadi_ik.steps.tasks import Task
+from casadi_ik.steps.tasks import MILLIMETRE, Task
 from casadi_ik.symbolic.linear_algebra import project_to_null_space, solve_spd
 from casadi_ik.symbolic.smooth import Expr
 
@@ -22,7 +22,7 @@ EXACT = 1e-6
 """Damping of a projector that is meant to be exact [unit of the task's Jacobian]."""
 
 RANK_FLOOR = 1e-3
-"""Damping of the augmented projector [rad/rad, and mm/rad times 1e-3]: below it a row left over
+"""Damping of the augmented projector [rad/rad, and m/rad]: below it a row left over
 from the higher tasks counts as dependent on them."""
 
 
@@ -53,45 +53,48 @@ def combine(
                 step = project_to_null_space(higher.jacobian, step, damping or EXACT)
             total = total + step
         return total
-    total, spared = steps[0], None
-    for higher, step in zip(tasks, steps[1:], strict=False):
-        spared = extended(spared, higher, damping)
-        total = total + spared.project(step)
+    projectors: list[Projector] = []
+    for higher in tasks[:-1]:
+        projectors.append(_projector(higher, projectors, damping))
+    total = steps[-1]
+    for step, projector in zip(reversed(steps[:-1]), reversed(projectors), strict=True):
+        total = step + projector.of_column(total)
     return total
 
 
 @dataclass(frozen=True, eq=False)
-class Spared:
-    """The projector P = I - A X into the null space of some tasks, r rows in all.
+class Projector:
+    """N = I - Y' Z with Z = (Y Y' + damping^2 I)^-1 Y, kept as its factors, both (3, k).
 
-    Its factors are a fifth of the matrix: forming P and multiplying it level by level took five
-    times the instructions.
-
-    Attributes:
-        A: (k, r).
-        X: (r, k).
+    Multiplied with vectors one after the other they take a third of the instructions of a product
+    of the matrices.
     """
 
-    A: Expr
-    X: Expr
+    Y: Expr
+    Z: Expr
 
-    def project(self, vectors: Expr) -> Expr:
-        """P v for every column of `vectors` (k, c)."""
-        return vectors - self.A @ (self.X @ vectors)
+    def of_column(self, column: Expr) -> Expr:
+        """N v for v (k, 1)."""
+        return column - self.Y.T @ (self.Z @ column)
+
+    def of_rows(self, rows: Expr) -> Expr:
+        """R N for R (r, k)."""
+        return rows - (rows @ self.Y.T) @ self.Z
 
 
-def extended(spared: Spared | None, task: Task, damping: float | None) -> Spared:
-    """One more task to be spared: P' = P N(J P), N(Y) = I - Y' (Y Y' + damping^2 I)^-1 Y."""
-    J = task.jacobian
+def _projector(task: Task, higher: Sequence[Projector], damping: float | None) -> Projector:
+    """What the tasks so far and one more leave free is N_1 N_2 ... N_k: this is N_k.
+
+    Y = J N_1 ... N_k-1 is the part of the task that the higher ones left to it.
+    """
+    Y = task.jacobian
     if damping is None:
-        damping, J = RANK_FLOOR, J * (1e-3 if task.is_position else 1.0)
-    if spared is None:
-        Y, PY = J, J.T
-    else:
-        Y = J - (J @ spared.A) @ spared.X
-        PY = spared.project(Y.T)
+        damping, Y = RANK_FLOOR, Y * (MILLIMETRE if task.is_position else 1.0)
+    for projector in higher:
+        Y = projector.of_rows(Y)
     G = Y @ Y.T + damping**2 * ca.DM.eye(Y.shape[0])
-    X = solve_spd(G, Y)
-    if spared is None:
-        return Spared(PY, X)
-    return Spared(ca.horzcat(spared.A, PY), ca.vertcat(spared.X, X))
+    # Structurally zero columns stay so: the highest tasks have many.
+    columns = sorted(set(Y.sparsity().get_col()))
+    Z = type(Y)(*Y.shape)
+    Z[:, columns] = solve_spd(G, Y[:, columns])
+    return Projector(Y, Z)

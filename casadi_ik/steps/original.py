@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,6 @@ from casadi_ik.steps.status import Phase, Status
 from casadi_ik.steps.targets import contact_errors, target_fields, targets, within_tolerance
 from casadi_ik.steps.tasks import (
     Task,
-    TaskSolver,
     contact_tasks,
     damped,
     palm_orientation_task,
@@ -75,7 +76,8 @@ class OriginalStep:
         """The whole iteration.
 
         What repeats, the solving of a task, is a function that is called: written out once per
-        task it made the C compiler slow.
+        task it made the C compiler slow. Only the columns of the actuators that move a task are
+        worked on.
         """
         return StepGraph(
             self._name,
@@ -97,10 +99,14 @@ class OriginalStep:
         if self.options.projection == "stacked":
             step = self._stacked()(parameters, *pairs)
         else:
-            solve = {kind: self._solve(kind) for kind in (True, False)}
+            # Instruction fetch bounds an iteration: tasks of one size share one function.
+            sizes = {len(columns) for _, columns in self._kinds}
+            solve = {size: self._solve(size) for size in sorted(sizes)}
+            place = self.parameters.slice
+            longest = {True: place("longest_error"), False: place("widest_error")}
             steps = [
-                solve[kind](parameters, pair)
-                for kind, pair in zip(self._kinds(), pairs, strict=True)
+                solve[len(columns)](parameters, parameters[longest[is_position]], pair)
+                for (is_position, columns), pair in zip(self._kinds, pairs, strict=True)
             ]
             step = self._combined()(*pairs, *steps)
         outputs = self._ending()(state, parameters, errors, step)
@@ -133,65 +139,87 @@ class OriginalStep:
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
         return state, parameters, self.state.unpack(state), self.parameters.unpack(parameters)
 
-    def _kinds(self) -> list[bool]:
-        """Of every task, whether it is a position."""
-        fingers = len(self.robot.fingers)
+    @cached_property
+    def _kinds(self) -> list[tuple[bool, tuple[int, ...]]]:
+        """Of every task by priority, whether it is a position, and the actuators that move it."""
+        robot, arm = self.robot, self.robot.arm_actuators
+        movers = [(*arm, *robot.finger_actuators(name)) for name in thumb_first(robot)]
         if self.options.order == "per-finger":
-            kinds = [True, False] * fingers
+            kinds = [(kind, columns) for columns in movers for kind in (True, False)]
         else:
-            kinds = [True] * fingers + [False] * fingers
-        return [False, *kinds] if self.options.palm_task else kinds
+            kinds = [(kind, columns) for kind in (True, False) for columns in movers]
+        return [(False, arm), *kinds] if self._turns_palm else kinds
+
+    @property
+    def _turns_palm(self) -> bool:
+        return self.options.palm_task and bool(self.robot.arm_actuators)
 
     def _view(self) -> ca.Function:
         """Errors (f, 2) of all fingers in point and normal, then all tasks by priority.
 
-        A task is its Jacobian and its error, [J, e] (3, n + 1).
+        A task is its Jacobian over the actuators that move it, and its error, [J, e] (3, k + 1).
         """
         state, parameters, s, p = self._inputs()
         robot, goals, body = self.robot, targets(self.robot, p), actuated(self.robot, s["q"])
-        every = tuple(range(len(robot.actuators)))
-        pairs = [contact_tasks(body, name, goals[name], every) for name in thumb_first(robot)]
+        arm = robot.arm_actuators
+        pairs = [
+            contact_tasks(body, name, goals[name], (*arm, *robot.finger_actuators(name)))
+            for name in thumb_first(robot)
+        ]
         if self.options.order == "per-finger":
             tasks = [task for pair in pairs for task in pair]
         else:
             tasks = [point for point, _ in pairs] + [normal for _, normal in pairs]
-        if self.options.palm_task:
+        if self._turns_palm:
             euler = self.options.palm_error == "euler"
             desired = palm_orientation(robot, goals)
-            tasks.insert(0, palm_orientation_task(body, desired, every, euler))
+            tasks.insert(0, palm_orientation_task(body, desired, arm, euler))
         errors = ca.horzcat(*contact_errors(body.kinematics, goals, robot.finger_names))
         seen = [ca.densify(ca.horzcat(task.jacobian, task.error)) for task in tasks]
         return ca.Function("view", [state, parameters], shared(errors, *seen))
 
-    def _task(self, pair: ca.SX, is_position: bool) -> Task:
-        return Task(pair[:, :-1], pair[:, -1], is_position)
+    def _solve(self, count: int) -> ca.Function:
+        """The step of one task alone over the actuators that move it, errors not above `longest`.
 
-    def _solve(self, is_position: bool) -> ca.Function:
-        """The step of one task alone."""
+        SDLS needs that, DLS does not look at it.
+        """
         _, parameters, _, p = self._inputs()
-        pair = ca.SX.sym("pair", 3, len(self.robot.actuators) + 1)
-        step = self._solver(p)(self._task(pair, is_position))
-        name = "solve_position" if is_position else "solve_orientation"
-        return ca.Function(name, [parameters, pair], shared(step))
+        longest, pair = ca.SX.sym("longest"), ca.SX.sym("pair", 3, count + 1)
+        if self.options.steps == "dls":
+            solver = damped(p["damping"])
+        else:
+            solver = selective(p["gamma"], longest, longest)
+        step = solver(Task(pair[:, :-1], pair[:, -1], is_position=True))
+        return ca.Function(f"solve_{count}", [parameters, longest, pair], shared(step))
+
+    def _pairs(self) -> tuple[list[ca.SX], list[Task]]:
+        """Symbols of all [J, e], and the tasks over all actuators that they stand for."""
+        n, pairs, tasks = len(self.robot.actuators), [], []
+        for i, (is_position, columns) in enumerate(self._kinds):
+            pair = ca.SX.sym(f"pair_{i}", 3, len(columns) + 1)
+            pairs.append(pair)
+            tasks.append(Task(_spread(pair[:, :-1], columns, n), pair[:, -1], is_position))
+        return pairs, tasks
 
     def _stacked(self) -> ca.Function:
         """One step for all tasks as one, without priorities."""
         _, parameters, _, p = self._inputs()
-        columns = len(self.robot.actuators) + 1
-        pairs = [ca.SX.sym(f"pair_{i}", 3, columns) for i in range(len(self._kinds()))]
-        stacked = ca.vertcat(*pairs)
-        step = damped_pinv_times(stacked[:, :-1], stacked[:, -1], p["damping"])
+        pairs, tasks = self._pairs()
+        J = ca.vertcat(*(task.jacobian for task in tasks))
+        e = ca.vertcat(*(task.error for task in tasks))
+        step = damped_pinv_times(ca.densify(J), e, p["damping"])
         return ca.Function("stacked", [parameters, *pairs], shared(step))
 
     def _combined(self) -> ca.Function:
         """One step from those of all tasks."""
-        n, kinds = len(self.robot.actuators), self._kinds()
-        pairs = [ca.SX.sym(f"pair_{i}", 3, n + 1) for i in range(len(kinds))]
-        steps = [ca.SX.sym(f"step_{i}", n) for i in range(len(kinds))]
-        tasks = [self._task(pair, kind) for pair, kind in zip(pairs, kinds, strict=True)]
+        n, (pairs, tasks) = len(self.robot.actuators), self._pairs()
+        given, steps = [], []
+        for i, (_, columns) in enumerate(self._kinds):
+            given.append(ca.SX.sym(f"step_{i}", len(columns)))
+            steps.append(_spread(given[i].T, columns, n).T)
         damping = self.options.damping if self.options.projectors == "damped" else None
-        step = combine(tasks, steps, self.options.projection, damping)
-        return ca.Function("combined", [*pairs, *steps], shared(step))
+        step = ca.densify(combine(tasks, steps, self.options.projection, damping))
+        return ca.Function("combined", [*pairs, *given], shared(step))
 
     def _ending(self) -> ca.Function:
         """Take the step, or end."""
@@ -218,7 +246,9 @@ class OriginalStep:
             "ending", [state, parameters, errors, step], shared(after, record, status)
         )
 
-    def _solver(self, p: dict[str, ca.SX]) -> TaskSolver:
-        if self.options.steps == "dls":
-            return damped(p["damping"])
-        return selective(p["gamma"], p["longest_error"], p["widest_error"])
+
+def _spread(matrix: ca.SX, columns: tuple[int, ...], n: int) -> ca.SX:
+    """A matrix (r, k) as the given columns of one with n, the others structurally zero."""
+    wide = ca.SX(matrix.shape[0], n)
+    wide[:, list(columns)] = matrix
+    return wide
