@@ -4,6 +4,7 @@ from casadi_ik.kernels.cache import cache_directory
 from casadi_ik.kernels.compiler import NoCompilerWarning
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.lookup import LookupKernel
 from casadi_ik.kernels.loop import FAILED, NON_FINITE, REPEATED, LoopKernel, LoopResult
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
@@ -15,6 +16,7 @@ __all__ = [
     "Field",
     "FunctionKernel",
     "Layout",
+    "LookupKernel",
     "LoopKernel",
     "LoopResult",
     "NoCompilerWarning",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
@@ -59,6 +60,7 @@ class FunctionKernel:
         self.input_shapes = tuple(_shape(function.size_in(i)) for i in range(function.n_in()))
         self.output_shapes = tuple(_shape(function.size_out(i)) for i in range(function.n_out()))
         self._names = tuple(function.name_in())
+        self._input_sizes = [function.numel_in(i) for i in range(function.n_in())]
         self._function = row_major(function)
         sizes = [function.numel_out(i) for i in range(function.n_out())]
         self._output_steps = np.array(sizes, dtype=np.int64)
@@ -87,30 +89,40 @@ class FunctionKernel:
             InputError: Wrong number of inputs, a wrong shape, or batches of different lengths.
             KernelError: The function itself reports a failure.
         """
-        arrays, count = self._arrays(inputs)
+        arrays, steps, count = self.checked(inputs)
         lead = () if count is None else (count,)
         outputs = tuple(np.empty((*lead, *shape)) for shape in self.output_shapes)
-        steps = [
-            array.size // max(count or 0, 1) if array.ndim > len(shape) else 0
-            for array, shape in zip(arrays, self.input_shapes, strict=True)
-        ]
         run = self._run_compiled if self.compiled else self._run_vm
         run(arrays, steps, outputs, 1 if count is None else count)
         return outputs
 
-    def _arrays(self, inputs: tuple[Any, ...]) -> tuple[list[NDArray[np.float64]], int | None]:
-        """The inputs as arrays and the length of the batch, None without one."""
+    def checked(
+        self, inputs: Sequence[Any]
+    ) -> tuple[list[NDArray[np.float64]], list[int], int | None]:
+        """Inputs of a call as arrays.
+
+        Returns:
+            The arrays; the doubles from one sample to the next of each, 0 where it is the same for
+            the whole batch; the length of the batch, None without one.
+
+        Raises:
+            InputError: See `__call__`.
+        """
         if len(inputs) != len(self.input_shapes):
             raise InputError(
                 f"{self.name}: {len(inputs)} inputs, expected {len(self.input_shapes)} "
                 f"({', '.join(self._names)})"
             )
         arrays: list[NDArray[np.float64]] = []
+        steps: list[int] = []
         count: int | None = None
-        for name, shape, values in zip(self._names, self.input_shapes, inputs, strict=True):
+        for name, shape, size, values in zip(
+            self._names, self.input_shapes, self._input_sizes, inputs, strict=True
+        ):
             array = doubles(values)
             arrays.append(array)
             if array.shape == shape:
+                steps.append(0)
                 continue
             if array.shape[1:] != shape or array.ndim != len(shape) + 1:
                 raise InputError(
@@ -122,7 +134,8 @@ class FunctionKernel:
                     f"{self.name}: input {name!r} is a batch of {len(array)}, another of {count}"
                 )
             count = len(array)
-        return arrays, count
+            steps.append(size)
+        return arrays, steps, count
 
     def _run_compiled(
         self,

@@ -62,13 +62,16 @@ class HandFirstMethod:
     @cached_property
     def table(self) -> PostureTable:
         """The hand postures that targets are compared with."""
-        return PostureTable(ArmHand(self._robot), self.step.layouts.hand, self.options.table)
+        return self._table(self.options.table)
 
     @cached_property
     def wide_table(self) -> PostureTable:
         """Many more postures, a good part of them at limits, for targets the first round misses."""
-        robot, options = ArmHand(self._robot), self.options
-        return PostureTable(robot, self.step.layouts.hand, options.wide_table, AT_LIMITS)
+        return self._table(self.options.wide_table, AT_LIMITS)
+
+    def _table(self, size: int, at_limits: float = 0.0) -> PostureTable:
+        hand = self.step.layouts.hand
+        return PostureTable(ArmHand(self._robot), hand, size, at_limits, compiled=self._compiled)
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
