@@ -158,8 +158,23 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        position, angle = self._errors(self.configuration(q), points, normals)
+        position, angle, _ = self._deviations(self.configuration(q), points, normals)
         return position, angle
+
+    def deviations(self, q: Array, points: Array, normals: Array) -> tuple[Array, Array, Array]:
+        """`errors` and `beyond_limits` at once, of configurations that need not be finite.
+
+        Args:
+            q: (k, n) actuator positions; NaN gives NaN.
+            points: (f, 3) or (k, f, 3) [m], base frame; NaN where free.
+            normals: (f, 3) or (k, f, 3), unit; NaN where free.
+
+        Returns:
+            Distances [m] (k, f), angles [rad] (k, f), and (k,) by how much the worst actuator or
+            joint is beyond its limits [rad or m].
+        """
+        position, angle, beyond = self._deviations(q, points, normals)
+        return position, angle, beyond
 
     def beyond_limits(self, q: ArrayLike) -> Array:
         """By how much the worst actuator or joint is beyond its limits [rad or m], () or (k,).
@@ -228,7 +243,7 @@ class ArmHand:
         return self._kernel("contacts", [q], [points, normals])
 
     @cached_property
-    def _errors(self) -> FunctionKernel:
+    def _deviations(self) -> FunctionKernel:
         q, f = self._symbols(), len(self.fingers)
         points, normals = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3)
         kinematics = actuated(self.description, q).kinematics
@@ -240,18 +255,20 @@ class ArmHand:
             # digits.
             apart, together = normal - normals[i, :].T, normal + normals[i, :].T
             angles.append(2 * ca.atan2(ca.norm_2(apart), ca.norm_2(together)))
-        outputs = [ca.vertcat(*positions), ca.vertcat(*angles)]
-        return self._kernel("errors", [q, points, normals], outputs)
+        outputs = [ca.vertcat(*positions), ca.vertcat(*angles), self._excess(q)]
+        return self._kernel("deviations", [q, points, normals], outputs)
 
     @cached_property
     def _beyond(self) -> FunctionKernel:
-        q, description = self._symbols(), self.description
-        theta = joint_positions(description, q)
-        both = ca.vertcat(q, theta)
+        q = self._symbols()
+        return self._kernel("beyond_limits", [q], [self._excess(q)])
+
+    def _excess(self, q: ca.SX) -> ca.SX:
+        description = self.description
+        both = ca.vertcat(q, joint_positions(description, q))
         lower = ca.DM(np.concatenate([self.lower, description.joint_lower]))
         upper = ca.DM(np.concatenate([self.upper, description.joint_upper]))
-        beyond = ca.mmax(ca.fmax(lower - both, both - upper))
-        return self._kernel("beyond_limits", [q], [beyond])
+        return ca.mmax(ca.fmax(lower - both, both - upper))
 
     @cached_property
     def _palm(self) -> FunctionKernel:

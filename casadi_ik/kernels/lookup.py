@@ -115,7 +115,7 @@ class LookupKernel:
 
     def _run_numpy(self, arrays: list[NDArray[np.float64]], found: NDArray[np.int64]) -> None:
         (keys,) = self.key(*arrays)
-        keys = keys.reshape(len(found), -1)  # also a single entry
+        keys = keys.reshape(len(found), self._keys.shape[1])  # also a single entry
         for start in range(0, len(keys), CHUNK):
             part = keys[start : start + CHUNK]
             known = ~np.isnan(part)

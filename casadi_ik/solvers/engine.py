@@ -124,7 +124,7 @@ class Engine:
     def _starts(self, q0: ArrayLike | None, count: int) -> Array:
         start = self.robot.configuration(q0, "q0")
         if start.ndim == 1:
-            return np.tile(start, (count, 1))
+            return np.repeat(start[None], count, axis=0)
         if len(start) != count:
             raise InputError(
                 f"q0: found {len(start)} rows for {count} targets, expected as many, or one (n,)"
@@ -158,7 +158,7 @@ class Engine:
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
-        success = np.all(verdict.ok, axis=1)
+        success = verdict.ok.all(axis=1)
         if problems.enforce_limits:
             success &= verdict.limits_ok
         status = np.where(success, int(Status.SOLVED), outcome.status)

@@ -73,7 +73,10 @@ class Problems:
         """
         first_row = 0
         if isinstance(rows, slice):
-            first_row = self.first_row + rows.indices(len(self))[0]
+            start, stop, _ = rows.indices(len(self))
+            if start == 0 and stop == len(self):
+                return self
+            first_row = self.first_row + start
         points, normals = self.points[rows], self.normals[rows]
         return replace(self, points=points, normals=normals, first_row=first_row)
 

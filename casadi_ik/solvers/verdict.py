@@ -35,24 +35,12 @@ def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
         problems: k targets, or one that all configurations are compared with.
         q: (k, n) configurations.
     """
-    return Verdict(*judge_contacts(robot, problems, q), within_limits(robot, q))
-
-
-def judge_contacts(
-    robot: ArmHand, problems: Problems, q: Array
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """The same without regard to limits: (k, f) distances [m], angles [rad], and what is met."""
     points, normals = problems.points, problems.normals
     if len(problems) == 1:
         points, normals = points[0], normals[0]
-    position, angle = robot.errors(q, points, normals)
+    position, angle, beyond = robot.deviations(q, points, normals)
     slack = 1 + TOLERANCE_SLACK
     # Free is what the target leaves out; an error that is NaN for another reason is no success.
-    met = (position <= problems.position_tolerance * slack) | np.isnan(problems.points[..., 0])
-    ok = met & ((angle <= problems.angle_tolerance * slack) | np.isnan(problems.normals[..., 0]))
-    return position, angle, ok
-
-
-def within_limits(robot: ArmHand, q: Array) -> NDArray[np.bool_]:
-    """(k,) whether every actuator and every joint of (k, n) configurations is within its limits."""
-    return robot.beyond_limits(q) <= LIMIT_SLACK
+    met = (position <= problems.position_tolerance * slack) | np.isnan(points[..., 0])
+    ok = met & ((angle <= problems.angle_tolerance * slack) | np.isnan(normals[..., 0]))
+    return Verdict(position, angle, ok, beyond <= LIMIT_SLACK)
