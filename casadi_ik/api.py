@@ -142,6 +142,8 @@ class Solver:
             LogError: The log cannot be written.
         """
         problems = self._problems([grasp], fixed)
+        if log is None and (quick := self._engine.quick(problems, q0, seed)) is not None:
+            return quick
         with self._recorder(log, seed) as recorder:
             batch = self._engine.solve(problems, q0, seed, 1, recorder, diagnose)
         return batch.solution(

@@ -165,13 +165,13 @@ class ArmHand:
         """`errors` and `beyond_limits` at once, of configurations that need not be finite.
 
         Args:
-            q: (k, n) actuator positions; NaN gives NaN.
+            q: (n,) or (k, n) actuator positions; NaN gives NaN.
             points: (f, 3) or (k, f, 3) [m], base frame; NaN where free.
             normals: (f, 3) or (k, f, 3), unit; NaN where free.
 
         Returns:
-            Distances [m] (k, f), angles [rad] (k, f), and (k,) by how much the worst actuator or
-            joint is beyond its limits [rad or m].
+            Distances [m] (f,) or (k, f), angles [rad] the same, and () or (k,) by how much the
+            worst actuator or joint is beyond its limits [rad or m].
         """
         position, angle, beyond = self._deviations(q, points, normals)
         return position, angle, beyond

@@ -33,6 +33,46 @@ class _Job(ctypes.Structure):
     )
 
 
+class SingleCall:
+    """One compiled call on fixed arrays; not to be shared by threads.
+
+    Attributes:
+        inputs: Arrays of the inputs' shapes; write into them.
+        outputs: Arrays of the outputs' shapes; a call overwrites them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        run: Any,
+        inputs: Sequence[NDArray[np.float64]],
+        outputs: Sequence[NDArray[np.float64]],
+    ) -> None:
+        self.inputs = tuple(inputs)
+        self.outputs = tuple(outputs)
+        self._name = name
+        self._run = run
+        sources = (ctypes.c_void_p * len(inputs))(*map(memory, inputs))
+        targets = (ctypes.c_void_p * len(outputs))(*map(memory, outputs))
+        steps = (ctypes.c_int64 * max(len(inputs), len(outputs)))()
+        self._kept = sources, targets, steps
+        self._job = _Job(
+            *map(ctypes.addressof, (sources, steps, targets, steps)), count=1, next=0, slice=SLICE
+        )
+        self._reference = ctypes.byref(self._job)
+
+    def __call__(self) -> None:
+        """Evaluate.
+
+        Raises:
+            KernelError: The function itself reports a failure.
+        """
+        self._job.next = 0
+        code = self._run(self._reference)
+        if code != Outcome.DONE:
+            check(self._name, code)
+
+
 class FunctionKernel:
     """Evaluates a Function, compiled to C if the machine can; several threads may call at once.
 
@@ -67,6 +107,7 @@ class FunctionKernel:
         library = self._load() if compiled else None
         self.compiled = library is not None
         self._map: Any = None if library is None else library[SYMBOL]
+        self._singles: list[SingleCall] = []
 
     def _load(self) -> ctypes.CDLL | None:
         counts = {"N_IN": len(self.input_shapes), "N_OUT": len(self.output_shapes)}
@@ -90,10 +131,47 @@ class FunctionKernel:
             KernelError: The function itself reports a failure.
         """
         arrays, steps, count = self.checked(inputs)
+        if self.compiled and count in (None, 1):
+            return self._run_one(arrays, count)
         lead = () if count is None else (count,)
         outputs = tuple(np.empty((*lead, *shape)) for shape in self.output_shapes)
         run = self._run_compiled if self.compiled else self._run_vm
         run(arrays, steps, outputs, 1 if count is None else count)
+        return outputs
+
+    def single(
+        self,
+        inputs: Sequence[NDArray[np.float64]] | None = None,
+        outputs: Sequence[NDArray[np.float64]] | None = None,
+    ) -> SingleCall:
+        """One call with memory of its own, to be made again and again.
+
+        Args:
+            inputs: Contiguous arrays to read from, of one sample's shapes; None: new ones.
+            outputs: The same for what is written.
+        """
+        return SingleCall(
+            self.name,
+            self._map,
+            inputs or [np.zeros(shape) for shape in self.input_shapes],
+            outputs or [np.zeros(shape) for shape in self.output_shapes],
+        )
+
+    def _run_one(
+        self, arrays: list[NDArray[np.float64]], count: int | None
+    ) -> tuple[NDArray[np.float64], ...]:
+        """A single sample: kept memory takes half the time of new memory."""
+        try:
+            single = self._singles.pop()
+        except IndexError:
+            single = self.single()
+        for kept, array in zip(single.inputs, arrays, strict=True):
+            kept[...] = array
+        single()
+        outputs = tuple(
+            output.copy() if count is None else output[None].copy() for output in single.outputs
+        )
+        self._singles.append(single)
         return outputs
 
     def checked(

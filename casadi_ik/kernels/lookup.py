@@ -32,6 +32,55 @@ CHUNK = 256
 """Samples that numpy compares at once: what fits into the cache."""
 
 
+class _Job(ctypes.Structure):
+    """`lookup_job` of drivers/lookup.c."""
+
+    _fields_ = (
+        ("inputs", ctypes.c_void_p),
+        ("input_steps", ctypes.c_void_p),
+        ("tiles", ctypes.c_void_p),
+        ("found", ctypes.c_void_p),
+        ("rows", ctypes.c_int64),
+        ("wanted", ctypes.c_int64),
+        ("count", ctypes.c_int64),
+        ("next", ctypes.c_int64),
+        ("slice", ctypes.c_double),
+    )
+
+
+class SingleLookup:
+    """One compiled lookup on fixed arrays; not to be shared by threads.
+
+    Attributes:
+        inputs: Arrays of the inputs' shapes; write into them.
+        found: (1, count) rows, nearest first; a call overwrites them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        run: Any,
+        inputs: Sequence[NDArray[np.float64]],
+        found: NDArray[np.int64],
+        job: _Job,
+        kept: Any,
+    ) -> None:
+        self.inputs = tuple(inputs)
+        self.found = found
+        self._name = name
+        self._run = run
+        self._job = job
+        self._kept = kept
+        self._reference = ctypes.byref(job)
+
+    def __call__(self) -> None:
+        """Look up."""
+        self._job.next = 0
+        code = self._run(self._reference)
+        if code != Outcome.DONE:
+            check(self._name, code)
+
+
 class LookupKernel:
     """Finds the nearest rows of one table; several threads may ask at once.
 
@@ -94,24 +143,39 @@ class LookupKernel:
             self._run_numpy(arrays, found)
         return found
 
+    def single(self, count: int) -> SingleLookup:
+        """One lookup with memory of its own, to be made again and again; of compiled ones only."""
+        inputs = [np.zeros(shape) for shape in self.key.input_shapes]
+        found = np.zeros((1, count), dtype=np.int64)
+        return SingleLookup(self.key.name, self._lookup, inputs, found, *self._job(inputs, found))
+
     def _run_compiled(
         self, arrays: list[NDArray[np.float64]], steps: list[int], found: NDArray[np.int64]
     ) -> None:
-        sources = (ctypes.c_void_p * len(arrays))(*map(memory, arrays))
-        strides = (ctypes.c_int64 * len(arrays))(*steps)
-        job = _Job(
-            ctypes.addressof(sources),
-            ctypes.addressof(strides),
-            memory(self._tiles),
-            memory(found),
-            len(self._keys),
-            found.shape[1],
-            len(found),
-            0,
-            SLICE,
-        )
+        job, _kept = self._job(arrays, found, steps)
         while (code := self._lookup(ctypes.byref(job))) != Outcome.DONE:
             check(self.key.name, code)
+
+    def _job(
+        self,
+        inputs: list[NDArray[np.float64]],
+        found: NDArray[np.int64],
+        steps: Sequence[int] = (),
+    ) -> tuple[_Job, Any]:
+        """A job, and memory that has to live as long."""
+        sources = (ctypes.c_void_p * len(inputs))(*map(memory, inputs))
+        strides = (ctypes.c_int64 * len(inputs))(*steps)
+        job = _Job(
+            inputs=ctypes.addressof(sources),
+            input_steps=ctypes.addressof(strides),
+            tiles=memory(self._tiles),
+            found=memory(found),
+            rows=len(self._keys),
+            wanted=found.shape[1],
+            count=len(found),
+            slice=SLICE,
+        )
+        return job, (sources, strides)
 
     def _run_numpy(self, arrays: list[NDArray[np.float64]], found: NDArray[np.int64]) -> None:
         (keys,) = self.key(*arrays)
@@ -124,22 +188,6 @@ class LookupKernel:
             distance = known.astype(np.float32) @ self._keys.T**2 - wanted @ self._keys.T
             order = distance.argsort(axis=1, kind="stable")
             found[start : start + CHUNK] = order[:, : found.shape[1]]
-
-
-class _Job(ctypes.Structure):
-    """`lookup_job` of drivers/lookup.c."""
-
-    _fields_ = (
-        ("inputs", ctypes.c_void_p),
-        ("input_steps", ctypes.c_void_p),
-        ("tiles", ctypes.c_void_p),
-        ("found", ctypes.c_void_p),
-        ("rows", ctypes.c_int64),
-        ("wanted", ctypes.c_int64),
-        ("count", ctypes.c_int64),
-        ("next", ctypes.c_int64),
-        ("slice", ctypes.c_double),
-    )
 
 
 def _rounded(values: NDArray[np.float64]) -> NDArray[np.float32]:

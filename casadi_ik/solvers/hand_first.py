@@ -15,14 +15,15 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import FunctionKernel, LoopKernel, LoopResult
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
+from casadi_ik.solvers.hand_first_single import FirstRound
+from casadi_ik.solvers.method import Outcome, Quick, TraceFormat, trace_format
 from casadi_ik.solvers.posture_table import PostureTable
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.coupling_record import coupling_jacobian
 from casadi_ik.steps.hand_first import HandFirstStep
 from casadi_ik.steps.hand_first_beginning import beginning
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
-from casadi_ik.steps.hand_first_state import STAGES, HandFirstLayouts
+from casadi_ik.steps.hand_first_state import STAGE_LABELS, HandFirstLayouts
 from casadi_ik.steps.status import Status
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
@@ -31,8 +32,6 @@ UNBOUNDED = 1e3
 
 AT_LIMITS = 0.5
 """Part of the range that the wide table moves to the limits."""
-
-LABELS = tuple(stage.label for stage in STAGES)
 
 MAX_ITERATIONS = 100_000
 """Far above what the stages' own budgets allow: the loop always ends by a status."""
@@ -56,6 +55,7 @@ class HandFirstMethod:
         self._robot = robot
         self._compiled = compiled
         self.step = HandFirstStep(robot, _closed_form(robot), options.candidates)
+        self._singles: list[FirstRound] = []
 
     @cached_property
     def kernel(self) -> LoopKernel:
@@ -103,15 +103,27 @@ class HandFirstMethod:
             if done is not None:
                 # It goes on where the last round stopped in the numeric arm's list of starts.
                 states[:, passed] = done
-            share = (time.perf_counter() - begin) / max(len(left), 1)
             result = self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
-            collected.take(waiting, result, share)
+            besides = time.perf_counter() - begin - result.time.sum()
+            collected.take(waiting, result, besides / max(len(left), 1))
             missed = np.flatnonzero(result.status != Status.SOLVED)
             if not len(missed):
                 break
             left, waiting, here = left.rows(missed), waiting[missed], here[missed]
             done = result.states[missed, passed]
         return collected.outcome(trace)
+
+    def quick(self, problems: Problems, q0: Array) -> Quick | None:
+        """The first round of one target; see `QuickMethod.quick`."""
+        if not self.kernel.compiled:
+            return None
+        try:
+            first = self._singles.pop()
+        except IndexError:
+            first = FirstRound(self.table, self._beginning, self.kernel, self.step.layouts)
+        found = first(problems, q0, self._terms(problems), MAX_ITERATIONS)
+        self._singles.append(first)
+        return found
 
     def rows(
         self, problems: Problems, q0: Array, numbers: Sequence[int] = (0,)
@@ -127,10 +139,7 @@ class HandFirstMethod:
         Returns:
             (m k, ...) states and parameters, round by round.
         """
-        lower, upper = problems.bounds(self._robot, UNBOUNDED)
-        tolerances = problems.position_tolerance, problems.angle_tolerance
-        terms = np.concatenate([*tolerances, lower, upper])
-        asked = problems.points, problems.normals, q0, terms
+        asked = problems.points, problems.normals, q0, self._terms(problems)
         parts = [self._beginning(*asked, found) for found in self._postures(problems, numbers)]
         if len(parts) == 1:
             return parts[0][0], parts[0][1]
@@ -155,6 +164,11 @@ class HandFirstMethod:
             else self.table.nearest(*targets, count)
             for number in numbers
         ]
+
+    def _terms(self, problems: Problems) -> Array:
+        """What `beginning` calls terms."""
+        bounds = problems.bounds(self._robot, UNBOUNDED)
+        return np.concatenate([problems.position_tolerance, problems.angle_tolerance, *bounds])
 
     @cached_property
     def _beginning(self) -> FunctionKernel:
@@ -201,7 +215,7 @@ class _Collected:
             iterations=self._counts.sum(axis=1),
             restarts=self._restarts,
             time=self._time,
-            phases={label: self._counts[:, i] for i, label in enumerate(LABELS)},
+            phases={label: self._counts[:, i] for i, label in enumerate(STAGE_LABELS)},
             rows=self._rows if trace else None,
         )
 

@@ -27,6 +27,7 @@ class PostureTable:
 
     Attributes:
         postures: (t, k) positions of the hand's actuators.
+        lookup: Finds rows of them.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class PostureTable:
             key = _with_posture(key, np.sqrt(pull / len(columns)) / half_ranges)
         contacts = robot.contacts(q)
         rows = (*contacts, self.postures) if self._pulled else contacts
-        self._lookup = LookupKernel(key, rows, compiled)
+        self.lookup = LookupKernel(key, rows, compiled)
 
     def nearest(
         self, points: Array, normals: Array, count: int, near: Array | None = None
@@ -80,7 +81,7 @@ class PostureTable:
             (k, count, hand) postures.
         """
         asked = (points, normals, near) if self._pulled else (points, normals)
-        return self.postures[self._lookup(count, *asked)]
+        return self.postures[self.lookup(count, *asked)]
 
 
 @cache

@@ -18,6 +18,10 @@ LIMITS = ("enforce", "ignore")
 """How joint limits are taken: as part of being solved, or not at all (the paper's reading)."""
 
 
+UNIT = 1e-15
+"""A normal whose length is so near to 1 has been normalised before."""
+
+
 @dataclass(frozen=True, eq=False)
 class Problems:
     """A batch of targets.
@@ -178,6 +182,8 @@ def target_arrays(
     if len(empty):
         row = first_row + int(empty[0])
         raise RowError(f"points: row {row} has no contact at all", row)
+    # What is a unit normal stays as it is: a contact gives the same target here and in a `Grasp`.
+    length[np.abs(length - 1) < UNIT] = 1.0
     return p, n / length[..., None]
 
 

@@ -111,8 +111,7 @@ class Trials:
     def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether configurations meet their targets, and if asked the robot's limits."""
         verdict = judge(self.robot, problems, q)
-        ok: NDArray[np.bool_] = verdict.ok.all(axis=1)
-        return ok & verdict.limits_ok if limits else ok
+        return verdict.all_ok & verdict.limits_ok if limits else verdict.all_ok
 
     def misses(self, problems: Problems, q: Array) -> Array:
         """(k, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
