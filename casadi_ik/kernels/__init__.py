@@ -2,6 +2,7 @@
 
 from casadi_ik.kernels.cache import cache_directory
 from casadi_ik.kernels.compiler import NoCompilerWarning
+from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.lookup import LookupKernel
@@ -14,6 +15,7 @@ __all__ = [
     "REPEATED",
     "RUNNING",
     "Field",
+    "FunctionGraph",
     "FunctionKernel",
     "Layout",
     "LookupKernel",

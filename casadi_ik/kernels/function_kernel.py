@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -14,6 +15,7 @@ from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.buffered import BufferedFunction, doubles, memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.outcome import SLICE, Outcome, check
 
 SYMBOL = "casadi_ik_map"
@@ -86,7 +88,7 @@ class FunctionKernel:
         output_shapes: Shape of one sample of each output.
     """
 
-    def __init__(self, function: ca.Function, compiled: bool = True) -> None:
+    def __init__(self, function: ca.Function | FunctionGraph, compiled: bool = True) -> None:
         """Compile the function or load it from the cache.
 
         Args:
@@ -96,14 +98,14 @@ class FunctionKernel:
         Raises:
             KernelError: The function has no C code, or the compiler refused it.
         """
-        self.name = function.name()
-        self.input_shapes = tuple(_shape(function.size_in(i)) for i in range(function.n_in()))
-        self.output_shapes = tuple(_shape(function.size_out(i)) for i in range(function.n_out()))
-        self._names = tuple(function.name_in())
-        self._input_sizes = [function.numel_in(i) for i in range(function.n_in())]
-        self._function = row_major(function)
-        sizes = [function.numel_out(i) for i in range(function.n_out())]
-        self._output_steps = np.array(sizes, dtype=np.int64)
+        graph = function if isinstance(function, FunctionGraph) else FunctionGraph.of(function)
+        self.name = graph.name
+        self.input_shapes = tuple(map(_shape, graph.inputs.values()))
+        self.output_shapes = tuple(map(_shape, graph.outputs))
+        self._graph = graph
+        self._names = tuple(graph.inputs)
+        self._input_sizes = [rows * columns for rows, columns in graph.inputs.values()]
+        self._output_steps = np.array([r * c for r, c in graph.outputs], dtype=np.int64)
         library = self._load() if compiled else None
         self.compiled = library is not None
         self._map: Any = None if library is None else library[SYMBOL]
@@ -111,9 +113,12 @@ class FunctionKernel:
 
     def _load(self) -> ctypes.CDLL | None:
         counts = {"N_IN": len(self.input_shapes), "N_OUT": len(self.output_shapes)}
-        return load_library(
-            self.name, lambda: self._function, define(counts) + driver_text("map"), SYMBOL
-        )
+        driver = define(counts) + driver_text("map")
+        return load_library(self.name, lambda: self._function, driver, SYMBOL, self._graph.recipe)
+
+    @cached_property
+    def _function(self) -> ca.Function:
+        return row_major(self._graph.function)
 
     def __call__(self, *inputs: Any) -> tuple[NDArray[np.float64], ...]:
         """Evaluate one sample or a batch.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.outcome import SLICE, Outcome, check
 
@@ -89,7 +90,9 @@ class LookupKernel:
         compiled: Whether calls run in compiled code; numpy finds the same rows.
     """
 
-    def __init__(self, key: ca.Function, rows: Sequence[Any], compiled: bool = True) -> None:
+    def __init__(
+        self, key: ca.Function | FunctionGraph, rows: Sequence[Any], compiled: bool = True
+    ) -> None:
         """Compile or load from the cache, and note the keys of the table.
 
         Args:
@@ -100,18 +103,19 @@ class LookupKernel:
         Raises:
             KernelError: The function has no C code, or the compiler refused it.
         """
-        self.key = FunctionKernel(key, compiled)
+        graph = key if isinstance(key, FunctionGraph) else FunctionGraph.of(key)
+        self.key = FunctionKernel(graph, compiled)
         (keys,) = self.key(*rows)
         self._keys = _rounded(np.nan_to_num(keys).reshape(len(keys), -1))
         # An entry of neighbouring rows side by side, tile by tile in the order of reading: whole
         # columns a power of two apart would fall on each other in the cache.
         padded = np.pad(self._keys, ((0, -len(keys) % TILE), (0, 0)))
         self._tiles = padded.reshape(-1, TILE, self._keys.shape[1]).transpose(0, 2, 1).copy()
-        library = self._load(key) if compiled else None
+        library = self._load(graph) if compiled else None
         self.compiled = library is not None
         self._lookup: Any = None if library is None else library[SYMBOL]
 
-    def _load(self, key: ca.Function) -> ctypes.CDLL | None:
+    def _load(self, graph: FunctionGraph) -> ctypes.CDLL | None:
         constants = {
             "N_IN": len(self.key.input_shapes),
             "N_KEY": self._keys.shape[1],
@@ -120,7 +124,9 @@ class LookupKernel:
             "LARGEST": LARGEST,
         }
         driver = define(constants) + driver_text("lookup")
-        return load_library(key.name(), lambda: row_major(key), driver, SYMBOL)
+        return load_library(
+            graph.name, lambda: row_major(graph.function), driver, SYMBOL, graph.recipe
+        )
 
     def __call__(self, count: int, *inputs: Any) -> NDArray[np.int64]:
         """Find the nearest rows.

@@ -7,19 +7,13 @@ stage starts from postures that nearly fit, wherever the palm may be.
 
 from __future__ import annotations
 
-from functools import cache
-from itertools import combinations, permutations
-
-import casadi as ca
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.kernels import LookupKernel
 from casadi_ik.solvers.problem import Array
+from casadi_ik.steps.contact_shape import contact_shape
 from casadi_ik.steps.even_spread import evenly
-
-LENGTH = 0.1
-"""Distances are divided by this [m], so that they weigh like the cosines."""
 
 
 class PostureTable:
@@ -57,11 +51,10 @@ class PostureTable:
         spread = np.clip(spread, 0.0, 1.0)
         q[:, columns] = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
         self.postures = q[:, columns]
-        key = contact_shape(len(robot.fingers))
         self._pulled = pull > 0
-        if self._pulled:
-            half_ranges = (robot.upper - robot.lower)[columns] / 2
-            key = _with_posture(key, np.sqrt(pull / len(columns)) / half_ranges)
+        half_ranges = (robot.upper - robot.lower)[columns] / 2
+        scales = np.sqrt(pull / len(columns)) / half_ranges
+        key = contact_shape(len(robot.fingers), scales if self._pulled else ())
         contacts = robot.contacts(q)
         rows = (*contacts, self.postures) if self._pulled else contacts
         self.lookup = LookupKernel(key, rows, compiled)
@@ -82,38 +75,3 @@ class PostureTable:
         """
         asked = (points, normals, near) if self._pulled else (points, normals)
         return self.postures[self.lookup(count, *asked)]
-
-
-@cache
-def contact_shape(f: int) -> ca.Function:
-    """Invariants of contacts under rigid motions, NaN where something is free (and for f = 1).
-
-    Distances of the points, cosines between the normals, slopes of the normals against the lines
-    between the points, and the side of the plane of three points that the normals are on.
-
-    Args:
-        f: Number of fingers.
-
-    Returns:
-        points (f, 3) [m] and normals (f, 3) -> values (s, 1).
-    """
-    points, normals = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3)
-    values = []
-    for i, j in combinations(range(f), 2):
-        values.append(ca.norm_2(points[i, :] - points[j, :]) / LENGTH)
-        values.append(ca.dot(normals[i, :], normals[j, :]))
-    for i, j in permutations(range(f), 2):
-        values.append(ca.dot(points[j, :] - points[i, :], normals[i, :]) / LENGTH)
-    for i, j, m in combinations(range(f), 3):
-        across = ca.cross(points[j, :] - points[i, :], points[m, :] - points[i, :])
-        values += [ca.dot(across, normals[k, :]) / LENGTH**2 for k in (i, j, m)]
-    outputs = [ca.vertcat(*values) if values else ca.SX(float("nan"))]
-    return ca.Function(f"contact_shape_{f}", [points, normals], outputs)
-
-
-def _with_posture(shape: ca.Function, scales: Array) -> ca.Function:
-    """The same with a posture (hand, 1) besides, its entries multiplied by scales."""
-    points, normals = (ca.SX.sym(shape.name_in(i), *shape.size_in(i)) for i in range(2))
-    near = ca.SX.sym("near", len(scales))
-    outputs = [ca.vertcat(shape(points, normals), near * ca.DM(scales))]
-    return ca.Function(f"{shape.name()}_near", [points, normals, near], outputs)

@@ -6,7 +6,9 @@ import sys
 
 import casadi as ca
 
+from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.recipe import recipe
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.hand_first_state import HandFirstLayouts
 from casadi_ik.steps.status import Phase
@@ -27,7 +29,7 @@ def terms(robot: RobotDescription) -> Layout:
     )
 
 
-def beginning(layouts: HandFirstLayouts) -> ca.Function:
+def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
     """First state and parameters of the step.
 
     Hand motors that move free fingers only stay where they are; every start is moved into the
@@ -37,6 +39,25 @@ def beginning(layouts: HandFirstLayouts) -> ca.Function:
         points (f, 3) [m] and normals (f, 3), NaN where free, where the robot is (n, 1), the
         `terms`, hand postures to try (candidates, hand) -> state, parameters.
     """
+    robot = layouts.robot
+    f, n = len(robot.fingers), len(robot.actuators)
+    name = ca.Function.fix_name(f"hand_first_beginning_{robot.name}")
+    return FunctionGraph(
+        name,
+        lambda: _build(name, layouts),
+        {
+            "points": (f, 3),
+            "normals": (f, 3),
+            "here": (n, 1),
+            "terms": (terms(robot).size, 1),
+            "postures": (layouts.candidates, len(layouts.hand)),
+        },
+        ((layouts.state.size, 1), (layouts.parameters.size, 1)),
+        recipe(name, robot, layouts.candidates),
+    )
+
+
+def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
     robot, hand = layouts.robot, list(layouts.hand)
     f, n = len(robot.fingers), len(robot.actuators)
     points, normals, here = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3), ca.SX.sym("q", n)
@@ -73,7 +94,6 @@ def beginning(layouts: HandFirstLayouts) -> ca.Function:
             "best_cost": sys.float_info.max,
         }
     )
-    name = ca.Function.fix_name(f"hand_first_beginning_{robot.name}")
     inputs = [points, normals, here, given, postures]
     return ca.Function(name, inputs, shared(state, parameters))
 
