@@ -135,8 +135,8 @@ class ChunkStream:
             parts = [part for part in self._waiting if part.channel == channel]
             for part in parts:
                 stop = start + len(part.rows) * part.size
-                buffer = data[start:stop].reshape(len(part.rows), part.size)
-                fill(buffer, channel, part.rows, part.sequence, part.log_time, part.publish_time)
+                times = part.log_time, part.publish_time
+                fill(data[start:stop], channel, part.rows, part.sequence, *times)
                 start = stop
             if start > first:
                 offsets = np.arange(first, start, parts[0].size, dtype=np.uint64)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import LoopKernel, LoopResult
+from casadi_ik.kernels.rows import opaque
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
 from casadi_ik.solvers.posture_table import PostureTable
@@ -249,7 +250,8 @@ class _Collected:
         if len(self._rounds) == 2:
             return self._rounds[1]
         order = np.argsort(np.concatenate(self._targets), kind="stable")
-        return np.concatenate(self._rounds)[order]
+        rows = np.concatenate(list(map(opaque, self._rounds)))
+        return np.take(rows, order).view(self._rounds[0].dtype)
 
 
 def _closed_form(robot: RobotDescription) -> SrsArm | None:
