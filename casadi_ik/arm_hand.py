@@ -215,6 +215,10 @@ class ArmHand:
 
     def urdf(self) -> str:
         """The robot as URDF text, see `casadi_ik.robots.to_urdf`."""
+        return self._urdf
+
+    @cached_property
+    def _urdf(self) -> str:
         return to_urdf(self.description)
 
     @cached_property

@@ -158,7 +158,8 @@ class Engine:
             if diagnose:
                 batch = self._diagnosed(asked, starts[part], outcome, batch)
             if recorder is not None and outcome.rows is not None:
-                recorder.record(self._block(asked, batch, outcome.rows, started))
+                block = self._block(asked, starts[part], seed, batch, outcome.rows, started)
+                recorder.record(block)
             batches.append(batch)
         return BatchSolution.joined(batches)
 
@@ -251,7 +252,13 @@ class Engine:
         return replace(batch, status=status, diagnoses=diagnoses)
 
     def _block(
-        self, problems: Problems, batch: BatchSolution, rows: NDArray[Any], started: int
+        self,
+        problems: Problems,
+        starts: Array,
+        seed: int,
+        batch: BatchSolution,
+        rows: NDArray[Any],
+        started: int,
     ) -> SolveBlock:
         before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
         return SolveBlock(
@@ -261,6 +268,8 @@ class Engine:
             format=self.method.trace_format,
             first=problems.first_row,
             problems=problems,
+            starts=starts,
+            seed=seed,
             batch=batch,
             rows=rows,
             started=started + (before * 1e9).astype(np.int64),

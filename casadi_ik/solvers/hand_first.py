@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import FunctionKernel, LoopKernel, LoopResult
+from casadi_ik.kernels.rows import opaque
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solvers.hand_first_single import FirstRound
 from casadi_ik.solvers.method import Outcome, Quick, TraceFormat, trace_format
@@ -196,7 +197,8 @@ class _Collected:
         if result.rows is not None:
             result.rows["candidate"] += before
         if not self._rounds:
-            self._q, self._cost, self._counts = q, cost, counts
+            # A copy: the states are much larger and need not stay.
+            self._q, self._cost, self._counts = q.copy(), cost.copy(), counts
             self._restarts, self._status, self._time = restarts, status, result.time + share
         else:
             better = (status == Status.SOLVED) | (cost < self._cost[targets])
@@ -225,7 +227,8 @@ class _Collected:
         if len(self._rounds) == 1:
             return self._rounds[0]
         order = np.argsort(np.concatenate(self._targets), kind="stable")
-        return np.concatenate(self._rounds)[order]
+        rows = np.concatenate(list(map(opaque, self._rounds)))
+        return np.take(rows, order).view(self._rounds[0].dtype)
 
 
 def _closed_form(robot: RobotDescription) -> SrsArm | None:
