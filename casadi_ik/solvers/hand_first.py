@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -117,39 +117,24 @@ class HandFirstMethod:
             rows=outcome.rows if trace else None,
         )
 
-    def rows(
-        self, problems: Problems, q0: Array, numbers: Sequence[int] = (0,)
-    ) -> tuple[Array, Array]:
-        """States and parameters of rounds, to be changed before `run_rows`.
+    def rows(self, problems: Problems, q0: Array, postures: Array) -> tuple[Array, Array]:
+        """States and parameters of the loop, to be changed before `run_rows`.
 
         Args:
             problems: k targets.
             q0: (k, n).
-            numbers: m rounds; of none there is a row per target without hand postures, fit for
-                refinement only.
+            postures: (k, candidates, hand) hand postures to start from, or (k, 1, hand).
 
         Returns:
-            (m k, ...) states and parameters, round by round.
+            (k, ...) states and parameters.
         """
-        count, hand = self.options.candidates, self.step.layouts.hand
-        if not numbers:
-            lookup = np.zeros((len(problems), count, len(hand)))
-            return self._states(q0), self._parameters(problems, q0, lookup)
-        wide = self.postures(problems, q0, max(numbers), all_wide=True) if any(numbers) else None
-        parts = []
-        for number in numbers:
-            if number and wide is not None:
-                lookup = wide[:, (number - 1) * count : number * count]
-            else:
-                lookup = self.postures(problems, q0, 0)
-            parts.append(self._parameters(problems, q0, lookup))
-        return np.tile(self._states(q0), (len(numbers), 1)), np.concatenate(parts)
+        return self._states(q0), self._parameters(problems, q0, postures)
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
-    def postures(self, problems: Problems, q0: Array, number: int, all_wide: bool = False) -> Array:
+    def postures(self, problems: Problems, q0: Array, number: int) -> Array:
         """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
 
         What moves free fingers only stays as in q0.
@@ -158,22 +143,20 @@ class HandFirstMethod:
             problems: k targets.
             q0: (k, n).
             number: The round.
-            all_wide: Whether those of the rounds 1, 2, ... before it are to stand before them.
         """
         count = self.options.candidates
-        if number == 0:
-            found = self.table.nearest(problems.points, problems.normals, count)
-        else:
-            found = self.wide_table.nearest(problems.points, problems.normals, number * count)
+        table, wanted = (self.wide_table, number * count) if number else (self.table, count)
+        found = table.nearest(problems.points, problems.normals, wanted)[:, -count:]
         needed = ~np.isnan(problems.points[..., 0]) @ self._moves
-        here = q0[:, None, self.step.layouts.hand]
-        return np.where(needed[:, None], found if all_wide else found[:, -count:], here)
+        return np.where(needed[:, None], found, q0[:, None, self.step.layouts.hand])
 
     def _parameters(self, problems: Problems, q0: Array, postures: Array) -> Array:
         layout = self.step.layouts.parameters
         count = len(problems)
         lower, upper = problems.bounds(self._robot, UNBOUNDED)
         hand = list(self.step.layouts.hand)
+        shape = count, self.options.candidates, len(hand)
+        inside = np.broadcast_to(np.clip(postures, lower[hand], upper[hand]), shape)
         free_points, free_normals = np.isnan(problems.points), np.isnan(problems.normals)
         counted = ~np.stack([free_points[..., 0], free_normals[..., 0]], axis=2)
         values: dict[str, Any] = {
@@ -184,8 +167,9 @@ class HandFirstMethod:
             "angle_tolerance": problems.angle_tolerance,
             "lower": lower,
             "upper": upper,
-            "postures": np.clip(postures, lower[hand], upper[hand]).reshape(count, -1),
+            "postures": inside.reshape(count, -1),
             "reach": 1.0,
+            "alone": 0.0,
             "start": np.clip(q0, lower, upper),
         }
         parameters = np.empty((count, layout.size))
