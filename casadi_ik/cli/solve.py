@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -79,12 +79,15 @@ def as_json(solution: Solution) -> dict[str, Any]:
 
 
 def _diagnosis(diagnosis: Diagnosis) -> dict[str, Any]:
-    plain = _plain(asdict(diagnosis))
-    return plain | {"reason": diagnosis.reason.name, "lines": list(diagnosis.lines)}
+    names = [item.name for item in fields(diagnosis) if item.name != "lazy"]
+    found = {name: getattr(diagnosis, name) for name in (*names, "reliefs", "freed", "lines")}
+    return _plain(found | {"reason": diagnosis.reason.name})
 
 
 def _plain(value: Any) -> Any:
     """What JSON can hold: arrays and tuples as lists, null for what is not finite."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain(asdict(value))
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -131,19 +131,13 @@ class AlternativeFinder:
     def _postures(self, problems: Problems, q0: Array, limits: Bounds) -> list[Array]:
         """Solutions (n,) with different hands, from every candidate of every round."""
         trials, method = self._trials, self._trials.method
-        options = method.options
-        _, parameters = method.rows(problems, q0[None], range(options.rounds))
-        hand = len(method.step.layouts.hand)
-        postures = parameters[:, trials.parameters.slice("postures")].reshape(-1, hand)
+        rounds = range(method.options.rounds)
+        postures = np.concatenate([method.postures(problems, number)[0] for number in rounds])
         starts = np.tile(limits.clip(q0), (len(postures), 1))
-        states, parameters = method.rows(repeated(problems, len(postures)), starts)
-        states[:, trials.state.slice("candidate")] = options.candidates - 1
-        rows = np.repeat(postures[:, None], options.candidates, axis=1)
-        parameters[:, trials.parameters.slice("postures")] = rows.reshape(len(postures), -1)
-        trials.set_bounds(parameters, limits)
+        asked = repeated(problems, len(postures))
+        states, parameters = trials.posture_rows(asked, starts, postures)
         loose = parameters.copy()
-        for name in ("position_tolerance", "angle_tolerance"):
-            parameters[:, trials.parameters.slice(name)] = CLOSE
+        trials.set_tolerance(parameters, CLOSE)
         q = trials.run(states, parameters)
         exact = replace(problems, tolerance=Tolerance(10 * CLOSE, 10 * CLOSE))
         kept = q[trials.solved(exact, q, problems.enforce_limits)]
@@ -167,7 +161,7 @@ class AlternativeFinder:
         if not self._arm:
             return [_Found(q, posture)]
         if self._branches is None:
-            return [_Found(arm, posture) for arm in self._searched(problems, q, limits, seed)]
+            return [_Found(arm, posture) for arm in self._searched(problems, q, seed)]
         palm = self.robot.palm(q)
         lower, upper = limits.lower[self._arm], limits.upper[self._arm]
 
@@ -184,12 +178,12 @@ class AlternativeFinder:
             found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
         return found or [_Found(q, posture)]
 
-    def _searched(self, problems: Problems, q: Array, limits: Bounds, seed: int) -> list[Array]:
+    def _searched(self, problems: Problems, q: Array, seed: int) -> list[Array]:
         """Different arms found from random ones, the hand starting as in q."""
         starts = self.robot.random(np.random.default_rng(seed), ARMS)
         starts[:, self._hand] = q[self._hand]
         starts[0] = q
-        ends = Descent(self._trials, repeated(problems, ARMS)).run(starts, limits)
+        ends = Descent(self._trials, problems).run(np.zeros(ARMS, np.intp), starts)
         ends = np.concatenate([q[None], ends])
         same = (np.abs(self._parts(ends - q, self._hand)) < DISTINCT).all(axis=1)
         kept = ends[same & self._trials.solved(problems, ends, problems.enforce_limits)]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 
 from casadi_ik.solvers.contact_verdict import ContactVerdict
 from casadi_ik.solvers.problem import Array, Tolerance
@@ -106,9 +107,41 @@ class NearContact:
     angle_error: float
 
 
+@dataclass(frozen=True)
+class Remedies:
+    """What makes a grasp solvable.
+
+    Attributes:
+        reliefs: Limits whose lifting does.
+        freed: Fingers and normals whose freeing makes the rest solvable.
+    """
+
+    reliefs: tuple[Relief, ...] = ()
+    freed: tuple[Freed, ...] = ()
+
+
+class Lazy:
+    """Remedies that are looked for when first asked for; pickled as what was found."""
+
+    def __init__(self, find: Callable[[], Remedies]) -> None:
+        """Take what finds them."""
+        self._find = find
+
+    @cached_property
+    def found(self) -> Remedies:
+        """The remedies, looked for once."""
+        return self._find()
+
+    def __getstate__(self) -> dict[str, Remedies]:
+        return {"found": self.found}
+
+
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """Why a grasp was not solved, with evidence.
+
+    What would help (`reliefs`, `freed`, and `lines`, which tells of them) is looked for when first
+    asked for, which takes some milliseconds; everything else is there at once.
 
     Attributes:
         reason: The first of the reasons that holds.
@@ -118,12 +151,11 @@ class Diagnosis:
         reach: The arm against the wrist's place; None unless the arm has a closed form and the
             hand fits.
         active: Actuators at a limit in the nearest configuration.
-        reliefs: Limits whose lifting makes it solvable.
-        freed: Fingers and normals whose freeing makes the rest solvable.
         enough: Tolerance with which the grasp would be solved.
         nearest: The contacts of the nearest configuration, by finger.
         q: (n,) that configuration; a solution if the reason is `REACHABLE`.
-        time: Seconds the diagnosis took.
+        time: Seconds the diagnosis took; in a batch its share. Without the search for remedies.
+        lazy: Where the remedies come from.
     """
 
     reason: Reason
@@ -131,12 +163,21 @@ class Diagnosis:
     hand: HandFit | None
     reach: ArmReach | None
     active: tuple[str, ...]
-    reliefs: tuple[Relief, ...]
-    freed: tuple[Freed, ...]
     enough: Tolerance
     nearest: Mapping[str, NearContact]
     q: Array
     time: float
+    lazy: Lazy = field(repr=False)
+
+    @property
+    def reliefs(self) -> tuple[Relief, ...]:
+        """Limits whose lifting makes it solvable."""
+        return self.lazy.found.reliefs
+
+    @property
+    def freed(self) -> tuple[Freed, ...]:
+        """Fingers and normals whose freeing makes the rest solvable."""
+        return self.lazy.found.freed
 
     @property
     def lines(self) -> tuple[str, ...]:

@@ -1,52 +1,57 @@
-"""Finds out why a grasp cannot be solved: by solving it again with less asked."""
+"""Finds out why grasps cannot be solved: by solving them again with less asked."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.grasps import Tolerance
-from casadi_ik.solvers.diagnosis import ArmReach, Diagnosis, Freed, HandFit, NearContact, Reason
+from casadi_ik.solvers.diagnosis import (
+    ArmReach,
+    Diagnosis,
+    HandFit,
+    Lazy,
+    NearContact,
+    Reason,
+    Remedies,
+)
 from casadi_ik.solvers.hand_first import HandFirstMethod
 from casadi_ik.solvers.minimax import MARGIN, Closest, closest
-from casadi_ik.solvers.palm_free import palm_free
+from casadi_ik.solvers.palm_free import HandFits, PalmFree
 from casadi_ik.solvers.problem import Array, Problems
-from casadi_ik.solvers.reliefs import Lift, lifts, relieve
-from casadi_ik.solvers.trials import Bounds, Descent, Trials, repeated
+from casadi_ik.solvers.remedies import RemedyFinder
+from casadi_ik.solvers.trials import Descent, Rows, Trials
 from casadi_ik.solvers.verdict import judge
 
-ROUNDS = 2
-"""First rounds of hand-first whose hand fits are looked at, and further rounds than it makes."""
+TOGETHER = 64
+"""Targets that are diagnosed in the same runs of the compiled loop."""
 
-RANDOM_STARTS = 24
-"""Random configurations the last search starts from, besides those found on the way."""
+PLACED = 2
+"""Fitted hands that the arm follows, besides what hand-first came to."""
 
-NEAR = 8.0
-"""If the contacts are missed by less than this factor, the search starts from more than what hand-
-first came to, whatever hand and reach say."""
+SEARCHES = ((8.0, 24, 4), (4.0, 96, 8), (1.5, 256, 32))
+"""If the contacts are missed by less than a factor, so many further starts are tried, whatever hand
+and reach say, and so many of the minima they lead to are followed."""
 
-CLOSE, CLOSE_STARTS = 2.0, 256
-"""If they are missed by less than this, from many more."""
+ALIKE = 3
+"""Every third of these starts has a hand that looks like the grasp, the others the nearest."""
 
-FOLLOWED = 8
-"""Local minima that are followed to the end."""
+CERTAIN = 1.1
+"""If hand and arm-hand both miss the contacts by this factor where they come closest, no arm is
+looked for that would help a hand that does not fit."""
+
+BARELY = 2.0
+"""If they are missed by less than this, limits are lifted that nothing presses against, too."""
 
 AT_LIMIT = 1e-6
 """How near to a limit counts as at it [rad or m]."""
 
 REAL = 1e-3
 """How far an arm's reach has to be missed to be the reason [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Freeing:
-    part: str
-    finger: str
-    problems: Problems
 
 
 class Diagnostician:
@@ -62,197 +67,202 @@ class Diagnostician:
         self.robot = robot
         self.method = method
         self._trials = Trials(robot, method)
+        self._palm_free = PalmFree(self._trials)
 
-    def diagnose(self, problems: Problems, q0: Array, nearest: Array | None) -> Diagnosis:
-        """Diagnose one grasp.
+    def diagnose(self, problems: Problems, q0: Array, nearest: Array | None) -> list[Diagnosis]:
+        """Diagnose k targets; each as if it were alone.
 
         Args:
-            problems: One target.
-            q0: (n,) start.
-            nearest: (n,) what hand-first came to; None if another method was asked.
+            problems: The targets.
+            q0: (k, n) starts.
+            nearest: (k, n) what hand-first came to; None if another method was asked.
         """
         self.method.prepare()
-        begin = time.perf_counter()
-        if nearest is not None:
-            return self._why(problems, q0, nearest, begin)
-        found = self.method.run(problems, q0[None], 0, trace=False).q[0]
-        if self._solves(problems, found):
-            return self._reachable(problems, found, begin)
-        return self._why(problems, q0, found, begin)
+        clock = _Clock(len(problems))
+        if nearest is None:
+            nearest = self.method.run(problems, q0, 0, trace=False).q
+        solved = self._solved(problems, nearest)
+        done, rest = np.flatnonzero(solved), np.flatnonzero(~solved)
+        near = self._nearest(problems.rows(done), nearest[done])
+        clock.lap(np.arange(len(problems)))
+        found = {
+            row: _reachable(problems, nearest[row], near[i], clock.seconds[row])
+            for i, row in enumerate(done.tolist())
+        }
+        for start in range(0, len(rest), TOGETHER):
+            rows = rest[start : start + TOGETHER]
+            whys = self._together(problems.rows(rows), q0[rows], nearest[rows])
+            found |= zip(rows.tolist(), whys, strict=True)
+        return [found[row] for row in range(len(problems))]
 
-    def _why(self, problems: Problems, q0: Array, nearest: Array, begin: float) -> Diagnosis:
-        hand, reach, ends = self._hand(problems, q0)
-        limits = self._trials.limits(problems)
-        pool = np.concatenate([nearest[None], ends])
-        best = closest(self._trials, problems, pool, limits, FOLLOWED)
-        relaxed, freed, relieved = self._relaxations(problems, q0, best, limits, hand)
+    def _together(self, problems: Problems, q0: Array, nearest: Array) -> Iterator[Diagnosis]:
+        """Diagnose targets that hand-first did not solve."""
+        every, clock = np.arange(len(problems)), _Clock(len(problems))
+        descent = Descent(self._trials, problems)
+        evidence, fits = self._hands(problems, q0)
+        refused = [_refused(*item) for item in evidence]
+        targets, ends = self._placed(fits)
+        targets, ends = np.concatenate([every, targets]), np.concatenate([nearest, ends])
+        best = closest(descent, targets, ends, PLACED + 1)
+        clock.lap(every)
         # Where neither the hand nor the reach says no, only searching can.
-        if best.ratio < NEAR or _reason(hand, reach, False) is Reason.NOT_FOUND:
-            pool = np.concatenate([pool, relieved])
-            pool = self._search(problems, limits, pool, RANDOM_STARTS)
-            best = closest(self._trials, problems, pool, limits, FOLLOWED)
-        if best.ratio < CLOSE and not self._solves(problems, best.fair):
-            pool = np.concatenate([pool, best.fair[None]])
-            pool = self._search(problems, limits, pool, CLOSE_STARTS)
-            best = closest(self._trials, problems, pool, limits, 4 * FOLLOWED)
-        if self._solves(problems, best.fair):
-            return self._reachable(problems, best.fair, begin)
-        reliefs = tuple(relieve(self._trials, problems, limits, relaxed, best.q))
-        reason = _reason(hand, reach, bool(reliefs))
-        verdict = judge(self.robot, problems, best.fair[None])
-        largest = problems.largest_tolerance
-        return Diagnosis(
-            reason=reason,
-            established=reason is not Reason.NOT_FOUND and best.ratio >= MARGIN,
-            hand=hand,
-            reach=reach,
-            active=self._active(best.q) if problems.enforce_limits else (),
-            reliefs=reliefs,
-            freed=freed,
-            enough=Tolerance(
-                max(float(np.nanmax(verdict.position_error)), largest.position),
-                max(_largest(verdict.angle_error), largest.angle),
-            ),
-            nearest=self._contacts(problems, best.q),
-            q=best.q,
-            time=time.perf_counter() - begin,
-        )
+        unsure = np.array([reason is None for reason in refused])
+        certain = self._certain(problems, fits, best)
+        for below, count, followed in SEARCHES:
+            unsure |= (best.ratio < below) & ~certain
+            rows = np.flatnonzero(unsure & ~self._solved(problems, best.fair))
+            if len(rows):
+                some, found = problems.rows(rows), best.rows(rows)
+                best.put(rows, self._search(some, q0[rows], found, count, followed))
+                clock.lap(rows)
+            unsure[:] = False
+        solved = self._solved(problems, best.fair)
+        near = self._nearest(problems, np.where(solved[:, None], best.fair, best.q))
+        enough = self._enough(problems, best.fair)
+        held = self._at_limit(best.q)
+        pressed = held | self._at_limit(best.fair) | (best.ratio <= BARELY)[:, None]
+        clock.lap(every)
+        for i in every.tolist():
+            if solved[i]:
+                yield _reachable(problems, best.fair[i], near[i], clock.seconds[i])
+                continue
+            hand, reach = evidence[i]
+            one, hand_only = problems.rows(slice(i, i + 1)), refused[i] is Reason.HAND
+            remedies = RemedyFinder(self._trials, one, q0[i], best.q[i], pressed[i], hand_only)
+            reason = refused[i]
+            if reason is None:
+                reason = Reason.LIMITS if remedies.lifting_helps() else Reason.NOT_FOUND
+            names = zip(self.robot.actuators, held[i].tolist(), strict=True)
+            clock.lap(every[i : i + 1])
+            yield Diagnosis(
+                reason=reason,
+                established=reason is not Reason.NOT_FOUND and bool(best.ratio[i] >= MARGIN),
+                hand=hand,
+                reach=reach,
+                active=tuple(name for name, at in names if at and problems.enforce_limits),
+                enough=enough[i],
+                nearest=near[i],
+                q=best.q[i],
+                time=float(clock.seconds[i]),
+                lazy=Lazy(remedies.find),
+            )
 
-    def _solves(self, problems: Problems, q: Array) -> bool:
-        return bool(self._trials.solved(problems, q[None], problems.enforce_limits)[0])
-
-    def _hand(self, problems: Problems, q0: Array) -> tuple[HandFit | None, ArmReach | None, Array]:
-        """The hand alone, the arm where the hand fits, and the configurations that came up."""
+    def _hands(
+        self, problems: Problems, q0: Array
+    ) -> tuple[Sequence[tuple[HandFit | None, ArmReach | None]], HandFits | None]:
+        """What the hand alone says of each target; nothing if there is no arm."""
         if not self.robot.description.arm_actuators:
-            return None, None, np.zeros((0, len(q0)))
-        made = self.method.options.rounds
-        numbers = [*range(min(ROUNDS, made)), *range(made, made + ROUNDS)]
-        postures, ends = self._trials.rounds(problems, q0, self._trials.limits(problems), numbers)
-        fits = palm_free(self.robot, problems, postures)
-        hand, arm = fits.fit(self.robot, problems), self.method.step.arm
-        if arm is None or not hand.fits:
-            return hand, None, ends
-        return hand, fits.reach(arm, problems.enforce_limits), ends
+            return [(None, None)] * len(problems), None
+        fits = self._palm_free.fits(problems, q0)
+        return self._palm_free.evidence(problems, fits), fits
 
-    def _relaxations(
-        self, problems: Problems, q0: Array, best: Closest, limits: Bounds, hand: HandFit | None
-    ) -> tuple[list[tuple[Lift, Array]], tuple[Freed, ...], Array]:
-        """Solve with limits lifted or something left free, all together.
+    def _certain(
+        self, problems: Problems, fits: HandFits | None, best: Closest
+    ) -> NDArray[np.bool_]:
+        """(k,) whether the hand alone already says no, however the arm holds it."""
+        if fits is None:
+            return np.zeros(len(problems), dtype=bool)
+        return np.minimum(fits.ratio(problems), best.ratio) >= CERTAIN
 
-        Limits that nothing presses against in the nearest configurations would not help; where
-        little is missing they are lifted all the same, as further starts.
+    def _placed(self, fits: HandFits | None) -> tuple[Rows, Array]:
+        """Configurations (m, n) that the best fits of each target lead to, and their targets."""
+        if fits is None:
+            return np.zeros(0, np.intp), np.zeros((0, len(self.robot.actuators)))
+        rows = fits.best(PLACED)
+        return fits.targets[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
 
-        Returns:
-            The lifts that solve it with their solutions, what may be left free, and all
-            configurations that came up.
+    def _search(
+        self, problems: Problems, q0: Array, best: Closest, count: int, followed: int
+    ) -> Closest:
+        """The closest to each target from random arms, with hands of all kinds.
+
+        The hands are those that came closest so far, and some that look like the grasp. A hand
+        without an arm is started at random itself.
         """
-        hand_only = hand is not None and not hand.fits
-        movable = limits.lower < limits.upper
-        pressed = movable.copy()
-        if best.ratio > CLOSE:
-            pressed &= self._at_limit(best.q) | self._at_limit(best.fair)
-        tried = lifts(self.robot, movable, pressed, hand_only) if problems.enforce_limits else []
-        freeings = self._freeings(problems)
-        parts = [problems] * len(tried) + [item.problems for item in freeings]
-        if not parts:
-            return [], (), np.zeros((0, len(q0)))
-        asked = replace(
-            problems,
-            points=np.concatenate([part.points for part in parts]),
-            normals=np.concatenate([part.normals for part in parts]),
-        )
-        bounds = limits.tiled(len(parts))
-        for i, lift in enumerate(tried):
-            lift.widen(self.robot, bounds, i)
-        q = Descent(self._trials, asked).run(np.tile(best.q, (len(parts), 1)), bounds)
-        ok = self._trials.solved(asked, q, limits=False)
-        rest = np.flatnonzero(~ok)
-        if len(rest):
-            left = Bounds(bounds.lower[rest], bounds.upper[rest])
-            q[rest] = self._trials.search(asked.rows(rest), q0, left)
-            ok[rest] = self._trials.solved(asked.rows(rest), q[rest], limits=False)
-        ok &= (bounds.beyond(q) == 0).all(axis=1)
-        relaxed = [(lift, q[i]) for i, lift in enumerate(tried) if ok[i]]
-        free = [
-            Freed(item.part, item.finger, q[i])
-            for i, item in enumerate(freeings, start=len(tried))
-            if ok[i]
-        ]
-        return relaxed, tuple(free), q
-
-    def _freeings(self, problems: Problems) -> list[_Freeing]:
-        """The target with a finger, a normal or all normals left free."""
-        found = []
-        known = ~np.isnan(problems.points[0, :, 0])
-        faced = ~np.isnan(problems.normals[0, :, 0])
-        for i, name in enumerate(self.robot.fingers):
-            points, normals = problems.points.copy(), problems.normals.copy()
-            normals[0, i] = np.nan
-            if faced[i]:
-                found.append(_Freeing("normal", name, replace(problems, normals=normals)))
-            if known[i] and known.sum() > 1:
-                points[0, i] = np.nan
-                freed = replace(problems, points=points, normals=normals)
-                found.append(_Freeing("finger", name, freed))
-        if faced.sum() > 1:
-            none = np.full_like(problems.normals, np.nan)
-            found.append(_Freeing("normal", "all", replace(problems, normals=none)))
-        return found
-
-    def _search(self, problems: Problems, limits: Bounds, pool: Array, count: int) -> Array:
-        """The problem itself again, from all that came up and from random configurations."""
+        targets = np.repeat(np.arange(len(problems)), count + 2)
         random = self.robot.random(np.random.default_rng(count), count)
-        starts = np.concatenate([pool, random])
-        descent = Descent(self._trials, repeated(problems, len(starts)))
-        return descent.run(descent.run(starts, limits), limits)
+        starts = np.tile(random, (len(problems), 1, 1))
+        if self.robot.description.arm_actuators:
+            hand = list(self.method.step.layouts.hand)
+            starts[:, ::2, hand] = best.fair[:, None, hand]
+            starts[:, 1::2, hand] = best.q[:, None, hand]
+            starts[:, ::ALIKE, hand] = self._alike(problems, -(-count // ALIKE))
+        starts = np.concatenate([best.q[:, None], best.fair[:, None], starts], axis=1)
+        descent = Descent(self._trials, problems)
+        ends = descent.run(targets, starts.reshape(len(targets), -1))
+        return closest(descent, targets, ends, followed)
+
+    def _alike(self, problems: Problems, count: int) -> Array:
+        """(k, count, hand) postures that look like the grasps, in turns."""
+        options = self.method.options
+        rounds = range(min(options.rounds, -(-count // options.candidates)))
+        found = [self.method.postures(problems, number) for number in rounds]
+        postures = np.concatenate(found, axis=1)
+        return postures[:, np.arange(count) % postures.shape[1]]
+
+    def _solved(self, problems: Problems, q: Array) -> NDArray[np.bool_]:
+        return self._trials.solved(problems, q, problems.enforce_limits)
+
+    def _nearest(self, problems: Problems, q: Array) -> list[dict[str, NearContact]]:
+        """The contacts of configurations (k, n), beside those asked for."""
+        points, normals = self.robot.contacts(q)
+        verdict = judge(self.robot, problems, q)
+        columns = points, normals, verdict.position_error, verdict.angle_error
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        return [
+            {
+                name: NearContact(tuple(point), tuple(normal), position, angle)
+                for name, point, normal, position, angle in zip(
+                    self.robot.fingers, *row, strict=True
+                )
+            }
+            for row in rows
+        ]
+
+    def _enough(self, problems: Problems, fair: Array) -> list[Tolerance]:
+        """Tolerances that configurations (k, n) keep to, no smaller than those asked for."""
+        verdict, least = judge(self.robot, problems, fair), problems.largest_tolerance
+        position = np.nanmax(verdict.position_error, axis=1, initial=least.position)
+        angle = np.nanmax(verdict.angle_error, axis=1, initial=least.angle)
+        return [Tolerance(*pair) for pair in zip(position.tolist(), angle.tolist(), strict=True)]
 
     def _at_limit(self, q: Array) -> NDArray[np.bool_]:
         return (q - self.robot.lower <= AT_LIMIT) | (self.robot.upper - q <= AT_LIMIT)
 
-    def _active(self, q: Array) -> tuple[str, ...]:
-        pairs = zip(self.robot.actuators, self._at_limit(q), strict=True)
-        return tuple(name for name, held in pairs if held)
 
-    def _contacts(self, problems: Problems, q: Array) -> dict[str, NearContact]:
-        points, normals = self.robot.contacts(q)
-        verdict = judge(self.robot, problems, q[None])
-        return {
-            name: NearContact(
-                _triple(points[i]),
-                _triple(normals[i]),
-                float(verdict.position_error[0, i]),
-                float(verdict.angle_error[0, i]),
-            )
-            for i, name in enumerate(self.robot.fingers)
-        }
+class _Clock:
+    """Seconds spent on each of k targets that are worked on together."""
 
-    def _reachable(self, problems: Problems, q: Array, begin: float) -> Diagnosis:
-        return Diagnosis(
-            reason=Reason.REACHABLE,
-            established=False,
-            hand=None,
-            reach=None,
-            active=(),
-            reliefs=(),
-            freed=(),
-            enough=problems.largest_tolerance,
-            nearest=self._contacts(problems, q),
-            q=q,
-            time=time.perf_counter() - begin,
-        )
+    def __init__(self, count: int) -> None:
+        self.seconds = np.zeros(count)
+        self._now = time.perf_counter()
+
+    def lap(self, targets: Rows) -> None:
+        """Share the time since the last lap among some targets."""
+        before, self._now = self._now, time.perf_counter()
+        self.seconds[targets] += (self._now - before) / len(targets)
 
 
-def _reason(hand: HandFit | None, reach: ArmReach | None, relieved: bool) -> Reason:
+def _refused(hand: HandFit | None, reach: ArmReach | None) -> Reason | None:
     if hand is not None and not hand.fits:
         return Reason.HAND
     if reach is not None and abs(reach.excess) > REAL:
         return Reason.REACH
-    return Reason.LIMITS if relieved else Reason.NOT_FOUND
+    return None
 
 
-def _largest(errors: Array) -> float:
-    return 0.0 if np.isnan(errors).all() else float(np.nanmax(errors))
-
-
-def _triple(vector: Array) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])
+def _reachable(
+    problems: Problems, q: Array, near: dict[str, NearContact], seconds: float
+) -> Diagnosis:
+    return Diagnosis(
+        reason=Reason.REACHABLE,
+        established=False,
+        hand=None,
+        reach=None,
+        active=(),
+        enough=problems.largest_tolerance,
+        nearest=near,
+        q=q,
+        time=float(seconds),
+        lazy=Lazy(Remedies),
+    )

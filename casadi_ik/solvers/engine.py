@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.solvers.alternatives import AlternativeFinder
-from casadi_ik.solvers.diagnosis import Diagnosis, Reason
+from casadi_ik.solvers.diagnosis import Reason
 from casadi_ik.solvers.diagnostician import Diagnostician
 from casadi_ik.solvers.hand_first import HandFirstMethod
 from casadi_ik.solvers.method import Method, Outcome, QuickMethod
@@ -28,6 +28,17 @@ from casadi_ik.solvers.tracking import Tracker
 from casadi_ik.solvers.verdict import judge, judge_one
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.status import Status
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A part of a batch, solved: when it was begun [ns], and what it came to."""
+
+    problems: Problems
+    starts: Array
+    started: int
+    outcome: Outcome
+    batch: BatchSolution
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,17 +161,10 @@ class Engine:
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
         self.method.prepare()
         batches = []
-        for part, started, outcome in self._outcomes(
-            problems, starts, int(seed), int(jobs), recorder is not None
-        ):
-            asked = problems.rows(part)
-            batch = self._judged(asked, outcome)
-            if diagnose:
-                batch = self._diagnosed(asked, starts[part], outcome, batch)
-            if recorder is not None and outcome.rows is not None:
-                block = self._block(asked, starts[part], seed, batch, outcome.rows, started)
-                recorder.record(block)
-            batches.append(batch)
+        for part in self._parts(problems, starts, int(seed), int(jobs), recorder, diagnose):
+            if recorder is not None and part.outcome.rows is not None:
+                recorder.record(self._block(part, int(seed), part.outcome.rows))
+            batches.append(part.batch)
         return BatchSolution.joined(batches)
 
     def _starts(self, q0: ArrayLike | None, count: int) -> Array:
@@ -173,18 +177,30 @@ class Engine:
             )
         return start
 
-    def _outcomes(
-        self, problems: Problems, starts: Array, seed: int, jobs: int, trace: bool
-    ) -> Iterator[tuple[slice, int, Outcome]]:
-        """Parts of the batch in order, when each began [ns], and what the method made of it."""
+    def _parts(
+        self,
+        problems: Problems,
+        starts: Array,
+        seed: int,
+        jobs: int,
+        recorder: Recorder | None,
+        diagnose: bool,
+    ) -> Iterator[_Part]:
+        """Parts of the batch in order, solved, judged and diagnosed side by side."""
+        trace = recorder is not None
 
-        def run(part: slice) -> tuple[slice, int, Outcome]:
-            started = time.time_ns()
-            outcome = self.method.run(problems.rows(part), starts[part], seed, trace)
+        def run(rows: slice) -> _Part:
+            started, asked = time.time_ns(), problems.rows(rows)
+            outcome = self.method.run(asked, starts[rows], seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
-            return part, started, outcome
+            batch = self._judged(asked, outcome)
+            if diagnose:
+                batch = self._diagnosed(asked, starts[rows], outcome, batch)
+            return _Part(asked, starts[rows], started, outcome, batch)
 
+        if diagnose:
+            _ = self.diagnostician
         if jobs == 1 and not trace:
             yield run(slice(0, len(problems)))
             return
@@ -193,7 +209,7 @@ class Engine:
             yield from map(run, parts)
             return
         with ThreadPoolExecutor(jobs) as pool:
-            ahead: deque[Future[tuple[slice, int, Outcome]]] = deque()
+            ahead: deque[Future[_Part]] = deque()
             for part in parts:
                 ahead.append(pool.submit(run, part))
                 if len(ahead) > jobs:
@@ -233,15 +249,16 @@ class Engine:
         if batch.success.all():
             return replace(batch, diagnoses=(None,) * len(batch))
         own = isinstance(self.method, HandFirstMethod)
-        found: dict[int, Diagnosis] = {}
         q, seconds = outcome.q.copy(), outcome.time.copy()
-        for row in map(int, np.flatnonzero(~batch.success)):
-            nearest = outcome.q[row] if own else None
-            one = problems.rows(slice(row, row + 1))
-            found[row] = self.diagnostician.diagnose(one, starts[row], nearest)
-            if own and found[row].reason is Reason.REACHABLE:
-                q[row] = found[row].q
-                seconds[row] += found[row].time
+        rows = np.flatnonzero(~batch.success)
+        diagnoses = self.diagnostician.diagnose(
+            problems.rows(rows), starts[rows], q[rows] if own else None
+        )
+        found = dict(zip(rows.tolist(), diagnoses, strict=True))
+        for row, why in found.items():
+            if own and why.reason is Reason.REACHABLE:
+                q[row] = why.q
+                seconds[row] += why.time
         batch = self._judged(problems, replace(outcome, q=q, time=seconds))
         diagnoses = tuple(
             None if solved else found[row] for row, solved in enumerate(batch.success)
@@ -251,28 +268,21 @@ class Engine:
         status[unreachable] = Status.UNREACHABLE
         return replace(batch, status=status, diagnoses=diagnoses)
 
-    def _block(
-        self,
-        problems: Problems,
-        starts: Array,
-        seed: int,
-        batch: BatchSolution,
-        rows: NDArray[Any],
-        started: int,
-    ) -> SolveBlock:
+    def _block(self, part: _Part, seed: int, rows: NDArray[Any]) -> SolveBlock:
+        batch = part.batch
         before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
         return SolveBlock(
             method=self.method.name,
             robot=self.robot.name,
             fingers=self.robot.fingers,
             format=self.method.trace_format,
-            first=problems.first_row,
-            problems=problems,
-            starts=starts,
+            first=part.problems.first_row,
+            problems=part.problems,
+            starts=part.starts,
             seed=seed,
             batch=batch,
             rows=rows,
-            started=started + (before * 1e9).astype(np.int64),
+            started=part.started + (before * 1e9).astype(np.int64),
         )
 
 

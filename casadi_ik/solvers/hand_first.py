@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -100,7 +100,7 @@ class HandFirstMethod:
         done: Array | None = None
         for number in range(self.options.rounds):
             begin = time.perf_counter()
-            states, parameters = self.rows(left, here, (number,))
+            states, parameters = self.rows(left, here, self.postures(left, number))
             if done is not None:
                 # It goes on where the last round stopped in the numeric arm's list of starts.
                 states[:, passed] = done
@@ -126,45 +126,38 @@ class HandFirstMethod:
         self._singles.append(first)
         return found
 
-    def rows(
-        self, problems: Problems, q0: Array, numbers: Sequence[int] = (0,)
-    ) -> tuple[Array, Array]:
-        """States and parameters of rounds, to be changed before `run_rows`.
+    def rows(self, problems: Problems, q0: Array, postures: Array) -> tuple[Array, Array]:
+        """States and parameters of the loop, to be changed before `run_rows`.
 
         Args:
             problems: k targets.
             q0: (k, n).
-            numbers: m rounds; of none there is a row per target without hand postures, fit for
-                refinement only.
+            postures: (k, candidates, hand) hand postures to start from, or (k, 1, hand). Motors
+                that move free fingers only stay as in q0.
 
         Returns:
-            (m k, ...) states and parameters, round by round.
+            (k, ...) states and parameters.
         """
-        asked = problems.points, problems.normals, q0, self._terms(problems)
-        parts = [self._beginning(*asked, found) for found in self._postures(problems, numbers)]
-        if len(parts) == 1:
-            return parts[0][0], parts[0][1]
-        return np.concatenate([part[0] for part in parts]), np.concatenate(
-            [part[1] for part in parts]
-        )
+        hand = len(self.step.layouts.hand)
+        tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
+        asked = problems.points, problems.normals, q0, self._terms(problems), tried
+        states, parameters = self._beginning(*asked)
+        return states, parameters
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
-    def _postures(self, problems: Problems, numbers: Sequence[int]) -> list[Array]:
-        """Candidates (k, candidates, hand) of rounds: first from the table, then the wide one."""
-        count, targets = self.options.candidates, (problems.points, problems.normals)
-        if not numbers:
-            return [np.zeros((len(problems), count, len(self.step.layouts.hand)))]
-        last = max(numbers)
-        wide = self.wide_table.nearest(*targets, last * count) if last else np.zeros(0)
-        return [
-            wide[:, (number - 1) * count : number * count]
-            if number
-            else self.table.nearest(*targets, count)
-            for number in numbers
-        ]
+    def postures(self, problems: Problems, number: int) -> Array:
+        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
+
+        Args:
+            problems: k targets.
+            number: The round.
+        """
+        count = self.options.candidates
+        table, wanted = (self.wide_table, number * count) if number else (self.table, count)
+        return table.nearest(problems.points, problems.normals, wanted)[:, -count:]
 
     def _terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms."""

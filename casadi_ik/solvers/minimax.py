@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casadi_ik.solvers.problem import Array, Problems
-from casadi_ik.solvers.trials import Bounds, Descent, Trials, allowed, repeated
+from casadi_ik.solvers.problem import Array
+from casadi_ik.solvers.trials import Descent, Rows, allowed, smallest
 
 ROUNDS = 16
 """Adaptations of the weights, at most."""
@@ -31,72 +31,74 @@ LIGHTEST = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Closest:
-    """What came closest.
+    """What came closest to k targets.
 
     Attributes:
-        q: (n,) configuration with the smallest squared error.
-        fair: (n,) configuration with the smallest largest error.
-        ratio: By which factor the tolerances would have to grow at least, near any of the minima.
+        q: (k, n) configurations with the smallest squared error.
+        fair: (k, n) configurations with the smallest largest error.
+        ratio: (k,) by which factor the tolerances would have to grow at least, near any of the
+            minima.
     """
 
     q: Array
     fair: Array
-    ratio: float
+    ratio: Array
+
+    def rows(self, rows: Rows) -> Closest:
+        """What came closest to some of the targets."""
+        return Closest(self.q[rows], self.fair[rows], self.ratio[rows])
+
+    def put(self, rows: Rows, found: Closest) -> None:
+        """Take what came closer to some of the targets."""
+        self.q[rows], self.fair[rows], self.ratio[rows] = found.q, found.fair, found.ratio
 
 
-def closest(trials: Trials, problems: Problems, q: Array, limits: Bounds, followed: int) -> Closest:
-    """Follow the best of some configurations of one target.
+def closest(descent: Descent, targets: Rows, q: Array, followed: int) -> Closest:
+    """Follow the best of some configurations to the end.
 
     Args:
-        trials: The loop.
-        problems: One target.
-        q: (k, n).
-        limits: To keep to.
-        followed: How many at most.
+        descent: Of k targets.
+        targets: (m,) which target a configuration is for; every target has one at least.
+        q: (m, n).
+        followed: How many of a target at most.
     """
-    tolerated = allowed(problems)
+    cost = (descent.misses(targets, q) ** 2).sum(axis=(1, 2))
+    kept = smallest(targets, cost, followed)
+    targets, q = targets[kept], q[kept]
+    count, first = len(q), np.searchsorted(targets, np.arange(len(descent.problems)))
+    tolerated = allowed(descent.problems)[targets]
     counted = tolerated > 0
-    cost = (trials.misses(repeated(problems, len(q)), q) ** 2).sum(axis=(1, 2))
-    q = q[_distinct(cost, followed)]
-    count = len(q)
-    descent = Descent(trials, repeated(problems, count))
-    total = float((tolerated**2).sum())
-    weights = np.tile(counted.astype(float), (count, 1, 1))
+    total = (tolerated**2).sum(axis=(1, 2))
+    weights = counted.astype(float)
     worst, bound = np.full(count, np.inf), np.zeros(count)
-    fair, plain = q.copy(), q.copy()
-    # Twice: the loop gives up where it gains little, which need not be at the minimum.
-    q = descent.run(descent.run(q, limits), limits)
-    rows, best = np.arange(count), np.inf
+    best = np.full(len(first), np.inf)
+    done = np.zeros(len(first), dtype=bool)
+    fair, plain, cost = q.copy(), q, np.zeros(count)
+    rows = np.arange(count)
     for number in range(ROUNDS):
-        q[rows] = descent.run(q[rows], limits, np.sqrt(weights[rows]), rows)
-        misses = trials.misses(repeated(problems, len(rows)), q[rows])
+        here = targets[rows]
+        q[rows] = descent.run(here, q[rows], weights=np.sqrt(weights[rows]))
+        misses = descent.misses(here, q[rows])
         if number == 0:
             plain, cost = q.copy(), (misses**2).sum(axis=(1, 2))
-        parts = np.where(counted, misses / np.where(counted, tolerated, 1.0), 0.0)
+        parts = np.divide(misses, tolerated[rows], where=counted[rows], out=np.zeros_like(misses))
         largest = parts.max(axis=(1, 2))
         better = rows[largest < worst[rows]]
         fair[better] = q[better]
         worst[rows] = np.minimum(worst[rows], largest)
         squares = (weights[rows] * misses**2).sum(axis=(1, 2))
-        bound[rows] = np.maximum(bound[rows], np.sqrt(squares / total))
-        before, best = best, worst.min()
+        bound[rows] = np.maximum(bound[rows], np.sqrt(squares / total[rows]))
+        before, best = best, np.minimum.reduceat(worst, first)
+        least = np.minimum.reduceat(bound, first)
         stuck = best > (1 - SETTLED) * before
-        if best <= 1 or (bound.min() > MARGIN and stuck) or bound.min() > (1 - SETTLED) * best:
-            break
+        done |= (best <= 1) | ((least > MARGIN) & stuck) | (least > (1 - SETTLED) * best)
         # A minimum that cannot come closer than another one already has is followed no further.
-        going = bound[rows] < best
-        new = np.where(counted, np.maximum(weights[rows] * parts, LIGHTEST), 0.0)
-        weights[rows] = new * (total / (new * tolerated**2).sum(axis=(1, 2)))[:, None, None]
-        rows = rows[going]
-    return Closest(plain[cost.argmin()], fair[worst.argmin()], float(bound.min()))
-
-
-def _distinct(cost: Array, most: int) -> list[int]:
-    """Indices of the smallest costs that differ, best first."""
-    chosen: list[int] = []
-    for i in np.argsort(cost):
-        if not chosen or cost[i] > cost[chosen[-1]] * 1.001:
-            chosen.append(int(i))
-        if len(chosen) == most:
+        going = ~done[here] & (bound[rows] < best[here])
+        if not going.any():
             break
-    return chosen
+        new = np.where(counted[rows], np.maximum(weights[rows] * parts, LIGHTEST), 0.0)
+        scale = total[rows] / (new * tolerated[rows] ** 2).sum(axis=(1, 2))
+        weights[rows] = new * scale[:, None, None]
+        rows = rows[going]
+    ratio = np.minimum.reduceat(bound, first)
+    return Closest(plain[smallest(targets, cost, 1)], fair[smallest(targets, worst, 1)], ratio)

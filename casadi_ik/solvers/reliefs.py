@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.solvers.diagnosis import Relief
 from casadi_ik.solvers.problem import Array, Problems
-from casadi_ik.solvers.trials import Bounds, Descent, Trials, repeated
+from casadi_ik.solvers.trials import Bounds, Descent, Trials
 
 HALVINGS = 8
 """How often what a limit has to give is halved, while a solution remains."""
@@ -77,8 +77,7 @@ def relieve(
         return
     count, robot = len(solved), trials.robot
     best = np.stack([solution for _, solution in solved])
-    asked = repeated(problems, 2 * count)
-    descent = Descent(trials, asked)
+    descent, rows = Descent(trials, problems), np.zeros(2 * count, dtype=np.intp)
     # What is given lies between two configurations: one within the limits, one that solves it.
     least, most = np.zeros((count, 1)), np.ones((count, 1))
     beyond = limits.beyond(best)
@@ -90,8 +89,8 @@ def relieve(
         )
         twice = Bounds(np.tile(bounds.lower, (2, 1)), np.tile(bounds.upper, (2, 1)))
         starts = np.concatenate([best, np.tile(q, (count, 1))])
-        reached = descent.run(starts, twice)
-        ok = trials.solved(asked, reached, limits=False).reshape(2, count)
+        reached = descent.run(rows, starts, twice)
+        ok = trials.solved(problems, reached, limits=False).reshape(2, count)
         reached = reached.reshape(2, count, -1)
         new = np.where(ok[0][:, None], reached[0], reached[1])
         either = np.logical_or(ok[0], ok[1])[:, None]

@@ -228,8 +228,7 @@ class _Walk:
 
     def _prepared(self, problems: Problems) -> tuple[Array, Array]:
         states, parameters = refinement_rows(self.trials, problems)
-        for name in ("position_tolerance", "angle_tolerance"):
-            parameters[:, self.trials.parameters.slice(name)] = CLOSE
+        self.trials.set_tolerance(parameters, CLOSE)
         return states, parameters
 
     def _near(self, q: Array) -> Bounds:

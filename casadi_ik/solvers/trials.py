@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +19,12 @@ from casadi_ik.steps.status import Phase
 
 NEVER = 1e-12
 """A tolerance that nothing meets: the loop then goes on to the minimum."""
+
+ALIKE = 1.001
+"""Two values of a row that differ by less than this factor count as the same."""
+
+Rows = NDArray[np.intp]
+"""Numbers of targets, one per row of something."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,49 +84,40 @@ class Trials:
         Returns:
             (k, n) configurations.
         """
-        states, parameters = self.method.rows(problems, bounds.clip(start))
+        starts = bounds.clip(start)
+        postures = self.method.postures(problems, 0)
+        states, parameters = self.method.rows(problems, starts, postures)
         self.set_bounds(parameters, bounds)
         return self.run(states, parameters)
 
-    def rounds(
-        self, problems: Problems, start: Array, bounds: Bounds, numbers: Sequence[int]
+    def posture_rows(
+        self, problems: Problems, start: Array, postures: Array
     ) -> tuple[Array, Array]:
-        """Some rounds of hand-first for one target, each with and without regard to the reach.
+        """Rows of the loop that know a single hand posture each.
 
-        Returns:
-            Configurations (m, n) whose hands the hand stage went through, and those (k, n) the
-            rounds ended with.
+        Args:
+            problems: k targets.
+            start: (k, n).
+            postures: (k, hand).
         """
-        states, parameters = self.method.rows(problems, bounds.clip(start)[None], numbers)
-        states, parameters = np.tile(states, (2, 1)), np.tile(parameters, (2, 1))
-        self.set_bounds(parameters, bounds)
-        parameters[: len(numbers), self.parameters.slice("reach")] = 0.0
-        result = self.method.run_rows(states, parameters, trace=True)
-        rows = result.rows
-        assert rows is not None
-        # A row holds what came before its step: what a fit ended with is in the row after it, or
-        # nowhere if that is the next candidate's; then its last two steps are as good.
-        fitted = rows["phase"] == Phase.HAND_FIT
-        after = fitted[:-1] & ~fitted[1:] & (rows["phase"][1:] != Phase.CANDIDATE)
-        fitted[:-2] &= ~(fitted[1:-1] & fitted[2:])
-        fitted[1:] |= after
-        ends = result.states[:, self.state.slice("q")]
-        return np.asarray(rows["q"][fitted], dtype=float), ends
+        states, parameters = self.method.rows(problems, start, postures[:, None])
+        states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
+        return states, parameters
 
     def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether configurations meet their targets, and if asked the robot's limits."""
         verdict = judge(self.robot, problems, q)
         return verdict.all_ok & verdict.limits_ok if limits else verdict.all_ok
 
-    def misses(self, problems: Problems, q: Array) -> Array:
-        """(k, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
-        position, angle = self.robot.errors(q, problems.points, problems.normals)
-        return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
-
     def set_bounds(self, parameters: Array, bounds: Bounds) -> None:
         """Put bounds into rows of parameters."""
         parameters[:, self.parameters.slice("lower")] = bounds.lower
         parameters[:, self.parameters.slice("upper")] = bounds.upper
+
+    def set_tolerance(self, parameters: Array, tolerance: float) -> None:
+        """Put one tolerance [m, rad] of all contacts into rows of parameters."""
+        parameters[:, self.parameters.slice("position_tolerance")] = tolerance
+        parameters[:, self.parameters.slice("angle_tolerance")] = tolerance
 
     def run(self, states: Array, parameters: Array) -> Array:
         """(k, n) configurations that rows lead to."""
@@ -129,52 +125,63 @@ class Trials:
 
 
 class Descent:
-    """Refinement of the whole arm-hand from given configurations, for k targets."""
+    """Refinement of the whole arm-hand from given configurations.
+
+    Attributes:
+        trials: The loop.
+        problems: k targets.
+    """
 
     def __init__(self, trials: Trials, problems: Problems) -> None:
-        """Lay out the rows once, for any number of runs."""
-        self._trials = trials
+        """Lay out a row per target, for any number of runs."""
+        self.trials = trials
+        self.problems = problems
         self._states, self._parameters = refinement_rows(trials, problems)
 
     def run(
-        self,
-        q: Array,
-        bounds: Bounds,
-        weights: Array | None = None,
-        rows: NDArray[np.intp] | None = None,
+        self, targets: Rows, q: Array, bounds: Bounds | None = None, weights: Array | None = None
     ) -> Array:
         """Refine.
 
         Args:
-            q: (k, n) starts.
-            bounds: (n,) or (k, n).
-            weights: (k, f, 2) of points and normals; None counts all alike. With weights the loop
+            targets: (m,) number of the target of each row.
+            q: (m, n) starts.
+            bounds: (n,) or (m, n); None keeps to the limits.
+            weights: (m, f, 2) of points and normals; None counts all alike. With weights the loop
                 does not stop at the tolerance.
-            rows: (k,) which targets; None is all of them.
 
         Returns:
-            (k, n) configurations.
+            (m, n) configurations.
         """
-        trials, chosen = self._trials, slice(None) if rows is None else rows
-        states, parameters = self._states[chosen].copy(), self._parameters[chosen].copy()
+        trials = self.trials
+        states, parameters = self._states[targets], self._parameters[targets]
+        bounds = bounds or trials.limits(self.problems)
         start = bounds.clip(q)
         states[:, trials.state.slice("q")] = start
         states[:, trials.state.slice("best_q")] = start
         trials.set_bounds(parameters, bounds)
         if weights is not None:
-            layout = trials.parameters
-            parameters[:, layout.slice("weights")] *= weights.reshape(len(q), -1)
-            parameters[:, layout.slice("position_tolerance")] = NEVER
-            parameters[:, layout.slice("angle_tolerance")] = NEVER
+            parameters[:, trials.parameters.slice("weights")] *= weights.reshape(len(q), -1)
+            trials.set_tolerance(parameters, NEVER)
         return trials.run(states, parameters)
+
+    def misses(self, targets: Rows, q: Array) -> Array:
+        """(m, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
+        points, normals = self.problems.points[targets], self.problems.normals[targets]
+        position, angle = self.trials.robot.errors(q, points, normals)
+        return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
+
+    def solved(self, targets: Rows, q: Array, limits: bool) -> NDArray[np.bool_]:
+        """(m,) see `Trials.solved`."""
+        return self.trials.solved(self.problems.rows(targets), q, limits)
 
 
 def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:
     """States and parameters of the loop that begin with the refinement of the whole arm-hand."""
-    home = np.tile(trials.robot.home, (len(problems), 1))
-    states, parameters = trials.method.rows(problems, home, ())
-    last = trials.method.options.candidates - 1
-    for name, value in ({"phase": Phase.REFINEMENT, "candidate": last} | fresh_fit()).items():
+    count, hand = len(problems), len(trials.method.step.layouts.hand)
+    home = np.tile(trials.robot.home, (count, 1))
+    states, parameters = trials.posture_rows(problems, home, np.zeros((count, hand)))
+    for name, value in ({"phase": Phase.REFINEMENT} | fresh_fit()).items():
         states[:, trials.state.slice(name)] = value
     return states, parameters
 
@@ -185,7 +192,24 @@ def repeated(problems: Problems, count: int) -> Problems:
 
 
 def allowed(problems: Problems) -> Array:
-    """(f, 2) the residuals that the tolerances allow, as `Trials.misses`; 0 where free."""
-    known = [~np.isnan(problems.points[0, :, 0]), ~np.isnan(problems.normals[0, :, 0])]
+    """(k, f, 2) the residuals that the tolerances allow, as `Descent.misses`; 0 where free."""
+    known = [~np.isnan(problems.points[..., 0]), ~np.isnan(problems.normals[..., 0])]
     tolerated = [problems.position_tolerance / LENGTH, 2 * np.sin(problems.angle_tolerance / 2)]
-    return np.stack(known, axis=1) * np.stack(tolerated, axis=1)
+    return np.stack(known, axis=2) * np.stack(tolerated, axis=1)
+
+
+def smallest(targets: Rows, values: Array, most: int) -> Rows:
+    """Rows with the smallest values of each target that differ, target by target, best first.
+
+    Args:
+        targets: (m,) number of the target of each row.
+        values: (m,) >= 0.
+        most: How many rows of a target at most.
+    """
+    order = np.lexsort((values, targets))
+    owner, value = targets[order], values[order]
+    fresh = np.ones(len(order), dtype=bool)
+    fresh[1:] = (owner[1:] != owner[:-1]) | (value[1:] > value[:-1] * ALIKE)
+    order, owner = order[fresh], owner[fresh]
+    rank = np.arange(len(order)) - np.searchsorted(owner, owner)
+    return order[rank < most]

@@ -137,6 +137,7 @@ class HandFirstStep:
         # nearest there is, and refinement starts from them.
         last = s["candidate"] + 1 >= self.layouts.candidates
         onwards = ca.logic_or(judged.within, last)
+        ended = ca.logic_and(judged.settled, ca.logic_and(onwards, p["alone"] > 0))
         after = self.layouts.state.pack(
             self._counted(s, Phase.HAND_FIT)
             | {
@@ -154,7 +155,8 @@ class HandFirstStep:
             }
             | judged.fit
         )
-        status = ca.SX(float(Status.RUNNING))
+        fitted = ca.if_else(judged.within, float(Status.SOLVED), float(Status.STALLED))
+        status = ca.if_else(ended, fitted, float(Status.RUNNING))
         record = self._row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged)
         return ca.Function("hand_fit", [state, parameters], shared(after, record, status))
 

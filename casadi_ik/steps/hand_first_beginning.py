@@ -79,6 +79,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "normals": _or_zero(normals, known[:, 1]),
             "weights": known,
             "reach": 1.0,
+            "alone": 0.0,
             "start": _bounded(here, t, list(range(n))),
             "postures": ca.horzcat(*tried).T,
             **t,

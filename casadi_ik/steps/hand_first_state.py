@@ -83,6 +83,7 @@ class HandFirstLayouts:
                 Field("lower", (n,), doc="lower bounds of q"),
                 Field("upper", (n,), doc="upper bounds of q"),
                 Field("reach", doc="weight of the arm's reach while the hand is fitted"),
+                Field("alone", doc="1 if a solve ends with the hand's fit, and the arm stays out"),
                 Field("start", (n,), doc="where a stage that needs a start begins"),
                 Field("postures", (self.candidates, len(self.hand)), doc="hand postures to try"),
             )
