@@ -113,7 +113,7 @@ class Diagnostician:
             rows = np.flatnonzero(unsure & ~self._solved(problems, best.fair))
             if len(rows):
                 some, found = problems.rows(rows), best.rows(rows)
-                best.put(rows, self._search(some, q0[rows], found, count, followed))
+                best.put(rows, self._search(some, found, count, followed))
                 clock.lap(rows)
             unsure[:] = False
         solved = self._solved(problems, best.fair)
@@ -172,7 +172,7 @@ class Diagnostician:
         return fits.targets[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
 
     def _search(
-        self, problems: Problems, q0: Array, best: Closest, count: int, followed: int
+        self, problems: Problems, best: Closest, count: int, followed: int
     ) -> Closest:
         """The closest to each target from random arms, with hands of all kinds.
 
