@@ -171,9 +171,7 @@ class Diagnostician:
         rows = fits.best(PLACED)
         return fits.targets[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
 
-    def _search(
-        self, problems: Problems, best: Closest, count: int, followed: int
-    ) -> Closest:
+    def _search(self, problems: Problems, best: Closest, count: int, followed: int) -> Closest:
         """The closest to each target from random arms, with hands of all kinds.
 
         The hands are those that came closest so far, and some that look like the grasp. A hand
