@@ -132,9 +132,9 @@ class AlternativeFinder:
         """Solutions (n,) with different hands, from every candidate of every round."""
         trials, method = self._trials, self._trials.method
         options = method.options
-        postures = np.concatenate(
-            [method.postures(problems, q0[None], number)[0] for number in range(options.rounds)]
-        )
+        _, parameters = method.rows(problems, q0[None], range(options.rounds))
+        hand = len(method.step.layouts.hand)
+        postures = parameters[:, trials.parameters.slice("postures")].reshape(-1, hand)
         starts = np.tile(limits.clip(q0), (len(postures), 1))
         states, parameters = method.rows(repeated(problems, len(postures)), starts)
         states[:, trials.state.slice("candidate")] = options.candidates - 1

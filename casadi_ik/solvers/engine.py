@@ -19,13 +19,13 @@ from casadi_ik.solvers.alternatives import AlternativeFinder
 from casadi_ik.solvers.diagnosis import Diagnosis, Reason
 from casadi_ik.solvers.diagnostician import Diagnostician
 from casadi_ik.solvers.hand_first import HandFirstMethod
-from casadi_ik.solvers.method import Method, Outcome
+from casadi_ik.solvers.method import Method, Outcome, QuickMethod
 from casadi_ik.solvers.parts import Parts
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.recorder import Recorder, SolveBlock
-from casadi_ik.solvers.solution import BatchSolution
+from casadi_ik.solvers.solution import BatchSolution, Solution
 from casadi_ik.solvers.tracking import Tracker
-from casadi_ik.solvers.verdict import judge
+from casadi_ik.solvers.verdict import judge, judge_one
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.status import Status
 
@@ -80,6 +80,48 @@ class Engine:
         """
         return Tracker(self.robot, self._hand_first, self.finder)
 
+    def quick(self, problems: Problems, q0: ArrayLike | None, seed: int) -> Solution | None:
+        """The answer to one target if it is solved at once, by the shortest way; None: `solve` it.
+
+        Args:
+            problems: One target.
+            q0: (n,) start; None is the robot's home.
+            seed: As for `solve`, which draws numbers for hard targets only.
+
+        Raises:
+            InputError: Bad q0 or seed.
+        """
+        method, robot = self.method, self.robot
+        if not isinstance(method, QuickMethod):
+            return None
+        start = robot.configuration(q0, "q0")
+        _whole("seed", seed, 0)
+        if start.ndim != 1:
+            return None
+        method.prepare()
+        begin = time.perf_counter()
+        found = method.quick(problems, start)
+        seconds = time.perf_counter() - begin
+        if found is None:
+            return None
+        verdict = judge_one(robot, problems, found.q)
+        if verdict is None:
+            return None
+        return Solution(
+            success=True,
+            status=Status.SOLVED,
+            q=found.q,
+            iterations=found.iterations,
+            restarts=found.restarts,
+            time=seconds,
+            contacts=dict(zip(robot.fingers, verdict.contacts, strict=True)),
+            phases=found.phases,
+            limits_ok=verdict.limits_ok,
+            method=method.name,
+            robot=robot.name,
+            actuators=robot.actuators,
+        )
+
     def solve(
         self,
         problems: Problems,
@@ -103,9 +145,8 @@ class Engine:
             InputError: Bad q0, seed or jobs, or targets the method cannot take.
         """
         starts = self._starts(q0, len(problems))
-        for name, value, least in (("jobs", jobs, 1), ("seed", seed, 0)):
-            if not isinstance(value, (int, np.integer)) or value < least:
-                raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")
+        _whole("jobs", jobs, 1)
+        _whole("seed", seed, 0)
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
         self.method.prepare()
         batches = []
@@ -125,7 +166,7 @@ class Engine:
     def _starts(self, q0: ArrayLike | None, count: int) -> Array:
         start = self.robot.configuration(q0, "q0")
         if start.ndim == 1:
-            return np.tile(start, (count, 1))
+            return np.repeat(start[None], count, axis=0)
         if len(start) != count:
             raise InputError(
                 f"q0: found {len(start)} rows for {count} targets, expected as many, or one (n,)"
@@ -144,6 +185,9 @@ class Engine:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
             return part, started, outcome
 
+        if jobs == 1 and not trace:
+            yield run(slice(0, len(problems)))
+            return
         parts = Parts(len(problems), jobs, trace)
         if jobs == 1:
             yield from map(run, parts)
@@ -159,12 +203,14 @@ class Engine:
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
-        success = np.all(verdict.ok, axis=1)
+        success = verdict.all_ok
         if problems.enforce_limits:
             success &= verdict.limits_ok
-        status = np.where(success, int(Status.SOLVED), outcome.status)
-        # A method that is content with what the verdict refuses has come to a standstill.
-        status = np.where(~success & (status == Status.SOLVED), int(Status.STALLED), status)
+        status, content = outcome.status, outcome.status == Status.SOLVED
+        if (content != success).any():
+            # A method that is content with what the verdict refuses has come to a standstill.
+            status = np.where(content, int(Status.STALLED), status)
+            status[success] = Status.SOLVED
         return BatchSolution(
             success=success,
             status=status,
@@ -228,3 +274,8 @@ class Engine:
             rows=rows,
             started=started + (before * 1e9).astype(np.int64),
         )
+
+
+def _whole(name: str, value: object, least: int) -> None:
+    if not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")

@@ -13,7 +13,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.solvers.hand_first import UNBOUNDED, HandFirstMethod
 from casadi_ik.solvers.problem import Array, Problems
-from casadi_ik.solvers.verdict import judge_contacts, within_limits
+from casadi_ik.solvers.verdict import judge
 from casadi_ik.steps.contact_fit import fresh_fit
 from casadi_ik.steps.hand_first_state import LENGTH
 from casadi_ik.steps.status import Phase
@@ -110,9 +110,8 @@ class Trials:
 
     def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether configurations meet their targets, and if asked the robot's limits."""
-        _, _, met = judge_contacts(self.robot, problems, q)
-        ok = np.all(met, axis=1)
-        return np.logical_and(ok, within_limits(self.robot, q)) if limits else ok
+        verdict = judge(self.robot, problems, q)
+        return verdict.all_ok & verdict.limits_ok if limits else verdict.all_ok
 
     def misses(self, problems: Problems, q: Array) -> Array:
         """(k, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
