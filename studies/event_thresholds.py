@@ -45,8 +45,8 @@ which every other solve passes. It tells where to look, not that a solve has fai
 ones pass it too. The Jacobians of thumb and palm have a redundant arm before them and hardly ever
 come near singular on these targets; their rules stand below what every solve passes (the loose
 end of the table), so that the event is rare and means something. Stalls and oscillations do not
-hang on their thresholds: over two orders of magnitude they catch nearly the same solves. Lead
-screws and four-bars come near their toggle positions only where limits leave them room to.
+hang on their thresholds: over two orders of magnitude they catch nearly the same solves. The
+lead screws and four-bars of Baxter's hand did not come as near to their toggle positions.
 """
 
 
