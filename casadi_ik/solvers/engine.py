@@ -174,9 +174,7 @@ class Engine:
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
-        success = np.all(verdict.ok, axis=1)
-        if problems.enforce_limits:
-            success &= verdict.limits_ok
+        success = verdict.solved(problems.enforce_limits)
         status = np.where(success, int(Status.SOLVED), outcome.status)
         # A method that is content with what the verdict refuses has come to a standstill.
         status = np.where(~success & (status == Status.SOLVED), int(Status.STALLED), status)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +84,12 @@ class PalmFree:
         """Ask the loop's hand stage."""
         self._trials = trials
         self._arm = trials.method.step.arm
+
+    @cached_property
+    def _palm(self) -> Array:
+        """(4, 4) where the palm is with the arm at zero."""
+        robot = self._trials.robot
+        return robot.palm(np.zeros(len(robot.actuators)))
 
     def evidence(self, problems: Problems, fits: HandFits) -> list[tuple[HandFit, ArmReach | None]]:
         """What the fits say of each target: the best one, and the one nearest to the arm's range.
@@ -186,8 +193,7 @@ class PalmFree:
 
     def _seen(self, asked: Problems, rotation: Array, origin: Array) -> Problems:
         """Targets moved with their palm poses to where the palm is with the arm at zero."""
-        robot = self._trials.robot
-        palm = robot.palm(np.zeros(len(robot.actuators)))
+        palm = self._palm
         turn = np.einsum("ij,kmj->kim", palm[:3, :3], rotation)
         points = np.einsum("kij,kfj->kfi", turn, asked.points - origin[:, None]) + palm[:3, 3]
         normals = np.einsum("kij,kfj->kfi", turn, asked.normals)

@@ -172,10 +172,6 @@ class Descent:
         position, angle = self.trials.robot.errors(q, points, normals)
         return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
 
-    def solved(self, targets: Rows, q: Array, limits: bool) -> NDArray[np.bool_]:
-        """(m,) see `Trials.solved`."""
-        return self.trials.solved(self.problems.rows(targets), q, limits)
-
 
 def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:
     """States and parameters of the loop that begin with the refinement of the whole arm-hand."""

@@ -26,6 +26,11 @@ class Verdict:
     ok: NDArray[np.bool_]
     limits_ok: NDArray[np.bool_]
 
+    def solved(self, limits: bool) -> NDArray[np.bool_]:
+        """(k,) whether every contact is met and, if asked, the robot's limits are kept."""
+        ok = np.all(self.ok, axis=1)
+        return np.logical_and(ok, self.limits_ok) if limits else ok
+
 
 def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
     """Compare configurations with their targets.
