@@ -142,6 +142,8 @@ class Solver:
             LogError: The log cannot be written.
         """
         problems = self._problems([grasp], fixed)
+        if log is None and (quick := self._engine.quick(problems, q0, seed)) is not None:
+            return quick
         with self._recorder(log, seed) as recorder:
             batch = self._engine.solve(problems, q0, seed, 1, recorder, diagnose)
         return batch.solution(
@@ -336,7 +338,9 @@ class Solver:
 
     def _fixed(self, fixed: Mapping[str, float] | None) -> Array | None:
         robot = self.robot
-        return fixed_array(fixed or {}, robot.actuators, robot.lower, robot.upper)
+        if not fixed:
+            return None
+        return fixed_array(fixed, robot.actuators, robot.lower, robot.upper)
 
     def _targets(
         self, points: ArrayLike, normals: ArrayLike, fixed: Array | None, first_row: int = 0
@@ -351,13 +355,16 @@ class Solver:
         for grasp in grasps:
             if not isinstance(grasp, Grasp):
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
-        targets = [grasp.arrays(robot.fingers) for grasp in grasps]
-        stacked = np.stack([np.stack(pair) for pair in targets])
-        points, normals = target_arrays(stacked[:, 0], stacked[:, 1], len(robot.fingers))
-        own = {name: contact.tolerance for name, contact in grasps[0].contacts.items()}
-        tolerances = (own.get(name) or self.tolerances[name] for name in robot.fingers)
+        # Contacts are checked when they are made.
+        points, normals = zip(*(grasp.arrays(robot.fingers) for grasp in grasps), strict=True)
+        own, usual = grasps[0].contacts, self.tolerances
+        tolerances = tuple(
+            (own[name].tolerance if name in own else None) or usual[name] for name in robot.fingers
+        )
         fixed_at = self._fixed(fixed)
-        return Problems(points, normals, tuple(tolerances), self._enforce, fixed=fixed_at)
+        return Problems(
+            np.array(points), np.array(normals), tolerances, self._enforce, fixed=fixed_at
+        )
 
     def _recorder(
         self,

@@ -6,16 +6,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
-from casadi_ik.kernels import FunctionKernel
+from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
-from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.couplings import joint_positions, toggle_margins
-from casadi_ik.symbolic.kinematics import Pose
 
 Array = NDArray[np.float64]
 
@@ -104,7 +100,7 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        (theta,) = self._joints(self.configuration(q))
+        (theta,) = self._kernels.joints(self.configuration(q))
         return _by_name(self.description.joint_names, theta)
 
     def toggle_margins(self, q: ArrayLike) -> dict[str, Any]:
@@ -122,7 +118,7 @@ class ArmHand:
             InputError: See `configuration`.
         """
         configuration = self.configuration(q)
-        names, kernel = self._toggle_margins
+        names, kernel = self._kernels.toggle_margins
         if not names:
             return {}
         (margins,) = kernel(configuration)
@@ -141,7 +137,7 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        points, normals = self._contacts(self.configuration(q))
+        points, normals = self._kernels.contacts(self.configuration(q))
         return points, normals
 
     def errors(self, q: ArrayLike, points: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
@@ -158,8 +154,23 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        position, angle = self._errors(self.configuration(q), points, normals)
+        position, angle, _ = self._kernels.deviations(self.configuration(q), points, normals)
         return position, angle
+
+    def deviations(self, q: Array, points: Array, normals: Array) -> tuple[Array, Array, Array]:
+        """`errors` and `beyond_limits` at once, of configurations that need not be finite.
+
+        Args:
+            q: (n,) or (k, n) actuator positions; NaN gives NaN.
+            points: (f, 3) or (k, f, 3) [m], base frame; NaN where free.
+            normals: (f, 3) or (k, f, 3), unit; NaN where free.
+
+        Returns:
+            Distances [m] (f,) or (k, f), angles [rad] the same, and () or (k,) by how much the
+            worst actuator or joint is beyond its limits [rad or m].
+        """
+        position, angle, beyond = self._kernels.deviations(q, points, normals)
+        return position, angle, beyond
 
     def beyond_limits(self, q: ArrayLike) -> Array:
         """By how much the worst actuator or joint is beyond its limits [rad or m], () or (k,).
@@ -169,7 +180,7 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        (beyond,) = self._beyond(self.configuration(q))
+        (beyond,) = self._kernels.beyond(self.configuration(q))
         return beyond
 
     def palm(self, q: ArrayLike) -> Array:
@@ -178,7 +189,7 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        (pose,) = self._palm(self.configuration(q))
+        (pose,) = self._kernels.palm(self.configuration(q))
         return pose
 
     def links(self, q: ArrayLike) -> dict[str, Array]:
@@ -193,7 +204,7 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        (poses,) = self._links(self.configuration(q))
+        (poses,) = self._kernels.links(self.configuration(q))
         names = self.description.links
         stacked = poses.reshape(*poses.shape[:-2], len(names), 4, 4)
         return {name: stacked[..., i, :, :] for i, name in enumerate(names)}
@@ -204,76 +215,15 @@ class ArmHand:
 
     def urdf(self) -> str:
         """The robot as URDF text, see `casadi_ik.robots.to_urdf`."""
+        return self._urdf
+
+    @cached_property
+    def _urdf(self) -> str:
         return to_urdf(self.description)
 
     @cached_property
-    def _joints(self) -> FunctionKernel:
-        q = self._symbols()
-        return self._kernel("joints", [q], [joint_positions(self.description, q)])
-
-    @cached_property
-    def _toggle_margins(self) -> tuple[tuple[str, ...], FunctionKernel]:
-        q = self._symbols()
-        margins = toggle_margins(self.description, q)
-        values = ca.vertcat(ca.SX(0, 1), *margins.values())
-        return tuple(margins), self._kernel("toggle_margins", [q], [values])
-
-    @cached_property
-    def _contacts(self) -> FunctionKernel:
-        q = self._symbols()
-        kinematics = actuated(self.description, q).kinematics
-        pairs = [kinematics.contact(name) for name in self.fingers]
-        points = ca.horzcat(*(point for point, _ in pairs)).T
-        normals = ca.horzcat(*(normal for _, normal in pairs)).T
-        return self._kernel("contacts", [q], [points, normals])
-
-    @cached_property
-    def _errors(self) -> FunctionKernel:
-        q, f = self._symbols(), len(self.fingers)
-        points, normals = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3)
-        kinematics = actuated(self.description, q).kinematics
-        positions, angles = [], []
-        for i, name in enumerate(self.fingers):
-            point, normal = kinematics.contact(name)
-            positions.append(ca.norm_2(point - points[i, :].T))
-            # Kahan's angle: exact at zero and at a half turn, where arc cosine loses half the
-            # digits.
-            apart, together = normal - normals[i, :].T, normal + normals[i, :].T
-            angles.append(2 * ca.atan2(ca.norm_2(apart), ca.norm_2(together)))
-        outputs = [ca.vertcat(*positions), ca.vertcat(*angles)]
-        return self._kernel("errors", [q, points, normals], outputs)
-
-    @cached_property
-    def _beyond(self) -> FunctionKernel:
-        q, description = self._symbols(), self.description
-        theta = joint_positions(description, q)
-        both = ca.vertcat(q, theta)
-        lower = ca.DM(np.concatenate([self.lower, description.joint_lower]))
-        upper = ca.DM(np.concatenate([self.upper, description.joint_upper]))
-        beyond = ca.mmax(ca.fmax(lower - both, both - upper))
-        return self._kernel("beyond_limits", [q], [beyond])
-
-    @cached_property
-    def _palm(self) -> FunctionKernel:
-        q = self._symbols()
-        return self._kernel("palm", [q], [_matrix(actuated(self.description, q).kinematics.palm)])
-
-    @cached_property
-    def _links(self) -> FunctionKernel:
-        q = self._symbols()
-        links = actuated(self.description, q).kinematics.links
-        poses = [_matrix(links[name]) for name in self.description.links]
-        return self._kernel("links", [q], [ca.vertcat(*poses)])
-
-    def _symbols(self) -> ca.SX:
-        return ca.SX.sym("q", len(self.actuators))
-
-    def _kernel(self, name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> FunctionKernel:
-        dense = [ca.densify(output) for output in outputs]
-        # A robot's name may be anything; a function's may not.
-        return FunctionKernel(
-            ca.Function(ca.Function.fix_name(f"{self.name}_{name}"), inputs, dense)
-        )
+    def _kernels(self) -> RobotKernels:
+        return RobotKernels(self.description)
 
 
 def load_robot(name_or_path: str | Path) -> ArmHand:
@@ -294,8 +244,3 @@ def _by_name(names: tuple[str, ...], values: Array) -> dict[str, Any]:
     if values.ndim == 1:
         return {name: float(value) for name, value in zip(names, values, strict=True)}
     return dict(zip(names, values.T, strict=True))
-
-
-def _matrix(pose: Pose) -> ca.SX:
-    bottom = ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]]))
-    return ca.vertcat(ca.horzcat(pose.rotation, pose.origin), bottom)

@@ -261,6 +261,8 @@ class ScrewControl:
             ),
             first=0,
             problems=Problems(free, free, Tolerance(), enforce_limits=True),
+            starts=trajectory.q[:1],
+            seed=0,
             batch=batch,
             rows=rows,
             started=np.array([began]),

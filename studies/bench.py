@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import bench_log_parts
 import bench_logs
 import numpy as np
 from bench_first_use import first_use
@@ -247,6 +248,7 @@ MEASUREMENTS: dict[str, Callable[[ik.ArmHand, Sizes], Section]] = {
     "first-use": lambda _, sizes: first_use(ik.METHODS, sizes.later),
     "iterations": iterations,
     "logs": lambda _, sizes: Section(*bench_logs.report(sizes.batch, sizes.repeats)),
+    "log-parts": lambda _, sizes: Section(*bench_log_parts.report(sizes.batch, sizes.repeats)),
     "peers": lambda _, sizes: measured(sizes.peers, 0, installed()),
 }
 

@@ -162,17 +162,21 @@ def _ratios(
     return full / bare
 
 
+def show(found: Report) -> None:
+    """Print it."""
+    table = Table(*found.columns, title=found.title, caption=found.note)
+    for row in found.rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="What a log costs.")
     parser.add_argument("--count", type=int, default=12_000, help="targets of hand-first")
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args(arguments)
-    found = report(options.count, options.repeats)
-    table = Table(*found.columns, title=found.title, caption=found.note)
-    for row in found.rows:
-        table.add_row(*row)
-    Console().print(table)
+    show(report(options.count, options.repeats))
 
 
 if __name__ == "__main__":

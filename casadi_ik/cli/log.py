@@ -122,10 +122,11 @@ def _worst(values: Any, factor: float) -> str:
 
 
 def _tally(kinds: Sequence[str], record: Mapping[str, Any]) -> str:
-    """How often what happened in a solve, but for what happens in every one."""
+    """How often what happened in a solve, but for what happens in every one; what was held."""
     counts = zip(kinds, np.ravel(record["events"]).tolist(), strict=True)
     usual = ("PHASE_CHANGE", "LIMIT_LEFT", "RELEASED")
     found = [f"{count} {plain_name(k.lower())}" for k, count in counts if count and k not in usual]
+    found += [f"{name} held" for name in record.get("fixed_mask", ())]
     return ", ".join(found)
 
 

@@ -64,7 +64,11 @@ def frame_matrix(frame: Frame) -> NDArray[np.float64]:
     return pose
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
+# libyaml where PyYAML has it: a tenth of the time.
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _UniqueKeyLoader(_SafeLoader):
     """YAML's own loader keeps the last of two equal keys without a word; this one objects."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:

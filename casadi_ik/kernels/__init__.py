@@ -2,8 +2,10 @@
 
 from casadi_ik.kernels.cache import cache_directory
 from casadi_ik.kernels.compiler import NoCompilerWarning
+from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.lookup import LookupKernel
 from casadi_ik.kernels.loop import FAILED, NON_FINITE, REPEATED, LoopKernel, LoopResult
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
@@ -13,8 +15,10 @@ __all__ = [
     "REPEATED",
     "RUNNING",
     "Field",
+    "FunctionGraph",
     "FunctionKernel",
     "Layout",
+    "LookupKernel",
     "LoopKernel",
     "LoopResult",
     "NoCompilerWarning",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 logger = logging.getLogger(__name__)
+
+_BYTE: Any = ctypes.c_char
 
 
 class BufferedFunction:
@@ -58,6 +61,9 @@ class BufferedFunction:
 
 def memory(array: NDArray[Any]) -> int:
     """The address of an array's first element."""
+    if array.flags.writeable and array.flags.c_contiguous and array.size:
+        # A third of the time of the way below, which knows every array.
+        return ctypes.addressof(_BYTE.from_buffer(array))
     return array.ctypes.data
 
 

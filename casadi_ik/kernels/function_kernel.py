@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -13,6 +15,7 @@ from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.buffered import BufferedFunction, doubles, memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.outcome import SLICE, Outcome, check
 
 SYMBOL = "casadi_ik_map"
@@ -32,6 +35,46 @@ class _Job(ctypes.Structure):
     )
 
 
+class SingleCall:
+    """One compiled call on fixed arrays; not to be shared by threads.
+
+    Attributes:
+        inputs: Arrays of the inputs' shapes; write into them.
+        outputs: Arrays of the outputs' shapes; a call overwrites them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        run: Any,
+        inputs: Sequence[NDArray[np.float64]],
+        outputs: Sequence[NDArray[np.float64]],
+    ) -> None:
+        self.inputs = tuple(inputs)
+        self.outputs = tuple(outputs)
+        self._name = name
+        self._run = run
+        sources = (ctypes.c_void_p * len(inputs))(*map(memory, inputs))
+        targets = (ctypes.c_void_p * len(outputs))(*map(memory, outputs))
+        steps = (ctypes.c_int64 * max(len(inputs), len(outputs)))()
+        self._kept = sources, targets, steps
+        self._job = _Job(
+            *map(ctypes.addressof, (sources, steps, targets, steps)), count=1, next=0, slice=SLICE
+        )
+        self._reference = ctypes.byref(self._job)
+
+    def __call__(self) -> None:
+        """Evaluate.
+
+        Raises:
+            KernelError: The function itself reports a failure.
+        """
+        self._job.next = 0
+        code = self._run(self._reference)
+        if code != Outcome.DONE:
+            check(self._name, code)
+
+
 class FunctionKernel:
     """Evaluates a Function, compiled to C if the machine can; several threads may call at once.
 
@@ -45,7 +88,7 @@ class FunctionKernel:
         output_shapes: Shape of one sample of each output.
     """
 
-    def __init__(self, function: ca.Function, compiled: bool = True) -> None:
+    def __init__(self, function: ca.Function | FunctionGraph, compiled: bool = True) -> None:
         """Compile the function or load it from the cache.
 
         Args:
@@ -55,22 +98,27 @@ class FunctionKernel:
         Raises:
             KernelError: The function has no C code, or the compiler refused it.
         """
-        self.name = function.name()
-        self.input_shapes = tuple(_shape(function.size_in(i)) for i in range(function.n_in()))
-        self.output_shapes = tuple(_shape(function.size_out(i)) for i in range(function.n_out()))
-        self._names = tuple(function.name_in())
-        self._function = row_major(function)
-        sizes = [function.numel_out(i) for i in range(function.n_out())]
-        self._output_steps = np.array(sizes, dtype=np.int64)
+        graph = function if isinstance(function, FunctionGraph) else FunctionGraph.of(function)
+        self.name = graph.name
+        self.input_shapes = tuple(map(_shape, graph.inputs.values()))
+        self.output_shapes = tuple(map(_shape, graph.outputs))
+        self._graph = graph
+        self._names = tuple(graph.inputs)
+        self._input_sizes = [rows * columns for rows, columns in graph.inputs.values()]
+        self._output_steps = np.array([r * c for r, c in graph.outputs], dtype=np.int64)
         library = self._load() if compiled else None
         self.compiled = library is not None
         self._map: Any = None if library is None else library[SYMBOL]
+        self._singles: list[SingleCall] = []
 
     def _load(self) -> ctypes.CDLL | None:
         counts = {"N_IN": len(self.input_shapes), "N_OUT": len(self.output_shapes)}
-        return load_library(
-            self.name, lambda: self._function, define(counts) + driver_text("map"), SYMBOL
-        )
+        driver = define(counts) + driver_text("map")
+        return load_library(self.name, lambda: self._function, driver, SYMBOL, self._graph.recipe)
+
+    @cached_property
+    def _function(self) -> ca.Function:
+        return row_major(self._graph.function)
 
     def __call__(self, *inputs: Any) -> tuple[NDArray[np.float64], ...]:
         """Evaluate one sample or a batch.
@@ -87,30 +135,77 @@ class FunctionKernel:
             InputError: Wrong number of inputs, a wrong shape, or batches of different lengths.
             KernelError: The function itself reports a failure.
         """
-        arrays, count = self._arrays(inputs)
+        arrays, steps, count = self.checked(inputs)
+        if self.compiled and count in (None, 1):
+            return self._run_one(arrays, count)
         lead = () if count is None else (count,)
         outputs = tuple(np.empty((*lead, *shape)) for shape in self.output_shapes)
-        steps = [
-            array.size // max(count or 0, 1) if array.ndim > len(shape) else 0
-            for array, shape in zip(arrays, self.input_shapes, strict=True)
-        ]
         run = self._run_compiled if self.compiled else self._run_vm
         run(arrays, steps, outputs, 1 if count is None else count)
         return outputs
 
-    def _arrays(self, inputs: tuple[Any, ...]) -> tuple[list[NDArray[np.float64]], int | None]:
-        """The inputs as arrays and the length of the batch, None without one."""
+    def single(
+        self,
+        inputs: Sequence[NDArray[np.float64]] | None = None,
+        outputs: Sequence[NDArray[np.float64]] | None = None,
+    ) -> SingleCall:
+        """One call with memory of its own, to be made again and again.
+
+        Args:
+            inputs: Contiguous arrays to read from, of one sample's shapes; None: new ones.
+            outputs: The same for what is written.
+        """
+        return SingleCall(
+            self.name,
+            self._map,
+            inputs or [np.zeros(shape) for shape in self.input_shapes],
+            outputs or [np.zeros(shape) for shape in self.output_shapes],
+        )
+
+    def _run_one(
+        self, arrays: list[NDArray[np.float64]], count: int | None
+    ) -> tuple[NDArray[np.float64], ...]:
+        """A single sample: kept memory takes half the time of new memory."""
+        try:
+            single = self._singles.pop()
+        except IndexError:
+            single = self.single()
+        for kept, array in zip(single.inputs, arrays, strict=True):
+            kept[...] = array
+        single()
+        outputs = tuple(
+            output.copy() if count is None else output[None].copy() for output in single.outputs
+        )
+        self._singles.append(single)
+        return outputs
+
+    def checked(
+        self, inputs: Sequence[Any]
+    ) -> tuple[list[NDArray[np.float64]], list[int], int | None]:
+        """Inputs of a call as arrays.
+
+        Returns:
+            The arrays; the doubles from one sample to the next of each, 0 where it is the same for
+            the whole batch; the length of the batch, None without one.
+
+        Raises:
+            InputError: See `__call__`.
+        """
         if len(inputs) != len(self.input_shapes):
             raise InputError(
                 f"{self.name}: {len(inputs)} inputs, expected {len(self.input_shapes)} "
                 f"({', '.join(self._names)})"
             )
         arrays: list[NDArray[np.float64]] = []
+        steps: list[int] = []
         count: int | None = None
-        for name, shape, values in zip(self._names, self.input_shapes, inputs, strict=True):
+        for name, shape, size, values in zip(
+            self._names, self.input_shapes, self._input_sizes, inputs, strict=True
+        ):
             array = doubles(values)
             arrays.append(array)
             if array.shape == shape:
+                steps.append(0)
                 continue
             if array.shape[1:] != shape or array.ndim != len(shape) + 1:
                 raise InputError(
@@ -122,7 +217,8 @@ class FunctionKernel:
                     f"{self.name}: input {name!r} is a batch of {len(array)}, another of {count}"
                 )
             count = len(array)
-        return arrays, count
+            steps.append(size)
+        return arrays, steps, count
 
     def _run_compiled(
         self,

@@ -64,6 +64,81 @@ class LoopResult:
         return () if self.rows is None else split_rows(self.rows, self.iterations)
 
 
+class _Job(ctypes.Structure):
+    """`loop_job` of drivers/loop.c."""
+
+    _fields_ = (
+        ("states", ctypes.c_void_p),
+        ("parameters", ctypes.c_void_p),
+        ("parameter_step", ctypes.c_int64),
+        ("iterations", ctypes.c_void_p),
+        ("status", ctypes.c_void_p),
+        ("seconds", ctypes.c_void_p),
+        ("mark", ctypes.c_void_p),
+        ("rows", ctypes.c_void_p),
+        ("capacity", ctypes.c_int64),
+        ("used", ctypes.c_int64),
+        ("count", ctypes.c_int64),
+        ("solve", ctypes.c_int64),
+        ("max_iterations", ctypes.c_int64),
+        ("slice", ctypes.c_double),
+    )
+
+
+def _job(
+    step: StepGraph, result: LoopResult, parameters: NDArray[np.float64], max_iterations: int
+) -> tuple[_Job, NDArray[np.float64]]:
+    """A job without a trace, and memory that has to live as long."""
+    mark = np.empty(step.state.size)
+    job = _Job(
+        states=memory(result.states),
+        parameters=memory(parameters),
+        parameter_step=0 if parameters.ndim == 1 else parameters.shape[1],
+        iterations=memory(result.iterations),
+        status=memory(result.status),
+        seconds=memory(result.time),
+        mark=memory(mark),
+        count=len(result.states),
+        max_iterations=max_iterations,
+        slice=SLICE,
+    )
+    return job, mark
+
+
+class SingleSolve:
+    """One compiled solve on fixed arrays, without a trace; not to be shared by threads.
+
+    Attributes:
+        parameters: (np,) write into it.
+        result: Of a batch of one; write the first state into `states`, a call overwrites all.
+    """
+
+    def __init__(self, step: StepGraph, loop: Any) -> None:
+        self.parameters = np.zeros(step.parameters.size)
+        self.result = LoopResult(
+            states=np.zeros((1, step.state.size)),
+            iterations=np.zeros(1, dtype=np.int64),
+            status=np.zeros(1, dtype=np.int32),
+            time=np.zeros(1),
+        )
+        self._name = step.name
+        self._loop = loop
+        self._job, self._mark = _job(step, self.result, self.parameters, 0)
+        self._reference = ctypes.byref(self._job)
+
+    def __call__(self, max_iterations: int) -> None:
+        """Solve, as `LoopKernel.run` does.
+
+        Raises:
+            KernelError: No work memory.
+        """
+        result, job = self.result, self._job
+        result.iterations[0], result.status[0], result.time[0] = 0, RUNNING, 0.0
+        job.solve, job.max_iterations = 0, max_iterations
+        while (code := self._loop(self._reference)) != Outcome.DONE:
+            check(self._name, code)
+
+
 class LoopKernel:
     """Runs a step until it ends, for each solve of a batch; several threads may run it at once.
 
@@ -160,22 +235,14 @@ class LoopKernel:
             result.rows.resize(int(result.iterations.sum()), refcheck=False)
         return result
 
+    def single(self) -> SingleSolve:
+        """One solve with memory of its own, to be made again and again; of compiled loops only."""
+        return SingleSolve(self.step, self._loop)
+
     def _run_compiled(
         self, result: LoopResult, parameters: NDArray[np.float64], max_iterations: int
     ) -> None:
-        mark = np.empty(self.step.state.size)
-        job = _Job(
-            states=memory(result.states),
-            parameters=memory(parameters),
-            parameter_step=0 if parameters.ndim == 1 else parameters.shape[1],
-            iterations=memory(result.iterations),
-            status=memory(result.status),
-            seconds=memory(result.time),
-            mark=memory(mark),
-            count=len(result.states),
-            max_iterations=max_iterations,
-            slice=SLICE,
-        )
+        job, _mark = _job(self.step, result, parameters, max_iterations)
         if result.rows is not None:
             job.rows, job.capacity = memory(result.rows), len(result.rows)
         while (code := self._loop(ctypes.byref(job))) != Outcome.DONE:
@@ -219,27 +286,6 @@ class LoopKernel:
             result.time[i] = perf_counter() - started
         if records is not None:
             records.flush()
-
-
-class _Job(ctypes.Structure):
-    """`loop_job` of drivers/loop.c."""
-
-    _fields_ = (
-        ("states", ctypes.c_void_p),
-        ("parameters", ctypes.c_void_p),
-        ("parameter_step", ctypes.c_int64),
-        ("iterations", ctypes.c_void_p),
-        ("status", ctypes.c_void_p),
-        ("seconds", ctypes.c_void_p),
-        ("mark", ctypes.c_void_p),
-        ("rows", ctypes.c_void_p),
-        ("capacity", ctypes.c_int64),
-        ("used", ctypes.c_int64),
-        ("count", ctypes.c_int64),
-        ("solve", ctypes.c_int64),
-        ("max_iterations", ctypes.c_int64),
-        ("slice", ctypes.c_double),
-    )
 
 
 class _Records:

@@ -33,6 +33,11 @@ def store_rows(layout: Layout, vectors: NDArray[np.float64], rows: NDArray[Any])
                 target[...] = values
 
 
+def opaque(rows: NDArray[Any]) -> NDArray[Any]:
+    """Rows (k,) as indivisible bytes: numpy copies these at once, records field by field."""
+    return np.ascontiguousarray(rows).view(np.dtype((np.void, rows.dtype.itemsize)))
+
+
 def split_rows(rows: NDArray[Any], counts: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
     """Views of the rows (sum of counts,) of each solve, by how many each of them has (k,)."""
     ends = np.cumsum(counts)

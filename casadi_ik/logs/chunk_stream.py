@@ -15,16 +15,17 @@ from casadi_ik.logs.mcap_file import McapFile, Summary
 from casadi_ik.logs.message import fill
 from casadi_ik.logs.messages import Messages
 
-CHUNK_SIZE = 2**21
-"""A chunk is closed at the end of the first solve with which it is larger [bytes]."""
+CHUNK_SIZE = 2**20
+"""A chunk is closed at the end of the first solve with which it is no smaller [bytes]."""
 
 
 class ChunkStream:
     """Writes messages to a file, chunk by chunk.
 
     A chunk is checked, compressed and written by a thread of its own, since all of that leaves
-    Python free to solve on; one at a time, so that what waits stays small. A log of a single chunk
-    needs no thread.
+    Python free to solve on. There is one such chunk at a time: a killed process loses at most two,
+    the one in work and the one being filled, each of `CHUNK_SIZE` and the rest of one solve. A log
+    of a single chunk needs no thread.
     """
 
     def __init__(
@@ -135,8 +136,8 @@ class ChunkStream:
             parts = [part for part in self._waiting if part.channel == channel]
             for part in parts:
                 stop = start + len(part.rows) * part.size
-                buffer = data[start:stop].reshape(len(part.rows), part.size)
-                fill(buffer, channel, part.rows, part.sequence, part.log_time, part.publish_time)
+                times = part.log_time, part.publish_time
+                fill(data[start:stop], channel, part.rows, part.sequence, *times)
                 start = stop
             if start > first:
                 offsets = np.arange(first, start, parts[0].size, dtype=np.uint64)

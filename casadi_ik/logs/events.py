@@ -28,10 +28,9 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.logs.event_kinds import EventKind, event_format, mask_words
 from casadi_ik.logs.event_rules import EventRules
 from casadi_ik.logs.limit_events import limit_changes
-from casadi_ik.logs.message import octets_of
 from casadi_ik.logs.singular_events import jacobians, near_singular, nearest_singular
 from casadi_ik.logs.standstill import oscillations, stalls
-from casadi_ik.logs.traces import Bools, Rows, Traces, bits_of, words_of
+from casadi_ik.logs.traces import Bools, Rows, Traces, Words, bits_of, words_of
 from casadi_ik.solvers.method import TraceFormat
 
 
@@ -66,49 +65,33 @@ def _collect(collected: _Collected, traces: Traces, rules: EventRules) -> None:
         *((name, EventKind.RESTART) for name in traces.starts_fields),
     ):
         if name in traces.names:
-            row, before, after = _code_changes(traces, name)
-            collected.add(row, kind, after, before)
+            codes = traces.column(name)
+            row = np.flatnonzero((codes[1:] != codes[:-1]) & ~traces.first[1:]) + 1
+            collected.add(row, kind, codes[row], codes[row - 1])
     if "limit_mask" in traces.names:
         for kind, change in limit_changes(traces, rules.limit_slack):
-            joints = np.zeros((len(change.row), collected.bits), dtype=bool)
-            joints[np.arange(len(joints)), change.bit] = True
+            joints = np.zeros((len(change.row), collected.words), np.uint32)
+            joints[np.arange(len(joints)), change.bit >> 5] = 1 << (change.bit & 31)
             collected.add(change.row, kind, change.value, change.limit, joints)
     if "active_mask" in traces.names:
-        bits, before = _mask_changes(traces, "active_mask")
-        size, size_before = bits.sum(axis=1), before.sum(axis=1)
-        changes = ((EventKind.ACTIVATED, bits & ~before), (EventKind.RELEASED, before & ~bits))
+        mask = traces.mask("active_mask")
+        before = traces.before(mask, mask[traces.firsts])
+        changes = ((EventKind.ACTIVATED, mask & ~before), (EventKind.RELEASED, before & ~mask))
         for kind, joints in changes:
             row = np.flatnonzero(joints.any(axis=1))
-            collected.add(row, kind, size[row], size_before[row], joints[row])
+            size, size_before = (bits_of(words[row]).sum(axis=1) for words in (mask, before))
+            collected.add(row, kind, size, size_before, joints[row])
     known = jacobians(traces.form, rules)
     for number, jacobian in enumerate(known, start=1):
         for kind, row, value, threshold in near_singular(traces, jacobian, rules):
-            joints = np.tile(collected.mask(jacobian.joints), (len(row), 1))
-            collected.add(row, kind, value, threshold, joints, number)
+            collected.add(row, kind, value, threshold, collected.mask(jacobian.joints), number)
     row, value = stalls(traces, rules)
-    at_limit = None
-    if "limit_mask" in traces.names:
-        at_limit = bits_of(traces.matrix("limit_mask")[row])
+    at_limit = traces.matrix("limit_mask")[row] if "limit_mask" in traces.names else 0
     number = nearest_singular(traces, known, row, rules)
     collected.add(row, EventKind.STALL, value, rules.stall_change, at_limit, number)
-    row, value, joints = oscillations(traces, rules)
-    number = nearest_singular(traces, known, row, rules)
+    row, value, swinging = oscillations(traces, rules)
+    joints, number = collected.masks(swinging), nearest_singular(traces, known, row, rules)
     collected.add(row, EventKind.OSCILLATION, value, rules.oscillation_step, joints, number)
-
-
-def _code_changes(traces: Traces, name: str) -> tuple[Rows, NDArray[Any], NDArray[Any]]:
-    """Rows whose code differs from that before, the first rows excepted, and both codes."""
-    codes = traces.matrix(name)[:, 0]
-    row = np.flatnonzero((codes[1:] != codes[:-1]) & ~traces.first[1:]) + 1
-    return row, codes[row - 1], codes[row]
-
-
-def _mask_changes(traces: Traces, name: str) -> tuple[Bools, Bools]:
-    """The bits of a mask and those in the row before, the same in the first row."""
-    bits = bits_of(traces.matrix(name))
-    before = np.concatenate([bits[:1], bits[:-1]])
-    before[traces.first] = bits[traces.first]
-    return bits, before
 
 
 class _Collected:
@@ -117,17 +100,19 @@ class _Collected:
     def __init__(self, traces: Traces) -> None:
         self._traces = traces
         self._form = event_format(traces.form)
-        self._dtype = self._form.layout.dtype
-        self._rows = [np.zeros(0, np.intp)]
-        self._events = [np.zeros(0, self._dtype)]
-        self.bits = 32 * mask_words(traces.form)
+        self._found: list[tuple[NDArray[Any], ...]] = []
+        self.words = mask_words(traces.form)
 
-    def mask(self, joints: tuple[str, ...]) -> Bools:
-        """(bits,) which actuators these are."""
+    def masks(self, joints: Bools) -> Words:
+        """Which actuators (e, n) as words (e, words)."""
+        padded = np.zeros((len(joints), 32 * self.words), dtype=bool)
+        padded[:, : joints.shape[1]] = joints
+        return words_of(padded)
+
+    def mask(self, joints: tuple[str, ...]) -> Words:
+        """(1, words) these actuators."""
         names = self._form.labels["joint_mask"]
-        mask = np.zeros(self.bits, dtype=bool)
-        mask[[names.index(joint) for joint in joints if joint in names]] = True
-        return mask
+        return self.masks(np.array([[name in joints for name in names]], dtype=bool))
 
     def add(
         self,
@@ -135,31 +120,34 @@ class _Collected:
         kind: EventKind,
         value: ArrayLike,
         threshold: ArrayLike,
-        joints: Bools | None = None,
+        joints: ArrayLike = 0,
         jacobian: ArrayLike = 0,
     ) -> None:
-        """Take events: their rows (e,), and the rest as numbers or (e,), the joints (e, n)."""
-        if not len(row):
+        """Take events: their rows (e,), and the rest as numbers or (e,), the joints (e, words)."""
+        count = len(row)
+        if not count:
             return
-        events = np.zeros(len(row), self._dtype)
-        events["kind"], events["value"], events["threshold"] = kind, value, threshold
-        events["jacobian"] = jacobian
-        if joints is not None:
-            padded = np.zeros((len(row), self.bits), dtype=bool)
-            padded[:, : joints.shape[1]] = joints
-            events["joint_mask"] = words_of(padded).reshape(events["joint_mask"].shape)
-        self._rows.append(row)
-        self._events.append(events)
+        words = np.zeros((count, self.words), np.uint32)
+        joints = np.asarray(joints)
+        words[:, : joints.shape[-1] if joints.ndim else None] = joints
+        columns = [np.broadcast_to(column, count) for column in (kind, value, threshold, jacobian)]
+        self._found.append((row, words, *columns))
 
     def sorted(self) -> NDArray[Any]:
         """The events by row and kind, their solve, iteration and phase filled in."""
-        row, octets = np.concatenate(self._rows), np.concatenate(list(map(octets_of, self._events)))
-        kind = np.concatenate([events["kind"] for events in self._events])
+        dtype = self._form.layout.dtype
+        if not self._found:
+            return np.zeros(0, dtype)
+        row, words, kind, *rest = map(np.concatenate, zip(*self._found, strict=True))
         order = np.argsort(row * len(EventKind) + kind, kind="stable")
-        row, events = row[order], octets[order].view(self._dtype)[:, 0]
+        events = np.zeros(len(order), dtype)
+        events["joint_mask"] = words[order].reshape(events["joint_mask"].shape)
+        row, events["kind"] = row[order], kind[order]
+        for name, column in zip(("value", "threshold", "jacobian"), rest, strict=True):
+            events[name] = column[order]
         solve = self._traces.solve[row]
         events["solve_id"] = solve
         events["iteration"] = row - self._traces.starts[solve]
         if "phase" in self._traces.names:
-            events["phase"] = self._traces.matrix("phase")[row, 0]
+            events["phase"] = self._traces.column("phase")[row]
         return events

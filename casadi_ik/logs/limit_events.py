@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.logs.event_kinds import EventKind
-from casadi_ik.logs.traces import Bools, Rows, Traces, bits_of
+from casadi_ik.logs.traces import Bools, Rows, Traces, places_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +29,17 @@ class LimitChanges:
     value: NDArray[np.float64]
     limit: NDArray[np.float64]
 
+    @classmethod
+    def at(cls, traces: Traces, row: Rows, bit: Rows, last: Rows) -> Self:
+        """Those at rows and bits (e,) that were last on the limit in other rows (e,)."""
+        value = _q(traces, row, bit)
+        return cls(row, bit, value, value if last is row else _q(traces, last, bit))
+
+    def corrected(self, wrong: Bools, right: Self) -> Self:
+        """These without the wrong ones (e,), and others instead."""
+        pairs = [(getattr(self, f.name), getattr(right, f.name)) for f in fields(self)]
+        return type(self)(*(np.concatenate([mine[~wrong], more]) for mine, more in pairs))
+
 
 def limit_changes(traces: Traces, slack: float) -> Iterator[tuple[EventKind, LimitChanges]]:
     """Where bits come (LIMIT_HIT) and where they go (LIMIT_LEFT).
@@ -36,39 +47,29 @@ def limit_changes(traces: Traces, slack: float) -> Iterator[tuple[EventKind, Lim
     Before the first row of a solve no bit counts as set, so a start on a limit is a hit. A bit
     that goes while the coordinate stays within `slack` of where it was is no leaving.
     """
-    mask = np.ascontiguousarray(traces.matrix("limit_mask"))
-    before = np.concatenate([np.zeros_like(mask[:1]), mask[:-1]])
-    before[traces.first] = 0
-    changed = np.flatnonzero((mask != before).any(axis=1))
-    bits_now, bits_before = bits_of(mask[changed]), bits_of(before[changed])
-    hit = _places(changed, bits_now & ~bits_before, 0)
-    left = _places(changed, bits_before & ~bits_now, 1)
-    gone = _q(traces, left[:, 2], left[:, 1]) - _q(traces, left[:, 0], left[:, 1])
-    flickers = np.abs(gone) <= slack
+    mask = traces.mask("limit_mask")
+    before = traces.before(mask, 0)
+    row, bit = places_of(mask & ~before)
+    hit = LimitChanges.at(traces, row, bit, row)
+    row, bit = places_of(before & ~mask)
+    left = LimitChanges.at(traces, row, bit, row - 1)
+    flickers = np.abs(left.value - left.limit) <= slack
     if flickers.any():
-        bits = bits_now.shape[1]
-        of_hit, of_left = (
-            traces.solve[places[:, 0]] * bits + places[:, 1] for places in (hit, left)
-        )
+        bits = 32 * mask.shape[1]
+        of_hit, of_left = (traces.solve[found.row] * bits + found.bit for found in (hit, left))
         unsure = np.zeros(len(traces.counts) * bits, dtype=bool)
         unsure[of_left[flickers]] = True
         hits, lefts = _follow(traces, *np.divmod(np.flatnonzero(unsure), bits), slack)
-        hit = np.concatenate([hit[~unsure[of_hit]], hits])
-        left = np.concatenate([left[~unsure[of_left]], lefts])
-    for kind, places in ((EventKind.LIMIT_HIT, hit), (EventKind.LIMIT_LEFT, left)):
-        row, bit, last = places.T
-        yield kind, LimitChanges(row, bit, _q(traces, row, bit), _q(traces, last, bit))
+        hit = hit.corrected(unsure[of_hit], hits)
+        left = left.corrected(unsure[of_left], lefts)
+    yield EventKind.LIMIT_HIT, hit
+    yield EventKind.LIMIT_LEFT, left
 
 
-def _places(changed: Rows, bits: Bools, back: int) -> Rows:
-    """(e, 3): row, bit, and the row `back` before, of every bit (changed, bits) that is set."""
-    which, bit = np.nonzero(bits)
-    row = changed[which]
-    return np.stack([row, bit, row - back], axis=1)
-
-
-def _follow(traces: Traces, solve: Rows, bit: Rows, slack: float) -> tuple[Rows, Rows]:
-    """Hits and leavings (e, 3) of coordinates whose bits flicker, through their whole solves.
+def _follow(
+    traces: Traces, solve: Rows, bit: Rows, slack: float
+) -> tuple[LimitChanges, LimitChanges]:
+    """Hits and leavings of coordinates whose bits flicker, through their whole solves.
 
     Args:
         traces: All solves.
@@ -89,15 +90,21 @@ def _follow(traces: Traces, solve: Rows, bit: Rows, slack: float) -> tuple[Rows,
     decided = np.flatnonzero(on | away)
     before = np.concatenate([[False], on[decided][:-1]])
     before &= np.concatenate([[-1], start[decided][:-1]]) == start[decided]
-    places = np.stack([row, bits, last], axis=1)
-    return places[decided[on[decided] & ~before]], places[decided[~on[decided] & before]]
+    hit, left = decided[on[decided] & ~before], decided[~on[decided] & before]
+    return (
+        LimitChanges.at(traces, row[hit], bits[hit], last[hit]),
+        LimitChanges.at(traces, row[left], bits[left], last[left]),
+    )
 
 
 def _q(traces: Traces, row: Rows, bit: Rows) -> NDArray[np.float64]:
     """Coordinates (e,); NaN where the trace has none."""
+    if "q" not in traces.names:
+        return np.full(len(row), np.nan)
+    q: NDArray[Any] = traces.matrix("q")
+    known = bit < q.shape[1]
+    if known.all():
+        return q[row, bit]
     values = np.full(len(row), np.nan)
-    if "q" in traces.names:
-        q: NDArray[Any] = traces.matrix("q")
-        known = bit < q.shape[1]
-        values[known] = q[row[known], bit[known]]
+    values[known] = q[row[known], bit[known]]
     return values

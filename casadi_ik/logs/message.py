@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from mcap.opcode import Opcode
+
+from casadi_ik.kernels.rows import opaque
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 """Encapsulation of little-endian plain CDR."""
@@ -31,11 +31,6 @@ HEAD = np.dtype([("prefix", PREFIX), ("cdr", "<u4")])
 CDR_NUMBER = int.from_bytes(CDR_HEADER, "little")
 
 
-def message_dtype(row: np.dtype[Any]) -> np.dtype[Any]:
-    """A whole message around a row: fields "prefix", "cdr", "row"."""
-    return np.dtype([("prefix", PREFIX), ("cdr", "<u4"), ("row", row)])
-
-
 def fill(
     buffer: np.ndarray,
     channel: int,
@@ -47,27 +42,24 @@ def fill(
     """Write messages.
 
     Args:
-        buffer: Bytes (k, message size), overwritten.
+        buffer: As many bytes as they have, overwritten.
         channel: Channel id.
         rows: (k,) packed.
         sequence: (k,).
         log_time: (k,) [ns].
         publish_time: (k,) [ns].
     """
-    # As bytes, since numpy copies a structured row field by field.
-    buffer[:, HEAD.itemsize :] = octets_of(rows)
-    head = np.empty(len(buffer), HEAD)
-    prefix = head["prefix"]
-    prefix["opcode"] = Opcode.MESSAGE
-    prefix["length"] = buffer.shape[1] - RECORD_HEAD
-    prefix["channel"] = channel
+    head = np.zeros(1, HEAD)
+    size = HEAD.itemsize + rows.dtype.itemsize
+    head["prefix"]["opcode"] = Opcode.MESSAGE
+    head["prefix"]["length"] = size - RECORD_HEAD
+    head["prefix"]["channel"] = channel
+    head["cdr"] = CDR_NUMBER
+    payload = opaque(rows)
+    messages = buffer.view([("head", opaque(head).dtype), ("row", payload.dtype)])
+    messages["head"] = opaque(head)
+    messages["row"] = payload
+    prefix = buffer.view([("prefix", PREFIX), ("rest", np.void, size - PREFIX.itemsize)])["prefix"]
     prefix["sequence"] = sequence
     prefix["log_time"] = log_time
     prefix["publish_time"] = publish_time
-    head["cdr"] = CDR_NUMBER
-    buffer[:, : HEAD.itemsize] = octets_of(head)
-
-
-def octets_of(rows: np.ndarray) -> np.ndarray:
-    """Rows (k,) as bytes (k, row size)."""
-    return np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), rows.dtype.itemsize)

@@ -82,12 +82,15 @@ def block_messages(
     events["solve_id"] += block.first
     kept = solves["kept"] > 0
     if not kept.all():
-        wanted = kept[of_row]
-        rows, of_row, iteration = rows[wanted], of_row[wanted], iteration[wanted]
-        published = published[wanted]
-        wanted = kept[event_of]
-        events, event_of, event_at = events[wanted], event_of[wanted], event_at[wanted]
-        event_published = event_published[wanted]
+        wanted = np.flatnonzero(kept[of_row])
+        rows, of_row, iteration, published = (
+            np.take(of_rows, wanted) for of_rows in (rows, of_row, iteration, published)
+        )
+        wanted = np.flatnonzero(kept[event_of])
+        events, event_of, event_at, event_published = (
+            np.take(of_events, wanted)
+            for of_events in (events, event_of, event_at, event_published)
+        )
     return [
         Messages(
             channels["iteration"],

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.logs.asked import Asked, asked_of
 from casadi_ik.logs.event_kinds import SINGULAR
 from casadi_ik.logs.log import Log
 from casadi_ik.logs.table import Part, Table, label_of
@@ -94,6 +95,7 @@ class OneSolve:
         rows: The trace, a row per iteration; none if the log has kept the totals only.
         events: What happened, by iteration.
         parameters: What the solver was set to.
+        asked: What it was asked besides its targets.
     """
 
     method: str
@@ -116,12 +118,12 @@ class OneSolve:
     rows: np.ndarray[Any, np.dtype[Any]]
     events: tuple[Happening, ...]
     parameters: Mapping[str, Any]
+    asked: Asked
 
-    @cached_property
+    @property
     def tolerances(self) -> tuple[Tolerance, ...]:
-        """What counted as reached, by finger; a contact's own tolerance is not in the log."""
-        known = self.parameters.get("tolerance", {})
-        return tuple(Tolerance(**known.get(finger, {})) for finger in self.fingers)
+        """What counted as reached, by finger."""
+        return self.asked.tolerances
 
     @property
     def position_tolerance(self) -> Array:
@@ -209,6 +211,7 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
         rows=iterations.rows,
         events=tuple(map(happening, events.records())) if len(events) else (),
         parameters=log.metadata.get("parameters", {}),
+        asked=asked_of(part, log.metadata),
     )
 
 

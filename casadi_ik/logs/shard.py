@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.kernels.layout import Layout
+from casadi_ik.kernels.rows import opaque
 from casadi_ik.logs import bulk
 from casadi_ik.logs.cdr import NUMPY_TYPES, Codec
 from casadi_ik.logs.clock import LogClock
 from casadi_ik.logs.contents import read_attachment, read_contents, reading
-from casadi_ik.logs.message import octets_of
 from casadi_ik.logs.provenance import CHECKSUM, METADATA_NAME, checksum
 from casadi_ik.logs.schema import parse_layout, topic
 from casadi_ik.logs.table import Part
@@ -159,10 +159,7 @@ class Shard:
             for name in chosen.names or ():
                 part[name] = rows[name]
             parts.append(part)
-        octets = [octets_of(part) for part in parts[1:]]
-        if not octets:
-            return times[0], parts[0]
-        return np.concatenate(times), np.concatenate(octets).view(chosen)[:, 0]
+        return np.concatenate(times), np.concatenate(list(map(opaque, parts))).view(chosen)
 
     def _decoded(
         self, stream: IO[bytes], wanted: bulk.Wanted, schema: Schema

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError
+from casadi_ik.kernels.rows import opaque
 from casadi_ik.logs.event_kinds import EventKind
-from casadi_ik.logs.message import octets_of
 from casadi_ik.logs.traces import as_matrix, bits_of
 
 if TYPE_CHECKING:
@@ -110,14 +110,13 @@ class Table:
     def array(self) -> NDArray[Any]:
         """The rows of the only method, (k,) structured, with "solve_id" (and "iteration") first."""
         part = self.part
-        extra = [name for name in self._keys if name not in (part.rows.dtype.names or ())]
-        described = [(name, "<u4") for name in extra] + part.rows.dtype.descr
-        result = np.empty(len(part), described)
-        size = 4 * len(extra)
-        octets_of(result)[:, size:] = octets_of(part.rows)
-        for name in extra:
-            result[name] = getattr(part, name)
-        return result
+        keys = [key for key in self._keys if key not in (part.rows.dtype.names or ())]
+        extra, rows = [(key, "<u4") for key in keys], opaque(part.rows)
+        result = np.empty(len(part), [*extra, ("row", rows.dtype)])
+        result["row"] = rows
+        for key in keys:
+            result[key] = getattr(part, key)
+        return result.view(extra + part.rows.dtype.descr)
 
     def frame(self) -> pl.DataFrame:
         """The rows as a polars DataFrame: a column per number, codes as their names.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +14,7 @@ from casadi_ik.solvers.method import TraceFormat
 
 Bools = NDArray[np.bool_]
 Rows = NDArray[np.intp]
+Words = NDArray[np.uint32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,7 @@ class Traces:
     form: TraceFormat
     rows: NDArray[Any]
     counts: NDArray[np.int64]
+    _columns: dict[str, NDArray[Any]] = field(default_factory=dict, init=False)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -52,8 +54,13 @@ class Traces:
     def first(self) -> Bools:
         """(m,) whether a row is the first of its solve."""
         first = np.zeros(len(self.rows), dtype=bool)
-        first[self.starts[self.counts > 0]] = True
+        first[self.firsts] = True
         return first
+
+    @cached_property
+    def firsts(self) -> Rows:
+        """The rows that are the first of their solves."""
+        return self.starts[self.counts > 0]
 
     @cached_property
     def piece(self) -> NDArray[np.int32]:
@@ -61,7 +68,7 @@ class Traces:
         new = self.first.copy()
         for name in ("phase", *self.starts_fields):
             if name in self.names:
-                codes = self.matrix(name)[:, 0]
+                codes = self.column(name)
                 new[1:] |= codes[1:] != codes[:-1]
         return np.cumsum(new, dtype=np.int32)
 
@@ -74,6 +81,23 @@ class Traces:
         """A field of all rows, (m, size); a view."""
         return as_matrix(self.rows[name])
 
+    def column(self, name: str) -> NDArray[Any]:
+        """A scalar field of all rows in one piece, (m,)."""
+        if name not in self._columns:
+            self._columns[name] = np.ascontiguousarray(self.rows[name])
+        return self._columns[name]
+
+    def mask(self, name: str) -> Words:
+        """A mask of all rows in one piece, (m, words)."""
+        return np.ascontiguousarray(self.matrix(name))
+
+    def before(self, mask: Words, start: Words | int) -> Words:
+        """A mask in the row before each, (m, words); in the first rows of solves `start`."""
+        before = np.empty_like(mask)
+        before[1:] = mask[:-1]
+        before[self.firsts] = start
+        return before
+
     def columns(self, name: str) -> NDArray[Any]:
         """The same as (size, m), each column in one piece: what is done to it then runs fast."""
         return self.matrix(name).T.copy(order="C")
@@ -82,7 +106,7 @@ class Traces:
         """Only some of the solves (k,)."""
         if wanted.all():
             return self
-        rows = self.rows[np.repeat(wanted, self.counts)]
+        rows = np.take(self.rows, np.flatnonzero(np.repeat(wanted, self.counts)))
         return Traces(self.form, rows, self.counts[wanted])
 
 
@@ -100,6 +124,16 @@ def bits_of(mask: NDArray[Any]) -> Bools:
 def words_of(bits: Bools) -> NDArray[np.uint32]:
     """The inverse of `bits_of` for 32-bit words."""
     return np.packbits(bits, axis=1, bitorder="little").view("<u4")
+
+
+def places_of(words: NDArray[np.uint32]) -> tuple[Rows, Rows]:
+    """Row and bit, both (e,), of every bit that is set in 32-bit words (m, words)."""
+    flat = words.reshape(-1)
+    some = np.flatnonzero(flat)
+    place = np.flatnonzero(bits_of(flat[some][:, None]))
+    word, bit = some[place >> 5], place & 31
+    row, number = np.divmod(word, words.shape[1])
+    return row, number * 32 + bit
 
 
 def entries(traces: Traces, begun: Bools, ended: Bools) -> Rows:

@@ -230,7 +230,7 @@ def _limits(solve: OneSolve) -> Iterator[str]:
     if restless:
         shown = [f"{joint} {count} times" for joint, count in Counter(restless).most_common()]
         yield f"to its limit and off again: {listed(shown)}"
-    beyond = " or beyond" if solve.parameters.get("limits") == "ignore" else ""
+    beyond = " or beyond" if solve.asked.limits == "ignore" else ""
     for joint, since in held(solve).items():
         yield f"{joint} at{beyond} its limit from iteration {since} to the end"
 
@@ -288,7 +288,7 @@ def _at_the_end(solve: OneSolve) -> Iterator[str]:
             yield f"at its end the {plain_name(jacobian)} is near singular"
     at_limit = held(solve)
     if at_limit:
-        beyond = " or beyond" if solve.parameters.get("limits") == "ignore" else ""
+        beyond = " or beyond" if solve.asked.limits == "ignore" else ""
         yield f"at its end at{beyond} a limit: {', '.join(at_limit)}"
     if solve.status == "ITERATION_LIMIT":
         yield _progress(solve)

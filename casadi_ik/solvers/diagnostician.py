@@ -25,7 +25,7 @@ from casadi_ik.solvers.palm_free import HandFits, PalmFree
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.remedies import RemedyFinder
 from casadi_ik.solvers.trials import Descent, Rows, Trials
-from casadi_ik.solvers.verdict import Verdict, judge, judge_contacts
+from casadi_ik.solvers.verdict import Verdict, judge
 
 TOGETHER = 64
 """Targets that are diagnosed in the same runs of the compiled loop."""
@@ -114,7 +114,7 @@ class Diagnostician:
             rows = rows[~self._solved(problems.rows(rows), best.fair[rows])]
             if len(rows):
                 some, found = problems.rows(rows), best.rows(rows)
-                best.put(rows, self._search(some, q0[rows], found, count, followed))
+                best.put(rows, self._search(some, found, count, followed))
                 clock.lap(rows)
             unsure[:] = False
         fair = judge(self.robot, problems, best.fair)
@@ -172,9 +172,7 @@ class Diagnostician:
         rows = fits.best(PLACED)
         return fits.targets[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
 
-    def _search(
-        self, problems: Problems, q0: Array, best: Closest, count: int, followed: int
-    ) -> Closest:
+    def _search(self, problems: Problems, best: Closest, count: int, followed: int) -> Closest:
         """The closest to each target from random arms, with hands of all kinds.
 
         The hands are those that came closest so far, and some that look like the grasp. A hand
@@ -187,17 +185,17 @@ class Diagnostician:
             hand = list(self.method.step.layouts.hand)
             starts[:, ::2, hand] = best.fair[:, None, hand]
             starts[:, 1::2, hand] = best.q[:, None, hand]
-            starts[:, ::ALIKE, hand] = self._alike(problems, q0, -(-count // ALIKE))
+            starts[:, ::ALIKE, hand] = self._alike(problems, -(-count // ALIKE))
         starts = np.concatenate([best.q[:, None], best.fair[:, None], starts], axis=1)
         descent = Descent(self._trials, problems)
         ends = descent.run(targets, starts.reshape(len(targets), -1))
         return closest(descent, targets, ends, followed)
 
-    def _alike(self, problems: Problems, q0: Array, count: int) -> Array:
+    def _alike(self, problems: Problems, count: int) -> Array:
         """(k, count, hand) postures that look like the grasps, in turns."""
         options = self.method.options
         rounds = range(min(options.rounds, -(-count // options.candidates)))
-        found = [self.method.postures(problems, q0, number) for number in rounds]
+        found = [self.method.postures(problems, number) for number in rounds]
         postures = np.concatenate(found, axis=1)
         return postures[:, np.arange(count) % postures.shape[1]]
 
@@ -209,7 +207,7 @@ class Diagnostician:
     def _nearest(self, problems: Problems, q: Array) -> list[dict[str, NearContact]]:
         """The contacts of configurations (k, n), beside those asked for."""
         points, normals = self.robot.contacts(q)
-        position_error, angle_error, _ = judge_contacts(self.robot, problems, q)
+        position_error, angle_error = self.robot.errors(q, problems.points, problems.normals)
         columns = points, normals, position_error, angle_error
         rows = zip(*(column.tolist() for column in columns), strict=True)
         return [

@@ -19,13 +19,13 @@ from casadi_ik.solvers.alternatives import AlternativeFinder
 from casadi_ik.solvers.diagnosis import Reason
 from casadi_ik.solvers.diagnostician import Diagnostician
 from casadi_ik.solvers.hand_first import HandFirstMethod
-from casadi_ik.solvers.method import Method, Outcome
+from casadi_ik.solvers.method import Method, Outcome, QuickMethod
 from casadi_ik.solvers.parts import Parts
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.recorder import Recorder, SolveBlock
-from casadi_ik.solvers.solution import BatchSolution
+from casadi_ik.solvers.solution import BatchSolution, Solution
 from casadi_ik.solvers.tracking import Tracker
-from casadi_ik.solvers.verdict import judge
+from casadi_ik.solvers.verdict import judge, judge_one
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.status import Status
 
@@ -35,6 +35,7 @@ class _Part:
     """A part of a batch, solved: when it was begun [ns], and what it came to."""
 
     problems: Problems
+    starts: Array
     started: int
     outcome: Outcome
     batch: BatchSolution
@@ -90,6 +91,48 @@ class Engine:
         """
         return Tracker(self.robot, self._hand_first, self.finder)
 
+    def quick(self, problems: Problems, q0: ArrayLike | None, seed: int) -> Solution | None:
+        """The answer to one target if it is solved at once, by the shortest way; None: `solve` it.
+
+        Args:
+            problems: One target.
+            q0: (n,) start; None is the robot's home.
+            seed: As for `solve`, which draws numbers for hard targets only.
+
+        Raises:
+            InputError: Bad q0 or seed.
+        """
+        method, robot = self.method, self.robot
+        if not isinstance(method, QuickMethod):
+            return None
+        start = robot.configuration(q0, "q0")
+        _whole("seed", seed, 0)
+        if start.ndim != 1:
+            return None
+        method.prepare()
+        begin = time.perf_counter()
+        found = method.quick(problems, start)
+        seconds = time.perf_counter() - begin
+        if found is None:
+            return None
+        verdict = judge_one(robot, problems, found.q)
+        if verdict is None:
+            return None
+        return Solution(
+            success=True,
+            status=Status.SOLVED,
+            q=found.q,
+            iterations=found.iterations,
+            restarts=found.restarts,
+            time=seconds,
+            contacts=dict(zip(robot.fingers, verdict.contacts, strict=True)),
+            phases=found.phases,
+            limits_ok=verdict.limits_ok,
+            method=method.name,
+            robot=robot.name,
+            actuators=robot.actuators,
+        )
+
     def solve(
         self,
         problems: Problems,
@@ -113,22 +156,21 @@ class Engine:
             InputError: Bad q0, seed or jobs, or targets the method cannot take.
         """
         starts = self._starts(q0, len(problems))
-        for name, value, least in (("jobs", jobs, 1), ("seed", seed, 0)):
-            if not isinstance(value, (int, np.integer)) or value < least:
-                raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")
+        _whole("jobs", jobs, 1)
+        _whole("seed", seed, 0)
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
         self.method.prepare()
         batches = []
         for part in self._parts(problems, starts, int(seed), int(jobs), recorder, diagnose):
             if recorder is not None and part.outcome.rows is not None:
-                recorder.record(self._block(part, part.outcome.rows))
+                recorder.record(self._block(part, seed, part.outcome.rows))
             batches.append(part.batch)
         return BatchSolution.joined(batches)
 
     def _starts(self, q0: ArrayLike | None, count: int) -> Array:
         start = self.robot.configuration(q0, "q0")
         if start.ndim == 1:
-            return np.tile(start, (count, 1))
+            return np.repeat(start[None], count, axis=0)
         if len(start) != count:
             raise InputError(
                 f"q0: found {len(start)} rows for {count} targets, expected as many, or one (n,)"
@@ -155,10 +197,13 @@ class Engine:
             batch = self._judged(asked, outcome)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
-            return _Part(asked, started, outcome, batch)
+            return _Part(asked, starts[rows], started, outcome, batch)
 
         if diagnose:
             _ = self.diagnostician
+        if jobs == 1 and not trace:
+            yield run(slice(0, len(problems)))
+            return
         parts = Parts(len(problems), jobs, trace)
         if jobs == 1:
             yield from map(run, parts)
@@ -175,9 +220,11 @@ class Engine:
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
         success = verdict.solved(problems.enforce_limits)
-        status = np.where(success, int(Status.SOLVED), outcome.status)
-        # A method that is content with what the verdict refuses has come to a standstill.
-        status = np.where(~success & (status == Status.SOLVED), int(Status.STALLED), status)
+        status, content = outcome.status, outcome.status == Status.SOLVED
+        if (content != success).any():
+            # A method that is content with what the verdict refuses has come to a standstill.
+            status = np.where(content, int(Status.STALLED), status)
+            status[success] = Status.SOLVED
         return BatchSolution(
             success=success,
             status=status,
@@ -219,7 +266,7 @@ class Engine:
         status[unreachable] = Status.UNREACHABLE
         return replace(batch, status=status, diagnoses=diagnoses)
 
-    def _block(self, part: _Part, rows: NDArray[Any]) -> SolveBlock:
+    def _block(self, part: _Part, seed: int, rows: NDArray[Any]) -> SolveBlock:
         batch = part.batch
         before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
         return SolveBlock(
@@ -229,7 +276,14 @@ class Engine:
             format=self.method.trace_format,
             first=part.problems.first_row,
             problems=part.problems,
+            starts=part.starts,
+            seed=seed,
             batch=batch,
             rows=rows,
             started=part.started + (before * 1e9).astype(np.int64),
         )
+
+
+def _whole(name: str, value: object, least: int) -> None:
+    if not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")

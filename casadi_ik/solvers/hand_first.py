@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.kernels import LoopKernel, LoopResult
+from casadi_ik.kernels import FunctionKernel, LoopKernel, LoopResult
+from casadi_ik.kernels.rows import opaque
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solvers.method import Outcome, TraceFormat, trace_format
+from casadi_ik.solvers.hand_first_single import FirstRound
+from casadi_ik.solvers.method import Outcome, Quick, TraceFormat, trace_format
 from casadi_ik.solvers.posture_table import PostureTable
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.steps.coupling_record import coupling_jacobian
 from casadi_ik.steps.hand_first import HandFirstStep
+from casadi_ik.steps.hand_first_beginning import beginning
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
-from casadi_ik.steps.hand_first_state import STAGES, HandFirstLayouts
-from casadi_ik.steps.status import Phase, Status
+from casadi_ik.steps.hand_first_state import STAGE_LABELS, HandFirstLayouts
+from casadi_ik.steps.status import Status
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
 UNBOUNDED = 1e3
@@ -53,6 +56,7 @@ class HandFirstMethod:
         self._robot = robot
         self._compiled = compiled
         self.step = HandFirstStep(robot, _closed_form(robot), options.candidates)
+        self._singles: list[FirstRound] = []
 
     @cached_property
     def kernel(self) -> LoopKernel:
@@ -62,17 +66,20 @@ class HandFirstMethod:
     @cached_property
     def table(self) -> PostureTable:
         """The hand postures that targets are compared with."""
-        return PostureTable(ArmHand(self._robot), self.step.layouts.hand, self.options.table)
+        return self._table(self.options.table)
 
     @cached_property
     def wide_table(self) -> PostureTable:
         """Many more postures, a good part of them at limits, for targets the first round misses."""
-        robot, options = ArmHand(self._robot), self.options
-        return PostureTable(robot, self.step.layouts.hand, options.wide_table, AT_LIMITS)
+        return self._table(self.options.wide_table, AT_LIMITS)
+
+    def _table(self, size: int, at_limits: float = 0.0) -> PostureTable:
+        hand = self.step.layouts.hand
+        return PostureTable(ArmHand(self._robot), hand, size, at_limits, compiled=self._compiled)
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
-        _ = self.kernel, self.table
+        _ = self.kernel, self.table, self._beginning
 
     @property
     def trace_format(self) -> TraceFormat:
@@ -87,35 +94,37 @@ class HandFirstMethod:
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch; see `Method.run`. No random numbers are drawn."""
         del seed
-        options, layouts = self.options, self.step.layouts
-        count = len(problems)
-        outcome = _Collected(count, len(self._robot.actuators), layouts.record.dtype)
-        waiting = np.arange(count)
-        states = self._states(q0)
-        passed = layouts.state.slice("passed")
-        for number in range(options.rounds if count else 0):
+        passed = self.step.layouts.state.slice("passed")
+        collected = _Collected(self.step.layouts)
+        left, waiting, here = problems, np.arange(len(problems)), q0
+        done: Array | None = None
+        for number in range(self.options.rounds):
             begin = time.perf_counter()
-            first = number * options.candidates
-            chosen = problems.rows(waiting)
-            lookup = self.postures(chosen, q0[waiting], number)
-            parameters = self._parameters(chosen, q0[waiting], lookup)
-            outcome.time[waiting] += (time.perf_counter() - begin) / max(len(waiting), 1)
-            result = self.kernel.run(states[waiting], parameters, MAX_ITERATIONS, trace)
-            outcome.take(layouts, waiting, result, first)
-            # The next round goes on where this one stopped in the numeric arm's list of starts.
-            states[waiting, passed] = result.states[:, passed]
-            waiting = waiting[result.status != Status.SOLVED]
-            if not len(waiting):
+            states, parameters = self.rows(left, here, self.postures(left, number))
+            if done is not None:
+                # It goes on where the last round stopped in the numeric arm's list of starts.
+                states[:, passed] = done
+            result = self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
+            besides = time.perf_counter() - begin - result.time.sum()
+            collected.take(waiting, result, besides / max(len(left), 1))
+            missed = np.flatnonzero(result.status != Status.SOLVED)
+            if not len(missed):
                 break
-        return Outcome(
-            q=outcome.q,
-            status=outcome.status,
-            iterations=outcome.counts.sum(axis=1),
-            restarts=outcome.restarts,
-            time=outcome.time,
-            phases={stage.label: outcome.counts[:, i] for i, stage in enumerate(STAGES)},
-            rows=outcome.rows if trace else None,
-        )
+            left, waiting, here = left.rows(missed), waiting[missed], here[missed]
+            done = result.states[missed, passed]
+        return collected.outcome(trace)
+
+    def quick(self, problems: Problems, q0: Array) -> Quick | None:
+        """The first round of one target; see `QuickMethod.quick`."""
+        if not self.kernel.compiled:
+            return None
+        try:
+            first = self._singles.pop()
+        except IndexError:
+            first = FirstRound(self.table, self._beginning, self.kernel, self.step.layouts)
+        found = first(problems, q0, self._terms(problems), MAX_ITERATIONS)
+        self._singles.append(first)
+        return found
 
     def rows(self, problems: Problems, q0: Array, postures: Array) -> tuple[Array, Array]:
         """States and parameters of the loop, to be changed before `run_rows`.
@@ -123,117 +132,89 @@ class HandFirstMethod:
         Args:
             problems: k targets.
             q0: (k, n).
-            postures: (k, candidates, hand) hand postures to start from, or (k, 1, hand).
+            postures: (k, candidates, hand) hand postures to start from.
 
         Returns:
             (k, ...) states and parameters.
         """
-        return self._states(q0), self._parameters(problems, q0, postures)
+        asked = problems.points, problems.normals, q0, self._terms(problems)
+        states, parameters = self._beginning(*asked, postures)
+        return states, parameters
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
-    def postures(self, problems: Problems, q0: Array, number: int) -> Array:
-        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
+    def postures(self, problems: Problems, number: int) -> Array:
+        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one."""
+        count, targets = self.options.candidates, (problems.points, problems.normals)
+        if number == 0:
+            return self.table.nearest(*targets, count)
+        return self.wide_table.nearest(*targets, number * count)[:, -count:]
 
-        What moves free fingers only stays as in q0.
-
-        Args:
-            problems: k targets.
-            q0: (k, n).
-            number: The round.
-        """
-        count = self.options.candidates
-        table, wanted = (self.wide_table, number * count) if number else (self.table, count)
-        found = table.nearest(problems.points, problems.normals, wanted)[:, -count:]
-        needed = ~np.isnan(problems.points[..., 0]) @ self._moves
-        return np.where(needed[:, None], found, q0[:, None, self.step.layouts.hand])
-
-    def _parameters(self, problems: Problems, q0: Array, postures: Array) -> Array:
-        layout = self.step.layouts.parameters
-        count = len(problems)
-        lower, upper = problems.bounds(self._robot, UNBOUNDED)
-        hand = list(self.step.layouts.hand)
-        shape = count, self.options.candidates, len(hand)
-        inside = np.broadcast_to(np.clip(postures, lower[hand], upper[hand]), shape)
-        free_points, free_normals = np.isnan(problems.points), np.isnan(problems.normals)
-        counted = ~np.stack([free_points[..., 0], free_normals[..., 0]], axis=2)
-        values: dict[str, Any] = {
-            "points": np.where(free_points, 0.0, problems.points).reshape(count, -1),
-            "normals": np.where(free_normals, 0.0, problems.normals).reshape(count, -1),
-            "weights": counted.reshape(count, -1),
-            "position_tolerance": problems.position_tolerance,
-            "angle_tolerance": problems.angle_tolerance,
-            "lower": lower,
-            "upper": upper,
-            "postures": inside.reshape(count, -1),
-            "reach": 1.0,
-            "alone": 0.0,
-            "start": np.clip(q0, lower, upper),
-        }
-        parameters = np.empty((count, layout.size))
-        for name, value in values.items():
-            parameters[:, layout.slice(name)] = value
-        return parameters
+    def _terms(self, problems: Problems) -> Array:
+        """What `beginning` calls terms."""
+        bounds = problems.bounds(self._robot, UNBOUNDED)
+        return np.concatenate([problems.position_tolerance, problems.angle_tolerance, *bounds])
 
     @cached_property
-    def _moves(self) -> NDArray[np.bool_]:
-        """(f, hand) whether a motor of the hand moves a finger."""
-        robot, hand = self._robot, self.step.layouts.hand
-        return np.array([np.isin(hand, robot.finger_actuators(f)) for f in robot.finger_names])
-
-    def _states(self, q0: Array) -> Array:
-        layout = self.step.layouts.state
-        states = np.zeros((len(q0), layout.size))
-        states[:, layout.slice("q")] = q0
-        states[:, layout.slice("best_q")] = q0
-        states[:, layout.slice("phase")] = Phase.CANDIDATE
-        states[:, layout.slice("best_cost")] = np.finfo(float).max
-        return states
+    def _beginning(self) -> FunctionKernel:
+        return FunctionKernel(beginning(self.step.layouts), self._compiled)
 
 
 class _Collected:
-    """Results of a batch whose rows may take several rounds; the best of a row is kept."""
+    """Results of a batch whose targets may take several rounds; the best of a target is kept."""
 
-    def __init__(self, count: int, n: int, record: np.dtype[Any]) -> None:
-        self.q = np.zeros((count, n))
-        self.status = np.full(count, int(Status.STALLED), dtype=np.int64)
-        self.restarts = np.zeros(count, dtype=np.int64)
-        self.counts = np.zeros((count, len(STAGES)), dtype=np.int64)
-        self.time = np.zeros(count)
-        self._rounds = [np.zeros(0, record)]
-        self._targets = [np.zeros(0, np.intp)]
-        self._cost = np.full(count, np.inf)
+    def __init__(self, layouts: HandFirstLayouts) -> None:
+        self._layouts = layouts
+        self._rounds: list[NDArray[Any]] = []
+        self._targets: list[NDArray[np.intp]] = []
 
-    def take(
-        self, layouts: HandFirstLayouts, rows: NDArray[np.intp], result: LoopResult, before: int
-    ) -> None:
-        """Take the results of some rows; `before` candidates were tried in earlier rounds."""
-        state = layouts.state
-        solved = result.status == Status.SOLVED
-        cost = result.states[:, state.slice("best_cost")][:, 0]
-        better = solved | (cost < self._cost[rows])
-        kept = rows[better]
-        self.q[kept] = result.states[better][:, state.slice("q")]
-        self._cost[kept] = cost[better]
-        self.status[rows] = np.where(result.status < 0, int(Status.INVALID), result.status)
-        candidate = result.states[:, state.slice("candidate")][:, 0].astype(np.int64)
-        self.restarts[rows] = before + np.minimum(candidate, layouts.candidates - 1)
-        self.counts[rows] += result.states[:, state.slice("counts")].astype(np.int64)
-        self.time[rows] += result.time
+    def take(self, targets: NDArray[np.intp], result: LoopResult, share: float) -> None:
+        """Take a round of some targets, the first time of all; `share` of them is time besides."""
+        state, before = self._layouts.state, self._layouts.candidates * len(self._rounds)
+        states = result.states
+        q, cost = states[:, state.slice("q")], states[:, state.slice("best_cost").start]
+        counts = states[:, state.slice("counts")].astype(np.int64)
+        candidate = states[:, state.slice("candidate").start].astype(np.int64)
+        restarts = before + np.minimum(candidate, self._layouts.candidates - 1)
+        status = result.status.astype(np.int64)
+        status[status < 0] = Status.INVALID
         if result.rows is not None:
             result.rows["candidate"] += before
-            self._rounds.append(result.rows)
-            self._targets.append(np.repeat(rows, result.iterations))
+        if not self._rounds:
+            # A copy: the states are much larger and need not stay.
+            self._q, self._cost, self._counts = q.copy(), cost.copy(), counts
+            self._restarts, self._status, self._time = restarts, status, result.time + share
+        else:
+            better = (status == Status.SOLVED) | (cost < self._cost[targets])
+            self._q[targets[better]], self._cost[targets[better]] = q[better], cost[better]
+            self._counts[targets] += counts
+            self._restarts[targets], self._status[targets] = restarts, status
+            self._time[targets] += result.time + share
+        self._rounds.append(result.rows if result.rows is not None else np.zeros(0))
+        self._targets.append(np.repeat(targets, result.iterations))
+
+    def outcome(self, trace: bool) -> Outcome:
+        """What became of the batch."""
+        return Outcome(
+            q=self._q,
+            status=self._status,
+            iterations=self._counts.sum(axis=1),
+            restarts=self._restarts,
+            time=self._time,
+            phases={label: self._counts[:, i] for i, label in enumerate(STAGE_LABELS)},
+            rows=self._rows if trace else None,
+        )
 
     @property
-    def rows(self) -> NDArray[Any]:
+    def _rows(self) -> NDArray[Any]:
         """The records of all rounds, target by target."""
-        if len(self._rounds) == 2:
-            return self._rounds[1]
+        if len(self._rounds) == 1:
+            return self._rounds[0]
         order = np.argsort(np.concatenate(self._targets), kind="stable")
-        return np.concatenate(self._rounds)[order]
+        rows = np.concatenate(list(map(opaque, self._rounds)))
+        return np.take(rows, order).view(self._rounds[0].dtype)
 
 
 def _closed_form(robot: RobotDescription) -> SrsArm | None:

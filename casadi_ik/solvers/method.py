@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,16 @@ class Outcome:
     def trace(self) -> tuple[NDArray[Any], ...]:
         """The rows of each solve, views into `rows`; empty if no trace was asked for."""
         return () if self.rows is None else split_rows(self.rows, self.iterations)
+
+
+@dataclass(frozen=True, eq=False)
+class Quick:
+    """What a method believes to be the solution of one target; fields as in `Outcome`."""
+
+    q: Array
+    iterations: int
+    restarts: int
+    phases: Mapping[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,5 +128,19 @@ class Method(Protocol):
 
         Raises:
             RowError: The method cannot take a target (for example a free finger).
+        """
+        ...
+
+
+@runtime_checkable
+class QuickMethod(Protocol):
+    """A method with a shorter way to the same answer for one easy target."""
+
+    def quick(self, problems: Problems, q0: Array) -> Quick | None:
+        """What `run` would find, if that is a solution found at once; None: ask `run`.
+
+        Args:
+            problems: One target.
+            q0: (n,) configuration to start from.
         """
         ...

@@ -13,7 +13,7 @@ from casadi_ik.solvers.contact_verdict import ContactVerdict
 from casadi_ik.solvers.diagnosis import ArmReach, HandFit
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.trials import NEVER, Rows, Trials, allowed, smallest
-from casadi_ik.solvers.verdict import judge_contacts
+from casadi_ik.solvers.verdict import judge
 from casadi_ik.steps.contact_fit import fresh_fit
 from casadi_ik.steps.hand_first_state import LENGTH
 from casadi_ik.steps.status import Phase
@@ -125,11 +125,11 @@ class PalmFree:
             q0: (k, n) where what is free stays.
         """
         method, every = self._trials.method, np.arange(len(problems))
-        nearest = method.postures(problems, q0, 0)
+        nearest = method.postures(problems, 0)
         fits = self._fitted(problems, q0, every, nearest[:, :FIRST])
         without = fits.without()
         if len(without):
-            wide = method.postures(problems.rows(without), q0[without], 1)
+            wide = method.postures(problems.rows(without), 1)
             more = np.concatenate([nearest[without, FIRST:], wide], axis=1)
             fits = HandFits.joined([fits, self._fitted(problems, q0, without, more)])
         rows = np.flatnonzero(fits.ok & np.isin(fits.targets, fits.without()))
@@ -176,7 +176,8 @@ class PalmFree:
         hand = states[:, trials.state.slice("q")].copy()
         hand[:, list(trials.robot.description.arm_actuators)] = 0.0
         seen = self._seen(problems.rows(targets), rotation, origin)
-        position, angle, met = judge_contacts(trials.robot, seen, hand)
+        verdict = judge(trials.robot, seen, hand)
+        position, angle = verdict.position_error, verdict.angle_error
         squares = (position / LENGTH) ** 2, (2 * np.sin(angle / 2)) ** 2
         distance, outside = self._wrist(problems, rotation, origin)
         return HandFits(
@@ -185,7 +186,7 @@ class PalmFree:
             parameters=parameters,
             position_error=position,
             angle_error=angle,
-            met=met,
+            met=verdict.ok,
             cost=np.nan_to_num(squares).sum(axis=(0, 2)),
             distance=distance,
             outside=outside,

@@ -18,6 +18,10 @@ LIMITS = ("enforce", "ignore")
 """How joint limits are taken: as part of being solved, or not at all (the paper's reading)."""
 
 
+UNIT = 1e-15
+"""A normal whose length is so near to 1 has been normalised before."""
+
+
 @dataclass(frozen=True, eq=False)
 class Problems:
     """A batch of targets.
@@ -73,7 +77,10 @@ class Problems:
         """
         first_row = 0
         if isinstance(rows, slice):
-            first_row = self.first_row + rows.indices(len(self))[0]
+            start, stop, _ = rows.indices(len(self))
+            if start == 0 and stop == len(self):
+                return self
+            first_row = self.first_row + start
         points, normals = self.points[rows], self.normals[rows]
         return replace(self, points=points, normals=normals, first_row=first_row)
 
@@ -175,6 +182,8 @@ def target_arrays(
     if len(empty):
         row = first_row + int(empty[0])
         raise RowError(f"points: row {row} has no contact at all", row)
+    # What is a unit normal stays as it is: a contact gives the same target here and in a `Grasp`.
+    length[np.abs(length - 1) < UNIT] = 1.0
     return p, n / length[..., None]
 
 

@@ -28,6 +28,8 @@ class SolveBlock:
         format: How the rows are to be read.
         first: Number of the first solve; solves are unique per method in one log.
         problems: The targets.
+        starts: Where each solve began, (k, n).
+        seed: Of the random numbers.
         batch: What became of them.
         rows: The iterations of all solves, one solve after the other, (sum of
             `BatchSolution.iterations`,) of the format's layout.
@@ -40,6 +42,8 @@ class SolveBlock:
     format: TraceFormat
     first: int
     problems: Problems
+    starts: NDArray[np.float64]
+    seed: int
     batch: BatchSolution
     rows: NDArray[Any]
     started: NDArray[np.int64]

@@ -151,14 +151,15 @@ class BatchSolution:
         fingers: tuple[str, ...],
     ) -> Solution:
         """One row as a `Solution`."""
+        verdicts = zip(
+            self.position_error[row].tolist(),
+            self.angle_error[row].tolist(),
+            self.ok[row].tolist(),
+            self.tolerances,
+            strict=True,
+        )
         contacts = {
-            name: ContactVerdict(
-                float(self.position_error[row, i]),
-                float(self.angle_error[row, i]),
-                bool(self.ok[row, i]),
-                self.tolerances[i],
-            )
-            for i, name in enumerate(fingers)
+            name: ContactVerdict(*verdict) for name, verdict in zip(fingers, verdicts, strict=True)
         }
         return Solution(
             success=bool(self.success[row]),

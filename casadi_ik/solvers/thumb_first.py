@@ -58,9 +58,10 @@ class ThumbFirstMethod:
     @cached_property
     def table(self) -> PostureTable:
         """The hand postures that targets are compared with."""
-        options = self.options
-        robot = ArmHand(self._robot)
-        return PostureTable(robot, self.step.hand, options.table, pull=options.pull)
+        robot, options = ArmHand(self._robot), self.options
+        return PostureTable(
+            robot, self.step.hand, options.table, pull=options.pull, compiled=self._compiled
+        )
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table."""

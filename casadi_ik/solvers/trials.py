@@ -12,7 +12,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.solvers.hand_first import UNBOUNDED, HandFirstMethod
 from casadi_ik.solvers.problem import Array, Problems
-from casadi_ik.solvers.verdict import judge_contacts, within_limits
+from casadi_ik.solvers.verdict import judge
 from casadi_ik.steps.contact_fit import fresh_fit
 from casadi_ik.steps.hand_first_state import LENGTH
 from casadi_ik.steps.status import Phase
@@ -85,7 +85,7 @@ class Trials:
             (k, n) configurations.
         """
         starts = bounds.clip(start)
-        postures = self.method.postures(problems, starts, 0)
+        postures = self.method.postures(problems, 0)
         states, parameters = self.method.rows(problems, starts, postures)
         self.set_bounds(parameters, bounds)
         return self.run(states, parameters)
@@ -100,15 +100,14 @@ class Trials:
             start: (k, n).
             postures: (k, hand).
         """
-        states, parameters = self.method.rows(problems, start, postures[:, None])
-        states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
+        count = self.method.options.candidates
+        states, parameters = self.method.rows(problems, start, postures[:, None].repeat(count, 1))
+        states[:, self.state.slice("candidate")] = count - 1
         return states, parameters
 
     def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether configurations meet their targets, and if asked the robot's limits."""
-        _, _, met = judge_contacts(self.robot, problems, q)
-        ok = np.all(met, axis=1)
-        return np.logical_and(ok, within_limits(self.robot, q)) if limits else ok
+        return judge(self.robot, problems, q).solved(limits)
 
     def set_bounds(self, parameters: Array, bounds: Bounds) -> None:
         """Put bounds into rows of parameters."""

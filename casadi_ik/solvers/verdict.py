@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.solvers.contact_verdict import ContactVerdict
 from casadi_ik.solvers.problem import Array, Problems
 
 LIMIT_SLACK = 1e-9
@@ -26,10 +28,23 @@ class Verdict:
     ok: NDArray[np.bool_]
     limits_ok: NDArray[np.bool_]
 
+    @property
+    def all_ok(self) -> NDArray[np.bool_]:
+        """(k,) whether every contact is met."""
+        met: NDArray[np.bool_] = np.logical_and.reduce(self.ok, axis=1)
+        return met
+
     def solved(self, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether every contact is met and, if asked, the robot's limits are kept."""
-        ok = np.all(self.ok, axis=1)
-        return np.logical_and(ok, self.limits_ok) if limits else ok
+        return self.all_ok & self.limits_ok if limits else self.all_ok
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedVerdict:
+    """How one configuration meets all contacts of its target."""
+
+    contacts: Sequence[ContactVerdict]
+    limits_ok: bool
 
 
 def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
@@ -40,24 +55,37 @@ def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
         problems: k targets, or one that all configurations are compared with.
         q: (k, n) configurations.
     """
-    return Verdict(*judge_contacts(robot, problems, q), within_limits(robot, q))
-
-
-def judge_contacts(
-    robot: ArmHand, problems: Problems, q: Array
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """The same without regard to limits: (k, f) distances [m], angles [rad], and what is met."""
     points, normals = problems.points, problems.normals
     if len(problems) == 1:
         points, normals = points[0], normals[0]
-    position, angle = robot.errors(q, points, normals)
+    position, angle, beyond = robot.deviations(q, points, normals)
     slack = 1 + TOLERANCE_SLACK
-    # Free is what the target leaves out; an error that is NaN for another reason is no success.
-    met = (position <= problems.position_tolerance * slack) | np.isnan(problems.points[..., 0])
-    ok = met & ((angle <= problems.angle_tolerance * slack) | np.isnan(problems.normals[..., 0]))
-    return position, angle, ok
+    placed = position <= problems.position_tolerance * slack
+    faced = angle <= problems.angle_tolerance * slack
+    ok = placed & faced
+    if not ok.all():
+        # Free is what the target leaves out; an error that is NaN for another reason is no success.
+        ok = (placed | np.isnan(points[..., 0])) & (faced | np.isnan(normals[..., 0]))
+    return Verdict(position, angle, ok, beyond <= LIMIT_SLACK)
 
 
-def within_limits(robot: ArmHand, q: Array) -> NDArray[np.bool_]:
-    """(k,) whether every actuator and every joint of (k, n) configurations is within its limits."""
-    return robot.beyond_limits(q) <= LIMIT_SLACK
+def judge_one(robot: ArmHand, problems: Problems, q: Array) -> SolvedVerdict | None:
+    """The verdict on one configuration if everything asked is there and met; None: ask `judge`.
+
+    Args:
+        robot: The robot.
+        problems: One target.
+        q: (n,).
+    """
+    position, angle, beyond = robot.deviations(q, problems.points[0], problems.normals[0])
+    limits_ok = bool(beyond <= LIMIT_SLACK)
+    if problems.enforce_limits and not limits_ok:
+        return None
+    contacts = []
+    slack = 1 + TOLERANCE_SLACK
+    errors = zip(position.tolist(), angle.tolist(), problems.tolerances, strict=True)
+    for distance, turn, tolerance in errors:
+        if not (distance <= tolerance.position * slack and turn <= tolerance.angle * slack):
+            return None
+        contacts.append(ContactVerdict(distance, turn, True, tolerance))
+    return SolvedVerdict(contacts, limits_ok)

@@ -17,6 +17,8 @@ from casadi_ik.symbolic.smooth import Expr
 STAGES = (Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT)
 """The stages in the order of their codes."""
 
+STAGE_LABELS = tuple(stage.label for stage in STAGES)
+
 LENGTH = 0.1
 """Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
 

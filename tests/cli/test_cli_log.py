@@ -52,6 +52,12 @@ def test_solves_that_are_asked_for(run: Command, folder: Path) -> None:
     assert "3 solves" in run("log", "solves", log, "--status", "SOLVED").out
 
 
+def test_solves_tell_what_was_held(run: Command, robot: ik.ArmHand, tmp_path: Path) -> None:
+    log, fixed = tmp_path / "held.mcap", {"lwr_joint_3": 0.2}
+    ik.Solver(robot).solve(ik.load_grasp("cup"), log=log, fixed=fixed)
+    assert "lwr_joint_3 held" in " ".join(run("log", "solves", log).out.split())
+
+
 def test_events_as_a_table(run: Command, folder: Path) -> None:
     done = run("log", "events", folder / "enhanced-dls.mcap", "--event", "PHASE_CHANGE")
     assert (done.exit, done.err) == (0, "")

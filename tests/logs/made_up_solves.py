@@ -92,6 +92,8 @@ def make_block(
         format=form,
         first=first,
         problems=Problems(rng.normal(size=(k, 3, 3)), normals, Tolerance(), True),
+        starts=rng.normal(size=(k, 14)),
+        seed=7,
         batch=batch,
         rows=np.concatenate(rows),
         started=T0 + 123_456_789 * (1 + numbers),

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.logs.asked import Asked
 from casadi_ik.logs.one_solve import Happening, OneSolve
+from casadi_ik.solvers import Tolerance
 
 FINGERS = ("thumb", "finger_2")
 JOINTS = ("joint_a", "joint_b", "joint_c")
@@ -65,9 +67,8 @@ def make_one(rows: np.ndarray[Any, np.dtype[Any]], **changes: Any) -> OneSolve:
         "labels": LABELS,
         "rows": rows,
         "events": (),
-        "parameters": {
-            "tolerance": {f: {"position": 5e-3, "angle": float(np.deg2rad(3))} for f in FINGERS}
-        },
+        "parameters": {},
+        "asked": Asked((Tolerance(5e-3, float(np.deg2rad(3))),) * len(FINGERS)),
     }
     return OneSolve(**(values | changes))
 

@@ -16,6 +16,7 @@ from rosbags.highlevel import AnyReader
 import casadi_ik as ik
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.logs import EventKind, LogClock, Table
+from casadi_ik.logs.chunk_stream import CHUNK_SIZE
 from casadi_ik.logs.event_kinds import event_format
 from casadi_ik.logs.schema import KINDS, topic
 from casadi_ik.logs.solve_rows import solve_format
@@ -85,7 +86,7 @@ def test_a_chunk_ends_where_a_solve_ends(write: Write) -> None:
         firsts = [chunk.message_start_time for chunk in contents.chunks]
         assert all((first - T0) % LogClock(T0).slot == 0 for first in firsts)
         sizes = [chunk.uncompressed_size for chunk in contents.chunks[:-1]]
-        assert all(2**21 <= size < 2**21 + 3000 * 400 for size in sizes)
+        assert all(CHUNK_SIZE <= size < CHUNK_SIZE + 3000 * 400 for size in sizes)
     found = ik.logs.open(whole).iterations()
     assert found.rows.tobytes() == make_block(*counts).rows.tobytes()
     assert ik.logs.open(parts).iterations(solve=5).rows.tobytes() == single[5].rows.tobytes()

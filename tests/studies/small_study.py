@@ -8,6 +8,8 @@ from pathlib import Path
 from runner import Setting, Study, TargetSet, run
 from targets import any_configuration, near_limits
 
+from casadi_ik.logs import Keep
+
 CHANGED = Setting("loose", "hand-first", tolerance=(2e-3, 0.05))
 STUDY = Study(
     "small",
@@ -19,4 +21,4 @@ STUDY = Study(
 )
 
 if __name__ == "__main__":
-    run(STUDY, Path(sys.argv[1]), jobs=2)
+    run(STUDY, Path(sys.argv[1]), jobs=2, keep=Keep())

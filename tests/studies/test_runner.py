@@ -100,10 +100,16 @@ def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
         process.wait()
         for path, content in before.items():
             assert path.read_bytes() == content, "what is done is not done again"
+            assert not ik.logs.open(path.with_suffix(".mcap")).info().unfinished
     assert kills > 0
     assert contents(tmp_path).equals(contents(done))
     claim(STUDY, tmp_path)
     assert not list(tmp_path.rglob("*.part"))
+    logs = [ik.logs.open(path) for path in tmp_path.rglob("*.mcap")]
+    assert len(logs) == len(list(STUDY.blocks()))
+    assert {len(log.solves()) for log in logs} == {STUDY.block}
+    iterations = sum(len(log.iterations()) for log in logs)
+    assert iterations == contents(tmp_path)["iterations"].sum()
 
 
 def test_a_study_grows(done, tmp_path):

@@ -1,0 +1,200 @@
+"""The rows of a table that are nearest to a key, which a CasADi Function makes of its inputs."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.kernels.buffered import memory
+from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.function_kernel import FunctionKernel
+from casadi_ik.kernels.outcome import SLICE, Outcome, check
+
+SYMBOL = "casadi_ik_lookup"
+
+STEPS = 64
+"""Keys are compared in steps of 1 / STEPS. Squares and their sums then have no rounding errors in
+single precision: compiled code and numpy find the same rows, alone and in a batch."""
+
+LARGEST = 8 * STEPS
+"""Entries of a key beyond this many steps count as this many."""
+
+TILE = 16
+"""Rows that compiled code compares at once: their sums stay in registers."""
+
+CHUNK = 256
+"""Samples that numpy compares at once: what fits into the cache."""
+
+
+class _Job(ctypes.Structure):
+    """`lookup_job` of drivers/lookup.c."""
+
+    _fields_ = (
+        ("inputs", ctypes.c_void_p),
+        ("input_steps", ctypes.c_void_p),
+        ("tiles", ctypes.c_void_p),
+        ("found", ctypes.c_void_p),
+        ("rows", ctypes.c_int64),
+        ("wanted", ctypes.c_int64),
+        ("count", ctypes.c_int64),
+        ("next", ctypes.c_int64),
+        ("slice", ctypes.c_double),
+    )
+
+
+class SingleLookup:
+    """One compiled lookup on fixed arrays; not to be shared by threads.
+
+    Attributes:
+        inputs: Arrays of the inputs' shapes; write into them.
+        found: (1, count) rows, nearest first; a call overwrites them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        run: Any,
+        inputs: Sequence[NDArray[np.float64]],
+        found: NDArray[np.int64],
+        job: _Job,
+        kept: Any,
+    ) -> None:
+        self.inputs = tuple(inputs)
+        self.found = found
+        self._name = name
+        self._run = run
+        self._job = job
+        self._kept = kept
+        self._reference = ctypes.byref(job)
+
+    def __call__(self) -> None:
+        """Look up."""
+        self._job.next = 0
+        code = self._run(self._reference)
+        if code != Outcome.DONE:
+            check(self._name, code)
+
+
+class LookupKernel:
+    """Finds the nearest rows of one table; several threads may ask at once.
+
+    Attributes:
+        key: The function that makes keys.
+        compiled: Whether calls run in compiled code; numpy finds the same rows.
+    """
+
+    def __init__(
+        self, key: ca.Function | FunctionGraph, rows: Sequence[Any], compiled: bool = True
+    ) -> None:
+        """Compile or load from the cache, and note the keys of the table.
+
+        Args:
+            key: Any inputs -> (s, 1); NaN is an entry that is not known and does not count.
+            rows: The inputs that belong to the rows, each with a leading dimension t.
+            compiled: False keeps to the virtual machine and numpy.
+
+        Raises:
+            KernelError: The function has no C code, or the compiler refused it.
+        """
+        graph = key if isinstance(key, FunctionGraph) else FunctionGraph.of(key)
+        self.key = FunctionKernel(graph, compiled)
+        (keys,) = self.key(*rows)
+        self._keys = _rounded(np.nan_to_num(keys).reshape(len(keys), -1))
+        # An entry of neighbouring rows side by side, tile by tile in the order of reading: whole
+        # columns a power of two apart would fall on each other in the cache.
+        padded = np.pad(self._keys, ((0, -len(keys) % TILE), (0, 0)))
+        self._tiles = padded.reshape(-1, TILE, self._keys.shape[1]).transpose(0, 2, 1).copy()
+        library = self._load(graph) if compiled else None
+        self.compiled = library is not None
+        self._lookup: Any = None if library is None else library[SYMBOL]
+
+    def _load(self, graph: FunctionGraph) -> ctypes.CDLL | None:
+        constants = {
+            "N_IN": len(self.key.input_shapes),
+            "N_KEY": self._keys.shape[1],
+            "TILE": TILE,
+            "STEPS": STEPS,
+            "LARGEST": LARGEST,
+        }
+        driver = define(constants) + driver_text("lookup")
+        return load_library(
+            graph.name, lambda: row_major(graph.function), driver, SYMBOL, graph.recipe
+        )
+
+    def __call__(self, count: int, *inputs: Any) -> NDArray[np.int64]:
+        """Find the nearest rows.
+
+        Args:
+            count: How many, at most as many as the table has.
+            inputs: Of the function, one at least with a leading batch dimension k.
+
+        Returns:
+            (k, count) rows, nearest first; of equally near ones the first of the table.
+
+        Raises:
+            InputError: Wrong inputs, see `FunctionKernel`.
+        """
+        arrays, steps, samples = self.key.checked(inputs)
+        found = np.empty((samples or 0, count), dtype=np.int64)
+        if self.compiled:
+            self._run_compiled(arrays, steps, found)
+        else:
+            self._run_numpy(arrays, found)
+        return found
+
+    def single(self, count: int) -> SingleLookup:
+        """One lookup with memory of its own, to be made again and again; of compiled ones only."""
+        inputs = [np.zeros(shape) for shape in self.key.input_shapes]
+        found = np.zeros((1, count), dtype=np.int64)
+        return SingleLookup(self.key.name, self._lookup, inputs, found, *self._job(inputs, found))
+
+    def _run_compiled(
+        self, arrays: list[NDArray[np.float64]], steps: list[int], found: NDArray[np.int64]
+    ) -> None:
+        job, _kept = self._job(arrays, found, steps)
+        while (code := self._lookup(ctypes.byref(job))) != Outcome.DONE:
+            check(self.key.name, code)
+
+    def _job(
+        self,
+        inputs: list[NDArray[np.float64]],
+        found: NDArray[np.int64],
+        steps: Sequence[int] = (),
+    ) -> tuple[_Job, Any]:
+        """A job, and memory that has to live as long."""
+        sources = (ctypes.c_void_p * len(inputs))(*map(memory, inputs))
+        strides = (ctypes.c_int64 * len(inputs))(*steps)
+        job = _Job(
+            inputs=ctypes.addressof(sources),
+            input_steps=ctypes.addressof(strides),
+            tiles=memory(self._tiles),
+            found=memory(found),
+            rows=len(self._keys),
+            wanted=found.shape[1],
+            count=len(found),
+            slice=SLICE,
+        )
+        return job, (sources, strides)
+
+    def _run_numpy(self, arrays: list[NDArray[np.float64]], found: NDArray[np.int64]) -> None:
+        (keys,) = self.key(*arrays)
+        keys = keys.reshape(len(found), self._keys.shape[1])  # also a single entry
+        for start in range(0, len(keys), CHUNK):
+            part = keys[start : start + CHUNK]
+            known = ~np.isnan(part)
+            wanted = 2 * _rounded(np.where(known, part, 0.0))
+            # |row - key|^2 over what is known, without the part that all rows share.
+            distance = known.astype(np.float32) @ self._keys.T**2 - wanted @ self._keys.T
+            order = distance.argsort(axis=1, kind="stable")
+            found[start : start + CHUNK] = order[:, : found.shape[1]]
+
+
+def _rounded(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    return np.rint(values * STEPS).clip(-LARGEST, LARGEST).astype(np.float32)

@@ -1,0 +1,139 @@
+"""Everything that is asked of a robot's kinematics in numbers, compiled when first used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.kernels.function_graph import FunctionGraph, Shape
+from casadi_ik.kernels.function_kernel import FunctionKernel
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.robots import RobotDescription
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.couplings import joint_positions, toggle_margins
+from casadi_ik.symbolic.kinematics import Pose
+
+
+class RobotKernels:
+    """Functions of q (n,) [rad or m], base frame, lengths in m, angles in rad."""
+
+    def __init__(self, robot: RobotDescription) -> None:
+        """Keep the description."""
+        self._robot = robot
+
+    @cached_property
+    def joints(self) -> FunctionKernel:
+        """Positions of all movable joints."""
+
+        def build(q: ca.SX) -> list[ca.SX]:
+            return [joint_positions(self._robot, q)]
+
+        return self._kernel("joints", build, {}, [(len(self._robot.joint_names), 1)])
+
+    @cached_property
+    def toggle_margins(self) -> tuple[tuple[str, ...], FunctionKernel]:
+        """Names of the joints with mechanisms, and how far these are from their toggle."""
+        q = ca.SX.sym("q", len(self._robot.actuators))
+        margins = toggle_margins(self._robot, q)
+        values = ca.densify(ca.vertcat(ca.SX(0, 1), *margins.values()))
+        name = ca.Function.fix_name(f"{self._robot.name}_toggle_margins")
+        return tuple(margins), FunctionKernel(ca.Function(name, [q], [values]))
+
+    @cached_property
+    def contacts(self) -> FunctionKernel:
+        """Contact points and normals, (f, 3) each."""
+
+        def build(q: ca.SX) -> list[ca.SX]:
+            kinematics = actuated(self._robot, q).kinematics
+            pairs = [kinematics.contact(name) for name in self._robot.finger_names]
+            points = ca.horzcat(*(point for point, _ in pairs)).T
+            normals = ca.horzcat(*(normal for _, normal in pairs)).T
+            return [points, normals]
+
+        f = len(self._robot.finger_names)
+        return self._kernel("contacts", build, {}, [(f, 3), (f, 3)])
+
+    @cached_property
+    def deviations(self) -> FunctionKernel:
+        """Distances and angles (f,) from points and normals (f, 3), and `beyond`."""
+
+        def build(q: ca.SX, points: ca.SX, normals: ca.SX) -> list[ca.SX]:
+            kinematics = actuated(self._robot, q).kinematics
+            positions, angles = [], []
+            for i, name in enumerate(self._robot.finger_names):
+                point, normal = kinematics.contact(name)
+                positions.append(ca.norm_2(point - points[i, :].T))
+                # Kahan's angle: exact at zero and at a half turn, where arc cosine loses half the
+                # digits.
+                apart, together = normal - normals[i, :].T, normal + normals[i, :].T
+                angles.append(2 * ca.atan2(ca.norm_2(apart), ca.norm_2(together)))
+            return [ca.vertcat(*positions), ca.vertcat(*angles), self._excess(q)]
+
+        f = len(self._robot.finger_names)
+        besides = {"points": (f, 3), "normals": (f, 3)}
+        return self._kernel("deviations", build, besides, [(f, 1), (f, 1), (1, 1)])
+
+    @cached_property
+    def beyond(self) -> FunctionKernel:
+        """Excess of the worst actuator or joint over its limits."""
+        return self._kernel("beyond_limits", lambda q: [self._excess(q)], {}, [(1, 1)])
+
+    def _excess(self, q: ca.SX) -> ca.SX:
+        description = self._robot
+        both = ca.vertcat(q, joint_positions(description, q))
+        lower = ca.DM(np.concatenate([description.lower, description.joint_lower]))
+        upper = ca.DM(np.concatenate([description.upper, description.joint_upper]))
+        return ca.mmax(ca.fmax(lower - both, both - upper))
+
+    @cached_property
+    def palm(self) -> FunctionKernel:
+        """Pose (4, 4) of the palm."""
+
+        def build(q: ca.SX) -> list[ca.SX]:
+            return [_matrix(actuated(self._robot, q).kinematics.palm)]
+
+        return self._kernel("palm", build, {}, [(4, 4)])
+
+    @cached_property
+    def links(self) -> FunctionKernel:
+        """Poses of all links, one below the other."""
+
+        def build(q: ca.SX) -> list[ca.SX]:
+            links = actuated(self._robot, q).kinematics.links
+            return [ca.vertcat(*(_matrix(links[name]) for name in self._robot.links))]
+
+        return self._kernel("links", build, {}, [(4 * len(self._robot.links), 4)])
+
+    def _kernel(
+        self,
+        name: str,
+        build: Callable[..., list[ca.SX]],
+        besides: Mapping[str, Shape],
+        outputs: Sequence[Shape],
+    ) -> FunctionKernel:
+        """The kernel of a function of q and what is given besides."""
+        # A robot's name may be anything; a function's may not.
+        full = ca.Function.fix_name(f"{self._robot.name}_{name}")
+        inputs = {"q": (len(self._robot.actuators), 1), **besides}
+
+        def function() -> ca.Function:
+            symbols = [ca.SX.sym(key, *shape) for key, shape in inputs.items()]
+            results = [ca.densify(output) for output in build(*symbols)]
+            return ca.Function(
+                full, symbols, results, list(inputs), [f"out_{i}" for i in range(len(results))]
+            )
+
+        known = recipe(full, self._recipe)
+        return FunctionKernel(FunctionGraph(full, function, inputs, tuple(outputs), known))
+
+    @cached_property
+    def _recipe(self) -> str:
+        return recipe(self._robot)
+
+
+def _matrix(pose: Pose) -> ca.SX:
+    bottom = ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]]))
+    return ca.vertcat(ca.horzcat(pose.rotation, pose.origin), bottom)
