@@ -263,7 +263,7 @@ def agreement(kept: Kept, before: Path) -> Section:
         "Certain: called unreachable, before / now. Nearest: largest distance of the nearest "
         "contacts, now by before, median."
     )
-    return Section(f"Against {before.name}", columns, rows, note)
+    return Section(f"Against another version ({before.name})", columns, rows, note)
 
 
 PARTS = "points", "reason", "certain", "nearest", "helps"
@@ -297,6 +297,8 @@ def main(arguments: list[str] | None = None) -> None:
             f"python studies/diagnosis.py --count {options.count} --bad-starts "
             f"{options.bad_starts} --impossible {options.impossible} --seed {options.seed}"
         )
+        if options.against:
+            command += f" --against {options.against.name}"
         write_report(options.out / "report.md", command, sections, TITLE)
 
 

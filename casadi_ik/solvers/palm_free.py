@@ -163,7 +163,8 @@ class PalmFree:
         weight = np.sqrt(np.minimum(loose / (3 * fits.outside[rows]), 1.0))
         parameters[:, trials.parameters.slice("reach")] = weight[:, None]
         trials.set_tolerance(parameters, NEVER)
-        return self._run(problems, fits.targets[rows], states, parameters)
+        slid = self._run(problems, fits.targets[rows], states, parameters)
+        return replace(slid, parameters=fits.parameters[rows])
 
     def _run(self, problems: Problems, targets: Rows, states: Array, parameters: Array) -> HandFits:
         """Run the hand stage of some rows to its end and judge what it came to."""
