@@ -23,6 +23,7 @@ from casadi_ik.solvers import (
     BatchSolution,
     Engine,
     Problems,
+    Questions,
     Recorder,
     Solution,
     SolvedBlock,
@@ -32,9 +33,8 @@ from casadi_ik.solvers import (
     Tolerance,
     Track,
     build_method,
-    fixed_array,
     method_options,
-    target_arrays,
+    tolerances_by_finger,
     travel_limits,
 )
 
@@ -87,7 +87,7 @@ class Solver:
             raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMITS)}")
         self.robot = robot
         self.method = method
-        self.tolerances = _by_finger(tolerance, robot.fingers)
+        self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
         self.limits = limits
         self.options = dict(options or {})
         if finger_step is not None and finger_step not in FINGER_STEPS:
@@ -96,6 +96,7 @@ class Solver:
             )
         if finger_step is not None and "finger_step" in method_options(method):
             self.options["finger_step"] = finger_step
+        self._questions = Questions(robot, self.tolerances, limits == "enforce")
         self._engine = Engine(
             robot, build_method(method, robot.description, self.options, compiled), compiled
         )
@@ -141,7 +142,7 @@ class Solver:
             UnsupportedError: The method cannot keep actuators fixed.
             LogError: The log cannot be written.
         """
-        problems = self._problems([grasp], fixed)
+        problems = self._questions.of_grasps([grasp], fixed)
         if log is None and (quick := self._engine.quick(problems, q0, seed)) is not None:
             return quick
         with self._recorder(log, seed) as recorder:
@@ -189,7 +190,7 @@ class Solver:
             UnsupportedError: The method cannot keep actuators fixed.
             LogError: The log cannot be written.
         """
-        problems = self._targets(points, normals, self._fixed(fixed))
+        problems = self._questions.of_arrays(points, normals, self._questions.held(fixed))
         with self._recorder(log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
 
@@ -227,10 +228,10 @@ class Solver:
             UnsupportedError: The method cannot keep actuators fixed.
             LogError: The log cannot be written.
         """
-        held = self._fixed(fixed)
+        held = self._questions.held(fixed)
 
         def ask(points: ArrayLike, normals: ArrayLike, first_row: int) -> Problems:
-            return self._targets(points, normals, held, first_row)
+            return self._questions.of_arrays(points, normals, held, first_row)
 
         with self._recorder(log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
@@ -269,8 +270,8 @@ class Solver:
             UnsupportedError: The method is not hand-first.
         """
         finder = self._engine.finder
-        problems = self._problems([grasp], fixed)
-        return finder.find(problems, self._start(q0), seed, limit, prefer)
+        problems = self._questions.of_grasps([grasp], fixed)
+        return finder.find(problems, self._questions.start(q0), seed, limit, prefer)
 
     def track(
         self,
@@ -303,10 +304,10 @@ class Solver:
         tracker = self._engine.tracker
         if not grasps:
             raise InputError("grasps: found none, expected at least one")
-        problems = self._problems(grasps, fixed)
+        problems = self._questions.of_grasps(grasps, fixed)
         travel = travel_limits(self.robot, period, velocity)
         prefer = "limits" if q0 is None else "q0"
-        return tracker.track(problems, self._start(q0), prefer, travel, seed)
+        return tracker.track(problems, self._questions.start(q0), prefer, travel, seed)
 
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
         """Solve one grasp by hand, one iteration at a time.
@@ -322,49 +323,9 @@ class Solver:
         method = self._engine.method
         if not isinstance(method, SteppedMethod):
             raise UnsupportedError(f"method {self.method!r} cannot be stepped by hand")
-        problems = self._problems([grasp], None)
-        states, parameters = method.start(problems, self._start(q0)[None])
+        problems = self._questions.of_grasps([grasp], None)
+        states, parameters = method.start(problems, self._questions.start(q0)[None])
         return Stepper(method.kernel.step, states[0], parameters[0])
-
-    @property
-    def _enforce(self) -> bool:
-        return self.limits == "enforce"
-
-    def _start(self, q0: ArrayLike | None) -> Array:
-        start = self.robot.configuration(q0, "q0")
-        if start.ndim != 1:
-            raise InputError(f"q0: found shape {start.shape}, expected ({len(start[0])},)")
-        return start
-
-    def _fixed(self, fixed: Mapping[str, float] | None) -> Array | None:
-        robot = self.robot
-        if not fixed:
-            return None
-        return fixed_array(fixed, robot.actuators, robot.lower, robot.upper)
-
-    def _targets(
-        self, points: ArrayLike, normals: ArrayLike, fixed: Array | None, first_row: int = 0
-    ) -> Problems:
-        p, n = target_arrays(points, normals, len(self.robot.fingers), first_row)
-        tolerances = tuple(self.tolerances.values())
-        return Problems(p, n, tolerances, self._enforce, first_row, fixed)
-
-    def _problems(self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None) -> Problems:
-        """Grasps that share the tolerances of the first."""
-        robot = self.robot
-        for grasp in grasps:
-            if not isinstance(grasp, Grasp):
-                raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
-        # Contacts are checked when they are made.
-        points, normals = zip(*(grasp.arrays(robot.fingers) for grasp in grasps), strict=True)
-        own, usual = grasps[0].contacts, self.tolerances
-        tolerances = tuple(
-            (own[name].tolerance if name in own else None) or usual[name] for name in robot.fingers
-        )
-        fixed_at = self._fixed(fixed)
-        return Problems(
-            np.array(points), np.array(normals), tolerances, self._enforce, fixed=fixed_at
-        )
 
     def _recorder(
         self,
@@ -384,20 +345,3 @@ class Solver:
             keep=keep,
             compression=compression,
         )
-
-
-def _by_finger(
-    tolerance: Tolerance | Mapping[str, Tolerance] | None, fingers: Sequence[str]
-) -> dict[str, Tolerance]:
-    if tolerance is None or isinstance(tolerance, Tolerance):
-        return dict.fromkeys(fingers, tolerance or Tolerance())
-    if not isinstance(tolerance, Mapping):
-        raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance, or one by finger")
-    for name, one in tolerance.items():
-        if name not in fingers:
-            raise InputError(
-                f"tolerance.{name}: no such finger; the robot's fingers: {', '.join(fingers)}"
-            )
-        if not isinstance(one, Tolerance):
-            raise InputError(f"tolerance.{name}: found {one!r}, expected a Tolerance")
-    return {name: tolerance.get(name, Tolerance()) for name in fingers}

@@ -6,6 +6,7 @@ from casadi_ik.solvers.contact_verdict import ContactVerdict
 from casadi_ik.solvers.diagnosis import Diagnosis, Reason
 from casadi_ik.solvers.engine import Engine
 from casadi_ik.solvers.problem import LIMITS, Problems, Tolerance, fixed_array, target_arrays
+from casadi_ik.solvers.questions import Questions, tolerances_by_finger
 from casadi_ik.solvers.recorder import Recorder
 from casadi_ik.solvers.registry import METHODS, build_method, method_options, method_summary
 from casadi_ik.solvers.solution import BatchSolution, Solution
@@ -29,6 +30,7 @@ __all__ = [
     "Jump",
     "Phase",
     "Problems",
+    "Questions",
     "Reason",
     "Recorder",
     "Solution",
@@ -44,5 +46,6 @@ __all__ = [
     "method_options",
     "method_summary",
     "target_arrays",
+    "tolerances_by_finger",
     "travel_limits",
 ]

@@ -132,7 +132,7 @@ class AlternativeFinder:
         """Solutions (n,) with different hands, from every candidate of every round."""
         trials, method = self._trials, self._trials.method
         rounds = range(method.options.rounds)
-        postures = np.concatenate([method.postures(problems, i)[0] for i in rounds])
+        postures = np.concatenate([method.postures(problems, number)[0] for number in rounds])
         starts = np.tile(limits.clip(q0), (len(postures), 1))
         asked = repeated(problems, len(postures))
         states, parameters = trials.posture_rows(asked, starts, postures)

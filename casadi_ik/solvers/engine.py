@@ -163,7 +163,7 @@ class Engine:
         batches = []
         for part in self._parts(problems, starts, int(seed), int(jobs), recorder, diagnose):
             if recorder is not None and part.outcome.rows is not None:
-                recorder.record(self._block(part, seed, part.outcome.rows))
+                recorder.record(self._block(part, int(seed), part.outcome.rows))
             batches.append(part.batch)
         return BatchSolution.joined(batches)
 

@@ -132,13 +132,16 @@ class HandFirstMethod:
         Args:
             problems: k targets.
             q0: (k, n).
-            postures: (k, candidates, hand) hand postures to start from.
+            postures: (k, candidates, hand) hand postures to start from, or (k, 1, hand). Motors
+                that move free fingers only stay as in q0.
 
         Returns:
             (k, ...) states and parameters.
         """
-        asked = problems.points, problems.normals, q0, self._terms(problems)
-        states, parameters = self._beginning(*asked, postures)
+        hand = len(self.step.layouts.hand)
+        tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
+        asked = problems.points, problems.normals, q0, self._terms(problems), tried
+        states, parameters = self._beginning(*asked)
         return states, parameters
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
@@ -146,11 +149,15 @@ class HandFirstMethod:
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
     def postures(self, problems: Problems, number: int) -> Array:
-        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one."""
-        count, targets = self.options.candidates, (problems.points, problems.normals)
-        if number == 0:
-            return self.table.nearest(*targets, count)
-        return self.wide_table.nearest(*targets, number * count)[:, -count:]
+        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
+
+        Args:
+            problems: k targets.
+            number: The round.
+        """
+        count = self.options.candidates
+        table, wanted = (self.wide_table, number * count) if number else (self.table, count)
+        return table.nearest(problems.points, problems.normals, wanted)[:, -count:]
 
     def _terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms."""

@@ -100,9 +100,8 @@ class Trials:
             start: (k, n).
             postures: (k, hand).
         """
-        count = self.method.options.candidates
-        states, parameters = self.method.rows(problems, start, postures[:, None].repeat(count, 1))
-        states[:, self.state.slice("candidate")] = count - 1
+        states, parameters = self.method.rows(problems, start, postures[:, None])
+        states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
         return states, parameters
 
     def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:

@@ -13,13 +13,15 @@ class IpoptParameters:
     """Parameters of the method.
 
     Attributes:
-        restarts: Starts drawn at random within the limits after the one from q0; 0 for none.
+        restarts: Starts drawn at random within the limits after the one from q0; 0 for none. Of
+            150 targets with every joint within 1 deg of a limit, 10 restarts missed 11 (local
+            minima), 30 one, 46 none; of 750 others 9 were enough.
         max_iterations: Budget of Ipopt's iterations, each start anew.
         optimality: Ipopt's own tolerance (``tol``) on its scaled optimality error. The contacts
             end up off by about its root where a coordinate stands at a bound.
     """
 
-    restarts: int = 10
+    restarts: int = 50
     max_iterations: int = 300
     optimality: float = 1e-14
 

@@ -14,7 +14,7 @@ METHOD = ("--method", "enhanced-dls")
 
 
 FILES: dict[str, tuple[bytes, str]] = {
-    "broken YAML": (b"robot: [1,\n  a: b", ":2:"),
+    "broken YAML": (b"robot: [1,\n  a: b", ": not valid YAML: "),
     "duplicate key": (b"robot: a\nrobot: b\n", "key 'robot' appears twice"),
     "empty": (b"", "expected"),
     "binary": (bytes(range(256)), "not UTF-8"),
