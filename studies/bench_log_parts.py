@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,7 +54,7 @@ class Stopwatch:
     """CPU time by stage [s] of what is run under `watching`; each thread counts its own."""
 
     def __init__(self) -> None:
-        self.seconds: Counter[str] = Counter()
+        self.seconds: defaultdict[str, float] = defaultdict(float)
         self.bytes = 0
 
     def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -106,14 +106,12 @@ class Grasp:
                 raise InputError(
                     f"contacts.{name}: no such finger; the robot's fingers: {', '.join(fingers)}"
                 )
-        points = np.full((len(fingers), 3), np.nan)
-        normals = np.full((len(fingers), 3), np.nan)
+        points, normals = np.empty((len(fingers), 3)), np.empty((len(fingers), 3))
         for row, finger in enumerate(fingers):
             contact = self.contacts.get(finger)
-            if contact is not None:
-                points[row] = contact.point
-                if contact.normal is not None:
-                    normals[row] = contact.normal
+            known = contact is not None
+            points[row] = contact.point if known else np.nan
+            normals[row] = contact.normal if known and contact.normal is not None else np.nan
         return points, normals
 
 

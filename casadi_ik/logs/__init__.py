@@ -1,5 +1,6 @@
 """MCAP logs: every iteration into a file, and back."""
 
+from casadi_ik.logs.asked import Asked
 from casadi_ik.logs.clock import LogClock
 from casadi_ik.logs.compare import matched, side_by_side
 from casadi_ik.logs.event_kinds import EventKind
@@ -17,6 +18,7 @@ from casadi_ik.logs.why import Explanation, explain
 from casadi_ik.logs.writer import Compression, McapRecorder
 
 __all__ = [
+    "Asked",
     "Compression",
     "EventKind",
     "EventRules",

@@ -19,65 +19,42 @@ from __future__ import annotations
 
 import os
 import re
-import struct
-from functools import cache
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 from mcap.writer import Writer
-from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import LogError, MissingExtraError
+from casadi_ik.errors import LogError
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs import schema
 from casadi_ik.logs.message import CDR_HEADER
 from casadi_ik.logs.one_solve import OneSolve
 from casadi_ik.logs.phrases import SERIOUS, errors, told
-from casadi_ik.symbolic.so3 import quaternion_from_matrix
-
-try:
-    from foxglove import Schema
-    from foxglove import messages as fox
-except ImportError as error:
-    raise MissingExtraError(
-        "viewer files need foxglove-sdk, which is not installed: pip install casadi-ik[viewer]"
-    ) from error
-
-Array = NDArray[np.float64]
+from casadi_ik.logs.viewer_messages import (
+    JOINT_STATE,
+    STRING,
+    Array,
+    Color,
+    Schema,
+    along,
+    arrow,
+    cdr_message,
+    fox,
+    inverses,
+    quaternion_of,
+    quaternions,
+    sphere,
+    stamp_of,
+    vector_of,
+)
 
 ITERATION = 10_000_000
 """Time between two iterations in the viewer [ns]."""
 
-STRING = ("std_msgs/msg/String", "string data\n")
-
-JOINT_STATE = (
-    "sensor_msgs/msg/JointState",
-    """\
-std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-""",
-)
-
-Color = tuple[float, float, float]
 TARGET, FREE = (0.94, 0.71, 0.0), (0.6, 0.6, 0.6)
 MET, MISSED = (0.12, 0.62, 0.33), (0.84, 0.18, 0.24)
 """Of contacts: asked for, of a free finger; within tolerance, out of it."""
-
-ARROW = 0.05
-"""Length of a contact's normal [m]."""
 
 
 def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) -> None:
@@ -148,7 +125,7 @@ class _View:
 
     def write(self) -> None:
         """All topics, each in its order; a reader sorts by time."""
-        self._add(self._ros("/robot_description", STRING), 0, _cdr(self.robot.urdf()))
+        self._add(self._ros("/robot_description", STRING), 0, cdr_message(self.robot.urdf()))
         self._targets()
         self._transforms()
         self._joint_states()
@@ -172,7 +149,7 @@ class _View:
     def _transforms(self) -> None:
         description, links = self.robot.description, self.robot.links(self.q)
         poses = [
-            (joint.parent, joint.child, _inverse(links[joint.parent]) @ links[joint.child])
+            (joint.parent, joint.child, inverses(links[joint.parent]) @ links[joint.child])
             for joint in description.joints
         ]
         poses += [
@@ -180,19 +157,19 @@ class _View:
             for finger in description.fingers
         ]
         frames = [
-            (parent, child, pose[:, :3, 3], _quaternions(pose[:, :3, :3]))
+            (parent, child, pose[:, :3, 3], quaternions(pose[:, :3, :3]))
             for parent, child, pose in poses
         ]
         channel = self._protobuf("/tf", fox.FrameTransforms.get_schema())
         for i, time in enumerate(self.times.tolist()):
-            stamp = _stamp(time)
+            stamp = stamp_of(time)
             transforms = [
                 fox.FrameTransform(
                     timestamp=stamp,
                     parent_frame_id=parent,
                     child_frame_id=child,
-                    translation=_vector(positions[i]),
-                    rotation=_quaternion(rotations[i]),
+                    translation=vector_of(positions[i]),
+                    rotation=quaternion_of(rotations[i]),
                 )
                 for parent, child, positions, rotations in frames
             ]
@@ -204,12 +181,12 @@ class _View:
         channel = self._ros("/joint_states", JOINT_STATE)
         none = np.zeros(0)
         for i, time in enumerate(self.times.tolist()):
-            state = _cdr(_stamp(time), self.root, list(joints), positions[i], none, none)
+            state = cdr_message(stamp_of(time), self.root, list(joints), positions[i], none, none)
             self._add(channel, i, state)
 
     def _targets(self) -> None:
         solve = self.solve
-        turned = _quaternions(_along(solve.target_normals))
+        turned = quaternions(along(solve.target_normals))
         contacts = [
             (f"{finger} target", solve.target_points[j], turned[j], TARGET)
             for j, finger in enumerate(solve.fingers)
@@ -221,7 +198,7 @@ class _View:
     def _contacts(self) -> None:
         solve = self.solve
         points, normals = self.robot.contacts(self.q)
-        turned = _quaternions(_along(normals.reshape(-1, 3))).reshape(*normals.shape[:2], 4)
+        turned = quaternions(along(normals.reshape(-1, 3))).reshape(*normals.shape[:2], 4)
         missed = (solve.rows["position_error"] > solve.position_tolerance) | (
             solve.rows["angle_error"] > solve.angle_tolerance
         )
@@ -238,14 +215,14 @@ class _View:
         self, i: int, contacts: list[tuple[str, Array, Array, Color]], thickness: float
     ) -> bytes:
         """Contacts as points with arrows along their normals: name, point, rotation, colour."""
-        stamp = _stamp(int(self.times[i]))
+        stamp = stamp_of(int(self.times[i]))
         entities = [
             fox.SceneEntity(
                 timestamp=stamp,
                 frame_id=self.root,
                 id=name,
-                spheres=[_sphere(point, 2.5 * thickness, color)],
-                arrows=[] if np.isnan(turned).any() else [_arrow(point, turned, thickness, color)],
+                spheres=[sphere(point, 2.5 * thickness, color)],
+                arrows=[] if np.isnan(turned).any() else [arrow(point, turned, thickness, color)],
             )
             for name, point, turned, color in contacts
         ]
@@ -281,93 +258,6 @@ class _View:
             lines.append((last, level, f"{finger} off by {errors(float(position), float(angle))}"))
         channel = self._protobuf("/ik/messages", fox.Log.get_schema())
         for i, level, text in sorted(lines, key=lambda line: line[0]):
-            stamp = _stamp(int(self.times[i]))
+            stamp = stamp_of(int(self.times[i]))
             log = fox.Log(timestamp=stamp, level=level, message=text, name=f"iteration {i}")
             self._add(channel, i, log.encode())
-
-
-def _inverse(pose: Array) -> Array:
-    """Inverse of rigid poses (k, 4, 4)."""
-    turned = pose[:, :3, :3].swapaxes(1, 2)
-    result = np.zeros_like(pose)
-    result[:, :3, :3] = turned
-    result[:, :3, 3] = -(turned @ pose[:, :3, 3, None])[..., 0]
-    result[:, 3, 3] = 1.0
-    return result
-
-
-def _cdr(*values: str | list[str] | Array | fox.Timestamp) -> bytes:
-    """A ROS 2 message of texts, lists of them, sequences of float64, and times."""
-    out = bytearray()
-    for value in values:
-        if isinstance(value, fox.Timestamp):
-            out += struct.pack("<iI", value.sec, value.nsec)
-        elif isinstance(value, np.ndarray):
-            out += bytes(-len(out) % 4) + struct.pack("<I", len(value))
-            if len(value):
-                out += bytes(-len(out) % 8) + value.astype("<f8").tobytes()
-        else:
-            if isinstance(value, list):
-                out += bytes(-len(out) % 4) + struct.pack("<I", len(value))
-            for text in [value] if isinstance(value, str) else value:
-                data = text.encode() + b"\0"
-                out += bytes(-len(out) % 4) + struct.pack("<I", len(data)) + data
-    return CDR_HEADER + bytes(out)
-
-
-def _stamp(time: int) -> fox.Timestamp:
-    return fox.Timestamp(*divmod(time, 1_000_000_000))
-
-
-def _vector(values: Array) -> fox.Vector3:
-    x, y, z = values.tolist()
-    return fox.Vector3(x=x, y=y, z=z)
-
-
-def _quaternion(values: Array) -> fox.Quaternion:
-    w, x, y, z = values.tolist()
-    return fox.Quaternion(x=x, y=y, z=z, w=w)
-
-
-def _quaternions(rotations: Array) -> Array:
-    """Unit quaternions (k, 4), scalar first, of rotations (k, 3, 3)."""
-    stacked = _quaternion_function().map(len(rotations))(np.hstack(list(rotations)))
-    return np.asarray(stacked, dtype=np.float64).T
-
-
-def _along(normals: Array) -> Array:
-    """Rotations (k, 3, 3) whose x axes are unit vectors (k, 3); NaN where those are."""
-    other = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    y = np.cross(normals, other)
-    y = y / np.linalg.norm(y, axis=1, keepdims=True)
-    z = np.cross(normals, y)
-    return np.stack([normals, y, z], axis=2).astype(np.float64)
-
-
-@cache
-def _quaternion_function() -> ca.Function:
-    R = ca.SX.sym("R", 3, 3)
-    return ca.Function("quaternion", [R], [quaternion_from_matrix(R)])
-
-
-def _color(color: Color) -> fox.Color:
-    return fox.Color(r=color[0], g=color[1], b=color[2], a=1.0)
-
-
-def _sphere(point: Array, size: float, color: Color) -> fox.SpherePrimitive:
-    pose = fox.Pose(position=_vector(point), orientation=fox.Quaternion(w=1.0))
-    return fox.SpherePrimitive(
-        pose=pose, size=fox.Vector3(x=size, y=size, z=size), color=_color(color)
-    )
-
-
-def _arrow(point: Array, turned: Array, thickness: float, color: Color) -> fox.ArrowPrimitive:
-    """An arrow from a point; in its own frame it points along x."""
-    return fox.ArrowPrimitive(
-        pose=fox.Pose(position=_vector(point), orientation=_quaternion(turned)),
-        shaft_length=0.7 * ARROW,
-        shaft_diameter=thickness,
-        head_length=0.3 * ARROW,
-        head_diameter=2.2 * thickness,
-        color=_color(color),
-    )

@@ -74,6 +74,10 @@ class Engine:
         return method
 
     @cached_property
+    def _quick(self) -> QuickMethod | None:
+        return self.method if isinstance(self.method, QuickMethod) else None
+
+    @cached_property
     def finder(self) -> AlternativeFinder:
         """Who finds several solutions.
 
@@ -102,14 +106,14 @@ class Engine:
         Raises:
             InputError: Bad q0 or seed.
         """
-        method, robot = self.method, self.robot
-        if not isinstance(method, QuickMethod):
+        method, robot = self._quick, self.robot
+        if method is None:
             return None
         start = robot.configuration(q0, "q0")
         _whole("seed", seed, 0)
         if start.ndim != 1:
             return None
-        method.prepare()
+        self.method.prepare()
         begin = time.perf_counter()
         found = method.quick(problems, start)
         seconds = time.perf_counter() - begin
@@ -128,7 +132,7 @@ class Engine:
             contacts=dict(zip(robot.fingers, verdict.contacts, strict=True)),
             phases=found.phases,
             limits_ok=verdict.limits_ok,
-            method=method.name,
+            method=self.method.name,
             robot=robot.name,
             actuators=robot.actuators,
         )

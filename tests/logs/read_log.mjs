@@ -8,6 +8,8 @@ const { McapIndexedReader } = require("@mcap/core");
 const { parse } = require("@foxglove/rosmsg");
 const { MessageReader } = require("@foxglove/rosmsg2-serialization");
 const { decompress } = require("fzstd");
+const protobuf = require("protobufjs");
+const { FileDescriptorSet } = require("protobufjs/ext/descriptor");
 
 const file = await open(path);
 const readable = {
@@ -23,8 +25,17 @@ const reader = await McapIndexedReader.Initialize({ readable, decompressHandlers
 const decoders = new Map();
 for (const channel of reader.channelsById.values()) {
   const schema = reader.schemasById.get(channel.schemaId);
-  const definition = parse(new TextDecoder().decode(schema.data), { ros2: true });
-  decoders.set(channel.id, [channel.topic, new MessageReader(definition)]);
+  if (channel.messageEncoding === "protobuf") {
+    const root = protobuf.Root.fromDescriptor(FileDescriptorSet.decode(schema.data));
+    const type = root.resolveAll().lookupType(schema.name);
+    const readable = { defaults: true, enums: String, longs: Number };
+    const decode = (data) => type.toObject(type.decode(data), readable);
+    decoders.set(channel.id, [channel.topic, decode]);
+  } else {
+    const definition = parse(new TextDecoder().decode(schema.data), { ros2: true });
+    const decoder = new MessageReader(definition);
+    decoders.set(channel.id, [channel.topic, (data) => decoder.readMessage(data)]);
+  }
 }
 const plain = (key, value) => {
   if (ArrayBuffer.isView(value)) return Array.from(value, (item) => plain("", item));
@@ -32,7 +43,7 @@ const plain = (key, value) => {
   return typeof value === "number" && !Number.isFinite(value) ? String(value) : value;
 };
 for await (const message of reader.readMessages({ validateCrcs: true })) {
-  const [topic, decoder] = decoders.get(message.channelId);
-  const values = decoder.readMessage(message.data);
+  const [topic, decode] = decoders.get(message.channelId);
+  const values = decode(message.data);
   console.log(JSON.stringify({ topic, time: message.logTime, values }, plain));
 }

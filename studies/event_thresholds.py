@@ -1,0 +1,186 @@
+"""What the thresholds of the log's events catch: events in solves that failed and that did not.
+
+Solves are made once and logged several times, each log with one threshold changed and every other
+kind of event as it is; what is counted is read from the logs::
+
+    python studies/event_thresholds.py
+    python studies/event_thresholds.py --count 30 --report /tmp/thresholds
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from bench_logs import Kept
+from runner.page import markdown_table, write_page
+from targets import any_configuration, random_arm_targets
+
+import casadi_ik as ik
+from casadi_ik.logs import EventKind, EventRules, Keep, McapRecorder
+from casadi_ik.solvers.recorder import SolveBlock
+
+FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""Thresholds are tried at these multiples of what is the rule."""
+
+REPORT = Path(__file__).parent / "results" / "event_thresholds"
+
+TOTALS = Keep(failed=False, singular=False, sample=0.0)
+"""The totals of a solve tell how often each kind of event happened."""
+
+
+READING = """
+## Reading it
+
+A threshold is of use where many of the failed solves pass it and few of the solved ones. For the
+closed chain the ratio falls as the threshold is loosened, while the share of failures it accounts
+for grows; the rule stands between a tighter one, which misses most failures, and a looser one,
+which every other solve passes. It tells where to look, not that a solve has failed: some solved
+ones pass it too. The Jacobians of thumb and palm have a redundant arm before them and hardly ever
+come near singular on these targets; their rules stand below what every solve passes (the loose
+end of the table), so that the event is rare and means something. Stalls and oscillations do not
+hang on their thresholds: over two orders of magnitude they catch nearly the same solves. The
+lead screws and four-bars of Baxter's hand did not come as near to their toggle positions.
+"""
+
+
+class Trial(NamedTuple):
+    """A rule to be tried.
+
+    Attributes:
+        kind: Of the events counted.
+        subject: What they are about.
+        threshold: The number tried.
+        usual: Whether that is the rule.
+        rules: With it; other Jacobians give no events.
+    """
+
+    kind: EventKind
+    subject: str
+    threshold: float
+    usual: bool
+    rules: EventRules
+
+
+@dataclass(frozen=True)
+class Caught:
+    """Share of solves with an event, and events per 1000 iterations."""
+
+    failed: float
+    solved: float
+    rate: float
+
+
+def trials(block: SolveBlock) -> Iterator[Trial]:
+    """Rules for every Jacobian of a method, for stalls and for oscillations."""
+    known = block.format.jacobians
+    silent = dict.fromkeys(known, 0.0), dict.fromkeys(known, math.inf)
+    for name, jacobian in known.items():
+        for factor in FACTORS:
+            if jacobian.singular > 0:
+                value = factor * jacobian.singular
+                rules = EventRules(singular=silent[0] | {name: value}, condition=silent[1])
+                yield Trial(EventKind.NEAR_SINGULAR, name, value, factor == 1, rules)
+        for factor in FACTORS:
+            if jacobian.condition < math.inf:
+                value = factor * jacobian.condition
+                rules = EventRules(singular=silent[0], condition=silent[1] | {name: value})
+                yield Trial(EventKind.ILL_CONDITIONED, name, value, factor == 1, rules)
+    usual = EventRules()
+    for factor in FACTORS:
+        value = factor * usual.stall_change
+        rules = EventRules(stall_change=value)
+        yield Trial(EventKind.STALL, "relative spread", value, factor == 1, rules)
+    for factor in FACTORS:
+        value = factor * usual.oscillation_step
+        rules = EventRules(oscillation_step=value)
+        yield Trial(EventKind.OSCILLATION, "shortest step", value, factor == 1, rules)
+
+
+def caught(blocks: Sequence[SolveBlock], trial: Trial) -> Caught:
+    """What a rule catches, from a log written by it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.mcap"
+        robot = blocks[0].robot
+        with McapRecorder(path, robot_name=robot, rules=trial.rules, keep=TOTALS) as recorder:
+            for block in blocks:
+                recorder.record(block)
+        solves = ik.logs.open(path).solves().array()
+    events, solved = solves["events"][:, trial.kind], solves["success"] > 0
+    found = events > 0
+    of_failed, of_solved = (
+        100 * float(found[rows].mean()) if rows.any() else math.nan for rows in (~solved, solved)
+    )
+    return Caught(of_failed, of_solved, 1e3 * float(events.sum() / solves["iterations"].sum()))
+
+
+def targets_of(robot: ik.ArmHand, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Shipped grasps on random arms and random hands, half and half."""
+    rng, names = np.random.default_rng(seed), ik.shipped_grasps(robot.name)
+    grasps = random_arm_targets(robot, names, max(count // 2 // len(names), 1), rng)
+    hands = robot.contacts(any_configuration(robot, rng, count // 2))
+    points, normals = (np.concatenate(pair) for pair in zip(grasps, hands, strict=True))
+    return points, normals
+
+
+def section(solver: ik.Solver, count: int, seed: int) -> str:
+    """The table of one method on one robot, as Markdown."""
+    kept, targets = Kept(), targets_of(solver.robot, count, seed)
+    batch = solver.solve_batch(*targets, seed=seed, log=kept)
+    rows = []
+    for trial in trials(kept.blocks[0]):
+        found = caught(kept.blocks, trial)
+        number = f"{trial.threshold:.2g}"
+        rows.append(
+            [
+                f"{trial.kind.name} {trial.subject}",
+                f"**{number}**" if trial.usual else number,
+                "" if math.isnan(found.failed) else f"{found.failed:.1f}",
+                "" if math.isnan(found.solved) else f"{found.solved:.1f}",
+                f"{found.failed / found.solved:.1f}" if found.solved > 0 < found.failed else "",
+                f"{found.rate:.2f}",
+            ]
+        )
+    heads = (
+        *("event", "threshold", "% of the failed", "% of the solved", "ratio"),
+        "per 1000 iterations",
+    )
+    failed = int((~batch.success).sum())
+    return (
+        f"## {solver.method} on {solver.robot.name}\n\n{len(batch)} solves, {failed} of them"
+        f" failed, {batch.iterations.mean():.0f} iterations on average.\n\n"
+        + markdown_table(heads, rows)
+    )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Solve, count, write the report."""
+    parser = argparse.ArgumentParser(description="What the thresholds of events catch.")
+    parser.add_argument("--count", type=int, default=480, help="targets of each method")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--report", type=Path, default=REPORT, help="folder of the report")
+    options = parser.parse_args(arguments)
+    barrett, ar10 = ik.load_robot("kuka_lwr_barrett"), ik.load_robot("baxter_ar10")
+    solvers = (
+        ik.Solver(barrett, "enhanced-dls", finger_step="closed-form"),
+        ik.Solver(barrett, "enhanced-sdls", finger_step="closed-form"),
+        ik.Solver(ar10, "hand-first"),
+    )
+    parts = [section(solver, options.count, options.seed) for solver in solvers]
+    text = f"""
+`python studies/event_thresholds.py --count {options.count} --seed {options.seed}`: half of the
+targets are shipped grasps on random arms, half are random hands on random arms, all reachable; one
+start from `robot.home`, within limits. A row is a threshold, the rule in bold, and the share of the
+solves that failed and of those that were solved in which the event happened at all.
+"""
+    write_page("What the thresholds of events catch", [text, *parts, READING], options.report)
+
+
+if __name__ == "__main__":
+    main()

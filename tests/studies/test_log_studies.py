@@ -1,0 +1,68 @@
+"""The studies of the log: what its events catch, what it consists of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bench_log_parts
+import event_thresholds
+import numpy as np
+import pytest
+from bench_logs import Kept
+
+import casadi_ik as ik
+from casadi_ik.logs import EventKind
+
+
+@pytest.fixture(scope="module")
+def kept() -> Kept:
+    robot = ik.load_robot("kuka_lwr_barrett")
+    options = {"max_iterations": 300}
+    solver = ik.Solver(robot, "enhanced-dls", finger_step="closed-form", options=options)
+    found = Kept()
+    solver.solve_batch(*event_thresholds.targets_of(robot, 24, 0), log=found)
+    return found
+
+
+def test_what_a_threshold_catches(kept: Kept) -> None:
+    """The share of solves whose smallest singular value is below it, by the traces themselves."""
+    rows = np.concatenate([block.rows for block in kept.blocks])
+    counts = np.concatenate([block.batch.iterations for block in kept.blocks])
+    solved = np.concatenate([block.batch.success for block in kept.blocks])
+    assert 0 < solved.sum() < len(solved)
+    starts = np.cumsum(counts) - counts
+    shares = []
+    for trial in event_thresholds.trials(kept.blocks[0]):
+        if (trial.kind, trial.subject) != (EventKind.NEAR_SINGULAR, "closed_chain"):
+            continue
+        lowest = np.fmin.reduceat(rows["sigma_closed_chain"], starts)
+        found = event_thresholds.caught(kept.blocks, trial)
+        below = lowest < np.float32(trial.threshold)
+        assert found.failed == pytest.approx(100 * below[~solved].mean())
+        assert found.solved == pytest.approx(100 * below[solved].mean())
+        shares.append(found.failed)
+    assert len(shares) == len(event_thresholds.FACTORS)
+    assert shares == sorted(shares)
+    assert shares[0] < shares[-1]
+
+
+def test_the_report_marks_the_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(event_thresholds, "FACTORS", (1.0, 10.0))
+    monkeypatch.setattr(event_thresholds.ik, "Solver", lambda robot, *_, **__: ik.api.Solver(robot))
+    event_thresholds.main(["--count", "24", "--report", str(tmp_path)])
+    text = (tmp_path / "report.md").read_text()
+    assert text.count("| STALL") == 6
+    assert text.count("**0.0001**") == 6
+    assert "## hand-first on baxter_ar10" in text
+
+
+def test_the_parts_of_a_log_are_the_whole() -> None:
+    report = bench_log_parts.report(count=240, repeats=1)
+    of = [row for row in report.rows if row[0] == "hand-first"]
+    seconds = {row[1]: float(row[2]) for row in of}
+    assert set(bench_log_parts.STAGES) < set(seconds)
+    assert all(seconds[stage] > 0 for stage in bench_log_parts.STAGES)
+    whole = seconds.pop("solving and logging")
+    (sampled,) = (name for name in seconds if "keep" in name)
+    seconds.pop(sampled)
+    assert sum(seconds.values()) == pytest.approx(whole, abs=0.1)
