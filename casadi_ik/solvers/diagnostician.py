@@ -79,7 +79,7 @@ class Diagnostician:
         """
         self.method.prepare()
         known = np.zeros(len(problems), dtype=bool)
-        clock = _Clock(len(problems))
+        clock = _Clock(np.zeros(len(problems)))
         if nearest is None:
             nearest = self.method.run(problems, q0, 0, trace=False).q
             known = judge(self.robot, problems, nearest).solved(problems.enforce_limits)
@@ -92,13 +92,16 @@ class Diagnostician:
         rest = np.flatnonzero(~known)
         for start in range(0, len(rest), TOGETHER):
             rows = rest[start : start + TOGETHER]
-            whys = self._together(problems.rows(rows), q0[rows], nearest[rows])
+            some, spent = problems.rows(rows), clock.seconds[rows]
+            whys = self._together(some, q0[rows], nearest[rows], _Clock(spent))
             found |= zip(rows.tolist(), whys, strict=True)
         return [found[row] for row in range(len(problems))]
 
-    def _together(self, problems: Problems, q0: Array, nearest: Array) -> Iterator[Diagnosis]:
+    def _together(
+        self, problems: Problems, q0: Array, nearest: Array, clock: _Clock
+    ) -> Iterator[Diagnosis]:
         """Diagnose targets that hand-first did not solve."""
-        every, clock = np.arange(len(problems)), _Clock(len(problems))
+        every = np.arange(len(problems))
         descent = Descent(self._trials, problems)
         evidence, fits = self._hands(problems, q0)
         refused = [_refused(*item) for item in evidence]
@@ -225,10 +228,10 @@ class Diagnostician:
 
 
 class _Clock:
-    """Seconds spent on each of k targets that are worked on together."""
+    """Seconds (k,) spent on each of the targets that are worked on together."""
 
-    def __init__(self, count: int) -> None:
-        self.seconds = np.zeros(count)
+    def __init__(self, seconds: Array) -> None:
+        self.seconds = seconds
         self._now = time.perf_counter()
 
     def lap(self, targets: Rows) -> None:

@@ -178,7 +178,7 @@ class PalmFree:
         hand[:, list(trials.robot.description.arm_actuators)] = 0.0
         seen = self._seen(problems.rows(targets), rotation, origin)
         verdict = judge(trials.robot, seen, hand)
-        position, angle = verdict.position_error, verdict.angle_error
+        position, angle, met = verdict.position_error, verdict.angle_error, verdict.ok
         squares = (position / LENGTH) ** 2, (2 * np.sin(angle / 2)) ** 2
         distance, outside = self._wrist(problems, rotation, origin)
         return HandFits(
@@ -187,7 +187,7 @@ class PalmFree:
             parameters=parameters,
             position_error=position,
             angle_error=angle,
-            met=verdict.ok,
+            met=met,
             cost=np.nan_to_num(squares).sum(axis=(0, 2)),
             distance=distance,
             outside=outside,
