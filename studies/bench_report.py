@@ -59,11 +59,13 @@ class Section:
         return "\n".join(lines)
 
 
-def write_report(path: Path, command: str, sections: Sequence[Section]) -> None:
+def write_report(
+    path: Path, command: str, sections: Sequence[Section], title: str = "Benchmark"
+) -> None:
     """Write all sections with command, date, machine and versions."""
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
     head = [
-        "# Benchmark",
+        f"# {title}",
         "",
         f"`{command}`, {datetime.now(UTC):%Y-%m-%d}. {_processor()}, {os.cpu_count()} cores, "
         f"{platform.system()}, Python {platform.python_version()}; load at the end {load}.",

@@ -25,7 +25,7 @@ from casadi_ik.solvers.palm_free import HandFits, PalmFree
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.remedies import RemedyFinder
 from casadi_ik.solvers.trials import Descent, Rows, Trials
-from casadi_ik.solvers.verdict import judge
+from casadi_ik.solvers.verdict import Verdict, judge
 
 TOGETHER = 64
 """Targets that are diagnosed in the same runs of the compiled loop."""
@@ -78,17 +78,18 @@ class Diagnostician:
             nearest: (k, n) what hand-first came to; None if another method was asked.
         """
         self.method.prepare()
+        known = np.zeros(len(problems), dtype=bool)
         clock = _Clock(len(problems))
         if nearest is None:
             nearest = self.method.run(problems, q0, 0, trace=False).q
-        solved = self._solved(problems, nearest)
-        done, rest = np.flatnonzero(solved), np.flatnonzero(~solved)
-        near = self._nearest(problems.rows(done), nearest[done])
-        clock.lap(np.arange(len(problems)))
-        found = {
-            row: _reachable(problems, nearest[row], near[i], clock.seconds[row])
-            for i, row in enumerate(done.tolist())
-        }
+            known = judge(self.robot, problems, nearest).solved(problems.enforce_limits)
+            clock.lap(np.arange(len(problems)))
+        found: dict[int, Diagnosis] = {}
+        for row in np.flatnonzero(known).tolist():
+            one = problems.rows(slice(row, row + 1))
+            (near,) = self._nearest(one, nearest[row : row + 1])
+            found[row] = _reachable(one, nearest[row], near, clock.seconds[row])
+        rest = np.flatnonzero(~known)
         for start in range(0, len(rest), TOGETHER):
             rows = rest[start : start + TOGETHER]
             whys = self._together(problems.rows(rows), q0[rows], nearest[rows])
@@ -109,16 +110,16 @@ class Diagnostician:
         unsure = np.array([reason is None for reason in refused])
         certain = self._certain(problems, fits, best)
         for below, count, followed in SEARCHES:
-            unsure |= (best.ratio < below) & ~certain
-            rows = np.flatnonzero(unsure & ~self._solved(problems, best.fair))
+            rows = np.flatnonzero(unsure | ((best.ratio < below) & ~certain))
+            rows = rows[~self._solved(problems.rows(rows), best.fair[rows])]
             if len(rows):
                 some, found = problems.rows(rows), best.rows(rows)
                 best.put(rows, self._search(some, found, count, followed))
                 clock.lap(rows)
             unsure[:] = False
-        solved = self._solved(problems, best.fair)
+        fair = judge(self.robot, problems, best.fair)
+        solved, enough = fair.solved(problems.enforce_limits), _enough(problems, fair)
         near = self._nearest(problems, np.where(solved[:, None], best.fair, best.q))
-        enough = self._enough(problems, best.fair)
         held = self._at_limit(best.q)
         pressed = held | self._at_limit(best.fair) | (best.ratio <= BARELY)[:, None]
         clock.lap(every)
@@ -199,13 +200,15 @@ class Diagnostician:
         return postures[:, np.arange(count) % postures.shape[1]]
 
     def _solved(self, problems: Problems, q: Array) -> NDArray[np.bool_]:
-        return self._trials.solved(problems, q, problems.enforce_limits)
+        if not len(q):
+            return np.zeros(0, dtype=bool)
+        return judge(self.robot, problems, q).solved(problems.enforce_limits)
 
     def _nearest(self, problems: Problems, q: Array) -> list[dict[str, NearContact]]:
         """The contacts of configurations (k, n), beside those asked for."""
         points, normals = self.robot.contacts(q)
-        verdict = judge(self.robot, problems, q)
-        columns = points, normals, verdict.position_error, verdict.angle_error
+        position_error, angle_error = self.robot.errors(q, problems.points, problems.normals)
+        columns = points, normals, position_error, angle_error
         rows = zip(*(column.tolist() for column in columns), strict=True)
         return [
             {
@@ -216,13 +219,6 @@ class Diagnostician:
             }
             for row in rows
         ]
-
-    def _enough(self, problems: Problems, fair: Array) -> list[Tolerance]:
-        """Tolerances that configurations (k, n) keep to, no smaller than those asked for."""
-        verdict, least = judge(self.robot, problems, fair), problems.largest_tolerance
-        position = np.nanmax(verdict.position_error, axis=1, initial=least.position)
-        angle = np.nanmax(verdict.angle_error, axis=1, initial=least.angle)
-        return [Tolerance(*pair) for pair in zip(position.tolist(), angle.tolist(), strict=True)]
 
     def _at_limit(self, q: Array) -> NDArray[np.bool_]:
         return (q - self.robot.lower <= AT_LIMIT) | (self.robot.upper - q <= AT_LIMIT)
@@ -247,6 +243,14 @@ def _refused(hand: HandFit | None, reach: ArmReach | None) -> Reason | None:
     if reach is not None and abs(reach.excess) > REAL:
         return Reason.REACH
     return None
+
+
+def _enough(problems: Problems, fair: Verdict) -> list[Tolerance]:
+    """Tolerances that were kept to, no smaller than those asked for."""
+    least = problems.largest_tolerance
+    position = np.nanmax(fair.position_error, axis=1, initial=least.position)
+    angle = np.nanmax(fair.angle_error, axis=1, initial=least.angle)
+    return [Tolerance(*pair) for pair in zip(position.tolist(), angle.tolist(), strict=True)]
 
 
 def _reachable(

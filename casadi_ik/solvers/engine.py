@@ -223,9 +223,7 @@ class Engine:
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
-        success = verdict.all_ok
-        if problems.enforce_limits:
-            success &= verdict.limits_ok
+        success = verdict.solved(problems.enforce_limits)
         status, content = outcome.status, outcome.status == Status.SOLVED
         if (content != success).any():
             # A method that is content with what the verdict refuses has come to a standstill.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,12 @@ class PalmFree:
         self._trials = trials
         self._arm = trials.method.step.arm
 
+    @cached_property
+    def _palm(self) -> Array:
+        """(4, 4) where the palm is with the arm at zero."""
+        robot = self._trials.robot
+        return robot.palm(np.zeros(len(robot.actuators)))
+
     def evidence(self, problems: Problems, fits: HandFits) -> list[tuple[HandFit, ArmReach | None]]:
         """What the fits say of each target: the best one, and the one nearest to the arm's range.
 
@@ -156,7 +163,8 @@ class PalmFree:
         weight = np.sqrt(np.minimum(loose / (3 * fits.outside[rows]), 1.0))
         parameters[:, trials.parameters.slice("reach")] = weight[:, None]
         trials.set_tolerance(parameters, NEVER)
-        return self._run(problems, fits.targets[rows], states, parameters)
+        slid = self._run(problems, fits.targets[rows], states, parameters)
+        return replace(slid, parameters=fits.parameters[rows])
 
     def _run(self, problems: Problems, targets: Rows, states: Array, parameters: Array) -> HandFits:
         """Run the hand stage of some rows to its end and judge what it came to."""
@@ -170,7 +178,7 @@ class PalmFree:
         hand[:, list(trials.robot.description.arm_actuators)] = 0.0
         seen = self._seen(problems.rows(targets), rotation, origin)
         verdict = judge(trials.robot, seen, hand)
-        position, angle, met = verdict.position_error, verdict.angle_error, verdict.ok
+        position, angle = verdict.position_error, verdict.angle_error
         squares = (position / LENGTH) ** 2, (2 * np.sin(angle / 2)) ** 2
         distance, outside = self._wrist(problems, rotation, origin)
         return HandFits(
@@ -179,7 +187,7 @@ class PalmFree:
             parameters=parameters,
             position_error=position,
             angle_error=angle,
-            met=met,
+            met=verdict.ok,
             cost=np.nan_to_num(squares).sum(axis=(0, 2)),
             distance=distance,
             outside=outside,
@@ -187,8 +195,7 @@ class PalmFree:
 
     def _seen(self, asked: Problems, rotation: Array, origin: Array) -> Problems:
         """Targets moved with their palm poses to where the palm is with the arm at zero."""
-        robot = self._trials.robot
-        palm = robot.palm(np.zeros(len(robot.actuators)))
+        palm = self._palm
         turn = np.einsum("ij,kmj->kim", palm[:3, :3], rotation)
         points = np.einsum("kij,kfj->kfi", turn, asked.points - origin[:, None]) + palm[:3, 3]
         normals = np.einsum("kij,kfj->kfi", turn, asked.normals)

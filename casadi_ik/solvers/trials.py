@@ -106,8 +106,7 @@ class Trials:
 
     def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether configurations meet their targets, and if asked the robot's limits."""
-        verdict = judge(self.robot, problems, q)
-        return verdict.all_ok & verdict.limits_ok if limits else verdict.all_ok
+        return judge(self.robot, problems, q).solved(limits)
 
     def set_bounds(self, parameters: Array, bounds: Bounds) -> None:
         """Put bounds into rows of parameters."""
@@ -170,10 +169,6 @@ class Descent:
         points, normals = self.problems.points[targets], self.problems.normals[targets]
         position, angle = self.trials.robot.errors(q, points, normals)
         return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
-
-    def solved(self, targets: Rows, q: Array, limits: bool) -> NDArray[np.bool_]:
-        """(m,) see `Trials.solved`."""
-        return self.trials.solved(self.problems.rows(targets), q, limits)
 
 
 def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:

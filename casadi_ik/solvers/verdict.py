@@ -34,6 +34,10 @@ class Verdict:
         met: NDArray[np.bool_] = np.logical_and.reduce(self.ok, axis=1)
         return met
 
+    def solved(self, limits: bool) -> NDArray[np.bool_]:
+        """(k,) whether every contact is met and, if asked, the robot's limits are kept."""
+        return self.all_ok & self.limits_ok if limits else self.all_ok
+
 
 @dataclass(frozen=True, eq=False)
 class SolvedVerdict:

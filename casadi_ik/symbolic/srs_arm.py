@@ -13,6 +13,7 @@ A = e(a1 t1) e(a2 t2) e(a3 t3), elbow B = e(a4 t4), wrist C = e(a5 t5) e(a6 t6) 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -81,7 +82,7 @@ class SrsArm:
     palm_rotation: Array
     wrist_in_palm: Array
 
-    @property
+    @cached_property
     def bent(self) -> float:
         """Angle between upper arm and forearm at q = 0 about the elbow's axis [rad]."""
         across = np.cross(self.upper_arm, self.forearm) @ self.elbow_axis

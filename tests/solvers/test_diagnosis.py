@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -253,6 +254,43 @@ def test_same_twice(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
     assert other is not None
     assert one.lines == other.lines
     np.testing.assert_array_equal(one.q, other.q)
+
+
+def impossible(robot: ik.ArmHand, count: int) -> tuple[Array, Array]:
+    """Targets of several kinds, most of them out of reach."""
+    rng = np.random.default_rng(21)
+    points, normals = robot.contacts(robot.random(rng, 4 * count))
+    points[:count] += [1.0, 0, 0]
+    points[count : 2 * count] += rng.normal(0, 0.02, (count, 3, 3))
+    points[2 * count : 3 * count] *= 1.15
+    normals[3 * count :, 0] *= -1
+    return points, normals
+
+
+def test_in_a_batch_as_alone(solver: ik.Solver, robot: ik.ArmHand) -> None:
+    points, normals = impossible(robot, 4)
+    whole = solver.solve_batch(points, normals, diagnose=True)
+    threads = solver.solve_batch(points, normals, diagnose=True, jobs=2)
+    assert (~whole.success).sum() >= 10
+    for row, one in enumerate(whole.diagnoses):
+        target = points[row : row + 1], normals[row : row + 1]
+        alone = solver.solve_batch(*target, diagnose=True).diagnoses[0]
+        for other in (alone, threads.diagnoses[row]):
+            assert (one is None) == (other is None)
+            if one is None or other is None:
+                continue
+            assert one.lines == other.lines
+            np.testing.assert_array_equal(one.q, other.q)
+
+
+def test_pickled_with_what_would_help(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
+    normals = cup[1] * np.array([[-1], [1], [1]])
+    diagnosis = diagnosed(solver, cup[0], normals)
+    copy = pickle.loads(pickle.dumps(diagnosis))
+    assert copy.freed
+    assert [item.finger for item in copy.freed] == [item.finger for item in diagnosis.freed]
+    assert copy.lines == diagnosis.lines
+    assert copy.nearest == diagnosis.nearest
 
 
 def residual(q: Array, robot: ik.ArmHand, points: Array, normals: Array) -> Array:

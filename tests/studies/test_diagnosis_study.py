@@ -1,0 +1,32 @@
+"""The study of the verdict runs and agrees with itself; the committed report is of many targets."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+STUDIES = Path(__file__).parents[2] / "studies"
+
+
+def test_the_study_agrees_with_itself_and_the_committed_report_has_no_false_alarm(tmp_path):
+    kept = tmp_path / "kept.npz"
+    small = [sys.executable, STUDIES / "diagnosis.py", "--impossible", "3"]
+    for more in (
+        ["--count", "0", "--keep", kept],
+        ["--count", "20", "--bad-starts", "20", "--against", kept, "--out", tmp_path],
+    ):
+        run = subprocess.run([*small, *more], capture_output=True, text=True)
+        assert run.returncode == 0, run.stderr
+    report = (tmp_path / "report.md").read_text()
+    rows = [line.strip("| ").split(" | ") for line in report.splitlines() if line.startswith("| ")]
+    compared = [row for row in rows if len(row) == 7 and row[0] != "targets"]
+    assert len(compared) >= 6
+    assert all(row[1] == row[2] and row[5] == "1.000" and row[6] == "100" for row in compared)
+
+    committed = (STUDIES / "results" / "diagnosis" / "report.md").read_text()
+    alarms = re.findall(r"\| ([\d,]+) \| [\d,]+ \| \d+ \| (\d+) \| (\d+) \|$", committed, re.M)
+    counts = [int(count.replace(",", "")) for count, _, _ in alarms]
+    assert sum(counts) >= 11_200
+    assert all(called == "0" for _, _, called in alarms)
