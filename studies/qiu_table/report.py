@@ -38,10 +38,10 @@ proposed approach". Every reading below is on the same targets, limits ignored. 
 |ln(rate / printed rate)| + |ln(iterations / printed iterations)|. Most readings solve several times
 as many targets as the paper prints; few they become only under an augmented projection: with
 damped pseudoinverses in the projectors and the palm first, or with exact ones finger by finger.
-Taken as `original-*` is the one that simply carries the paper's own hierarchy of thumb reaching on
-to the other fingers (palm, then point and normal finger by finger) with damped projectors: near the
-printed means of the DLS method in both figures. No one reading suits both methods: the distances
-say which comes closest for each.
+The methods of the paper differ in the step alone, so one reading has to serve both: taken as
+`original-*` is "augmented, damped projectors, palm first, finger by finger", which carries the
+paper's own hierarchy of thumb reaching on to the other fingers. The last table says how it compares
+with the others for both methods together; for one method alone another may come closer.
 """
 
 CYCLES = """

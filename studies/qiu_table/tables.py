@@ -25,6 +25,10 @@ BUDGET = 10_000
 HEADS = {"ignore": "limits ignored", "enforce": "within limits"}
 
 
+NEAREST = 5
+"""Readings that are shown for both methods together."""
+
+
 def figures_of(name: str, rows: pl.DataFrame) -> tuple[Metric, Metric, Metric]:
     """Success, iterations and time of the solved cases."""
     solved = rows.filter(pl.col("success"))
@@ -91,21 +95,33 @@ def readings(table: pl.DataFrame, study: Study) -> tuple[str, list[Metric]]:
     """One line per reading of the original methods, with its distance from the printed means.
 
     The distance is |ln(rate / printed rate)| + |ln(iterations / printed iterations)|; none if
-    nothing was solved.
+    nothing was solved. A second table has the readings that suit both methods together best.
     """
     rows, metrics = [], []
+    distances: dict[str, list[float]] = {}
     for setting, part, found in _found(table, study):
         metrics += found
         printed = printed_mean(setting.method)
         distance = "-"
         if found[0].value > 0:
             ratios = (found[0].value / printed.success, found[1].value / printed.iterations)
-            distance = f"{sum(abs(math.log(ratio)) for ratio in ratios):.2f}"
+            apart = sum(abs(math.log(ratio)) for ratio in ratios)
+            distance = f"{apart:.2f}"
+            distances.setdefault(setting.key.partition(", ")[2], []).append(apart)
         rows.append([setting.key, *_cells(found), distance, f"{len(part):,}"])
     for method in ("original-dls", "original-sdls"):
         printed = printed_mean(method)
         rows.append([f"{method}, printed", *_printed(printed)[:2], "0", ""])
-    return markdown_table(["reading", "solved %", "iterations", "distance", "n"], rows), metrics
+    both = {reading: sum(pair) for reading, pair in distances.items() if len(pair) == 2}
+    nearest = sorted(both, key=lambda reading: both[reading])[:NEAREST]
+    tables = [
+        markdown_table(["reading", "solved %", "iterations", "distance", "n"], rows),
+        markdown_table(
+            ["reading of both methods", "sum of the distances"],
+            [[reading, f"{both[reading]:.2f}"] for reading in nearest],
+        ),
+    ]
+    return "\n\n".join(tables), metrics
 
 
 def _found(
