@@ -26,7 +26,6 @@ from qiu_table.settings import METHODS, ablation_study, readings_study, table_st
 from runner import Study, add_run_arguments, run_from
 
 FULL = 10_000
-SMALL_BLOCK = 10  # of the original methods, which count to 10,000 nearly always
 ABLATION_BLOCK = 10
 
 
@@ -53,10 +52,10 @@ def main(arguments: list[str] | None = None) -> None:
         seed, robots = options.seed, options.out / "robots"
         slow = [name for name in methods if name.startswith("original")]
         fast = [name for name in methods if name not in slow]
-        block, small = options.block, min(options.block, SMALL_BLOCK)
+        block = options.block
         return (
             table_study("table", fast, count, seed, block),
-            table_study("originals", slow, count, seed, small),
+            table_study("originals", slow, count, seed, block),
             ablation_study(robots, ablation_count, seed, min(options.block, ABLATION_BLOCK)),
             readings_study(ablation_count, seed, min(options.block, ABLATION_BLOCK)),
         )

@@ -6,7 +6,8 @@ from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.lookup import LookupKernel
-from casadi_ik.kernels.loop import FAILED, NON_FINITE, REPEATED, LoopKernel, LoopResult
+from casadi_ik.kernels.loop import LoopKernel
+from casadi_ik.kernels.loop_result import FAILED, NON_FINITE, REPEATED, LoopResult
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
 __all__ = [

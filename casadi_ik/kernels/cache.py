@@ -23,7 +23,7 @@ from pathlib import Path
 import casadi as ca
 
 from casadi_ik.errors import KernelError
-from casadi_ik.kernels.codegen import library_source
+from casadi_ik.kernels.codegen import driver_text, library_source
 from casadi_ik.kernels.compiler import Compiler, find_compiler, warn_no_compiler
 
 FORMAT = 1
@@ -56,17 +56,23 @@ def cache_directory() -> Path:
 
 
 def load_library(
-    name: str, build: Callable[[], ca.Function], driver: str, symbol: str, recipe: str = ""
+    name: str,
+    build: Callable[[], ca.Function],
+    driver: str,
+    symbol: str,
+    recipe: str = "",
+    write: Callable[[ca.Function, str], str] = library_source,
 ) -> ctypes.CDLL | None:
     """The compiled library of a function and a driver: from this process, from disk, or built.
 
     Args:
-        name: The function's.
+        name: Of the library's file.
         build: Gives the function, dense and row-major (`codegen.row_major`).
         driver: C text of the driver, with its constants.
         symbol: The function the driver exports.
         recipe: What the function follows from (`recipe`), "" if that is not known. Where a
             library of that recipe is at hand, the function is not built.
+        write: Gives the library's text from the function and the driver.
 
     Returns:
         The library, or None where there is no compiler (a `NoCompilerWarning` says so once).
@@ -91,7 +97,7 @@ def load_library(
             stem = f"{name}-{key}"
             library = _find(directory, stem, symbol)
             if library is None:
-                library = _build(directory, stem, library_source(function, driver), compiler)
+                library = _build(directory, stem, write(function, driver), compiler)
             _loaded[key] = library
         if brief:
             _note(directory / f"{name}-{brief}.key", key)
@@ -139,7 +145,8 @@ def library_key(function: ca.Function, driver: str, compiler: Compiler) -> str:
 def _surroundings(compiler: Compiler, driver: str) -> tuple[str, ...]:
     """What a library is built from besides its graph."""
     system = (platform.system(), platform.machine())
-    return (str(FORMAT), ca.CasadiMeta.version(), *system, compiler.identity, driver)
+    shared = (driver_text("common"), driver_text("lanes"))
+    return (str(FORMAT), ca.CasadiMeta.version(), *system, compiler.identity, *shared, driver)
 
 
 def _hash(*parts: str) -> str:

@@ -82,11 +82,22 @@ def function_source(function: ca.Function) -> str:
     return text
 
 
+def step_names(name: str) -> str:
+    """The macros by which drivers name a function's symbols."""
+    suffixes = ("", "_work", "_checkout", "_release", "_incref")
+    return "".join(f"#define STEP{suffix} {name}{suffix}\n" for suffix in suffixes)
+
+
 def library_source(function: ca.Function, driver: str) -> str:
     """The text of a whole library: the function's code, its names, what drivers share, a driver."""
-    name = function.name()
-    suffixes = ("", "_work", "_checkout", "_release", "_incref")
-    names = "".join(f"#define STEP{suffix} {name}{suffix}\n" for suffix in suffixes)
     # More than one thread at once may hold memory of a function that needs some.
     header = "#define CASADI_MAX_NUM_THREADS 64\n"
-    return "\n".join((header, function_source(function), names, driver_text("common"), driver))
+    return "\n".join(
+        (
+            header,
+            function_source(function),
+            step_names(function.name()),
+            driver_text("common"),
+            driver,
+        )
+    )

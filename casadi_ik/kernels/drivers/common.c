@@ -28,6 +28,7 @@ static double monotonic(void) {
 
 /* Everything one call of a driver works on; each call has its own, so threads never share any. */
 typedef struct {
+  void *block;
   const casadi_real **arg;
   casadi_real **res;
   casadi_int *iw;
@@ -56,10 +57,11 @@ static void give_back(workspace *space) {
   while (__atomic_test_and_set(&checkout_lock, __ATOMIC_ACQUIRE)) {}
   STEP_release(space->mem);
   __atomic_clear(&checkout_lock, __ATOMIC_RELEASE);
-  free((void *) space->w);
+  free(space->block);
 }
 
-/* One allocation for all arrays, doubles first so that everything is aligned. */
+/* One allocation for all arrays, numbers first so that everything is aligned: malloc's alignment
+ * is less than vectors need. */
 static int set_up(workspace *space, size_t extra) {
   casadi_int n_arg = 0, n_res = 0, n_iw = 0, n_w = 0;
   size_t doubles, bytes;
@@ -68,8 +70,10 @@ static int set_up(workspace *space, size_t extra) {
   doubles = (size_t) n_w + extra + 1;
   bytes = doubles * sizeof(casadi_real) + (size_t) n_iw * sizeof(casadi_int)
         + (size_t) n_arg * sizeof(casadi_real *) + (size_t) n_res * sizeof(casadi_real *);
-  block = (char *) malloc(bytes);
-  if (!block) return NO_MEMORY;
+  space->block = malloc(bytes + sizeof(casadi_real));
+  if (!space->block) return NO_MEMORY;
+  block = (char *) space->block;
+  block += sizeof(casadi_real) - (uintptr_t) block % sizeof(casadi_real);
   space->w = (casadi_real *) block;
   space->extra = space->w + n_w;
   space->iw = (casadi_int *) (block + doubles * sizeof(casadi_real));
@@ -77,7 +81,7 @@ static int set_up(workspace *space, size_t extra) {
   space->res = (casadi_real **) (space->arg + n_arg);
   space->mem = checkout();
   if (space->mem < 0) {
-    free(block);
+    free(space->block);
     return NO_CHECKOUT;
   }
   return DONE;

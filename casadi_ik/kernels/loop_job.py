@@ -1,0 +1,165 @@
+"""The compiled loops: what they work on, and how they are called.
+
+`drivers/loop.c` makes one solve after the other, `drivers/loop_lanes.c` four side by side.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.kernels.buffered import memory
+from casadi_ik.kernels.lanes import LANES
+from casadi_ik.kernels.loop_result import FIRST_ROWS, LoopResult
+from casadi_ik.kernels.outcome import SLICE, Outcome, check
+from casadi_ik.kernels.rows import opaque
+from casadi_ik.kernels.step_graph import RUNNING, StepGraph
+
+
+class Job(ctypes.Structure):
+    """`loop_job` of drivers/loop_lanes.c, the beginning of which is that of drivers/loop.c."""
+
+    _fields_ = (
+        ("states", ctypes.c_void_p),
+        ("parameters", ctypes.c_void_p),
+        ("parameter_step", ctypes.c_int64),
+        ("iterations", ctypes.c_void_p),
+        ("status", ctypes.c_void_p),
+        ("seconds", ctypes.c_void_p),
+        ("mark", ctypes.c_void_p),
+        ("rows", ctypes.c_void_p),
+        ("capacity", ctypes.c_int64),
+        ("used", ctypes.c_int64),
+        ("count", ctypes.c_int64),
+        ("solve", ctypes.c_int64),
+        ("max_iterations", ctypes.c_int64),
+        ("slice", ctypes.c_double),
+        ("places", ctypes.c_void_p),
+        ("running", ctypes.c_void_p),
+    )
+
+
+class CompiledBatch:
+    """A batch on its way through a compiled loop."""
+
+    def __init__(
+        self, step: StepGraph, result: LoopResult, parameters: NDArray[np.float64], budget: int
+    ) -> None:
+        """Keep the arrays; `result` has the first states and gets everything else.
+
+        Args:
+            step: The step.
+            result: As `LoopKernel.run` makes it.
+            parameters: Shape (k, np), or (np,) for all solves.
+            budget: Iterations of each solve.
+        """
+        self.name = step.name
+        self.result = result
+        self._parameters = parameters
+        self._mark = np.zeros((step.state.size, LANES))
+        self.job = Job(
+            states=memory(result.states),
+            parameters=memory(parameters),
+            parameter_step=0 if parameters.ndim == 1 else parameters.shape[1],
+            iterations=memory(result.iterations),
+            status=memory(result.status),
+            seconds=memory(result.time),
+            mark=memory(self._mark),
+            count=len(result.states),
+            max_iterations=budget,
+            slice=SLICE,
+        )
+
+    def run(self, loop: Any) -> None:
+        """One solve after the other.
+
+        Args:
+            loop: `casadi_ik_loop` of a library.
+
+        Raises:
+            KernelError: No work memory.
+        """
+        self._rows_to(FIRST_ROWS)
+        while (code := loop(ctypes.byref(self.job))) != Outcome.DONE:
+            check(self.name, code)
+            if code == Outcome.ROWS_FULL:
+                self._rows_to(2 * self.job.capacity)
+        self._rows_to(self.job.used)
+
+    def run_side_by_side(self, loop: Any) -> None:
+        """Four solves at a time.
+
+        Args:
+            loop: `casadi_ik_loop_lanes` of a library.
+
+        Raises:
+            KernelError: No work memory, or the step failed.
+        """
+        running = np.full(LANES, -1, dtype=np.int64)
+        places = np.empty((0, 2), dtype=np.int64)
+        self.job.running = memory(running)
+        self._rows_to(FIRST_ROWS)
+        while True:
+            if self.result.rows is not None and len(self.result.rows) > len(places):
+                places.resize((len(self.result.rows), 2), refcheck=False)
+                self.job.places = memory(places)
+            code = loop(ctypes.byref(self.job))
+            if code == Outcome.DONE:
+                break
+            check(self.name, code)
+            if code == Outcome.ROWS_FULL:
+                self._rows_to(2 * self.job.capacity)
+        if self.result.rows is not None:
+            self._rows_to(self.job.used)
+            self._put_in_order(places[: self.job.used])
+
+    def _rows_to(self, count: int) -> None:
+        """Make room for so many rows, in place: a long trace is not copied."""
+        rows = self.result.rows
+        if rows is not None:
+            rows.resize(count, refcheck=False)
+            self.job.rows, self.job.capacity = memory(rows), count
+
+    def _put_in_order(self, places: NDArray[np.int64]) -> None:
+        """Rows solve by solve, from the order in which they were made."""
+        iterations = self.result.iterations
+        first = np.cumsum(iterations) - iterations
+        rows: Any = self.result.rows
+        made = opaque(rows.copy())
+        opaque(rows)[first[places[:, 0]] + places[:, 1]] = made
+
+
+class SingleSolve:
+    """One compiled solve on fixed arrays, without a trace; not to be shared by threads.
+
+    Attributes:
+        parameters: (np,) write into it.
+        result: Of a batch of one; write the first state into `states`, a call overwrites all.
+    """
+
+    def __init__(self, step: StepGraph, loop: Any) -> None:
+        self.parameters = np.zeros(step.parameters.size)
+        self.result = LoopResult(
+            states=np.zeros((1, step.state.size)),
+            iterations=np.zeros(1, dtype=np.int64),
+            status=np.zeros(1, dtype=np.int32),
+            time=np.zeros(1),
+        )
+        self._loop = loop
+        self._batch = CompiledBatch(step, self.result, self.parameters, 0)
+        self._reference = ctypes.byref(self._batch.job)
+
+    def __call__(self, max_iterations: int) -> None:
+        """Solve, as `LoopKernel.run` does.
+
+        Raises:
+            KernelError: No work memory.
+        """
+        result, job = self.result, self._batch.job
+        result.iterations[0], result.status[0], result.time[0] = 0, RUNNING, 0.0
+        job.solve, job.max_iterations = 0, max_iterations
+        while (code := self._loop(self._reference)) != Outcome.DONE:
+            check(self._batch.name, code)
