@@ -53,7 +53,7 @@ AS_THEY_ARE = tuple(
         rf"wr?\d+ = {POINTER};",
         r"if \(res\[(\d+)\](?:!=0)?\) res\[\1\]\[\d+\]\s*=\s*[aw]\d+;",
         r"if \(casadi_f\d+\(arg1, res1, iw, w, 0\)\) return 1;",
-        rf"casadi_copy\({POINTER}, \d+, (?:res\[\d+\]|w\d+)\);",
+        rf"casadi_copy\((?:{POINTER}|arg\[\d+\]), \d+, (?:res\[\d+\]|w\d+)\);",
         rf"casadi_clear\({POINTER}, \d+\);",
         r"for \(i=0, rr=w\d+, cs=wr?\d+; i<\d+; \+\+i\) "
         r"for \(j=0; j<\d+; \+\+j\) rr\[i\+j\*\d+\] = \*cs\+\+;",
@@ -67,7 +67,9 @@ ZEROS = re.compile(r"static const casadi_real casadi_zeros\[(\d+)\]")
 OUTPUTS = re.compile(r"/\* .*->\((.*)\) \*/")
 SIZE = re.compile(r"\[(\d+)(?:x(\d+))?\]")
 BRANCH = re.compile(r"\s*if \(casadi_f(\d+)\(arg\+1, res, iw, w, 0\)\) return 1;")
-RENAMED = ("sq", "fabs", "fmin", "fmax", "copy", "clear")
+RENAMED = {"nan": "NAN", "inf": "INFINITY"} | {
+    name: f"lanes_{name}" for name in ("sq", "fabs", "fmin", "fmax", "copy", "clear")
+}
 KEPT = ("_work", "_checkout", "_release", "_incref")
 
 
@@ -82,16 +84,15 @@ def lanes_source(function: ca.Function, driver: str) -> str:
         UnsuitedError: The code has a line of a kind not foreseen.
         KernelError: The graph has no C code.
     """
-    name = function.name()
     text = function_source(function)
     zeros = ZEROS.search(text)
     return "\n".join(
         (
             driver_text("lanes"),
-            *(f"#define casadi_{own} lanes_{own}" for own in RENAMED),
+            *(f"#define casadi_{name} {own}" for name, own in RENAMED.items()),
             f"static const lanes casadi_zeros[{zeros[1] if zeros else 1}];",
-            *_functions(text, name),
-            step_names(name),
+            *_functions(text, function.name()),
+            step_names(function.name()),
             driver_text("common"),
             driver,
         )

@@ -10,12 +10,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.buffered import doubles
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text, row_major
-from casadi_ik.kernels.lanes import LANES, UnsuitedError, lanes_source
-from casadi_ik.kernels.loop_job import CompiledBatch, SingleSolve
+from casadi_ik.kernels.lanes import LANES, lanes_source
+from casadi_ik.kernels.loop_job import SLOTS, CompiledBatch, SingleSolve
 from casadi_ik.kernels.loop_result import CODE_LIMIT, FAILED, NON_FINITE, REPEATED, LoopResult
 from casadi_ik.kernels.loop_vm import run_vm
 from casadi_ik.kernels.rows import row_driver
@@ -69,7 +69,7 @@ class LoopKernel:
                 self.step.recipe,
                 lanes_source,
             )
-        except UnsuitedError as error:
+        except KernelError as error:
             logger.info("%s: one solve at a time: %s", self.step.name, error)
             return None
         return (
@@ -86,6 +86,8 @@ class LoopKernel:
             "FAILED": FAILED,
             "REPEATED": REPEATED,
             "CODE_LIMIT": CODE_LIMIT,
+            "SLOTS": SLOTS,
+            "STAGE": self.step.stage_place,
         }
         return define(constants) + row_driver(self.step.record) + driver_text(name)
 

@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.buffered import memory
-from casadi_ik.kernels.lanes import LANES
 from casadi_ik.kernels.loop_result import FIRST_ROWS, LoopResult
 from casadi_ik.kernels.outcome import SLICE, Outcome, check
 from casadi_ik.kernels.rows import opaque
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
+
+SLOTS = 32
+"""Solves under way at once, of which four have the lanes."""
 
 
 class Job(ctypes.Structure):
@@ -38,7 +40,7 @@ class Job(ctypes.Structure):
         ("max_iterations", ctypes.c_int64),
         ("slice", ctypes.c_double),
         ("places", ctypes.c_void_p),
-        ("running", ctypes.c_void_p),
+        ("slots", ctypes.c_void_p),
     )
 
 
@@ -59,7 +61,7 @@ class CompiledBatch:
         self.name = step.name
         self.result = result
         self._parameters = parameters
-        self._mark = np.zeros((step.state.size, LANES))
+        self._mark = np.zeros((SLOTS, step.state.size))
         self.job = Job(
             states=memory(result.states),
             parameters=memory(parameters),
@@ -98,9 +100,9 @@ class CompiledBatch:
         Raises:
             KernelError: No work memory, or the step failed.
         """
-        running = np.full(LANES, -1, dtype=np.int64)
+        slots = np.full(SLOTS, -1, dtype=np.int64)
         places = np.empty((0, 2), dtype=np.int64)
-        self.job.running = memory(running)
+        self.job.slots = memory(slots)
         self._rows_to(FIRST_ROWS)
         while True:
             if self.result.rows is not None and len(self.result.rows) > len(places):

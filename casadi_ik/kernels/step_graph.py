@@ -30,6 +30,8 @@ class StepGraph:
         record: Layout of what is logged of each iteration.
         compilable: False if the graph holds a node that has no C code (an Ipopt call); such a
             graph runs in CasADi's virtual machine.
+        stage: Name of the number in the state by which the step chooses what to do, "" if it does
+            the same always. Solves in the same stage are made side by side.
         recipe: See `recipe`; a library of the same recipe is taken without building the function.
     """
 
@@ -39,11 +41,17 @@ class StepGraph:
     parameters: Layout
     record: Layout
     compilable: bool = True
+    stage: str = ""
     recipe: str = ""
 
     def __post_init__(self) -> None:
         if isinstance(self.source, ca.Function):
             _ = self.function
+
+    @property
+    def stage_place(self) -> int:
+        """Where in the state the stage is, -1 if there is none."""
+        return self.state.slice(self.stage).start if self.stage else -1
 
     @cached_property
     def function(self) -> ca.Function:

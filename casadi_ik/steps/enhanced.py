@@ -123,6 +123,7 @@ class EnhancedStep:
             self.parameters,
             self.record,
             self.options.finger_step != "ipopt",
+            stage="phase",
             recipe=recipe(self._name, self.robot, self.options),
         )
 

@@ -63,6 +63,7 @@ class HandFirstStep:
             layouts.state,
             layouts.parameters,
             layouts.record,
+            stage="phase",
             recipe=recipe(self._name, self.robot, layouts.candidates),
         )
 

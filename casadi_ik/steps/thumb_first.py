@@ -80,6 +80,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             self.parameters,
             self.record,
             self.options.step != "proxqp",
+            stage="phase",
             recipe=recipe(self._name, self.robot, self.options),
         )
 

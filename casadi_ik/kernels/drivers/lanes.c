@@ -63,9 +63,15 @@ LANES_INLINE lanes lanes_fmin(lanes x, lanes y) {
     return value;                                              \
   }
 
+#if defined(__x86_64__)
+LANES_INLINE lanes lanes_sqrt(lanes x) { return __builtin_ia32_sqrtpd256(x); }
+LANES_INLINE lanes lanes_floor(lanes x) { return __builtin_ia32_roundpd256(x, 9); }
+LANES_INLINE lanes lanes_ceil(lanes x) { return __builtin_ia32_roundpd256(x, 10); }
+#else
 LANES_OF_ONE(sqrt)
 LANES_OF_ONE(floor)
 LANES_OF_ONE(ceil)
+#endif
 LANES_OF_ONE(sin)
 LANES_OF_ONE(cos)
 LANES_OF_ONE(tan)

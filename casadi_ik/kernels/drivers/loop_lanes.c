@@ -1,7 +1,12 @@
 /* loop.c for four solves side by side, each as it would be alone: see there.
  *
- * A lane that has finished its solve takes the next one; the order of the rows is put right in
- * Python, from `places`.
+ * A step costs least when the four take the same branches, so some more solves than four are under
+ * way: a lane whose solve ends or changes its stage takes another one of the stage the lanes are
+ * in, and when there are not enough of them all lanes turn to the stage most solves wait for. The
+ * rows come as they are made; `places` says whose they are.
+ *
+ * Expects besides what loop.c does N_PARAMETERS, SLOTS and STAGE, the place in the state of the
+ * number that tells the stages apart, -1 if there is none.
  */
 
 typedef struct {
@@ -11,7 +16,7 @@ typedef struct {
   int64_t *iterations;         /* (count), zeros at the start */
   int32_t *status;             /* (count), RUNNING at the start */
   double *seconds;             /* (count), zeros at the start; solves side by side share the time */
-  double *mark;                /* (N_STATE, LANES), the states later ones are compared with */
+  double *mark;                /* (SLOTS, N_STATE), the states later ones are compared with */
   unsigned char *rows;         /* (capacity) rows, or NULL: no trace */
   int64_t capacity;
   int64_t used;                /* rows written so far */
@@ -20,73 +25,192 @@ typedef struct {
   int64_t max_iterations;      /* of one solve, at least 1 */
   double slice;                /* [s] after which Python gets a look at its signals */
   int64_t *places;             /* (capacity, 2) solve and iteration of each row */
-  int64_t *running;            /* (LANES) the solve of each lane, -1 = none */
+  int64_t *slots;              /* (SLOTS) the solves under way, -1 = none */
 } loop_job;
+
+#define STAGES 8
+#define NOBODY (-1)
+
+/* Solves that wait, by stage. */
+typedef struct {
+  int known;                   /* stages met so far; more than STAGES share the last place */
+  double stage[STAGES];
+  int height[STAGES];
+  int waiting[STAGES][SLOTS];  /* slots */
+} queues;
+
+/* What the lanes work on. */
+typedef struct {
+  int slot[LANES];             /* whose state, or NOBODY */
+  int queue;                   /* where its like wait */
+  lanes *now, *next, *mark, *parameters, *record;
+} bench;
 
 #define LANE(pack, k, lane) (((double *) (pack))[(k) * LANES + (lane)])
 
-static void load(const loop_job *job, int lane, lanes *state, lanes *parameters) {
-  const double *from = job->states + job->running[lane] * N_STATE;
-  int k;
-  for (k = 0; k < N_STATE; ++k) LANE(state, k, lane) = from[k];
-  from = job->parameters + job->running[lane] * job->parameter_step;
-  for (k = 0; k < N_PARAMETERS; ++k) LANE(parameters, k, lane) = from[k];
+static int queue_of(queues *all, double stage) {
+  int i;
+  for (i = 0; i < all->known; ++i) {
+    if (all->stage[i] == stage) return i;
+  }
+  if (all->known == STAGES) return STAGES - 1;
+  all->stage[all->known] = stage;
+  return all->known++;
 }
 
-static void save(const loop_job *job, int lane, const lanes *state) {
-  double *to = job->states + job->running[lane] * N_STATE;
+static void queue_up(queues *all, const loop_job *job, int slot) {
+  const double stage = STAGE < 0 ? 0 : job->states[job->slots[slot] * N_STATE + STAGE];
+  const int i = queue_of(all, stage);
+  all->waiting[i][all->height[i]++] = slot;
+}
+
+/* The next solve gets a slot. */
+static void admit(queues *all, loop_job *job, int slot) {
+  job->slots[slot] = NOBODY;
+  if (job->solve == job->count) return;
+  job->slots[slot] = job->solve++;
+  queue_up(all, job, slot);
+}
+
+static void sit_down(bench *b, const loop_job *job, int lane, int slot) {
+  const int64_t solve = job->slots[slot];
+  const double *state = job->states + solve * N_STATE, *mark = job->mark + slot * N_STATE;
+  const double *given = job->parameters + solve * job->parameter_step;
+  int k;
+  for (k = 0; k < N_STATE; ++k) LANE(b->now, k, lane) = state[k];
+  for (k = 0; k < N_STATE; ++k) LANE(b->mark, k, lane) = mark[k];
+  for (k = 0; k < N_PARAMETERS; ++k) LANE(b->parameters, k, lane) = given[k];
+  b->slot[lane] = slot;
+}
+
+static void stand_up(bench *b, loop_job *job, int lane, const lanes *state) {
+  double *to = job->states + job->slots[b->slot[lane]] * N_STATE;
+  double *mark = job->mark + b->slot[lane] * N_STATE;
   int k;
   for (k = 0; k < N_STATE; ++k) to[k] = LANE(state, k, lane);
+  for (k = 0; k < N_STATE; ++k) mark[k] = LANE(b->mark, k, lane);
+  b->slot[lane] = NOBODY;
 }
 
-/* A free lane gets the next solve; what it worked on before stays in it if there is none. */
-static int fill(loop_job *job, lanes *state, lanes *parameters) {
-  int lane, busy = 0;
+/* As many lanes as possible get a solve; returns how many have one. */
+static int fill(bench *b, queues *all, loop_job *job) {
+  int lane, i, busy = 0, most = 0;
   for (lane = 0; lane < LANES; ++lane) {
-    if (job->running[lane] < 0 && job->solve < job->count) {
-      job->running[lane] = job->solve++;
-      load(job, lane, state, parameters);
+    if (b->slot[lane] == NOBODY && all->height[b->queue] > 0) {
+      sit_down(b, job, lane, all->waiting[b->queue][--all->height[b->queue]]);
     }
-    busy += job->running[lane] >= 0;
+    busy += b->slot[lane] != NOBODY;
   }
-  return busy;
+  if (busy == LANES) return busy;
+  for (i = 1; i < all->known; ++i) {
+    if (all->height[i] > all->height[most]) most = i;
+  }
+  if (all->height[most] <= busy) return busy;
+  for (lane = 0; lane < LANES; ++lane) {
+    const int slot = b->slot[lane];
+    if (slot == NOBODY) continue;
+    stand_up(b, job, lane, b->now);
+    queue_up(all, job, slot);
+  }
+  b->queue = most;
+  for (lane = 0; lane < LANES && all->height[most] > 0; ++lane) {
+    sit_down(b, job, lane, all->waiting[most][--all->height[most]]);
+  }
+  return lane;
 }
 
-static void write_rows(loop_job *job, const lanes *record) {
-  double own[N_RECORD + 1];
-  int lane, k;
+/* A lane without a solve does what another does, so that it takes no branch of its own. */
+static void imitate(bench *b) {
+  int lane, k, busy = 0;
+  while (b->slot[busy] == NOBODY) ++busy;
   for (lane = 0; lane < LANES; ++lane) {
-    const int64_t solve = job->running[lane];
-    if (solve < 0) continue;
-    for (k = 0; k < N_RECORD; ++k) own[k] = LANE(record, k, lane);
-    job->places[2 * job->used] = solve;
-    job->places[2 * job->used + 1] = job->iterations[solve] - 1;
-    store_row(own, job->rows + ROW_BYTES * job->used++);
+    if (b->slot[lane] != NOBODY) continue;
+    for (k = 0; k < N_STATE; ++k) LANE(b->now, k, lane) = LANE(b->now, k, busy);
+    for (k = 0; k < N_PARAMETERS; ++k) {
+      LANE(b->parameters, k, lane) = LANE(b->parameters, k, busy);
+    }
   }
+}
+
+static void write_row(const bench *b, loop_job *job, int lane, int64_t solve) {
+  double own[N_RECORD + 1];
+  int k;
+  for (k = 0; k < N_RECORD; ++k) own[k] = LANE(b->record, k, lane);
+  job->places[2 * job->used] = solve;
+  job->places[2 * job->used + 1] = job->iterations[solve] - 1;
+  store_row(own, job->rows + ROW_BYTES * job->used++);
 }
 
 /* Which lanes have a finite state, and which the one they were marked at. */
-LANES_TARGET static void examine(
-    const lanes *next, const lanes *mark, lane_mask *finite, lane_mask *repeated) {
+LANES_TARGET static void examine(const bench *b, lane_mask *finite, lane_mask *repeated) {
   lanes sum = {0};
   lane_mask apart = {0};
   int k;
   for (k = 0; k < N_STATE; ++k) {
-    sum += next[k] * SPREAD(0.0);
-    apart |= (lane_mask) next[k] ^ (lane_mask) mark[k];
+    sum += b->next[k] * SPREAD(0.0);
+    apart |= (lane_mask) b->next[k] ^ (lane_mask) b->mark[k];
   }
   *finite = (lane_mask) (sum == SPREAD(0.0));
   *repeated = (lane_mask) (apart == (lane_mask) {0});
 }
 
-/* The seconds since last time, shared by the solves that were running. */
-static void share(loop_job *job, int busy, double *since) {
-  const double now = monotonic(), each = busy ? (now - *since) / busy : 0;
+/* What comes of a lane's solve after a step; the state is in `now`, the one before in `next`. */
+static int settle(
+    bench *b, queues *all, loop_job *job, int lane, double code, int finite, int repeated) {
+  const int slot = b->slot[lane];
+  const int64_t solve = job->slots[slot], iteration = job->iterations[solve];
+  int32_t status;
+  int k;
+  /* Written so that a NaN code fails the test too. */
+  if (!(code > -CODE_LIMIT && code < CODE_LIMIT) || !finite) {
+    status = NON_FINITE;
+  } else {
+    status = (int32_t) code;
+    if (status == RUNNING && iteration > 1 && repeated) status = REPEATED;
+  }
+  if (!(iteration & (iteration - 1))) {
+    for (k = 0; k < N_STATE; ++k) LANE(b->mark, k, lane) = LANE(b->now, k, lane);
+  }
+  job->status[solve] = status;
+  if (status != RUNNING || iteration == job->max_iterations) {
+    stand_up(b, job, lane, status == NON_FINITE ? b->next : b->now);
+    admit(all, job, slot);
+    return 1;
+  }
+#if STAGE >= 0
+  if (LANE(b->now, STAGE, lane) != LANE(b->next, STAGE, lane)) {
+    stand_up(b, job, lane, b->now);
+    queue_up(all, job, slot);
+    return 1;
+  }
+#endif
+  return 0;
+}
+
+/* The seconds since last time, shared by the solves that had the lanes. */
+static void share(const int64_t *solves, int busy, const loop_job *job, double *since) {
+  const double now = monotonic(), each = (now - *since) / busy;
   int lane;
   for (lane = 0; lane < LANES; ++lane) {
-    if (job->running[lane] >= 0) job->seconds[job->running[lane]] += each;
+    if (solves[lane] != NOBODY) job->seconds[solves[lane]] += each;
   }
   *since = now;
+}
+
+static void begin(bench *b, queues *all, loop_job *job, lanes *memory) {
+  int slot, lane;
+  b->now = memory;
+  b->next = b->now + N_STATE;
+  b->mark = b->next + N_STATE;
+  b->parameters = b->mark + N_STATE;
+  b->record = b->parameters + N_PARAMETERS;
+  b->queue = 0;
+  memset(all, 0, sizeof *all);
+  for (lane = 0; lane < LANES; ++lane) b->slot[lane] = NOBODY;
+  for (slot = 0; slot < SLOTS; ++slot) {
+    if (job->slots[slot] == NOBODY) admit(all, job, slot);
+    else queue_up(all, job, slot);
+  }
 }
 
 /* Whether this machine can run what LANES_TARGET asks for. */
@@ -100,87 +224,54 @@ EXPORT int casadi_ik_has_lanes(void) {
 
 EXPORT LANES_TARGET int casadi_ik_loop_lanes(loop_job *job) {
   workspace space;
-  lanes *now, *next, *parameters, *mark, *record, code;
+  queues all;
+  bench b;
+  lanes code, *last;
   lane_mask finite, repeated;
   int64_t ticks = 0;
   double limit, since;
-  int lane, k, busy, outcome = set_up(&space, 3 * N_STATE + N_PARAMETERS + N_RECORD);
+  int64_t solves[LANES];
+  int lane, busy, outcome = set_up(&space, 3 * N_STATE + N_PARAMETERS + N_RECORD);
   if (outcome != DONE) return outcome;
-  now = space.extra;
-  next = now + N_STATE;
-  mark = next + N_STATE;
-  parameters = mark + N_STATE;
-  record = parameters + N_PARAMETERS;
-  memcpy(mark, job->mark, N_STATE * sizeof(lanes));
-  memset(now, 0, N_STATE * sizeof(lanes));
-  memset(parameters, 0, N_PARAMETERS * sizeof(lanes));
-  for (lane = 0; lane < LANES; ++lane) {
-    if (job->running[lane] >= 0) load(job, lane, now, parameters);
-  }
+  begin(&b, &all, job, space.extra);
   since = monotonic();
   limit = since + job->slice;
 
-  while ((busy = fill(job, now, parameters))) {
-    int ended = 0;
-    while (!ended) {
-      lanes *last = now;
-      if (job->rows && job->used + LANES > job->capacity) {
-        outcome = ROWS_FULL;
-        break;
-      }
-      if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {
-        outcome = SLICE_OVER;
-        break;
-      }
-      space.arg[0] = now;
-      space.arg[1] = parameters;
-      space.res[0] = next;
-      space.res[1] = job->rows ? record : NULL;
+  while (outcome == DONE && (busy = fill(&b, &all, job))) {
+    int changed = 0;
+    for (lane = 0; lane < LANES; ++lane) {
+      solves[lane] = b.slot[lane] == NOBODY ? NOBODY : job->slots[b.slot[lane]];
+    }
+    while (!changed) {
+      if (job->rows && job->used + LANES > job->capacity) outcome = ROWS_FULL;
+      if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) outcome = SLICE_OVER;
+      if (outcome != DONE) break;
+      if (busy < LANES) imitate(&b);
+      space.arg[0] = b.now;
+      space.arg[1] = b.parameters;
+      space.res[0] = b.next;
+      space.res[1] = job->rows ? b.record : NULL;
       space.res[2] = &code;
       if (STEP(space.arg, space.res, space.iw, space.w, space.mem)) {
-        give_back(&space);
-        return STEP_FAILED;
+        outcome = STEP_FAILED;
+        break;
       }
-      examine(next, mark, &finite, &repeated);
-      now = next;
-      next = last;
+      examine(&b, &finite, &repeated);
+      last = b.now;
+      b.now = b.next;
+      b.next = last;
       for (lane = 0; lane < LANES; ++lane) {
-        if (job->running[lane] >= 0) ++job->iterations[job->running[lane]];
-      }
-      if (job->rows) write_rows(job, record);
-      for (lane = 0; lane < LANES; ++lane) {
-        const int64_t solve = job->running[lane];
-        int64_t iteration;
-        int32_t status;
-        if (solve < 0) continue;
-        iteration = job->iterations[solve];
-        /* Written so that a NaN code fails the test too. */
-        if (!(code[lane] > -CODE_LIMIT && code[lane] < CODE_LIMIT) || !finite[lane]) {
-          status = NON_FINITE;
-        } else {
-          status = (int32_t) code[lane];
-          if (status == RUNNING && iteration > 1 && repeated[lane]) status = REPEATED;
-        }
-        if (!(iteration & (iteration - 1))) {
-          for (k = 0; k < N_STATE; ++k) LANE(mark, k, lane) = LANE(now, k, lane);
-        }
-        if (status == RUNNING && iteration < job->max_iterations) continue;
-        if (!ended) share(job, busy, &since);
-        ended = 1;
-        save(job, lane, status == NON_FINITE ? last : now);
-        job->status[solve] = status;
-        job->running[lane] = -1;
+        if (solves[lane] == NOBODY) continue;
+        ++job->iterations[solves[lane]];
+        if (job->rows) write_row(&b, job, lane, solves[lane]);
+        changed |= settle(&b, &all, job, lane, code[lane], finite[lane] != 0, repeated[lane] != 0);
       }
     }
-    if (outcome != DONE) {
-      share(job, busy, &since);
-      for (lane = 0; lane < LANES; ++lane) {
-        if (job->running[lane] >= 0) save(job, lane, now);
-      }
-      break;
-    }
+    share(solves, busy, job, &since);
   }
-  memcpy(job->mark, mark, N_STATE * sizeof(lanes));
+  for (lane = 0; lane < LANES; ++lane) {
+    if (b.slot[lane] != NOBODY) stand_up(&b, job, lane, b.now);
+  }
   give_back(&space);
   return outcome;
 }
