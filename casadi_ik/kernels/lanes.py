@@ -91,12 +91,13 @@ def lanes_source(function: ca.Function, driver: str) -> str:
 def _functions(text: str) -> Iterator[_Function]:
     """The functions with the signature of a step, callees before callers."""
     lines = iter(text.splitlines())
-    sizes: tuple[tuple[int, ...], ...] = ((), ())
+    inputs: tuple[int, ...] = ()
+    outputs: tuple[int, ...] = ()
     for line in lines:
         if signature := SIGNATURE.fullmatch(line):
-            sizes = tuple(_sizes(half) for half in signature.groups())
+            inputs, outputs = _sizes(signature[1]), _sizes(signature[2])
         elif head := HEAD.fullmatch(line):
-            yield _Function(head[1], *sizes, tuple(iter(lines.__next__, "}")))
+            yield _Function(head[1], inputs, outputs, tuple(iter(lines.__next__, "}")))
 
 
 def _sizes(arguments: str) -> tuple[int, ...]:

@@ -8,6 +8,9 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
 
 #define LANES 4
 typedef double lanes __attribute__((vector_size(LANES * sizeof(double))));
@@ -65,9 +68,9 @@ LANES_INLINE lanes lanes_fmin(lanes x, lanes y) {
   }
 
 #if defined(__x86_64__)
-LANES_INLINE lanes lanes_sqrt(lanes x) { return __builtin_ia32_sqrtpd256(x); }
-LANES_INLINE lanes lanes_floor(lanes x) { return __builtin_ia32_roundpd256(x, 9); }
-LANES_INLINE lanes lanes_ceil(lanes x) { return __builtin_ia32_roundpd256(x, 10); }
+LANES_INLINE lanes lanes_sqrt(lanes x) { return _mm256_sqrt_pd(x); }
+LANES_INLINE lanes lanes_floor(lanes x) { return _mm256_floor_pd(x); }
+LANES_INLINE lanes lanes_ceil(lanes x) { return _mm256_ceil_pd(x); }
 #else
 LANES_OF_ONE(sqrt)
 LANES_OF_ONE(floor)

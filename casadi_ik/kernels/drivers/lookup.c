@@ -93,6 +93,7 @@ EXPORT int casadi_ik_lookup(lookup_job *job) {
   distance = (float *) (space.extra + N_KEY);
   nearest = distance + job->rows + TILE;
 #if defined(__x86_64__)
+  __builtin_cpu_init();
   if (__builtin_cpu_supports("avx2")) measured = measure_avx2;
 #endif
   if (job->count - job->next > CLOCK_INTERVAL) limit = monotonic() + job->slice;

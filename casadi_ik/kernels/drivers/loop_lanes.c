@@ -203,6 +203,7 @@ static void begin(bench *b, queues *all, loop_job *job, lanes *memory) {
 /* Whether this machine can run what LANES_TARGET asks for. */
 EXPORT int casadi_ik_has_lanes(void) {
 #if defined(__x86_64__)
+  __builtin_cpu_init();
   return __builtin_cpu_supports("avx2") != 0;
 #else
   return 1;
