@@ -31,8 +31,8 @@ VARIABLE = r"[A-Za-z_]\w*(?:\[\d+\])?|\(\*\w+\+\+\)"
 OPERAND = rf"{SPACE}(?:{CONSTANT}|{VARIABLE}){SPACE}"
 
 FUNCTIONS = (
-    r"sqrt|floor|ceil|sin|cos|tan|asin|acos|atan|exp|log|tanh|atan2|fmod|hypot|pow"
-    r"|casadi_sq|casadi_fabs|casadi_fmin|casadi_fmax"
+    r"sqrt|floor|ceil|sin|cos|tan|asin|acos|atan|exp|log|tanh|atan2|fmod|pow"
+    r"|casadi_sq|casadi_hypot|casadi_fabs|casadi_fmin|casadi_fmax"
 )
 
 OPERATION = re.compile(rf"\(({OPERAND})(<=|>=|==|!=|&&|\|\||[-+*/<>])({OPERAND})\)")
@@ -57,7 +57,7 @@ AS_THEY_ARE = tuple(
         rf"casadi_clear\({POINTER}, \d+\);",
         r"for \(i=0, rr=w\d+, cs=wr?\d+; i<\d+; \+\+i\) "
         r"for \(j=0; j<\d+; \+\+j\) rr\[i\+j\*\d+\] = \*cs\+\+;",
-        r"for \(rr=[^;()]*, cs=[^;()]*; cs!=[^;()]*; cs\+=\d+\) \*rr\+\+ = \*cs;",
+        r"for \(rr=[^;]*, cs=[^;]*; cs!=[^;]*; cs\+=\d+\) \*rr\+\+ = \*cs;",
         r"return (?:0|casadi_f\d+\(arg, res, iw, w, mem\));",
     )
 )
@@ -68,7 +68,7 @@ OUTPUTS = re.compile(r"/\* .*->\((.*)\) \*/")
 SIZE = re.compile(r"\[(\d+)(?:x(\d+))?\]")
 BRANCH = re.compile(r"\s*if \(casadi_f(\d+)\(arg\+1, res, iw, w, 0\)\) return 1;")
 RENAMED = {"nan": "NAN", "inf": "INFINITY"} | {
-    name: f"lanes_{name}" for name in ("sq", "fabs", "fmin", "fmax", "copy", "clear")
+    name: f"lanes_{name}" for name in ("sq", "fabs", "fmin", "fmax", "hypot", "copy", "clear")
 }
 KEPT = ("_work", "_checkout", "_release", "_incref")
 
