@@ -16,7 +16,8 @@ from casadi_ik.kernels import (
     LoopResult,
     StepGraph,
 )
-from casadi_ik.kernels.lanes import LANES, UnsuitedError, lanes_source
+from casadi_ik.kernels.lanes import LANES, lanes_source
+from casadi_ik.kernels.lanes_lines import UnsuitedError
 from casadi_ik.kernels.loop_job import SLOTS
 
 from .graphs import (
