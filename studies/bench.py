@@ -247,8 +247,8 @@ MEASUREMENTS: dict[str, Callable[[ik.ArmHand, Sizes], Section]] = {
     "threads": threads,
     "first-use": lambda _, sizes: first_use(ik.METHODS, sizes.later),
     "iterations": iterations,
-    "logs": lambda _, sizes: Section(*bench_logs.report(sizes.batch, sizes.repeats)),
-    "log-parts": lambda _, sizes: Section(*bench_log_parts.report(sizes.batch, sizes.repeats)),
+    "logs": lambda _, sizes: bench_logs.report(sizes.batch, sizes.repeats),
+    "log-parts": lambda _, sizes: bench_log_parts.report(sizes.batch, sizes.repeats),
     "peers": lambda _, sizes: measured(sizes.peers, 0, installed()),
 }
 

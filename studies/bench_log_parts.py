@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections import defaultdict
@@ -19,13 +18,11 @@ from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
-import numpy as np
-from bench_logs import FEWER, METHODS, Report, show
-from targets import random_arm_targets
+from bench_logs import Dropped, Targets, cases, main
+from bench_report import Section
 
 import casadi_ik as ik
 from casadi_ik.logs import chunk, chunk_stream, mcap_file, writer
-from casadi_ik.solvers.recorder import SolveBlock
 
 WRITING = ("checksum", "compression", "writing to disk")
 """What is done to finished bytes, whoever has made them."""
@@ -34,24 +31,8 @@ STAGES = ("detecting events", "solve rows", "times and order", "filling chunks",
 """What a log consists of, in this order; what is not among them is in the rest."""
 
 
-class Dropped:
-    """A recorder that forgets the blocks: the solves are traced, nothing is done with it."""
-
-    def record(self, block: SolveBlock) -> None:
-        """Forget it."""
-
-    def close(self) -> None:
-        """Nothing to do."""
-
-    def __enter__(self) -> Dropped:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to do."""
-
-
 class Stopwatch:
-    """CPU time by stage [s] of what is run under `watching`; each thread counts its own."""
+    """CPU time by stage [s] of what is run under `watching`."""
 
     def __init__(self) -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)
@@ -61,17 +42,17 @@ class Stopwatch:
         """The function, its time counted."""
 
         def run(*arguments: Any, **options: Any) -> Any:
-            begin = time.thread_time()
+            begin = time.process_time()
             try:
                 return function(*arguments, **options)
             finally:
-                self.seconds[stage] += time.thread_time() - begin
+                self.seconds[stage] += time.process_time() - begin
 
         return run
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Watch the writer at work, where it works."""
+        """Watch the writer at work."""
 
         def checksum(data: memoryview) -> int:
             self.bytes += len(data)
@@ -106,35 +87,28 @@ class Stopwatch:
                 patch.stop()
 
 
-def report(count: int = 12_000, repeats: int = 9) -> Report:
+def report(count: int, repeats: int) -> Section:
     """Measure.
 
     Args:
         count: Targets of hand-first; the others get fewer.
         repeats: Of every run; they take turns.
     """
-    robot = ik.load_robot("kuka_lwr_barrett")
-    names = ik.shipped_grasps(robot.name)
     rows: list[list[str]] = []
     notes = []
-    for method, settings in METHODS.items():
-        each = max(count // len(names) // (1 if not settings else FEWER), 1)
-        targets = random_arm_targets(robot, names, each, np.random.default_rng(0))
-        solver = ik.Solver(robot, method, **settings)
+    for solver, targets in cases(count):
         found, note = _measured(solver, targets, repeats)
         rows += found
         notes.append(note)
     columns = "method", "part", "µs a solve", "µs an iteration", "of a solve without log %"
     text = (
-        "CPU time of all threads; the log with zstd. Of each kind of run the one with the least "
-        f"total counts; its parts are timed where they happen. {' '.join(notes)}"
+        "CPU time; the log with zstd. Of each kind of run the one with the least total counts. "
+        f"{' '.join(notes)}"
     )
-    return Report("What a log consists of", columns, rows, text)
+    return Section("What a log consists of", columns, rows, text)
 
 
-def _measured(
-    solver: ik.Solver, targets: tuple[np.ndarray, np.ndarray], repeats: int
-) -> tuple[list[list[str]], str]:
+def _measured(solver: ik.Solver, targets: Targets, repeats: int) -> tuple[list[list[str]], str]:
     """Rows of the table and a sentence about them."""
     least: dict[str, tuple[float, Stopwatch]] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -159,9 +133,7 @@ def _measured(
     (bare, _), (traced, _), (full, watch), (sampled, _) = (least[name] for name in runs)
     parts = {"solving, without log": bare, "tracing": traced - bare}
     parts |= {stage: watch.seconds[stage] for stage in STAGES}
-    parts |= {
-        "the rest (indexes, threads, colder caches)": full - traced - sum(watch.seconds.values())
-    }
+    parts |= {"the rest (indexes, colder caches)": full - traced - sum(watch.seconds.values())}
     parts |= {"solving and logging": full, "the same, keep=Keep(sample=0.01)": sampled}
     rows = [
         [
@@ -182,14 +154,5 @@ def _measured(
     return rows, note
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description="Where the time of a logged study goes.")
-    parser.add_argument("--count", type=int, default=12_000, help="targets of hand-first")
-    parser.add_argument("--repeats", type=int, default=9)
-    options = parser.parse_args(arguments)
-    show(report(options.count, options.repeats))
-
-
 if __name__ == "__main__":
-    main()
+    main("Where the time of a logged study goes.", report, repeats=9)

@@ -11,15 +11,14 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, get_args
+from typing import Any, Self, get_args
 
 import numpy as np
+from bench_report import Section
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 from targets import random_arm_targets
 
 import casadi_ik as ik
@@ -34,30 +33,19 @@ METHODS: dict[str, dict[str, Any]] = {
 FEWER = 25
 """The slow methods get so many times fewer targets."""
 
-
-class Report(NamedTuple):
-    """A table and how it was measured."""
-
-    title: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    note: str
+Targets = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-class Kept:
-    """A recorder that keeps the blocks in memory."""
-
-    def __init__(self) -> None:
-        self.blocks: list[SolveBlock] = []
+class Dropped:
+    """A recorder that forgets the blocks: the solves are traced, nothing is done with it."""
 
     def record(self, block: SolveBlock) -> None:
-        """Keep it."""
-        self.blocks.append(block)
+        """Forget it."""
 
     def close(self) -> None:
         """Nothing to do."""
 
-    def __enter__(self) -> Kept:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -67,6 +55,27 @@ class Kept:
         traceback: TracebackType | None,
     ) -> None:
         """Nothing to do."""
+
+
+class Kept(Dropped):
+    """A recorder that keeps the blocks in memory."""
+
+    def __init__(self) -> None:
+        self.blocks: list[SolveBlock] = []
+
+    def record(self, block: SolveBlock) -> None:
+        """Keep it."""
+        self.blocks.append(block)
+
+
+def cases(count: int) -> Iterator[tuple[ik.Solver, Targets]]:
+    """A solver of each of the `METHODS` and its targets: `count` of hand-first, fewer of others."""
+    robot = ik.load_robot("kuka_lwr_barrett")
+    names = ik.shipped_grasps(robot.name)
+    for method, settings in METHODS.items():
+        each = max(count // len(names) // (1 if not settings else FEWER), 1)
+        targets = random_arm_targets(robot, names, each, np.random.default_rng(0))
+        yield ik.Solver(robot, method, **settings), targets
 
 
 def least(run: Callable[[], object], repeats: int) -> float:
@@ -80,44 +89,33 @@ def least(run: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
-def report(count: int = 12_000, repeats: int = 5) -> Report:
+def report(count: int, repeats: int) -> Section:
     """Measure.
 
     Args:
         count: Targets of hand-first; the others get fewer.
         repeats: Of each measurement.
     """
-    robot = ik.load_robot("kuka_lwr_barrett")
-    names = ik.shipped_grasps(robot.name)
     rows: list[list[str]] = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.mcap"
-        for method, settings in METHODS.items():
-            each = max(count // len(names) // (1 if not settings else FEWER), 1)
-            targets = random_arm_targets(robot, names, each, np.random.default_rng(0))
-            solver = ik.Solver(robot, method, **settings)
+        for solver, targets in cases(count):
             for compression in get_args(ik.logs.Compression):
-                rows.append(
-                    [method, compression, *_measured(solver, targets, compression, path, repeats)]
-                )
+                cells = _measured(solver, targets, compression, path, repeats)
+                rows.append([solver.method, compression, *cells])
     columns = (
         *("method", "compression", "iterations per solve", "write µs", "bytes"),
         *("study, CPU", "study, wall", "read µs", "to polars µs"),
     )
     note = (
         "Per iteration, solves and events included; the least CPU time of all repetitions. Study: "
-        "`solve_batch` with a log over the same without one; chunks are compressed and written by "
-        "a thread of their own, so that the wall time needs an idle core to profit."
+        "`solve_batch` with a log over the same without one; wall time waits for the disk as well."
     )
-    return Report("Logs", columns, rows, note)
+    return Section("Logs", columns, rows, note)
 
 
 def _measured(
-    solver: ik.Solver,
-    targets: tuple[np.ndarray, np.ndarray],
-    compression: Any,
-    path: Path,
-    repeats: int,
+    solver: ik.Solver, targets: Targets, compression: Any, path: Path, repeats: int
 ) -> list[str]:
     kept = Kept()
     solver.solve_batch(*targets, log=kept)
@@ -162,22 +160,20 @@ def _ratios(
     return full / bare
 
 
-def show(found: Report) -> None:
-    """Print it."""
-    table = Table(*found.columns, title=found.title, caption=found.note)
-    for row in found.rows:
-        table.add_row(*row)
-    Console().print(table)
+def main(description: str, measure: Callable[[int, int], Section], repeats: int) -> None:
+    """Measure as the command line says, and print.
 
-
-def main(arguments: list[str] | None = None) -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description="What a log costs.")
+    Args:
+        description: What is measured.
+        measure: Called with the targets of hand-first and the repetitions.
+        repeats: Unless the command line says otherwise.
+    """
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--count", type=int, default=12_000, help="targets of hand-first")
-    parser.add_argument("--repeats", type=int, default=5)
-    options = parser.parse_args(arguments)
-    show(report(options.count, options.repeats))
+    parser.add_argument("--repeats", type=int, default=repeats)
+    options = parser.parse_args()
+    measure(options.count, options.repeats).show()
 
 
 if __name__ == "__main__":
-    main()
+    main("What a log costs.", report, repeats=5)

@@ -4,7 +4,7 @@ Solves are made once and logged several times, each log with one threshold chang
 kind of event as it is; what is counted is read from the logs::
 
     python studies/event_thresholds.py
-    python studies/event_thresholds.py --count 30 --report /tmp/thresholds
+    python studies/event_thresholds.py --count 30 --report out/thresholds
 """
 
 from __future__ import annotations

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -15,17 +14,15 @@ from casadi_ik.logs.mcap_file import McapFile, Summary
 from casadi_ik.logs.message import fill
 from casadi_ik.logs.messages import Messages
 
-CHUNK_SIZE = 2**20
+CHUNK_SIZE = 2**21
 """A chunk is closed at the end of the first solve with which it is no smaller [bytes]."""
 
 
 class ChunkStream:
     """Writes messages to a file, chunk by chunk.
 
-    A chunk is checked, compressed and written by a thread of its own, since all of that leaves
-    Python free to solve on. There is one such chunk at a time: a killed process loses at most two,
-    the one in work and the one being filled, each of `CHUNK_SIZE` and the rest of one solve. A log
-    of a single chunk needs no thread.
+    A chunk is on the disk before the next one is begun. Of what `add` has taken a killed process
+    loses the chunk that is being filled, less than `CHUNK_SIZE`, and no more.
     """
 
     def __init__(
@@ -46,18 +43,10 @@ class ChunkStream:
         self._waiting: list[Messages] = []
         self._size = 0
         self._new: tuple[list[Schema], list[Channel]] = ([], [])
-        self._thread: ThreadPoolExecutor | None = None
-        self._writing: Future[None] | None = None
 
     @property
     def closed(self) -> bool:
-        """Whether nothing more can be written.
-
-        Raises:
-            LogError: A chunk could not be written.
-        """
-        if self._writing is not None and self._writing.done():
-            self._wait()
+        """Whether nothing more can be written."""
         return self._file.closed
 
     def define(self, schema: Schema, channel: Channel) -> None:
@@ -71,7 +60,7 @@ class ChunkStream:
         """Take messages of the same solves on several channels.
 
         Raises:
-            LogError: An earlier chunk could not be written.
+            LogError: A chunk could not be written; the chunks before can be read.
         """
         count, start = len(parts[0].ends), 0
         size = np.sum([part.ends * part.size for part in parts], axis=0)
@@ -82,9 +71,7 @@ class ChunkStream:
             self._waiting += [part.of_solves(start, stop) for part in parts]
             self._size += int(size[stop - 1]) - done
             if self._size >= CHUNK_SIZE:
-                self._wait()
-                self._thread = self._thread or ThreadPoolExecutor(1, "casadi_ik log")
-                self._writing = self._thread.submit(self._write, *self._gathered())
+                self._write()
             start = stop
 
     def close(self) -> None:
@@ -93,37 +80,18 @@ class ChunkStream:
         Raises:
             LogError: It could not be written; the chunks before can be read.
         """
-        self._end_thread()
-        self._wait()
         if self._file.closed:
             return
         if self._waiting:
-            self._write(*self._gathered())
+            self._write()
         self._finish()
 
     def discard(self) -> None:
         """Give up what waits; a file that has nothing else goes away, any other is finished."""
-        self._end_thread()
-        with contextlib.suppress(LogError):
-            self._wait()
-            if not self._file.closed and self._file.position:
+        if not self._file.closed and self._file.position:
+            with contextlib.suppress(LogError):
                 self._finish()
         self._file.close()
-
-    def _wait(self) -> None:
-        """Until the chunk in work is on the disk.
-
-        Raises:
-            LogError: It could not be written.
-        """
-        writing, self._writing = self._writing, None
-        if writing is not None:
-            writing.result()
-
-    def _end_thread(self) -> None:
-        if self._thread is not None:
-            self._thread.shutdown()
-            self._thread = None
 
     def _gathered(self) -> tuple[np.ndarray, list[Run]]:
         """What waits as the contents of a chunk, and where in it which messages are."""
@@ -146,7 +114,9 @@ class ChunkStream:
         self._waiting, self._size, self._new = [], 0, ([], [])
         return data, runs
 
-    def _write(self, data: np.ndarray, runs: list[Run]) -> None:
+    def _write(self) -> None:
+        """Make a chunk of what waits, and write it."""
+        data, runs = self._gathered()
         pieces = self._unwritten()
         position = self._file.position + sum(map(len, pieces))
         written, index = chunk_bytes(data.data, runs, self._compression, position)

@@ -70,9 +70,10 @@ class McapFile:
     def write(self, pieces: Sequence[bytes | memoryview]) -> None:
         """Append, with one call to the system if it takes all at once; nothing is buffered.
 
+        If it fails or is interrupted, the file ends where it ended before.
+
         Raises:
-            LogError: It could not be written. The file ends where it ended before; if that is
-                nowhere, it is gone.
+            LogError: It could not be written. The file is closed; if nothing is in it, it is gone.
         """
         data = memoryview(b"".join(pieces))
         try:
@@ -81,12 +82,15 @@ class McapFile:
             done = 0
             while done < len(data):
                 done += os.write(self._descriptor, data[done:])
-        except OSError as error:
+            self.position += len(data)
+        except BaseException as error:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._descriptor, self.position)
+                os.lseek(self._descriptor, self.position, os.SEEK_SET)
+            if not isinstance(error, OSError):
+                raise
             self.close()
             raise self._failure(error) from error
-        self.position += len(data)
 
     def close(self) -> None:
         """Close and unlock; a file this writer made and never wrote to goes away."""

@@ -173,6 +173,34 @@ def test_an_interrupted_log_keeps_its_chunks(tmp_path: Path) -> None:
     assert 0 < len(log.solves()) < 10
 
 
+@pytest.mark.parametrize("written", [0, 1, 2])
+def test_an_interrupt_while_a_chunk_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    """Its bytes are on the disk, but nobody knows it: the log goes on from where it ended."""
+    write, calls = os.write, []
+
+    def interrupted(descriptor: int, data: Any) -> int:
+        done = write(descriptor, data)
+        calls.append(done)
+        if len(calls) == written + 1:
+            raise KeyboardInterrupt
+        return done
+
+    monkeypatch.setattr("casadi_ik.logs.mcap_file.os.write", interrupted)
+    path = tmp_path / "cup.mcap"
+    with pytest.raises(KeyboardInterrupt):
+        record_many(path, 4)
+    if not written:
+        assert list(tmp_path.iterdir()) == []
+        return
+    log = ik.logs.open(path)
+    assert log.info().unfinished == ()
+    assert log.info().chunks == written
+    solves = len(log.solves())
+    assert log.iterations().rows.tobytes() == make_block(*[1000] * solves).rows.tobytes()
+
+
 def test_a_link_is_followed(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     link = tmp_path / "link.mcap"
