@@ -1,76 +1,57 @@
-"""C code of one solve rewritten for four side by side.
+"""The library of a function for four solves side by side.
 
-CasADi writes one operation a line: `a3=(a1*a2);`. Where `casadi_real` is a vector of four doubles,
-arithmetic means the same four times over; what does not (comparisons, choices, calls of the C
-library, plain numbers) is given the names of `drivers/lanes.c`. Only lines known to mean the same
-are let through, so code of a kind not foreseen is refused rather than run wrong.
+The generated code is there twice: as CasADi wrote it, and once more for vectors of four doubles
+(`lanes_lines.py`), `casadi_f3` as `lanes_f3`. A function with a line that has no form for vectors
+is called for each of the four as it is. What nobody calls the compiler leaves out.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import casadi as ca
 
-from casadi_ik.errors import KernelError
 from casadi_ik.kernels.codegen import driver_text, function_source, step_names
+from casadi_ik.kernels.lanes_lines import UnsuitedError, rewritten
 
 LANES = 4
 """Solves side by side; as in drivers/lanes.c."""
 
-
-class UnsuitedError(KernelError):
-    """The code has a line that cannot be rewritten."""
-
-
-SPACE = r"[ \t]*"
-NUMBER = r"-?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-CONSTANT = rf"{NUMBER}|-?casadi_(?:inf|nan)"
-VARIABLE = r"[A-Za-z_]\w*(?:\[\d+\])?|\(\*\w+\+\+\)"
-OPERAND = rf"{SPACE}(?:{CONSTANT}|{VARIABLE}){SPACE}"
-
-FUNCTIONS = (
-    r"sqrt|floor|ceil|sin|cos|tan|asin|acos|atan|exp|log|tanh|atan2|fmod|hypot|pow"
-    r"|casadi_sq|casadi_fabs|casadi_fmin|casadi_fmax"
-)
-
-OPERATION = re.compile(rf"\(({OPERAND})(<=|>=|==|!=|&&|\|\||[-+*/<>])({OPERAND})\)")
-SIGN = re.compile(rf"\({SPACE}([-!])({OPERAND})\)")
-CHOICE = re.compile(rf"\(({OPERAND})\?({OPERAND}):{SPACE}0{SPACE}\)")
-CALL = re.compile(rf"({FUNCTIONS})\(({OPERAND})(?:,({OPERAND}))?\)")
-GIVEN = re.compile(r"arg\[(\d+)\]\s*\?\s*(arg\[\1\]\[\d+\])\s*:\s*0")
-
-ASSIGNMENT = re.compile(r"(\s*)([aw]\d+(?:\[\d+\])?)\s*([-+*/]?=)(.*);")
-ELEMENTWISE = re.compile(r"(\s*for \(i=0, [^;()]*; i<\d+; \+\+i\) )\(\*rr\+\+\)\s*([-+*/]?=)(.*);")
-POINTER = r"(?:arg\[\d+\] \? arg\[\d+\] : casadi_zeros|\(?&?w\w*(?:[-+]\d+)?\)?|0)"
-AS_THEY_ARE = tuple(
-    re.compile(rf"\s*{pattern}")
-    for pattern in (
-        r"(?:/\*.*\*/)?",
-        r"(?:const )?casadi_(?:real|int)\b[\w\s,*=+]*;",
-        rf"(?:arg1|res1)\[\d+\]={POINTER};",
-        rf"wr?\d+ = {POINTER};",
-        r"if \(res\[(\d+)\](?:!=0)?\) res\[\1\]\[\d+\]\s*=\s*[aw]\d+;",
-        r"if \(casadi_f\d+\(arg1, res1, iw, w, 0\)\) return 1;",
-        rf"casadi_copy\((?:{POINTER}|arg\[\d+\]), \d+, (?:res\[\d+\]|w\d+)\);",
-        rf"casadi_clear\({POINTER}, \d+\);",
-        r"for \(i=0, rr=w\d+, cs=wr?\d+; i<\d+; \+\+i\) "
-        r"for \(j=0; j<\d+; \+\+j\) rr\[i\+j\*\d+\] = \*cs\+\+;",
-        r"for \(rr=[^;()]*, cs=[^;()]*; cs!=[^;()]*; cs\+=\d+\) \*rr\+\+ = \*cs;",
-        r"return (?:0|casadi_f\d+\(arg, res, iw, w, mem\));",
-    )
-)
-
-HEAD = re.compile(r"(?:static|CASADI_SYMBOL_EXPORT) (int \w+\(const casadi_real\*\* arg, .*\) ?\{)")
-ZEROS = re.compile(r"static const casadi_real casadi_zeros\[(\d+)\]")
-OUTPUTS = re.compile(r"/\* .*->\((.*)\) \*/")
-SIZE = re.compile(r"\[(\d+)(?:x(\d+))?\]")
+SIGNATURE = re.compile(r"/\* \w+:\((.*)\)->\((.*)\) \*/")
+HEAD = re.compile(r"(?:static|CASADI_SYMBOL_EXPORT) int (\w+)\(const casadi_real\*\* arg, .*\) ?\{")
+SIZE = re.compile(r"[io]\d+(?:\[(\d+)(?:x(\d+))?(?:,(\d+)nz)?\])?")
 BRANCH = re.compile(r"\s*if \(casadi_f(\d+)\(arg\+1, res, iw, w, 0\)\) return 1;")
-RENAMED = {"nan": "NAN", "inf": "INFINITY"} | {
-    name: f"lanes_{name}" for name in ("sq", "fabs", "fmin", "fmax", "copy", "clear")
-}
-KEPT = ("_work", "_checkout", "_release", "_incref")
+BY_FIRST_ARGUMENT = re.compile(r"\s*(switch|if) \(arg\[0\] \? casadi_to_int\(\*arg\[0\]\) : 0\) \{")
+ZEROS = re.compile(r"static const casadi_real casadi_zeros\[(\d+)\]")
+MEMORY = re.compile(r"casadi_f\d+_(?:mem|checkout)")
+WORK = re.compile(r"\*sz_(arg|res) = (\d+);")
+RENAMED = ("sq", "fabs", "fmin", "fmax", "hypot", "copy", "clear", "zeros")
+
+
+@dataclass(frozen=True)
+class _Function:
+    """A function of the generated code.
+
+    Attributes:
+        name: As CasADi named it.
+        inputs: How many numbers each input has.
+        outputs: How many numbers each output has.
+        body: Its lines.
+    """
+
+    name: str
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+    body: tuple[str, ...]
+
+    @property
+    def head(self) -> str:
+        """The first line of its form for vectors; `wanted` has a bit for each lane that counts."""
+        name = "lanes_" + self.name.removeprefix("casadi_")
+        given = "const lanes** arg, lanes** res, casadi_int* iw, lanes* w, int wanted"
+        return f"LANES_TARGET static int {name}({given}) {{"
 
 
 def lanes_source(function: ca.Function, driver: str) -> str:
@@ -81,144 +62,118 @@ def lanes_source(function: ca.Function, driver: str) -> str:
         driver: C text of the driver, with its constants.
 
     Raises:
-        UnsuitedError: The code has a line of a kind not foreseen.
+        UnsuitedError: The outermost function has no form for vectors, or one needs memory.
         KernelError: The graph has no C code.
     """
+    name = function.name()
     text = function_source(function)
+    if MEMORY.search(text):
+        raise UnsuitedError(f"{name}: a function with memory of its own")
     zeros = ZEROS.search(text)
+    *inner, step, entry = _functions(text)
+    room = {key: int(size) for key, size in WORK.findall(text)}
     return "\n".join(
         (
+            "#define CASADI_SYMBOL_EXPORT static",
+            text,
             driver_text("lanes"),
-            *(f"#define casadi_{name} {own}" for name, own in RENAMED.items()),
-            f"static const lanes casadi_zeros[{zeros[1] if zeros else 1}];",
-            *_functions(text, function.name()),
-            step_names(function.name()),
+            *(f"#undef casadi_{own}\n#define casadi_{own} lanes_{own}" for own in RENAMED),
+            f"static const lanes lanes_zeros[{zeros[1] if zeros else 1}];",
+            *(line for each in inner for line in _side_by_side(each, room)),
+            *(line for each in (step, entry) for line in _for_vectors(each)),
+            step_names(name).replace(f"STEP {name}", f"STEP lanes_{name}"),
             driver_text("common"),
             driver,
         )
     )
 
 
-def _functions(text: str, name: str) -> list[str]:
-    """The functions of the generated code that a driver needs, rewritten."""
-    found: list[str] = []
+def _functions(text: str) -> Iterator[_Function]:
+    """The functions with the signature of a step, callees before callers."""
     lines = iter(text.splitlines())
-    signature = ""
-    kept = re.compile(rf"CASADI_SYMBOL_EXPORT ((?:int|void) {name}(?:{'|'.join(KEPT)})\(.*)")
+    sizes: tuple[tuple[int, ...], ...] = ((), ())
     for line in lines:
-        if head := HEAD.fullmatch(line):
-            body = list(_until_end(lines))
-            found.append(f"LANES_TARGET static {head[1]}")
-            found.extend(_branches(body, signature) or map(_rewritten, body))
-            found.append("}")
-        elif head := kept.fullmatch(line):
-            found.extend((f"static {head[1]}", *_until_end(lines), "}"))
-        signature = line
-    return found
+        if signature := SIGNATURE.fullmatch(line):
+            sizes = tuple(_sizes(half) for half in signature.groups())
+        elif head := HEAD.fullmatch(line):
+            yield _Function(head[1], *sizes, tuple(iter(lines.__next__, "}")))
 
 
-def _until_end(lines: Iterator[str]) -> Iterator[str]:
-    """The lines of a function's body."""
-    for line in lines:
-        if line == "}":
-            return
-        yield line
+def _sizes(arguments: str) -> tuple[int, ...]:
+    """Numbers of each argument: `o0` has one, `o0[3]` three, `o0[3x2]` six, `o0[3x2,4nz]` four."""
+    return tuple(
+        int(nonzeros) if nonzeros else int(rows or 1) * int(columns or 1)
+        for rows, columns, nonzeros in SIZE.findall(arguments)
+    )
 
 
-def _branches(body: list[str], signature: str) -> list[str] | None:
-    """The body of a function that calls one of others by its first argument; None for the rest.
+def _side_by_side(function: _Function, room: dict[str, int]) -> list[str]:
+    """The function for vectors; one lane after the other where there is no other way."""
+    try:
+        return _for_vectors(function)
+    except UnsuitedError:
+        return _one_by_one(function, room)
 
-    Where the four agree, the branch they take is called; otherwise each branch that any of them
-    takes, and everyone keeps the results of its own.
-    """
-    switch = body[0].strip() == "switch (arg[0] ? casadi_to_int(*arg[0]) : 0) {"
-    choice = body[0].strip() == "if (arg[0] ? casadi_to_int(*arg[0]) : 0) {"
-    if not (switch or choice):
-        return None
-    called = [match[1] for line in body if (match := BRANCH.fullmatch(line))]
-    outputs = OUTPUTS.fullmatch(signature)
-    if outputs is None or not called:
-        raise UnsuitedError(f"branches of an unknown kind: {signature!r}")
-    sizes = [_size(output) for output in outputs[1].split(",")]
-    # Of `if`, the first branch is that of everything but 0.
-    order = called if switch else called[::-1]
-    last = len(order) - 1
-    results = range(len(sizes))
+
+def _for_vectors(function: _Function) -> list[str]:
+    if choice := BY_FIRST_ARGUMENT.fullmatch(function.body[0]):
+        body = _branches(function, choice[1])
+    else:
+        body = [rewritten(line) for line in function.body]
+    return [function.head, *body, "}"]
+
+
+def _one_by_one(function: _Function, room: dict[str, int]) -> list[str]:
+    """Each lane that counts calls the function as it is."""
+    sizes = [*function.inputs, *function.outputs]
     return [
-        *(f"  lanes own{k}[{size}];" for k, size in enumerate(sizes)),
-        f"  casadi_real *given[{len(sizes)}];",
-        f"  lane_mask branch = lanes_branch(arg[0], {last}), mine;",
-        "  int b;",
-        f"  for (b = 0; b <= {last}; ++b) {{",
-        "    mine = (lane_mask) (branch == (lane_mask) {b, b, b, b});",
-        "    if (!lanes_any(mine)) continue;",
-        "    if (lanes_all(mine)) {",
-        *_calls(order, "return", "      "),
+        function.head,
+        f"  static const int sizes[] = {{{', '.join(map(str, sizes))}}};",
+        f"  double numbers[{sum(sizes)}];",
+        f"  const double *one_arg[{room['arg']}];",
+        f"  double *one_res[{room['res']}];",
+        f"  const lanes_alone alone = {{{function.name}, {len(function.inputs)}, "
+        f"{len(function.outputs)}, sizes, numbers, one_arg, one_res}};",
+        "  return lanes_one_by_one(&alone, arg, res, iw, (double *) w, wanted);",
+        "}",
+    ]
+
+
+def _branches(function: _Function, word: str) -> list[str]:
+    """The body of a function that calls one of others by its first argument.
+
+    Where all that count agree, the branch they take is called; otherwise each branch that any of
+    them takes, and everyone keeps the results of its own.
+    """
+    called = [match[1] for line in function.body if (match := BRANCH.fullmatch(line))]
+    # Of `if`, the first branch is that of everything but 0.
+    order = called if word == "switch" else called[::-1]
+    sizes = list(enumerate(function.outputs))
+    return [
+        *(f"  lanes own{k}[{size}];" for k, size in sizes),
+        f"  lanes *given[{len(sizes)}];",
+        "  int branch[LANES], b, mine;",
+        f"  lanes_branch(arg[0], {len(order) - 1}, branch);",
+        f"  for (b = 0; b < {len(order)}; ++b) {{",
+        "    mine = wanted & lanes_in(branch, b);",
+        "    if (!mine) continue;",
+        "    if (mine == wanted) {",
+        *_calls(order, "return {call};"),
         "    }",
-        *(f"    given[{k}] = res[{k}];" for k in results),
-        *(f"    if (res[{k}]) res[{k}] = own{k};" for k in results),
-        *_calls(order, "", "    "),
-        *(f"    res[{k}] = given[{k}];" for k in results),
-        *(f"    lanes_keep(mine, own{k}, {size}, res[{k}]);" for k, size in enumerate(sizes)),
+        *(f"    given[{k}] = res[{k}];" for k, _ in sizes),
+        *(f"    if (res[{k}]) res[{k}] = own{k};" for k, _ in sizes),
+        *_calls(order, "if ({call}) return 1; break;"),
+        *(f"    res[{k}] = given[{k}];" for k, _ in sizes),
+        *(f"    lanes_keep(mine, own{k}, {size}, res[{k}]);" for k, size in sizes),
         "  }",
         "  return 0;",
     ]
 
 
-def _calls(order: list[str], word: str, indent: str) -> Iterator[str]:
+def _calls(order: list[str], form: str) -> Iterator[str]:
     """A switch over b that calls the functions."""
-    yield f"{indent}switch (b) {{"
+    yield "    switch (b) {"
     for case, number in enumerate(order):
-        call = f"casadi_f{number}(arg + 1, res, iw, w, 0)"
-        done = f"return {call};" if word else f"if ({call}) return 1; break;"
-        yield f"{indent}  case {case}: {done}"
-    yield f"{indent}}}"
-
-
-def _size(output: str) -> int:
-    """Numbers of an output in a signature: `o0` has one, `o0[3]` three, `o0[3x2]` six."""
-    found = SIZE.search(output)
-    return 1 if found is None else int(found[1]) * int(found[2] or 1)
-
-
-def _rewritten(line: str) -> str:
-    """One line of a function's body.
-
-    Raises:
-        UnsuitedError: A line of a kind not foreseen.
-    """
-    if any(pattern.fullmatch(line) for pattern in AS_THEY_ARE):
-        return line
-    if match := ASSIGNMENT.fullmatch(line):
-        return f"{match[1]}{match[2]} {match[3]} {_value(match[4].strip())};"
-    if match := ELEMENTWISE.fullmatch(line):
-        return f"{match[1]}(*rr++) {match[2]} {_value(match[3].strip())};"
-    raise UnsuitedError(f"no side-by-side form of {line.strip()!r}")
-
-
-def _value(text: str) -> str:
-    """The right-hand side of an assignment: one operation."""
-    if match := GIVEN.fullmatch(text):
-        return f"arg[{match[1]}] ? {match[2]} : SPREAD(0.0)"
-    if match := OPERATION.fullmatch(text):
-        left, operator, right = _operand(match[1]), match[2], _operand(match[3])
-        if operator in ("&&", "||"):
-            return f"TRUTH(IS({left}) {operator[0]} IS({right}))"
-        both = f"({left} {operator} {right})"
-        return both if operator in "+-*/" else f"TRUTH{both}"
-    if match := SIGN.fullmatch(text):
-        value = _operand(match[2])
-        return f"(-{value})" if match[1] == "-" else f"TRUTH({value} == SPREAD(0.0))"
-    if match := CHOICE.fullmatch(text):
-        return f"lanes_if_else_zero({_operand(match[1])}, {_operand(match[2])})"
-    if match := CALL.fullmatch(text):
-        values = ", ".join(_operand(value) for value in match.groups()[1:] if value)
-        return f"lanes_{match[1].removeprefix('casadi_')}({values})"
-    if re.fullmatch(OPERAND, text):
-        return _operand(text)
-    raise UnsuitedError(f"no side-by-side form of the value {text!r}")
-
-
-def _operand(text: str) -> str:
-    text = text.strip()
-    return f"SPREAD({text})" if re.fullmatch(CONSTANT, text) else text
+        call = f"lanes_f{number}(arg + 1, res, iw, w, mine)"
+        yield f"      case {case}: {form.format(call=call)}"
+    yield "    }"

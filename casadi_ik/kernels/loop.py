@@ -57,9 +57,16 @@ class LoopKernel:
             self.step.name, lambda: self._function, self._driver("loop"), SYMBOL, self.step.recipe
         )
 
+    @property
+    def lanes(self) -> int:
+        """How many solves of a batch are made side by side; 1 where that is not possible."""
+        return 1 if self._side_by_side is None else LANES
+
     @cached_property
     def _side_by_side(self) -> Any:
         """The loop that makes four solves at a time; None where there is none."""
+        if not self.compiled:
+            return None
         try:
             library = load_library(
                 f"{self.step.name}_lanes",

@@ -81,8 +81,9 @@ def branching_step() -> StepGraph:
     left = ca.Function("left", [x, p], [ca.sin(3 * x) * p[0], record_of(x, p)])
     right = ca.Function("right", [x, p], [ca.sqrt(1 + x * x) - 2 * ca.cos(x), record_of(-x, p)])
     branch = ca.Function.conditional("branch", [left], right)
+    which = ca.Function("which", [x, p], [ca.sum1(x) > p[1]])
     xm, pm = ca.MX.sym("x", 4), ca.MX.sym("p", 2)
-    new, record = branch(ca.sum1(xm) > pm[1], xm, pm)
+    new, record = branch(which(xm, pm), xm, pm)
     status = ca.if_else(ca.fabs(new[0] - pm[1]) < 0.01, DONE, RUNNING)
     return step_of("branching_step", ca.Function("branching_step", [xm, pm], [new, record, status]))
 

@@ -11,7 +11,9 @@ from pinocchio_oracle import PinocchioRobot, verdict
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnknownNameError, UnsupportedError
+from casadi_ik.kernels.lanes import LANES
 from casadi_ik.solvers import method_summary
+from casadi_ik.solvers.registry import build_method
 
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
 ROBOTS = ik.shipped_names("arm_hands")
@@ -161,6 +163,15 @@ def test_a_batch_is_its_single_solves(case):
         for row in range(3):
             alone = solver.solve_batch(case.points[row : row + 1], case.normals[row : row + 1])
             np.testing.assert_array_equal(whole.q[row], alone.q[0])
+
+
+def test_a_batch_goes_side_by_side(case):
+    """No line of any shipped method's code is refused by the rewriting."""
+    options = {"finger_step": "closed-form"} if case.method.startswith("enhanced") else {}
+    kernel = getattr(build_method(case.method, case.robot.description, options), "kernel", None)
+    if kernel is None or not kernel.compiled:
+        pytest.skip("no compiled loop")
+    assert kernel.lanes == LANES
 
 
 def test_threads_change_nothing(case):

@@ -1,6 +1,7 @@
-/* Four solves side by side: the step's arithmetic on vectors whose entries belong to four solves.
+/* The step's arithmetic on vectors whose entries belong to four solves.
  *
- * Stands before the code CasADi generated, which `lanes.py` has rewritten to call what is here.
+ * Stands between the code as CasADi generated it and the same rewritten to call what is here
+ * (`lanes.py`).
  * Every entry is computed as one double would be (no contraction, the same library functions), so
  * a solve's iterates are bit for bit those it has alone. Vectors are those of gcc and clang.
  */
@@ -19,8 +20,8 @@ typedef int64_t lane_mask __attribute__((vector_size(LANES * sizeof(double))));
 #endif
 #define LANES_INLINE static inline __attribute__((always_inline)) LANES_TARGET
 
+#undef casadi_real
 #define casadi_real lanes
-#define casadi_int long long int
 
 #define SPREAD(x) ((lanes) {(x), (x), (x), (x)})
 #define TRUTH(mask) ((lanes) ((lane_mask) (mask) & (lane_mask) SPREAD(1.0)))
@@ -96,27 +97,63 @@ static inline void lanes_clear(lanes *to, casadi_int count) {
   if (to) memset(to, 0, (size_t) count * sizeof(lanes));
 }
 
-/* Branches: which one each lane takes, `last` for all numbers that are not 0 ... last - 1.
- * As CasADi's casadi_to_int the fraction is dropped; of a choice, everything but 0 is the last. */
-LANES_INLINE lane_mask lanes_branch(const lanes *index, int64_t last) {
-  lane_mask branch = {0};
+/* Which branch each lane takes, `last` for all numbers that are not 0 ... last - 1. As CasADi's
+ * casadi_to_int the fraction is dropped; of two branches everything but 0 takes the last. */
+static void lanes_branch(const lanes *index, int last, int *branch) {
   int i;
-  for (i = 0; index && i < LANES; ++i) {
-    const double x = (*index)[i];
-    branch[i] = x > -1 && x < (double) last ? (int64_t) x : last;
+  for (i = 0; i < LANES; ++i) {
+    const double x = index ? ((const double *) index)[i] : 0;
+    branch[i] = x > -1 && x < last ? (int) x : last;
   }
-  return branch;
 }
 
-LANES_INLINE int lanes_any(lane_mask mask) {
-  return (mask[0] | mask[1] | mask[2] | mask[3]) != 0;
+/* A bit for each lane that takes branch b. */
+static int lanes_in(const int *branch, int b) {
+  int i, bits = 0;
+  for (i = 0; i < LANES; ++i) bits |= (branch[i] == b) << i;
+  return bits;
 }
 
-LANES_INLINE int lanes_all(lane_mask mask) {
-  return (mask[0] & mask[1] & mask[2] & mask[3]) != 0;
+static void lanes_keep(int mine, const lanes *own, int count, lanes *result) {
+  int i, k;
+  if (!result) return;
+  for (i = 0; i < LANES; ++i) {
+    if (!(mine >> i & 1)) continue;
+    for (k = 0; k < count; ++k) {
+      ((double *) result)[k * LANES + i] = ((const double *) own)[k * LANES + i];
+    }
+  }
 }
 
-LANES_INLINE void lanes_keep(lane_mask mine, const lanes *own, int count, lanes *result) {
-  int k;
-  for (k = 0; result && k < count; ++k) result[k] = lanes_select(mine, own[k], result[k]);
+/* A function of plain doubles and memory for a call of it. */
+typedef struct {
+  int (*function)(const double **, double **, casadi_int *, double *, int);
+  int n_in, n_out;
+  const int *sizes;            /* numbers of each input, then of each output */
+  double *numbers;             /* their sum */
+  const double **arg;
+  double **res;
+} lanes_alone;
+
+static int lanes_one_by_one(const lanes_alone *alone, const lanes **arg, lanes **res,
+                            casadi_int *iw, double *w, int wanted) {
+  int lane, i, k;
+  for (lane = 0; lane < LANES; ++lane) {
+    double *number = alone->numbers;
+    const int *size = alone->sizes;
+    if (!(wanted >> lane & 1)) continue;
+    for (i = 0; i < alone->n_in; ++i, number += *size++) {
+      alone->arg[i] = arg[i] ? number : NULL;
+      for (k = 0; arg[i] && k < *size; ++k) number[k] = ((const double *) arg[i])[k * LANES + lane];
+    }
+    for (i = 0; i < alone->n_out; ++i, number += *size++) alone->res[i] = res[i] ? number : NULL;
+    if (alone->function(alone->arg, alone->res, iw, w, 0)) return 1;
+    size = alone->sizes + alone->n_in;
+    for (i = 0; i < alone->n_out; ++i, ++size) {
+      for (k = 0; res[i] && k < *size; ++k) {
+        ((double *) res[i])[k * LANES + lane] = alone->res[i][k];
+      }
+    }
+  }
+  return 0;
 }

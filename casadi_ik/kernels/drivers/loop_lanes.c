@@ -119,19 +119,6 @@ static int fill(bench *b, queues *all, loop_job *job) {
   return lane;
 }
 
-/* A lane without a solve does what another does, so that it takes no branch of its own. */
-static void imitate(bench *b) {
-  int lane, k, busy = 0;
-  while (b->slot[busy] == NOBODY) ++busy;
-  for (lane = 0; lane < LANES; ++lane) {
-    if (b->slot[lane] != NOBODY) continue;
-    for (k = 0; k < N_STATE; ++k) LANE(b->now, k, lane) = LANE(b->now, k, busy);
-    for (k = 0; k < N_PARAMETERS; ++k) {
-      LANE(b->parameters, k, lane) = LANE(b->parameters, k, busy);
-    }
-  }
-}
-
 static void write_row(const bench *b, loop_job *job, int lane, int64_t solve) {
   double own[N_RECORD + 1];
   int k;
@@ -238,21 +225,21 @@ EXPORT LANES_TARGET int casadi_ik_loop_lanes(loop_job *job) {
   limit = since + job->slice;
 
   while (outcome == DONE && (busy = fill(&b, &all, job))) {
-    int changed = 0;
+    int changed = 0, wanted = 0;
     for (lane = 0; lane < LANES; ++lane) {
       solves[lane] = b.slot[lane] == NOBODY ? NOBODY : job->slots[b.slot[lane]];
+      if (solves[lane] != NOBODY) wanted |= 1 << lane;
     }
     while (!changed) {
       if (job->rows && job->used + LANES > job->capacity) outcome = ROWS_FULL;
       if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) outcome = SLICE_OVER;
       if (outcome != DONE) break;
-      if (busy < LANES) imitate(&b);
       space.arg[0] = b.now;
       space.arg[1] = b.parameters;
       space.res[0] = b.next;
       space.res[1] = job->rows ? b.record : NULL;
       space.res[2] = &code;
-      if (STEP(space.arg, space.res, space.iw, space.w, space.mem)) {
+      if (STEP(space.arg, space.res, space.iw, space.w, wanted)) {
         outcome = STEP_FAILED;
         break;
       }

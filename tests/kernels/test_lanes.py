@@ -1,0 +1,187 @@
+"""Four solves side by side: each bit for bit as in the virtual machine, whatever the others do."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from casadi_ik.kernels import (
+    NON_FINITE,
+    REPEATED,
+    RUNNING,
+    Field,
+    Layout,
+    LoopKernel,
+    LoopResult,
+    StepGraph,
+)
+from casadi_ik.kernels.lanes import LANES, lanes_source
+from casadi_ik.kernels.lanes_lines import UnsuitedError
+from casadi_ik.kernels.loop_job import SLOTS
+
+from .graphs import (
+    COUNT,
+    DONE,
+    branching_step,
+    circling_step,
+    counting_step,
+    needs_compiler,
+    random_step,
+    step_of,
+)
+
+pytestmark = needs_compiler
+
+COUNTS = (LANES, LANES + 1, 2 * SLOTS + 3)
+"""Solves in a batch: as many as lanes, one that must wait, many more than are under way at once."""
+
+
+def assert_as_in_vm(
+    step: StepGraph, states: np.ndarray, parameters: np.ndarray, budget: int
+) -> LoopResult:
+    """The result, once it is known to be that of the virtual machine."""
+    kernel = LoopKernel(step)
+    assert kernel.lanes == LANES
+    found = kernel.run(states, parameters, budget, trace=True)
+    expected = LoopKernel(step, compiled=False).run(states, parameters, budget, trace=True)
+    assert found.states.tobytes() == expected.states.tobytes()
+    np.testing.assert_array_equal(found.iterations, expected.iterations)
+    np.testing.assert_array_equal(found.status, expected.status)
+    assert found.rows is not None
+    assert expected.rows is not None
+    assert found.rows.tobytes() == expected.rows.tobytes()
+    untraced = kernel.run(states, parameters, budget)
+    assert untraced.states.tobytes() == expected.states.tobytes()
+    return found
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("step", [random_step(0), random_step(1), branching_step()])
+def test_as_in_vm(step: StepGraph, count: int) -> None:
+    rng = np.random.default_rng(count)
+    states, parameters = rng.normal(size=(count, 4)), rng.normal(size=(count, 2))
+    found = assert_as_in_vm(step, states, parameters, 300)
+    # Not vacuous: solves end at different iterations.
+    assert count < COUNTS[-1] or len(np.unique(found.iterations)) > 2
+
+
+def staged_step(stages: int) -> StepGraph:
+    """Goes through its stages by chance, each with an arithmetic of its own."""
+    x, stage, p = ca.SX.sym("x"), ca.SX.sym("stage"), ca.SX.sym("p")
+    cases = [
+        ca.Function(f"case_{i}", [x, p], [ca.sin((3 + i) * x + p) * 2 + i / 7])
+        for i in range(stages)
+    ]
+    xm, sm, pm = ca.MX.sym("x"), ca.MX.sym("stage"), ca.MX.sym("p")
+    new = ca.Function.conditional("choose", cases[:-1], cases[-1])(sm, xm, pm)
+    # The digits up to the sixth after the point are as good as chance.
+    digits = ca.floor(1e6 * ca.fabs(x))
+    drawn = digits - stages * ca.floor(digits / stages)
+    after = ca.Function(
+        "after",
+        [x, stage],
+        [
+            ca.if_else(ca.sin(50 * x) > 0.2, drawn, stage),
+            ca.if_else(ca.fabs(x) < 0.01, DONE, RUNNING),
+        ],
+    )
+    next_stage, status = after(new, sm)
+    state = ca.MX.sym("state", 2)
+    function = ca.Function("inner", [xm, sm, pm], [ca.vertcat(new, next_stage), new, status])
+    name = f"staged_{stages}"
+    outer = ca.Function(name, [state, pm], list(function(state[0], state[1], pm)))
+    layout = Layout((Field("x"), Field("stage")))
+    return StepGraph(name, outer, layout, Layout((Field("p"),)), COUNT, stage="stage")
+
+
+# Eleven stages are more than the driver keeps apart.
+@pytest.mark.parametrize("stages", [2, 4, 11])
+@pytest.mark.parametrize("count", COUNTS)
+def test_stages(stages: int, count: int) -> None:
+    rng = np.random.default_rng(count + stages)
+    states = np.column_stack([rng.normal(size=count), rng.integers(stages, size=count)])
+    found = assert_as_in_vm(staged_step(stages), states, rng.normal(size=(count, 1)), 400)
+    assert count < COUNTS[-1] or len(np.unique(found.states[:, 1])) > 1
+    assert count < COUNTS[-1] or len(np.unique(found.iterations)) > 2
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_every_end_beside_every_other(count: int) -> None:
+    """Done, repeated, not finite, out of iterations: side by side in one batch."""
+    x, p = ca.SX.sym("x"), ca.SX.sym("p", 2)
+    counting, exploding = x + 1, x * x * 1e30
+    circling = ca.if_else(x >= 20, x - 3, x + 1)
+    new = ca.if_else(p[0] == 0, counting, ca.if_else(p[0] == 1, exploding, circling))
+    new = ca.if_else(p[0] == 3, x + 0.25, new)
+    status = ca.if_else(ca.logic_and(p[0] == 0, new >= p[1]), DONE, RUNNING)
+    step = step_of("all_ends", ca.Function("all_ends", [x, p], [new, new, status]), COUNT)
+    rng = np.random.default_rng(count)
+    parameters = np.column_stack([np.arange(count) % 4, rng.integers(1, 90, size=count)])
+    found = assert_as_in_vm(step, rng.uniform(1, 2, size=(count, 1)), parameters, 100)
+    assert set(found.status.tolist()) == {DONE, REPEATED, NON_FINITE, RUNNING}
+
+
+def test_pauses_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("casadi_ik.kernels.loop_job.SLICE", 0.0)
+    rng = np.random.default_rng(3)
+    count = COUNTS[-1]
+    states = np.column_stack([rng.normal(size=count), np.zeros(count)])
+    assert_as_in_vm(staged_step(4), states, rng.normal(size=(count, 1)), 400)
+    assert_as_in_vm(circling_step("circling_lanes"), np.zeros((9, 1)), np.arange(9.0)[:, None], 500)
+
+
+def test_shared_parameters_and_time() -> None:
+    kernel = LoopKernel(counting_step())
+    result = kernel.run(np.arange(10.0)[:, None], [500.0], 1000)
+    np.testing.assert_array_equal(result.states[:, 0], 500.0)
+    np.testing.assert_array_equal(result.iterations, 500 - np.arange(10))
+    assert (result.time > 0).all()
+
+
+SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 1e-310, 1e300, np.inf, -np.inf, np.nan])
+
+
+def test_operations_on_special_numbers() -> None:
+    """Every operation the rewriting knows, on every pair of special numbers."""
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    unary = [ca.sqrt, ca.floor, ca.ceil, ca.sin, ca.cos, ca.tan, ca.asin, ca.acos, ca.atan]
+    unary += [ca.exp, ca.log, ca.tanh, ca.fabs, ca.logic_not, lambda v: v * v]
+    binary = [ca.atan2, ca.fmod, ca.hypot, ca.fmin, ca.fmax, ca.logic_and, ca.logic_or]
+    values = [-x, x + y, x - y, x * y, x / y, 2 / x, x < y, x <= y, x == y, x != y, x**3.7]
+    values += [f(x) for f in unary] + [f(x, y) for f in binary]
+    values += [ca.if_else(x, y, -1), ca.if_else(x > 0, ca.inf, y)]
+    record = Layout.record(Field("values", (len(values),), "f8"))
+    # The state stays as it is, so that the operations may give anything.
+    state, p = ca.SX.sym("state"), ca.SX.sym("p", 2)
+    results = ca.substitute(ca.vertcat(*values), ca.vertcat(x, y), p)
+    function = ca.Function("operations", [state, p], [state, results, ca.SX(DONE)])
+    step = StepGraph(
+        "operations", function, Layout((Field("x"),)), Layout((Field("p", (2,)),)), record
+    )
+    pairs = np.stack(np.meshgrid(SPECIAL, SPECIAL), axis=-1).reshape(-1, 2)
+    kernel = LoopKernel(step)
+    assert kernel.lanes == LANES
+    states = np.zeros((len(pairs), 1))
+    found = kernel.run(states, pairs, 1, trace=True).rows
+    expected = LoopKernel(step, compiled=False).run(states, pairs, 1, trace=True).rows
+    assert found is not None
+    assert expected is not None
+    np.testing.assert_array_equal(found["values"], expected["values"])
+    assert np.isfinite(found["values"]).any(axis=0).all()
+
+
+def test_unforeseen_code_is_refused_and_runs_one_by_one() -> None:
+    x, p = ca.SX.sym("x"), ca.SX.sym("p")
+    function = ca.Function("unforeseen", [x, p], [ca.sinh(x) + p, x, ca.SX(RUNNING)])
+    with pytest.raises(UnsuitedError, match="sinh"):
+        lanes_source(function, "")
+    kernel = LoopKernel(step_of("unforeseen", function, COUNT))
+    assert kernel.compiled
+    assert kernel.lanes == 1
+    result = kernel.run(np.full((9, 1), 0.1), [0.0], 1)
+    np.testing.assert_array_equal(result.states, np.sinh(0.1))
+
+
+def test_without_compiler_there_are_no_lanes() -> None:
+    assert LoopKernel(counting_step(), compiled=False).lanes == 1
