@@ -61,6 +61,7 @@ class CompiledBatch:
         self.name = step.name
         self.result = result
         self._parameters = parameters
+        self._places = np.empty((0, 2), dtype=np.int64)
         self._mark = np.zeros((SLOTS, step.state.size))
         self.job = Job(
             states=memory(result.states),
@@ -84,12 +85,7 @@ class CompiledBatch:
         Raises:
             KernelError: No work memory.
         """
-        self._rows_to(FIRST_ROWS)
-        while (code := loop(ctypes.byref(self.job))) != Outcome.DONE:
-            check(self.name, code)
-            if code == Outcome.ROWS_FULL:
-                self._rows_to(2 * self.job.capacity)
-        self._rows_to(self.job.used)
+        self._run(loop)
 
     def run_side_by_side(self, loop: Any) -> None:
         """Four solves at a time.
@@ -101,37 +97,34 @@ class CompiledBatch:
             KernelError: No work memory, or the step failed.
         """
         slots = np.full(SLOTS, -1, dtype=np.int64)
-        places = np.empty((0, 2), dtype=np.int64)
         self.job.slots = memory(slots)
+        self._run(loop)
+        if self.result.rows is not None:
+            self._put_in_order(self.result.rows)
+
+    def _run(self, loop: Any) -> None:
         self._rows_to(FIRST_ROWS)
-        while True:
-            if self.result.rows is not None and len(self.result.rows) > len(places):
-                places.resize((len(self.result.rows), 2), refcheck=False)
-                self.job.places = memory(places)
-            code = loop(ctypes.byref(self.job))
-            if code == Outcome.DONE:
-                break
+        while (code := loop(ctypes.byref(self.job))) != Outcome.DONE:
             check(self.name, code)
             if code == Outcome.ROWS_FULL:
                 self._rows_to(2 * self.job.capacity)
-        if self.result.rows is not None:
-            self._rows_to(self.job.used)
-            self._put_in_order(places[: self.job.used])
+        self._rows_to(self.job.used)
 
     def _rows_to(self, count: int) -> None:
         """Make room for so many rows, in place: a long trace is not copied."""
         rows = self.result.rows
         if rows is not None:
             rows.resize(count, refcheck=False)
-            self.job.rows, self.job.capacity = memory(rows), count
+            self._places.resize((count, 2), refcheck=False)
+            self.job.rows, self.job.places = memory(rows), memory(self._places)
+            self.job.capacity = count
 
-    def _put_in_order(self, places: NDArray[np.int64]) -> None:
+    def _put_in_order(self, rows: NDArray[Any]) -> None:
         """Rows solve by solve, from the order in which they were made."""
         iterations = self.result.iterations
         first = np.cumsum(iterations) - iterations
-        rows: Any = self.result.rows
-        made = opaque(rows.copy())
-        opaque(rows)[first[places[:, 0]] + places[:, 1]] = made
+        solve, iteration = self._places.T
+        opaque(rows)[first[solve] + iteration] = opaque(rows.copy())
 
 
 class SingleSolve:

@@ -36,7 +36,7 @@ class LoopResult:
         iterations: Steps made, shape (k,); the one that became non-finite counts.
         status: Shape (k,): the step's status, `RUNNING` if the iterations ran out, `NON_FINITE`,
             `FAILED` or `REPEATED`.
-        time: Seconds inside the loop, shape (k,).
+        time: Seconds inside the loop, shape (k,); solves side by side share them.
         rows: The records of all iterations of all solves, one after the other, shape
             (sum of iterations,), of the record layout's dtype; None if no trace was asked for.
     """

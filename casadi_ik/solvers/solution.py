@@ -27,7 +27,7 @@ class Solution:
         q: (n,) actuator positions reached [rad or m].
         iterations: Iterations over all phases and restarts.
         restarts: How often the method began anew.
-        time: Seconds the solve took.
+        time: Seconds the solve took; in a batch its share of the time.
         contacts: Verdict by finger.
         phases: Iterations by phase name, in the order of the phases.
         limits_ok: Whether every actuator and joint is within its limits.
@@ -62,7 +62,7 @@ class BatchSolution:
         q: (k, n) actuator positions [rad or m].
         iterations: (k,).
         restarts: (k,).
-        time: (k,) seconds per solve.
+        time: (k,) seconds per solve; solves made side by side share the time.
         position_error: (k, f) [m], NaN where free.
         angle_error: (k, f) [rad], NaN where free.
         ok: (k, f) bool.

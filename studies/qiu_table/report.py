@@ -30,8 +30,8 @@ The paper prints six of its twelve objects; its means here are over those six. I
 neither its grasps, nor its start as numbers, nor whether limits were enforced: the grasps and so
 the targets are our own. Its "Can" stands beside our tomato soup can, which is a guess, and of that
 can's enhanced DLS it prints time and iterations the wrong way round (put right here). Times are
-those of the compiled loops on this machine while others were at work on it, beside MATLAB's: an
-order of magnitude, no more.
+a solve's share of the compiled loop, which makes four at once, on this machine while others were at
+work on it, beside MATLAB's: an order of magnitude, no more.
 """
 
 DIFFERENCES = """
