@@ -16,7 +16,6 @@ from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.logs import Compression, Keep, McapRecorder
 from casadi_ik.solvers import (
-    FINGER_STEPS,
     LIMITS,
     METHODS,
     Alternative,
@@ -89,13 +88,7 @@ class Solver:
         self.method = method
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
         self.limits = limits
-        self.options = dict(options or {})
-        if finger_step is not None and finger_step not in FINGER_STEPS:
-            raise InputError(
-                f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
-            )
-        if finger_step is not None and "finger_step" in method_options(method):
-            self.options["finger_step"] = finger_step
+        self.options = method_options(method, options or {}, finger_step)
         self._questions = Questions(robot, self.tolerances, limits == "enforce")
         self._engine = Engine(
             robot, build_method(method, robot.description, self.options, compiled), compiled

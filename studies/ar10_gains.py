@@ -16,9 +16,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 from ar10.figures import draw_run, finish, translation
-from ar10.report import table
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from runner.page import markdown_table
 
 import casadi_ik as ik
 from casadi_ik.symbolic import dual_quaternion as dq
@@ -123,8 +123,7 @@ explain that: once the gain times the remaining slider error is less than half a
 any more, so what is left grows as 1/gain. With that one number assumed, the model's figures are of
 the table's size.
 
-{table(("gain", "Table I, X and Y [mm]", "its norm [mm]", header), rows)}
-
+{markdown_table(("gain", "Table I, X and Y [mm]", "its norm [mm]", header), rows)}
 The gain of 1 ends closer in the model than on their hand, where it also oscillated a little; in the
 model it is a Newton step. A delay between measurement and motion, which the model does not have,
 may be the difference. Their finger frame's orientation is not published, so the norms are what can
@@ -134,8 +133,7 @@ The rate of the fall, fitted to the logarithm of the norm above 1e-7 with exact 
 law of gain g per step multiplies the error by 1 - g, a rate of -ln(1 - g) per step; the continuous
 law's rate would be g itself.
 
-{table(("gain", "fitted rate per step", "-ln(1 - gain)"), rate_rows(rates))}
-"""
+{markdown_table(("gain", "fitted rate per step", "-ln(1 - gain)"), rate_rows(rates))}"""
 
 
 def relative_pose(robot: ik.ArmHand, out: Path) -> str:
@@ -179,7 +177,7 @@ the index's proximal joint, which eq. (16) has, is missing there, so that joint 
 exactly by every gain.
 
 {
-        table(
+        markdown_table(
             (
                 "gain",
                 "fitted rate per step",
@@ -189,7 +187,6 @@ exactly by every gain.
             rows,
         )
     }
-
 The paper finds 0.6 most suited and an offset of {RELATIVE_OFFSET[0]} mm in x and
 {RELATIVE_OFFSET[1]} mm in y at the end of Fig. 5. In the model 0.6 is the best of those that do not
 take the whole step at once, which overshoots here too; the offset is the next section's.
@@ -253,8 +250,7 @@ trades millimetres against radians; adding m^2 to rad^2 as (17) does, a radian c
 so nearly all of the orientation's misfit is paid for in position. Counting 1 cm as a radian shrinks
 the offset, but only a task that asks for no more than the hand has makes it vanish.
 
-{table(("task", "rows", "left, median [mm]", "90th percentile [mm]", "below 1 um"), rows)}
-
+{markdown_table(("task", "rows", "left, median [mm]", "90th percentile [mm]", "below 1 um"), rows)}
 {goals} goals, gain 0.6, 200 steps; the distance task is measured by its own error. The
 paper's {RELATIVE_OFFSET[0]} mm are of the size that the six-row law leaves; how large it is depends
 on how far the wanted pose is from the family, which is assumed here and not published.
@@ -288,7 +284,7 @@ the three directions that are left bring the sliders back towards the middle of 
 the distance never notices.
 
 {
-        table(
+        markdown_table(
             (
                 "centring per step",
                 "margin to the nearest limit, median [% of stroke]",
@@ -298,8 +294,7 @@ the distance never notices.
             ),
             rows,
         )
-    }
-"""
+    }"""
 
 
 ROWS = {"pose": "6", "position": "3", "distance": "1"}

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from ar10.report import table
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from runner.page import markdown_table
 
 import casadi_ik as ik
 from casadi_ik.calibration import (
@@ -159,7 +159,6 @@ An outlier is a pose with twenty times the noise. "Tip" is the root mean square 
 estimated from the true tip at 100 new postures, median / 90th percentile over hands.
 
 {losses}
-
 The 95 % intervals hold what they say with every loss, outliers or not: the covariance counts the
 scatter that there is. What robust losses gain is the size of the intervals and of the errors. The
 noise is estimated with the rest, from medians, which a quarter of outliers moves a little.
@@ -171,14 +170,12 @@ noise is estimated with the rest, from medians, which a quarter of outliers move
 With 10 % outliers and the Cauchy loss:
 
 {sizes}
-
 ## What is learned
 
 By kind of number, 10 % outliers: the part of the prior's variance that the data took away, and how
 many of the true numbers the 95 % intervals hold.
 
 {groups}
-
 ## What the data cannot know
 
 Two sliders move the finger in a plane; not everything can be seen in that. In units of the priors,
@@ -193,8 +190,7 @@ with zero are, mixed with one another: the size of the four-bar, of which angles
 a shift of each of the three axes along itself, made up for by what follows; and a turn about each,
 made up for by the reference angles.
 
-{directions}
-"""
+{directions}"""
 
 
 def loss_table(results: dict[tuple[str, float], Trials]) -> str:
@@ -205,7 +201,7 @@ def loss_table(results: dict[tuple[str, float], Trials]) -> str:
         for (loss, outliers), t in results.items()
     ]  # fmt: skip
     header = ("outliers", "loss", "held by 95 % intervals", "tip [mm]", "noise found / true")
-    return table((*header, "converged"), rows)
+    return markdown_table((*header, "converged"), rows)
 
 
 def size_table(sizes: dict[int, Trials]) -> str:
@@ -214,7 +210,9 @@ def size_table(sizes: dict[int, Trials]) -> str:
         (str(count), f"{t.coverage():.1f} %", spread(t.misses), spread(t.described))
         for count, t in sizes.items()
     ]
-    return table(("poses", "held by 95 % intervals", "tip [mm]", "tip as described [mm]"), rows)
+    return markdown_table(
+        ("poses", "held by 95 % intervals", "tip [mm]", "tip as described [mm]"), rows
+    )
 
 
 def group_table(result: Trials) -> str:
@@ -234,7 +232,7 @@ def group_table(result: Trials) -> str:
         taken = 100 * learned[columns]
         rows.append((name, str(columns.sum()), f"{taken.min():.0f} to {taken.max():.0f} %",
                      f"{held:.1f} %"))  # fmt: skip
-    return table(("numbers", "how many", "learned (one hand)", "held"), rows)
+    return markdown_table(("numbers", "how many", "learned (one hand)", "held"), rows)
 
 
 def direction_table(found: Calibration) -> str:
@@ -244,7 +242,7 @@ def direction_table(found: Calibration) -> str:
          ", ".join(f"{part:+.2f} {name}" for name, part in list(names.items())[:5]))
         for value, names in found.unidentified()[:12]
     ]  # fmt: skip
-    return table(("singular value", "direction"), rows)
+    return markdown_table(("singular value", "direction"), rows)
 
 
 def draw_bars(results: dict[tuple[str, float], Trials], path: Path) -> None:

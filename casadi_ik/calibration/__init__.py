@@ -1,7 +1,7 @@
 """Calibration: the hand's own dimensions from measured fingertip poses."""
 
 from casadi_ik.calibration.describe import write_description
-from casadi_ik.calibration.estimate import Calibration, calibrate
+from casadi_ik.calibration.estimate import calibrate
 from casadi_ik.calibration.losses import LOSSES
 from casadi_ik.calibration.measurements import (
     Measurements,
@@ -10,6 +10,7 @@ from casadi_ik.calibration.measurements import (
 )
 from casadi_ik.calibration.model import HandModel
 from casadi_ik.calibration.parameters import GROUPS, Parameter, Priors, hand_parameters
+from casadi_ik.calibration.result import Calibration
 from casadi_ik.calibration.synthetic import simulate, true_values
 
 __all__ = [

@@ -7,6 +7,7 @@ import re
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from casadi_ik.cli.calibrate_parser import add_calibrate
 from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.values import assignment, file_name, numbers, one_of, positive, whole
 from casadi_ik.errors import InputError
@@ -66,21 +67,6 @@ is named on stderr and does not stop the rest.
 exit codes: 0 all solved, 1 not all solved, 2 bad input
 """
 
-_CALIBRATE_EXAMPLES = """\
-example:
-  casadi-ik calibrate poses.csv --robot ar10 --out my_ar10.yaml
-  casadi-ik solve my_grasp.yaml --robot my_ar10.yaml
-
-DATA.csv has a header and a row per measured fingertip pose, in the robot's base frame:
-  finger,index_proximal_slider,index_middle_slider,x,y,z,qw,qx,qy,qz
-  index,0.0485,0.0512,-0.0462,0.0896,0.1447,0.7065,0.0282,-0.7065,-0.0282
-the actuators that move the finger [rad or m], the contact point [m] and, if measured, the contact
-frame as a unit quaternion (its four columns may be left out, or empty in a row)
-
-exit codes: 0 written, 1 no estimate was found, 2 bad input
-"""
-
-
 _INVALID_CHOICE = re.compile(r"invalid choice: (.*) \(choose from (.*)\)")
 
 
@@ -111,7 +97,7 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True, title="commands")
     _add_solve(commands)
     _add_batch(commands)
-    _add_calibrate(commands)
+    add_calibrate(commands)
     for name, run, text in (
         ("robots", _robots, "list the shipped robots: fingers and actuators"),
         ("methods", _methods, "list the methods"),
@@ -169,55 +155,6 @@ def _add_batch(commands: Any) -> None:
     )
     _add_diagnose(parser, default=False)
     parser.set_defaults(run=_batch)
-
-
-def _add_calibrate(commands: Any) -> None:
-    parser = commands.add_parser(
-        "calibrate",
-        help="estimate a hand's dimensions from measured fingertip poses",
-        description="Estimate linkage dimensions, joint axes and contact frames of a robot's hand.",
-        epilog=_CALIBRATE_EXAMPLES,
-    )
-    parser.add_argument("data", metavar="DATA.csv", help="measured poses, see below")
-    parser.add_argument("--robot", metavar="R", required=True, help="a shipped name or a YAML file")
-    parser.add_argument(
-        "--estimate",
-        metavar="GROUP",
-        nargs="+",
-        type=one_of("linkage", "axes", "tips"),
-        default=["linkage", "axes", "tips"],
-        help="which numbers: linkage, axes, tips (default: all three)",
-    )
-    parser.add_argument(
-        "--loss",
-        metavar="cauchy|huber|squares",
-        type=one_of("cauchy", "huber", "squares"),
-        default="cauchy",
-        help="how outliers count; squares takes them in full (default: cauchy)",
-    )
-    parser.add_argument(
-        "--noise-position",
-        metavar="METRES",
-        type=positive,
-        default=0.5e-3,
-        help="standard deviation of a measured coordinate, as long as the data are too few to show "
-        "it (default: 0.0005)",
-    )
-    parser.add_argument(
-        "--noise-angle",
-        metavar="RADIANS",
-        type=positive,
-        default=0.0175,
-        help="the same of a measured angle (default: 0.0175, 1 deg)",
-    )
-    parser.add_argument(
-        "--out",
-        metavar="CALIBRATED.yaml",
-        type=file_name(".yaml"),
-        required=True,
-        help="write the robot with its estimated numbers",
-    )
-    parser.set_defaults(run=_calibrate)
 
 
 def _add_solver_options(parser: argparse.ArgumentParser) -> None:
@@ -293,12 +230,6 @@ def _batch(arguments: argparse.Namespace) -> Answer:
     from casadi_ik.cli.batch import batch
 
     return batch(arguments)
-
-
-def _calibrate(arguments: argparse.Namespace) -> Answer:
-    from casadi_ik.cli.calibrate import calibrate
-
-    return calibrate(arguments)
 
 
 def _robots(_: argparse.Namespace) -> Answer:

@@ -8,6 +8,7 @@ is that of one of the faces.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -17,6 +18,21 @@ from casadi_ik.grasps import meshes
 from casadi_ik.grasps.meshes import Mesh
 
 Array = NDArray[np.float64]
+
+
+class Surface(Protocol):
+    """What each shape has to say of itself; the type checker asks every member of `Shape` for it.
+
+    A Protocol, as msgspec's structs cannot have abstract methods.
+    """
+
+    def _nearest(self, points: Array) -> tuple[Array, Array]:
+        """Signed distance (k,) and unit outward normal (k, 3) for points (k, 3)."""
+        ...
+
+    def mesh(self, resolution: int = 32) -> Mesh:
+        """Vertices (v, 3) [m] on the surface and triangles (t, 3), outward by the right hand."""
+        ...
 
 
 class Primitive(
@@ -30,19 +46,15 @@ class Primitive(
 
     source: str
 
-    def signed_distance(self, points: ArrayLike) -> Array:
+    def signed_distance(self: Surface, points: ArrayLike) -> Array:
         """Distance to the surface [m], negative inside: (k,) for (k, 3), () for (3,)."""
         rows, shape = _rows(points)
         return self._nearest(rows)[0].reshape(shape[:-1])
 
-    def normal(self, points: ArrayLike) -> Array:
+    def normal(self: Surface, points: ArrayLike) -> Array:
         """Unit outward normal at the nearest surface point, same shape as the points."""
         rows, shape = _rows(points)
         return self._nearest(rows)[1].reshape(shape)
-
-    def mesh(self, resolution: int = 32) -> Mesh:
-        """Vertices (v, 3) [m] on the surface and triangles (t, 3), outward by the right hand."""
-        raise NotImplementedError
 
     def check(self) -> str:
         """What is wrong with the numbers, as "key: found, expected", or ""."""
@@ -52,10 +64,6 @@ class Primitive(
                 if isinstance(number, (int, float)) and not 0 < number < np.inf:
                     return f"{name}: found {number}, expected a positive finite length"
         return ""
-
-    def _nearest(self, points: Array) -> tuple[Array, Array]:
-        """Signed distance (k,) and unit outward normal (k, 3) for points (k, 3)."""
-        raise NotImplementedError
 
 
 class Sphere(Primitive, frozen=True, tag="sphere", kw_only=True):

@@ -12,7 +12,8 @@ from casadi_ik.errors import InputError
 from casadi_ik.logs.log import Log
 from casadi_ik.logs.one_solve import OneSolve
 from casadi_ik.logs.phrases import errors, number, plain_name
-from casadi_ik.logs.why import held, within, worst
+from casadi_ik.logs.row_errors import within, worst
+from casadi_ik.logs.why import held
 
 SAME = 1e-9
 """How far targets may be apart and be the same [m, or parts of a unit normal]."""

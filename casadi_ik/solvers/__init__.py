@@ -13,11 +13,9 @@ from casadi_ik.solvers.solution import BatchSolution, Solution
 from casadi_ik.solvers.stepper import SteppedMethod, Stepper
 from casadi_ik.solvers.stream import SolvedBlock, Stream
 from casadi_ik.solvers.tracking import Jump, Track, travel_limits
-from casadi_ik.steps.qiu_parameters import FINGER_STEPS
 from casadi_ik.steps.status import Phase, Status
 
 __all__ = [
-    "FINGER_STEPS",
     "LIMITS",
     "METHODS",
     "PREFERENCES",

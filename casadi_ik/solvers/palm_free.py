@@ -14,8 +14,7 @@ from casadi_ik.solvers.diagnosis import ArmReach, HandFit
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.trials import NEVER, Rows, Trials, allowed, smallest
 from casadi_ik.solvers.verdict import judge
-from casadi_ik.steps.contact_fit import fresh_fit
-from casadi_ik.steps.hand_first_state import LENGTH
+from casadi_ik.steps.contact_fit import LENGTH, fresh_fit
 from casadi_ik.steps.status import Phase
 from casadi_ik.symbolic.srs_arm import SrsArm, reach
 

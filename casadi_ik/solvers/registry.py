@@ -17,7 +17,7 @@ from casadi_ik.steps.enhanced import EnhancedStep
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
 from casadi_ik.steps.ipopt_parameters import IpoptParameters
 from casadi_ik.steps.original import OriginalStep
-from casadi_ik.steps.qiu_parameters import OriginalParameters, QiuParameters
+from casadi_ik.steps.qiu_parameters import FINGER_STEPS, OriginalParameters, QiuParameters
 from casadi_ik.steps.thumb_first_parameters import ThumbFirstParameters
 
 
@@ -131,13 +131,28 @@ def method_summary(name: str) -> str:
     return _entry(name).summary
 
 
-def method_options(name: str) -> tuple[str, ...]:
-    """What can be set of a method: the fields of its parameter record.
+def method_options(
+    name: str, options: Mapping[str, Any], finger_step: str | None
+) -> dict[str, Any]:
+    """Options of a method, with the finger step if the method has one.
+
+    Args:
+        name: One of `METHODS`.
+        options: What was set besides.
+        finger_step: One of `FINGER_STEPS`; None leaves the method's own.
 
     Raises:
         UnknownNameError: No such method.
+        InputError: No such finger step.
     """
-    return _entry(name).options
+    if finger_step is None:
+        return dict(options)
+    if finger_step not in FINGER_STEPS:
+        raise InputError(
+            f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
+        )
+    has_one = "finger_step" in _entry(name).options
+    return {**options, "finger_step": finger_step} if has_one else dict(options)
 
 
 def build_method(

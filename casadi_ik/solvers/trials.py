@@ -13,8 +13,7 @@ from casadi_ik.kernels.layout import Layout
 from casadi_ik.solvers.hand_first import UNBOUNDED, HandFirstMethod
 from casadi_ik.solvers.problem import Array, Problems
 from casadi_ik.solvers.verdict import judge
-from casadi_ik.steps.contact_fit import fresh_fit
-from casadi_ik.steps.hand_first_state import LENGTH
+from casadi_ik.steps.contact_fit import LENGTH, fresh_fit
 from casadi_ik.steps.status import Phase
 
 NEVER = 1e-12

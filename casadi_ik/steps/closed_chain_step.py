@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.steps.hand_first_state import LENGTH
+from casadi_ik.steps.contact_fit import LENGTH
 from casadi_ik.steps.proxqp import proxqp
 from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated
 from casadi_ik.symbolic.directions import normal_error, perpendicular

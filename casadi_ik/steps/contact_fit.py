@@ -12,8 +12,10 @@ from typing import Any
 
 import casadi as ca
 
-from casadi_ik.steps.hand_first_state import LENGTH, errors, within_tolerance
 from casadi_ik.symbolic.smooth import Expr
+
+LENGTH = 0.1
+"""Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
 
 DAMPING_START = 1e-3
 DAMPING_FLOOR = 1e-12
@@ -143,3 +145,27 @@ def weighted_residual(position: Sequence[Expr], normal: Sequence[Expr], weights:
     rows = [position[i] / LENGTH * weights[i, 0] for i in range(len(position))]
     rows += [normal[i] * weights[i, 1] for i in range(len(normal))]
     return ca.vertcat(*rows)
+
+
+def errors(residual: Expr, f: int) -> tuple[Expr, Expr]:
+    """Distances [m] and chords of a residual of `weighted_residual`, each (f, 1)."""
+    positions = [ca.norm_2(residual[3 * i : 3 * i + 3]) * LENGTH for i in range(f)]
+    chords = [ca.norm_2(residual[3 * (f + i) : 3 * (f + i) + 3]) for i in range(f)]
+    return ca.vertcat(*positions), ca.vertcat(*chords)
+
+
+def within_tolerance(positions: Expr, normals: Expr, p: dict[str, Expr]) -> Expr:
+    """Whether every contact is met.
+
+    Args:
+        positions: (f, 1) distances [m], zero where free.
+        normals: (f, 1) lengths of the difference of the unit normals, zero where free.
+        p: Parameters.
+
+    Returns:
+        Boolean; an angle is compared through the chord 2 sin(angle / 2).
+    """
+    chord = 2 * ca.sin(p["angle_tolerance"] / 2)
+    return ca.logic_and(
+        ca.mmax(positions - p["position_tolerance"]) <= 0, ca.mmax(normals - chord) <= 0
+    )

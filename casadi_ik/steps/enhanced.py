@@ -12,23 +12,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
-from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
-from casadi_ik.robots.description import Array, RobotDescription
-from casadi_ik.steps.enhanced_record import enhanced_record, enhanced_row
-from casadi_ik.steps.finger_step import finger_step_function, planar_fingers
+from casadi_ik.steps.enhanced_state import EnhancedLayouts
+from casadi_ik.steps.finger_step import finger_step_function
 from casadi_ik.steps.hierarchy import combine
 from casadi_ik.steps.limits import kept_within
 from casadi_ik.steps.palm_estimate import palm_orientation
 from casadi_ik.steps.palm_motion import palm_motion
-from casadi_ik.steps.qiu_parameters import QiuParameters
-from casadi_ik.steps.recorded_jacobian import RecordedJacobian
 from casadi_ik.steps.status import Phase, Status
-from casadi_ik.steps.targets import contact_errors, target_fields, targets, within_tolerance
+from casadi_ik.steps.targets import contact_errors, targets, within_tolerance
 from casadi_ik.steps.tasks import (
     MILLIMETRE,
     Task,
@@ -41,78 +35,14 @@ from casadi_ik.steps.tasks import (
     weighted_damped,
 )
 from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
+from casadi_ik.symbolic.closed_chain import closed_chain
 from casadi_ik.symbolic.measures import condition_number, singular_values
 from casadi_ik.symbolic.smooth import safe_norm
 from casadi_ik.symbolic.subexpressions import shared
 
-Counts = NDArray[np.int64]
 
-
-class EnhancedStep:
+class EnhancedStep(EnhancedLayouts):
     """Builds the step graph of an enhanced method for one robot."""
-
-    def __init__(self, robot: RobotDescription, options: QiuParameters) -> None:
-        """Lay out state, parameters and record.
-
-        Args:
-            robot: The description.
-            options: The structural choices; numbers are parameters of the graph.
-
-        Raises:
-            UnsupportedError: The robot is not of the kind the method needs.
-        """
-        n = len(robot.actuators)
-        self.robot = robot
-        self.options = options
-        self.chain = split(robot, options.borrowed)
-        planar_fingers(robot)  # refused now rather than when the graph is built
-        self.state = Layout(
-            (
-                Field("q", (n,)),
-                Field("phase"),
-                Field("best", doc="smallest summed error of thumb reaching so far"),
-                Field("waited", doc="iterations since `best` fell"),
-                Field("reached", doc="iterations spent in thumb reaching"),
-            )
-        )
-        self.parameters = Layout(
-            (
-                *target_fields(robot),
-                Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not"),
-                Field("reaching_damping"),
-                Field("chain_damping"),
-                Field("chain_lever", unit="mm"),
-                Field("reaching_gamma"),
-                Field("chain_gamma"),
-                Field("longest_error", unit="mm"),
-                Field("widest_error", unit="rad"),
-                Field("weights", (len(self.chain.active),)),
-                Field("reaching_patience"),
-                Field("reaching_iterations"),
-                Field("step_cap"),
-            )
-        )
-        self.record = enhanced_record(robot)
-
-    @property
-    def jacobians(self) -> dict[str, RecordedJacobian]:
-        """The Jacobians in the record.
-
-        The paper names no thresholds; these are ours. A metre of the thumb's tip asks for more
-        than 20 rad of some joint, a rad of the palm for more than 2 rad, the platform for passive
-        joints that move 100 times as far as it turns. H_p has lengths in millimetres: its condition
-        number is above 400 everywhere.
-        """
-        names = self.robot.actuator_names
-        arm = tuple(names[i] for i in self.robot.arm_actuators)
-        thumb = tuple(names[i] for i in self.robot.finger_actuators(self.robot.thumb))
-        passive = tuple(names[i] for i in self.chain.passive if i != VIRTUAL)
-        return {
-            "thumb": RecordedJacobian(arm + thumb, singular=0.05),
-            "palm": RecordedJacobian(arm, singular=0.5),
-            "closed_chain": RecordedJacobian(passive, singular=0.01, condition=1e5),
-        }
 
     def graph(self) -> StepGraph:
         """The whole iteration; compilable unless the finger step calls Ipopt."""
@@ -144,37 +74,6 @@ class EnhancedStep:
         in_reaching = state[self.state.slice("phase")] < Phase.HAND_ALIGNMENT
         outputs = choose(in_reaching, state, parameters)
         return ca.Function(self._name, [state, parameters], list(outputs))
-
-    def parameter_values(
-        self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool
-    ) -> dict[str, float | list[float] | Array]:
-        """Values of all parameter fields but the targets."""
-        options = self.options
-        given = {
-            "position_tolerance": position_tolerance,
-            "angle_tolerance": angle_tolerance,
-            "enforce_limits": float(enforce_limits),
-            "weights": [
-                options.virtual_weight if column == VIRTUAL else options.joint_weight
-                for column in self.chain.active
-            ],
-        }
-        named = (name for name in self.parameters.names if hasattr(options, name))
-        return given | {name: float(getattr(options, name)) for name in named}
-
-    def first_state(self) -> dict[str, float]:
-        """Values of all state fields but q."""
-        return {
-            "phase": float(Phase.THUMB_REACHING),
-            "best": float(np.finfo(float).max),
-            "waited": 0.0,
-            "reached": 0.0,
-        }
-
-    def phase_counts(self, states: Array, iterations: Counts) -> dict[Phase, Counts]:
-        """Iterations by phase (k,) from the last states (k, ns) and all iterations (k,)."""
-        reached = states[:, self.state.slice("reached")][:, 0].astype(np.int64)
-        return {Phase.THUMB_REACHING: reached, Phase.HAND_ALIGNMENT: iterations - reached}
 
     def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
@@ -228,9 +127,7 @@ class EnhancedStep:
             }
         )
         status = ca.SX(float(Status.RUNNING))
-        record = enhanced_row(
-            self.record,
-            robot,
+        record = self.row(
             s["q"],
             positions,
             angles,
@@ -269,9 +166,7 @@ class EnhancedStep:
         after = self.state.pack(s | {"q": ca.if_else(solved, closed, q_next)})
         thumb_linear, _ = body.contact_jacobian(robot.thumb, columns)
         spectrum = singular_values(chain.H_p)
-        record = enhanced_row(
-            self.record,
-            robot,
+        record = self.row(
             closed,
             positions,
             angles,

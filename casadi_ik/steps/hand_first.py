@@ -20,9 +20,8 @@ from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.arm_placement import ALLOWED, ITERATIONS, place_arm
-from casadi_ik.steps.contact_fit import EXACT, Judged, Tried, fresh_fit, judge, judge_contacts
-from casadi_ik.steps.coupling_record import coupling_values
-from casadi_ik.steps.hand_first_state import STAGES, HandFirstLayouts, errors
+from casadi_ik.steps.contact_fit import EXACT, fresh_fit, judge, judge_contacts
+from casadi_ik.steps.hand_first_state import STAGES, HandFirstLayouts
 from casadi_ik.steps.hand_fit import PalmAndHand, best_palm, fit_step, hand_contacts
 from casadi_ik.steps.numeric_arm import STARTS, nearest_start, pose_step
 from casadi_ik.steps.status import Phase, Status
@@ -31,8 +30,6 @@ from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
-
-NOTHING = float("nan")
 
 
 class HandFirstStep:
@@ -119,7 +116,7 @@ class HandFirstStep:
             | fresh_fit()
         )
         status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
-        record = self._row(s, p, q, Phase.CANDIDATE, status)
+        record = self.layouts.row(s, p, q, Phase.CANDIDATE, status)
         return ca.Function("candidate", [state, parameters], shared(after, record, status))
 
     @property
@@ -158,7 +155,7 @@ class HandFirstStep:
         )
         fitted = ca.if_else(judged.within, float(Status.SOLVED), float(Status.STALLED))
         status = ca.if_else(ended, fitted, float(Status.RUNNING))
-        record = self._row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged)
+        record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged)
         return ca.Function("hand_fit", [state, parameters], shared(after, record, status))
 
     def _placement(self) -> ca.Function:
@@ -219,7 +216,7 @@ class HandFirstStep:
         )
         solved = ca.logic_and(exact, s["fits"] > 0)
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self._row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
+        record = self.layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
         inputs = [state, parameters, arm, passed]
         return ca.Function("pose_step", inputs, shared(after, record, status))
 
@@ -249,7 +246,7 @@ class HandFirstStep:
             }
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self._row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
+        record = self.layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
         return ca.Function("place", [state, parameters, arm, margin], shared(after, record, status))
 
     def _refinement(self) -> ca.Function:
@@ -272,7 +269,7 @@ class HandFirstStep:
             | judged.fit
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self._row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged)
+        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged)
         return ca.Function("refinement", [state, parameters], shared(after, record, status))
 
     def _counted(self, s: dict[str, Expr], stage: Phase) -> dict[str, Expr]:
@@ -285,45 +282,6 @@ class HandFirstStep:
 
     def _with_arm(self, q: Expr, arm: Expr) -> Expr:
         return _with(q, self.robot.arm_actuators, arm)
-
-    def _row(
-        self,
-        s: dict[str, Expr],
-        p: dict[str, Expr],
-        q: Expr,
-        phase: Phase,
-        status: Expr,
-        tried: Tried | None = None,
-        judged: Judged | None = None,
-        margin: Expr = NOTHING,
-    ) -> Expr:
-        f = len(self.robot.fingers)
-        positions: Expr = [NOTHING] * f
-        angles: Expr = [NOTHING] * f
-        if tried is not None:
-            positions, chords = errors(tried.before, f)
-            angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
-            positions = ca.if_else(p["weights"][:, 0] > 0, positions, NOTHING)
-            angles = ca.if_else(p["weights"][:, 1] > 0, angles, NOTHING)
-        at_limit = ca.logic_or(q <= p["lower"], q >= p["upper"])
-        bits = ca.DM([2.0**i for i in range(q.numel())])
-        return self.layouts.record.pack(
-            {
-                "q": q,
-                "cost": ca.sumsqr(tried.before) if tried else NOTHING,
-                "position_error": positions,
-                "angle_error": angles,
-                "damping": s["damping"],
-                "step_size": tried.size if tried else NOTHING,
-                "margin": margin,
-                **coupling_values(self.robot, q),
-                "limit_mask": ca.dot(at_limit, bits),
-                "candidate": s["candidate"],
-                "accepted": judged.accepted if judged else 0.0,
-                "phase": float(phase),
-                "status": status,
-            }
-        )
 
 
 def _with(q: Expr, rows: Sequence[int], values: Expr) -> Expr:

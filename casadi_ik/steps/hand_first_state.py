@@ -10,7 +10,9 @@ import casadi as ca
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.bounded_step import Bounded
-from casadi_ik.steps.coupling_record import coupling_fields
+from casadi_ik.steps.contact_fit import Judged, Tried, errors
+from casadi_ik.steps.coupling_record import coupling_fields, coupling_values
+from casadi_ik.steps.limits import bits
 from casadi_ik.steps.status import Phase
 from casadi_ik.symbolic.smooth import Expr
 
@@ -19,8 +21,7 @@ STAGES = (Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT
 
 STAGE_LABELS = tuple(stage.label for stage in STAGES)
 
-LENGTH = 0.1
-"""Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
+NOTHING = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,26 +115,51 @@ class HandFirstLayouts:
         rows = list(self.hand)
         return Bounded(q[rows], p["lower"][rows], p["upper"][rows], first)
 
+    def row(
+        self,
+        s: dict[str, Expr],
+        p: dict[str, Expr],
+        q: Expr,
+        phase: Phase,
+        status: Expr,
+        tried: Tried | None = None,
+        judged: Judged | None = None,
+        margin: Expr = NOTHING,
+    ) -> Expr:
+        """What is logged at q (n, 1).
 
-def within_tolerance(positions: Expr, normals: Expr, p: dict[str, Expr]) -> Expr:
-    """Whether every contact is met.
-
-    Args:
-        positions: (f, 1) distances [m], zero where free.
-        normals: (f, 1) lengths of the difference of the unit normals, zero where free.
-        p: Parameters.
-
-    Returns:
-        Boolean; an angle is compared through the chord 2 sin(angle / 2).
-    """
-    chord = 2 * ca.sin(p["angle_tolerance"] / 2)
-    return ca.logic_and(
-        ca.mmax(positions - p["position_tolerance"]) <= 0, ca.mmax(normals - chord) <= 0
-    )
-
-
-def errors(residual: Expr, f: int) -> tuple[Expr, Expr]:
-    """Distances [m] and chords of a residual of `weighted_residual`, each (f, 1)."""
-    positions = [ca.norm_2(residual[3 * i : 3 * i + 3]) * LENGTH for i in range(f)]
-    chords = [ca.norm_2(residual[3 * (f + i) : 3 * (f + i) + 3]) for i in range(f)]
-    return ca.vertcat(*positions), ca.vertcat(*chords)
+        Args:
+            s: State before the iteration.
+            p: Parameters.
+            q: The configuration.
+            phase: The stage.
+            status: Whether the solve goes on.
+            tried: The damped step, if the stage makes one.
+            judged: What was made of it.
+            margin: Of the arm, if the stage places it.
+        """
+        f = len(self.robot.fingers)
+        positions: Expr = [NOTHING] * f
+        angles: Expr = [NOTHING] * f
+        if tried is not None:
+            positions, chords = errors(tried.before, f)
+            angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
+            positions = ca.if_else(p["weights"][:, 0] > 0, positions, NOTHING)
+            angles = ca.if_else(p["weights"][:, 1] > 0, angles, NOTHING)
+        return self.record.pack(
+            {
+                "q": q,
+                "cost": ca.sumsqr(tried.before) if tried else NOTHING,
+                "position_error": positions,
+                "angle_error": angles,
+                "damping": s["damping"],
+                "step_size": tried.size if tried else NOTHING,
+                "margin": margin,
+                **coupling_values(self.robot, q),
+                "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
+                "candidate": s["candidate"],
+                "accepted": judged.accepted if judged else 0.0,
+                "phase": float(phase),
+                "status": status,
+            }
+        )

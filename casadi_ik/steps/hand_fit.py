@@ -13,8 +13,8 @@ import casadi as ca
 
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.bounded_step import clip, damped_step
-from casadi_ik.steps.contact_fit import Tried, weighted_residual
-from casadi_ik.steps.hand_first_state import LENGTH, HandFirstLayouts
+from casadi_ik.steps.contact_fit import LENGTH, Tried, weighted_residual
+from casadi_ik.steps.hand_first_state import HandFirstLayouts
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.alignment import align
 from casadi_ik.symbolic.se3 import compose, exp_se3

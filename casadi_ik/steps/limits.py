@@ -17,5 +17,9 @@ def kept_within(robot: RobotDescription, q: Expr, enforce: Expr) -> Expr:
 def limit_mask(robot: RobotDescription, q: Expr) -> Expr:
     """Bit i is set where actuator i stands at or beyond a limit."""
     lower, upper = ca.DM(robot.lower.tolist()), ca.DM(robot.upper.tolist())
-    bits = ca.DM([2.0**i for i in range(len(robot.actuators))])
-    return ca.dot(ca.logic_or(q <= lower, q >= upper), bits)
+    return bits(ca.logic_or(q <= lower, q >= upper))
+
+
+def bits(flags: Expr) -> Expr:
+    """Bit i is set where flag i (n, 1) is."""
+    return ca.dot(flags, ca.DM([2.0**i for i in range(flags.numel())]))

@@ -11,9 +11,8 @@ import numpy as np
 
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.steps.bounded_step import Bounded, clip, damped_step
-from casadi_ik.steps.contact_fit import Tried
+from casadi_ik.steps.contact_fit import LENGTH, Tried
 from casadi_ik.steps.even_spread import evenly
-from casadi_ik.steps.hand_first_state import LENGTH
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr

@@ -5,13 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import casadi as ca
+
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.steps.limits import bits
 from casadi_ik.steps.status import Phase
+from casadi_ik.steps.thumb_first_merit import Merit
 from casadi_ik.steps.thumb_first_parameters import ThumbFirstParameters
+from casadi_ik.symbolic.smooth import Expr
 
 STAGES = (Phase.HAND_ALIGNMENT, Phase.CANDIDATE, Phase.ARM_PLACEMENT)
 """What an iteration may be, the most frequent first."""
+
+NOTHING = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +101,41 @@ class ThumbFirstLayouts:
             Field("phase", (), "u1"),
             Field("status", (), "u1", "", "0 running, else the final status"),
         )
+
+    def row(
+        self,
+        s: dict[str, Expr],
+        p: dict[str, Expr],
+        q: Expr,
+        phase: Phase,
+        status: Expr,
+        there: Merit,
+        **measured: Expr,
+    ) -> Expr:
+        """What is logged of an iteration.
+
+        Args:
+            s: State before it.
+            p: Parameters.
+            q: (n, 1) where it led.
+            phase: What it was.
+            status: Whether the solve goes on.
+            there: The contacts at q.
+            measured: The other fields; those that the phase does not have are left out.
+        """
+        values: dict[str, Expr] = {
+            "q": q,
+            "cost": there.cost,
+            "position_error": ca.if_else(p["weights"][:, 0] > 0, there.positions, NOTHING),
+            "angle_error": ca.if_else(p["weights"][:, 1] > 0, there.angles, NOTHING),
+            "damping": NOTHING,
+            "step_size": NOTHING,
+            "manipulability": NOTHING,
+            "held_mask": 0.0,
+            "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
+            "start": s["start"],
+            "accepted": 0.0,
+            "phase": float(phase),
+            "status": status,
+        }
+        return self.record.pack(values | measured)

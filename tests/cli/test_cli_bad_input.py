@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,30 +14,30 @@ NAN, INF = float("nan"), float("inf")
 METHOD = ("--method", "enhanced-dls")
 
 
+# What follows the file's name; where a text ends, libyaml says at the start of the next line.
 FILES: dict[str, tuple[bytes, str]] = {
-    "broken YAML": (b"robot: [1,\n  a: b", ": not valid YAML: "),
-    "duplicate key": (b"robot: a\nrobot: b\n", "key 'robot' appears twice"),
-    "empty": (b"", "expected"),
-    "binary": (bytes(range(256)), "not UTF-8"),
-    "zeros": (bytes(100), "not valid YAML"),
-    "a list": (b"[1, 2]", "expected"),
-    "a number": (b"12", "expected"),
-    "code": (b"!!python/object/apply:os.system ['echo hi']", "not valid YAML"),
-    "holds itself": (b"contacts: &a\n  thumb: *a\n", "itself"),
-    "no contacts": (b"robot: kuka_lwr_barrett", "contacts"),
-    "contacts empty": (b"robot: kuka_lwr_barrett\ncontacts: {}", "contacts: "),
-    "contacts a list": (b"contacts: [1, 2]", "contacts: "),
+    "broken YAML": (b"robot: [1,\n  a: b", r":(2:7|3:1): not valid YAML: .*expected ',' or '\]'"),
+    "duplicate key": (b"robot: a\nrobot: b\n", ":2:1: not valid YAML: key 'robot' appears twice"),
+    "empty": (b"", ": .*expected"),
+    "binary": (bytes(range(256)), ": cannot be read: not UTF-8"),
+    "zeros": (bytes(100), ": not valid YAML: unacceptable character"),
+    "a list": (b"[1, 2]", ": .*expected"),
+    "a number": (b"12", ": .*expected"),
+    "code": (b"!!python/object/apply:os.system ['echo hi']", ":1:1: not valid YAML: could not"),
+    "holds itself": (b"contacts: &a\n  thumb: *a\n", ": nested too deeply, or holds itself"),
+    "no contacts": (b"robot: kuka_lwr_barrett", ": .*missing required field `contacts`"),
+    "contacts empty": (b"robot: kuka_lwr_barrett\ncontacts: {}", ": contacts: empty"),
+    "contacts a list": (b"contacts: [1, 2]", ": contacts: expected"),
 }
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_bad_grasp_file(name: str, refused: Callable[..., str], tmp_path: Path) -> None:
-    content, fragment = FILES[name]
+    content, says = FILES[name]
     path = tmp_path / "bad.yaml"
     path.write_bytes(content)
     error = refused("solve", path)
-    assert error.startswith(f"{path}:")
-    assert fragment in error
+    assert re.match(re.escape(str(path)) + says, error), error
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -52,6 +53,10 @@ shape: {kind: sphere, diameter: 60 mm, source: list}
 mass: {value: 0.1 kg, source: list}
 sources: {list: somewhere}
 """
+
+
+def test_every_kind_of_shape_is_tested():
+    assert {type(shape) for shape in SHAPES} == set(get_args(Shape))
 
 
 @pytest.fixture(scope="module")

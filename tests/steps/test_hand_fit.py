@@ -6,8 +6,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from casadi_ik.steps.contact_fit import LENGTH, errors, within_tolerance
 from casadi_ik.steps.hand_first_parameters import HandFirstParameters
-from casadi_ik.steps.hand_first_state import LENGTH, HandFirstLayouts, errors, within_tolerance
+from casadi_ik.steps.hand_first_state import HandFirstLayouts
 from casadi_ik.steps.hand_fit import (
     PalmAndHand,
     best_palm,
