@@ -23,11 +23,8 @@ from pathlib import Path
 import casadi as ca
 
 from casadi_ik.errors import KernelError
-from casadi_ik.kernels.codegen import driver_text, library_source
+from casadi_ik.kernels.codegen import library_source
 from casadi_ik.kernels.compiler import Compiler, find_compiler, warn_no_compiler
-
-FORMAT = 1
-"""Part of the key; to be raised when the way libraries are built changes otherwise unseen."""
 
 KEY = re.compile("[0-9a-f]{32}")
 
@@ -86,18 +83,20 @@ def load_library(
         return None
     directory = cache_directory()
     with _lock:
-        brief = _hash(*_surroundings(compiler, driver), recipe) if recipe else ""
+        brief = (
+            library_key(f"{ca.CasadiMeta.version()} {recipe} {driver}", compiler) if recipe else ""
+        )
         library = _recognised(directory, name, brief, symbol) if brief else None
         if library is not None:
             return library
-        function = build()
-        key = library_key(function, driver, compiler)
+        source = write(build(), driver)
+        key = library_key(source, compiler)
         library = _loaded.get(key)
         if library is None:
             stem = f"{name}-{key}"
             library = _find(directory, stem, symbol)
             if library is None:
-                library = _build(directory, stem, write(function, driver), compiler)
+                library = _build(directory, stem, source, compiler)
             _loaded[key] = library
         if brief:
             _note(directory / f"{name}-{brief}.key", key)
@@ -128,25 +127,9 @@ def _note(path: Path, key: str) -> None:
         part.unlink(missing_ok=True)
 
 
-def library_key(function: ca.Function, driver: str, compiler: Compiler) -> str:
-    """Hash of everything a library is built from, 32 hexadecimal digits.
-
-    Raises:
-        KernelError: The function cannot be serialized.
-    """
-    try:
-        graph = function.serialize()
-    except RuntimeError as error:
-        # Python callbacks, for one, can be neither written down nor generated.
-        raise KernelError(f"kernel {function.name()!r}: no C code: {error}") from error
-    return _hash(*_surroundings(compiler, driver), graph)
-
-
-def _surroundings(compiler: Compiler, driver: str) -> tuple[str, ...]:
-    """What a library is built from besides its graph."""
-    system = (platform.system(), platform.machine())
-    shared = (driver_text("common"), driver_text("lanes"))
-    return (str(FORMAT), ca.CasadiMeta.version(), *system, compiler.identity, *shared, driver)
+def library_key(source: str, compiler: Compiler) -> str:
+    """Hash of everything a library is built from, 32 hexadecimal digits."""
+    return _hash(platform.system(), platform.machine(), compiler.identity, source)
 
 
 def _hash(*parts: str) -> str:

@@ -1,8 +1,9 @@
 """The library of a function for four solves side by side.
 
 The generated code is there twice: as CasADi wrote it, and once more for vectors of four doubles
-(`lanes_lines.py`), `casadi_f3` as `lanes_f3`. A function with a line that has no form for vectors
-is called for each of the four as it is. What nobody calls the compiler leaves out.
+(`lanes_lines.py`), `casadi_f3` as `lanes_f3`. An inner function with a line that has no form for
+vectors is called as it is, once for each lane that counts; the outermost must have one. What nobody
+calls the compiler leaves out.
 """
 
 from __future__ import annotations
@@ -21,7 +22,11 @@ LANES = 4
 
 SIGNATURE = re.compile(r"/\* \w+:\((.*)\)->\((.*)\) \*/")
 HEAD = re.compile(r"(?:static|CASADI_SYMBOL_EXPORT) int (\w+)\(const casadi_real\*\* arg, .*\) ?\{")
-SIZE = re.compile(r"[io]\d+(?:\[(\d+)(?:x(\d+))?(?:,(\d+)nz)?\])?")
+ARGUMENT = re.compile(r"\w+(\[(?:(\d+)(?:x(\d+))?(?:,(\d+)nz)?)?\])?")
+BETWEEN_ARGUMENTS = re.compile(r",(?![^\[]*\])")
+FAILURE = re.compile(
+    r"\s*return (?!0;|casadi_f\d+\(arg, res, iw, w, mem\);).*|.*\) return (?!1;).*"
+)
 BRANCH = re.compile(r"\s*if \(casadi_f(\d+)\(arg\+1, res, iw, w, 0\)\) return 1;")
 BY_FIRST_ARGUMENT = re.compile(r"\s*(switch|if) \(arg\[0\] \? casadi_to_int\(\*arg\[0\]\) : 0\) \{")
 ZEROS = re.compile(r"static const casadi_real casadi_zeros\[(\d+)\]")
@@ -62,7 +67,8 @@ def lanes_source(function: ca.Function, driver: str) -> str:
         driver: C text of the driver, with its constants.
 
     Raises:
-        UnsuitedError: The outermost function has no form for vectors, or one needs memory.
+        UnsuitedError: The outermost function has no form for vectors, or one needs memory or can
+            fail.
         KernelError: The graph has no C code.
     """
     name = function.name()
@@ -97,15 +103,24 @@ def _functions(text: str) -> Iterator[_Function]:
         if signature := SIGNATURE.fullmatch(line):
             inputs, outputs = _sizes(signature[1]), _sizes(signature[2])
         elif head := HEAD.fullmatch(line):
-            yield _Function(head[1], inputs, outputs, tuple(iter(lines.__next__, "}")))
+            body = tuple(iter(lines.__next__, "}"))
+            # A failure would be that of all four.
+            if failures := [line for line in body if FAILURE.fullmatch(line)]:
+                raise UnsuitedError(f"{head[1]} can fail: {failures[0].strip()!r}")
+            yield _Function(head[1], inputs, outputs, body)
 
 
 def _sizes(arguments: str) -> tuple[int, ...]:
-    """Numbers of each argument: `o0` has one, `o0[3]` three, `o0[3x2]` six, `o0[3x2,4nz]` four."""
-    return tuple(
-        int(nonzeros) if nonzeros else int(rows or 1) * int(columns or 1)
-        for rows, columns, nonzeros in SIZE.findall(arguments)
-    )
+    """Numbers of each argument: `x` has one, `x[3]` three, `x[3x2]` six, `x[3x2,4nz]` four."""
+    sizes: list[int] = []
+    for argument in BETWEEN_ARGUMENTS.split(arguments) if arguments else ():
+        found = ARGUMENT.fullmatch(argument)
+        if found is None:
+            raise UnsuitedError(f"argument of an unknown form: {argument!r}")
+        shape, rows, columns, nonzeros = found.groups()
+        size = int(nonzeros or int(rows or 0) * int(columns or 1))
+        sizes.append(size if shape else 1)
+    return tuple(sizes)
 
 
 def _side_by_side(function: _Function, room: dict[str, int]) -> list[str]:

@@ -2,7 +2,8 @@
 
 CasADi writes one operation a line: `a3=(a1*a2);`. Where `casadi_real` is a vector, arithmetic means
 the same four times over; what does not (comparisons, choices, calls of the C library, plain
-numbers) is given the names of `drivers/lanes.c`. Only lines known to mean the same are let through.
+numbers) is given the names of `drivers/lanes.c`. Only lines of the forms CasADi is known to write
+are let through.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ AS_THEY_ARE = tuple(
     re.compile(rf"\s*{pattern}")
     for pattern in (
         r"(?:/\*.*\*/)?",
-        r"(?:const )?casadi_(?:real|int)\b[\w\s,*=+]*;",
+        r"(?:const )?casadi_(?:real|int)\b(?!.*=\d)[\w\s,*=+]*;",
         rf"(?:arg1|res1)\[\d+\]={POINTER};",
         rf"wr\d+ = {POINTER};",
         r"if \(res\[(\d+)\](?:!=0)?\) res\[\1\]\[\d+\]\s*=\s*[aw]\d+;",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import warnings
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +16,7 @@ from casadi_ik.kernels.buffered import doubles
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text, row_major
 from casadi_ik.kernels.lanes import LANES, lanes_source
+from casadi_ik.kernels.lanes_lines import UnsuitedError
 from casadi_ik.kernels.loop_job import SLOTS, CompiledBatch, SingleSolve
 from casadi_ik.kernels.loop_result import CODE_LIMIT, FAILED, NON_FINITE, REPEATED, LoopResult
 from casadi_ik.kernels.loop_vm import run_vm
@@ -76,8 +78,11 @@ class LoopKernel:
                 self.step.recipe,
                 lanes_source,
             )
-        except KernelError as error:
+        except UnsuitedError as error:
             logger.info("%s: one solve at a time: %s", self.step.name, error)
+            return None
+        except KernelError as error:
+            warnings.warn(f"one solve at a time: {error}", RuntimeWarning, stacklevel=2)
             return None
         return (
             None if library is None or not library.casadi_ik_has_lanes() else library[SYMBOL_LANES]

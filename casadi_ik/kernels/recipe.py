@@ -34,6 +34,8 @@ def _sources() -> bytes:
     digest = hashlib.sha256(f"numpy {version('numpy')}".encode())
     root = Path(__file__).parents[1]
     for package in BUILDERS:
-        for path in sorted((root / package).rglob("*.py")):
+        for path in sorted((root / package).rglob("*.[pc]*")):
+            if path.suffix not in (".py", ".c"):
+                continue
             digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.digest()

@@ -25,6 +25,7 @@ from casadi_ik.kernels import (
     cache_directory,
     compiler,
 )
+from casadi_ik.kernels.codegen import library_source
 from casadi_ik.kernels.recipe import recipe as recipe_of
 
 from .graphs import counting_step, needs_compiler
@@ -70,16 +71,20 @@ def test_second_use_builds_nothing(directory: Path, monkeypatch: pytest.MonkeyPa
 def test_key_tells_everything_apart(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = compiler.find_compiler()
     assert found is not None
-    base = cache.library_key(function(), "driver", found)
-    assert cache.library_key(function(), "driver", found) == base
+
+    def key(built: ca.Function, driver: str, by: compiler.Compiler) -> str:
+        return cache.library_key(library_source(built, driver), by)
+
+    base = key(function(), "driver", found)
+    assert key(function(), "driver", found) == base
     monkeypatch.setenv("CASADI_IK_CFLAGS", "-O1")
     flagged = compiler.find_compiler()
     assert flagged is not None
     others = {
-        cache.library_key(function(2.5), "driver", found),
-        cache.library_key(function(), "other driver", found),
-        cache.library_key(function(), "driver", flagged),
-        cache.library_key(function(), "driver", compiler.Compiler(found.command, "other")),
+        key(function(2.5), "driver", found),
+        key(function(), "other driver", found),
+        key(function(), "driver", flagged),
+        key(function(), "driver", compiler.Compiler(found.command, "other")),
     }
     assert len(others | {base}) == 5
 

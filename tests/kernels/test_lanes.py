@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from casadi_ik.kernels import (
+    FAILED,
     NON_FINITE,
     REPEATED,
     RUNNING,
@@ -168,7 +169,48 @@ def test_operations_on_special_numbers() -> None:
     assert found is not None
     assert expected is not None
     np.testing.assert_array_equal(found["values"], expected["values"])
+    alone = [kernel.run(states[:1], pair[None], 1, trace=True).rows["values"] for pair in pairs]
+    # Of two zeros the virtual machine takes another as minimum than the C library does.
+    same = np.signbit(found["values"]) == np.signbit(np.concatenate(alone))
+    assert (same | np.isnan(found["values"])).all()
     assert np.isfinite(found["values"]).any(axis=0).all()
+
+
+def test_inner_function_without_vector_form_is_called_for_each() -> None:
+    """One with named, sparse and matrix arguments, taken by some of the four only."""
+    x, p = ca.SX.sym("x"), ca.SX.sym("p")
+    turn = ca.SX.sym("turn", ca.Sparsity.lower(3))
+    results = [ca.sinh(x) * p / 9, ca.mtimes(turn, ca.vertcat(x, p, 1)), ca.SX(x + 1)]
+    names = ["state", "gain", "turn"], ["new", "turned", "unused"]
+    alone = ca.Function("alone", [x, p, turn], results, *names)
+    plain = ca.Function("plain", [x, p, turn], [x / 2, ca.vertcat(p, x, x), p], *names)
+    xm, pm = ca.MX.sym("x"), ca.MX.sym("p")
+    matrix = ca.Function("matrix", [x], [ca.tril(ca.SX.ones(3, 3)) * x])(xm)
+    which = ca.Function("which", [x], [ca.sin(40 * x) > 0])(xm)
+    new, turned, _ = ca.Function.if_else("either", alone, plain)(which, xm, pm, matrix)
+    done = ca.Function("done", [x], [ca.if_else(ca.fabs(x) < 1e-3, DONE, RUNNING)])(new)
+    function = ca.Function("calls_alone", [xm, pm], [new, turned, done])
+    step = step_of("calls_alone", function, Layout.record(Field("turned", (3,))))
+    assert "lanes_one_by_one(&alone" in lanes_source(function, "")
+    for count in COUNTS:
+        rng = np.random.default_rng(count)
+        states, parameters = rng.normal(size=(count, 1)), rng.uniform(5, 12, size=(count, 1))
+        found = assert_as_in_vm(step, states, parameters, 60)
+        assert count < COUNTS[-1] or len(np.unique(found.iterations)) > 2
+
+
+def test_a_step_that_fails_ends_its_solve_only() -> None:
+    x, p = ca.MX.sym("x"), ca.MX.sym("p")
+    low = ca.Function(
+        "low", [x, p], [x.attachAssert(x < p, "too large") + 1], {"never_inline": True}
+    )
+    function = ca.Function("fails_inside", [x, p], [low(x, p), x, 0])
+    with pytest.raises(UnsuitedError, match="can fail"):
+        lanes_source(function, "")
+    result = LoopKernel(step_of("fails_inside", function, COUNT)).run(
+        np.zeros((9, 1)), np.arange(9.0)[:, None], 5
+    )
+    assert result.status.tolist() == [FAILED] * 5 + [RUNNING] * 4
 
 
 def test_unforeseen_code_is_refused_and_runs_one_by_one() -> None:

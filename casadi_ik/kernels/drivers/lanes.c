@@ -42,15 +42,6 @@ LANES_INLINE lanes lanes_sq(lanes x) { return x * x; }
 
 LANES_INLINE lanes lanes_fabs(lanes x) { return (lanes) ((lane_mask) x & INT64_MAX); }
 
-/* Of equal numbers the second, of a NaN the other: as the C library of x86 does it. */
-LANES_INLINE lanes lanes_fmax(lanes x, lanes y) {
-  return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x > y), x, y));
-}
-
-LANES_INLINE lanes lanes_fmin(lanes x, lanes y) {
-  return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x < y), x, y));
-}
-
 #define LANES_OF_ONE(NAME)                               \
   LANES_INLINE lanes lanes_##NAME(lanes x) {             \
     lanes value;                                         \
@@ -90,6 +81,20 @@ LANES_OF_TWO(fmod)
 LANES_OF_TWO(hypot)
 LANES_OF_TWO(pow)
 
+#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
+/* Of equal numbers the second, of a NaN the other: as that library does it. */
+LANES_INLINE lanes lanes_fmax(lanes x, lanes y) {
+  return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x > y), x, y));
+}
+
+LANES_INLINE lanes lanes_fmin(lanes x, lanes y) {
+  return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x < y), x, y));
+}
+#else
+LANES_OF_TWO(fmax)
+LANES_OF_TWO(fmin)
+#endif
+
 static inline void lanes_copy(const lanes *from, casadi_int count, lanes *to) {
   if (!to) return;
   if (from) memcpy(to, from, (size_t) count * sizeof(lanes));
@@ -100,13 +105,13 @@ static inline void lanes_clear(lanes *to, casadi_int count) {
   if (to) memset(to, 0, (size_t) count * sizeof(lanes));
 }
 
-/* Which branch each lane takes, `last` for all numbers that are not 0 ... last - 1. As CasADi's
- * casadi_to_int the fraction is dropped; of two branches everything but 0 takes the last. */
+/* Which branch each lane takes, `last` for all numbers that are not 0 ... last - 1: converted as
+ * casadi_to_int does it; of two branches everything but 0 takes the last. */
 static void lanes_branch(const lanes *index, int last, int *branch) {
   int i;
   for (i = 0; i < LANES; ++i) {
-    const double x = index ? ((const double *) index)[i] : 0;
-    branch[i] = x > -1 && x < last ? (int) x : last;
+    const casadi_int k = index ? (casadi_int) ((const double *) index)[i] : 0;
+    branch[i] = k >= 0 && k < last ? (int) k : last;
   }
 }
 

@@ -7,8 +7,8 @@
  * such iteration in it that is no smaller than its length.
  *
  * Expects the macros N_STATE, N_RECORD, ROW_BYTES, RUNNING, NON_FINITE, FAILED, REPEATED, CODE_LIMIT
- * and the function store_row(record, row). Everything that must survive a pause lives in the job's arrays, so a
- * call that returns SLICE_OVER or ROWS_FULL is taken up again by calling once more.
+ * and the function store_row(record, row). Everything that must survive a pause lives in the
+ * job's arrays, so a call that returns SLICE_OVER or ROWS_FULL is taken up again by calling once more.
  */
 
 typedef struct {

@@ -2,8 +2,8 @@
  *
  * A step costs least when the four take the same branches, so some more solves than four are under
  * way: a lane whose solve ends or changes its stage takes another one of the stage the lanes are
- * in, and when there are not enough of them all lanes turn to the stage most solves wait for. The
- * rows come as they are made; `places` says whose they are.
+ * in, and when more wait for another stage than lanes are left at work, all turn to that. The rows
+ * come as they are made; `places` says whose they are.
  *
  * Expects besides what loop.c does N_PARAMETERS, SLOTS and STAGE, the place in the state of the
  * number that tells the stages apart, -1 if there is none.
@@ -60,7 +60,7 @@ static int queue_of(queues *all, double stage) {
 
 static void queue_up(queues *all, const loop_job *job, int slot) {
   const double stage = STAGE < 0 ? 0 : job->states[job->slots[slot] * N_STATE + STAGE];
-  const int i = queue_of(all, stage);
+  const int i = queue_of(all, stage == stage ? stage : -1);
   all->waiting[i][all->height[i]++] = slot;
 }
 
@@ -202,7 +202,9 @@ static void begin(bench *b, queues *all, loop_job *job, lanes *memory) {
 
 /* Whether this machine can run what LANES_TARGET asks for. */
 EXPORT int casadi_ik_has_lanes(void) {
-#if defined(__x86_64__)
+#if defined(_WIN32) && !defined(__clang__)
+  return 0; /* gcc does not align vectors on the stack there */
+#elif defined(__x86_64__)
   __builtin_cpu_init();
   return __builtin_cpu_supports("avx2") != 0;
 #else
