@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-PART_BYTES = 2**22
-"""About how many bytes of iterations a part may have if they are to be kept."""
+PART_BYTES = 2**24
+"""About how many bytes of iterations a part may have if they are to be kept. At the end of a part
+its last solves have the vectors to themselves, so small parts cost time; what a part has made is
+lost if the process is killed before it goes to the log."""
 
 FIRST_PART = 64
 """Solves of the first parts of a traced batch, from which the others' size is learned."""
