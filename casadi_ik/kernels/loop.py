@@ -101,7 +101,8 @@ class LoopKernel:
             "SLOTS": SLOTS,
             "STAGE": self.step.stage_place,
         }
-        return define(constants) + row_driver(self.step.record) + driver_text(name)
+        job = driver_text("loop_job")
+        return define(constants) + row_driver(self.step.record) + job + driver_text(name)
 
     @cached_property
     def _function(self) -> ca.Function:

@@ -22,7 +22,7 @@ SLOTS = 32
 
 
 class Job(ctypes.Structure):
-    """`loop_job` of drivers/loop_lanes.c, the beginning of which is that of drivers/loop.c."""
+    """`loop_job` of drivers/loop_job.c."""
 
     _fields_ = (
         ("states", ctypes.c_void_p),

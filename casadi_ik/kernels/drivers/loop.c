@@ -11,23 +11,6 @@
  * job's arrays, so a call that returns SLICE_OVER or ROWS_FULL is taken up again by calling once more.
  */
 
-typedef struct {
-  double *states;              /* (count, N_STATE), start in, end out */
-  const double *parameters;
-  int64_t parameter_step;      /* doubles from one solve to the next, 0 = the same for all */
-  int64_t *iterations;         /* (count), zeros at the start */
-  int32_t *status;             /* (count), RUNNING at the start */
-  double *seconds;             /* (count), zeros at the start */
-  double *mark;                /* (N_STATE), the state later ones are compared with */
-  unsigned char *rows;         /* (capacity) rows, or NULL: no trace */
-  int64_t capacity;
-  int64_t used;                /* rows written so far */
-  int64_t count;               /* solves */
-  int64_t solve;               /* first solve not yet finished */
-  int64_t max_iterations;      /* of one solve */
-  double slice;                /* [s] after which Python gets a look at its signals */
-} loop_job;
-
 /* x * 0 is 0 for finite x and NaN otherwise; the sum has no branch and no library call. */
 static int all_finite(const double *x) {
   double sum = 0;

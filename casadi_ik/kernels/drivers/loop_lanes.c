@@ -9,25 +9,6 @@
  * number that tells the stages apart, -1 if there is none.
  */
 
-typedef struct {
-  double *states;              /* (count, N_STATE), start in, end out */
-  const double *parameters;
-  int64_t parameter_step;      /* doubles from one solve to the next, 0 = the same for all */
-  int64_t *iterations;         /* (count), zeros at the start */
-  int32_t *status;             /* (count), RUNNING at the start */
-  double *seconds;             /* (count), zeros at the start; solves side by side share the time */
-  double *mark;                /* (SLOTS, N_STATE), the states later ones are compared with */
-  unsigned char *rows;         /* (capacity) rows, or NULL: no trace */
-  int64_t capacity;
-  int64_t used;                /* rows written so far */
-  int64_t count;               /* solves */
-  int64_t solve;               /* first solve not yet begun */
-  int64_t max_iterations;      /* of one solve, at least 1 */
-  double slice;                /* [s] after which Python gets a look at its signals */
-  int64_t *places;             /* (capacity, 2) solve and iteration of each row */
-  int64_t *slots;              /* (SLOTS) the solves under way, -1 = none */
-} loop_job;
-
 #define STAGES 8
 #define NOBODY (-1)
 
