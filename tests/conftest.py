@@ -9,10 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from pinocchio_oracle import PinocchioRobot
 from toy_robots import copy_shipped_robot, write_coupled_robot
 
 import casadi_ik as ik
+
+# How long an example takes says nothing on a busy machine.
+settings.register_profile("any machine", deadline=None)
+settings.load_profile("any machine")
 
 
 @pytest.fixture(scope="session")

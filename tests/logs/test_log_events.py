@@ -316,7 +316,7 @@ def test_windows_are_checked() -> None:
         EventRules(oscillation_window=2)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), counts=st.lists(st.integers(0, 40), min_size=1, max_size=5))
 def test_solves_do_not_see_each_other(seed: int, counts: list[int]) -> None:
     """A block of solves has the events of its solves, whatever stands before and after them."""

@@ -45,7 +45,7 @@ def flat(value: Any) -> np.ndarray:
     return np.asarray(value).ravel()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(layout=layouts(), data=st.data())
 def test_a_row_is_its_own_message(layout: Layout, data: st.DataObject) -> None:
     row = np.frombuffer(
@@ -67,7 +67,7 @@ def test_a_row_is_its_own_message(layout: Layout, data: st.DataObject) -> None:
         np.testing.assert_array_equal(flat(getattr(third, third_name)), expected)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(layout=layouts())
 def test_the_layout_comes_back_from_the_schema(layout: Layout) -> None:
     assert schema.parse_layout(schema.schema_text(layout)) == layout
@@ -104,7 +104,7 @@ def as_lists(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(message=messages())
 def test_codec_agrees_with_mcap_ros2(message: tuple[str, dict[str, Any]]) -> None:
     text, values = message
@@ -116,7 +116,7 @@ def test_codec_agrees_with_mcap_ros2(message: tuple[str, dict[str, Any]]) -> Non
         assert as_lists(getattr(theirs, name)) == value
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(message=messages(), data=st.data())
 def test_a_cut_message_is_an_error(
     message: tuple[str, dict[str, Any]], data: st.DataObject

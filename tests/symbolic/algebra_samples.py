@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 
-PROPERTY = settings(deadline=None, derandomize=True, max_examples=60)
+PROPERTY = settings(derandomize=True, max_examples=60)
 
 coordinate = st.floats(-1.0, 1.0, allow_subnormal=False)
 vectors = st.tuples(coordinate, coordinate, coordinate).map(np.array)

@@ -138,7 +138,7 @@ def test_the_straight_arm_is_exact_and_finite(robot, closed):
     np.testing.assert_allclose(robot.palm(with_arm(robot, found)), palm, atol=2e-6)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     heights=st.fixed_dictionaries(
         {number: st.floats(0.05, 0.4) for number in ("1", "2", "3", "4", "5", "6", "7")}

@@ -6,8 +6,8 @@ typedef struct {
   int64_t *iterations;         /* (count), zeros at the start */
   int32_t *status;             /* (count), RUNNING at the start */
   double *seconds;             /* (count), zeros at the start */
-  double *mark;                /* (SLOTS, N_STATE), states later ones are compared with; one by one only the
-                                  first is used */
+  double *mark;                /* (SLOTS, N_STATE), states later ones are compared with; one by
+                                  one only the first is used */
   unsigned char *rows;         /* (capacity) rows, or NULL: no trace */
   int64_t capacity;
   int64_t used;                /* rows written so far */
