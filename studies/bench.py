@@ -47,7 +47,7 @@ class Sizes:
     repeats: int = 7
     memory: int = 1_000_000
     peers: int = 60
-    iterations: int = 24
+    iterations: int = 120
     later: int = 3
 
 
