@@ -8,7 +8,7 @@ import pytest
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.solvers import Engine, Problems, Status, Tolerance
 from casadi_ik.solvers.method import Outcome, TraceFormat
-from casadi_ik.solvers.parts import FIRST_PART, Parts
+from casadi_ik.solvers.parts import FIRST_PART, PART_BYTES, Parts
 
 LAYOUT = Layout.record(Field("row", (), "f8"))
 
@@ -126,7 +126,9 @@ def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
         np.testing.assert_array_equal(block.rows["row"], np.arange(rows.start, rows.stop))
 
 
-@pytest.mark.parametrize(("bytes_per_solve", "size"), [(2**12, 2**10), (2**30, 1), (1, 10**6)])
+@pytest.mark.parametrize(
+    ("bytes_per_solve", "size"), [(PART_BYTES // 2**10, 2**10), (2**30, 1), (1, 10**6)]
+)
 def test_parts_are_as_large_as_their_iterations_allow(bytes_per_solve, size):
     parts = Parts(10**6, 1, trace=True)
     found = []
