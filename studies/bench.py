@@ -85,6 +85,7 @@ def solves(robot: ik.ArmHand, sizes: Sizes) -> Section:
     rows = []
     for kind, tolerance, targets in kinds(robot, sizes.batch, 0):
         solver = ik.Solver(robot, tolerance=tolerance)
+        solver.solve_batch(*targets)  # may compile
         batch = solver.solve_batch(*targets)
         count = len(targets[0])
         timing = timed(
