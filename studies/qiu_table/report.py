@@ -23,8 +23,7 @@ within 5 mm and 3 deg; "within limits" asks besides that every joint is within i
 method keeps to them in every iteration. *One start* from the robot's home for the paper's methods,
 at most 10,000 iterations. Means of iterations and time are over solved cases, as in the paper.
 Intervals are 95 % confidence (Wilson's for rates). `n` is the number of targets; the paper's is
-120,000. Where less was run, as with methods that count to 10,000 nearly always, the targets are the
-first of every object, as many of each.
+120,000. Where less was run the targets are the first of every object, as many of each.
 
 The paper prints six of its twelve objects; its means here are over those six. It publishes
 neither its grasps, nor its start as numbers, nor whether limits were enforced: the grasps and so
