@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.robots.couplings import FourBar
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.steps.interrupts import interrupt_afterwards
 from casadi_ik.steps.ipopt_parameters import IpoptParameters
 from casadi_ik.steps.ipopt_watch import EXACT, JOINT_SLACK, Watch, within
 from casadi_ik.steps.status import Status
@@ -186,7 +187,7 @@ class WholeNlp:
         if cost < EXACT**2 and self._within(start, joints):
             return self._unmoved(start, first, Status.STALLED)
         free, zero = np.full(self._rows, np.inf), np.zeros(self._rows)
-        with self._lock:
+        with self._lock, interrupt_afterwards():
             self._watch.begin(self._rows, joints)
             begin, near = start / self._scale, cost < NEAR
             solver = self._solvers[WARM if near else COLD]
@@ -200,8 +201,6 @@ class WholeNlp:
             )
             path, rows = self._watch.end()
             stats: dict[str, Any] = solver.stats()
-            if stats["return_status"] == "User_Requested_Stop" and not self._watch.stopped:
-                raise KeyboardInterrupt  # CasADi has taken it for itself
         if not len(path):  # Ipopt could not evaluate the start
             return self._unmoved(start, first, Status.INVALID)
         path = path[:, : self._n] * self._scale

@@ -82,7 +82,7 @@ def test_interrupted(tmp_path: Path) -> None:
         time.sleep(0.05)
     time.sleep(0.5)
     deadline = time.monotonic() + 60
-    # Ipopt was seen to lose an interrupt now and then (about one in fifty): press again.
+    # One that arrives before the handler stands may be lost: press again.
     while process.poll() is None and time.monotonic() < deadline:
         process.send_signal(signal.SIGINT)
         with contextlib.suppress(subprocess.TimeoutExpired):
