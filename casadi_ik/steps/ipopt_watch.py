@@ -22,9 +22,6 @@ class Watch(ca.Callback):
 
     For a program over x = (motors, slacks s) whose constraints are (r - s, joints). One solve at
     a time: `begin`, then Ipopt, then `end`.
-
-    Attributes:
-        stopped: Whether it was this that stopped Ipopt.
     """
 
     def __init__(self, nx: int, ng: int, parameters: int) -> None:
@@ -35,14 +32,13 @@ class Watch(ca.Callback):
         self._wanted = [ca.nlpsol_out().index(name) for name in ("x", "g")]
         self._path: list[Array] = []
         self._rows: list[Array] = []
-        self.stopped = False
         self._contacts = 0
         self._joints: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
         self.construct("watch", {})
 
     def begin(self, contacts: int, joints: tuple[Array, Array]) -> None:
         """A new solve: how many rows of the constraints are r - s, and the limits of the others."""
-        self._path, self._rows, self.stopped = [], [], False
+        self._path, self._rows = [], []
         self._contacts, self._joints = contacts, joints
 
     def end(self) -> tuple[Array, Array]:
@@ -72,8 +68,7 @@ class Watch(ca.Callback):
         self._path.append(x)
         self._rows.append(rows)
         r, joints = rows[: self._contacts], rows[self._contacts :]
-        self.stopped = bool(r @ r < EXACT**2) and within(joints, self._joints)
-        np.frombuffer(res[0], dtype=float)[0] = self.stopped
+        np.frombuffer(res[0], dtype=float)[0] = r @ r < EXACT**2 and within(joints, self._joints)
         return 0
 
 
