@@ -7,22 +7,16 @@ from casadi_ik.control import ScrewControl
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
-from casadi_ik.solvers import (
-    METHODS,
-    Alternative,
-    ArmBranch,
-    BatchSolution,
-    ContactVerdict,
-    Diagnosis,
-    Jump,
-    Phase,
-    Reason,
-    Solution,
-    Status,
-    Track,
-)
-from casadi_ik.solvers.trajectory import Trajectory
-from casadi_ik.steps.screw_objectives import ScrewTask
+from casadi_ik.methods.registry import METHODS
+from casadi_ik.methods.screw_control.objectives import ScrewTask
+from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.diagnosis import Diagnosis, Reason
+from casadi_ik.problem.solution import BatchSolution, Solution
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.trajectory import Trajectory
+from casadi_ik.solving.alternatives.branches import ArmBranch
+from casadi_ik.solving.alternatives.finder import Alternative
+from casadi_ik.solving.alternatives.tracking import Jump, Track
 
 __all__ = [
     "METHODS",

@@ -15,27 +15,16 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.logs import Compression, Keep, McapRecorder
-from casadi_ik.solvers import (
-    LIMITS,
-    METHODS,
-    Alternative,
-    BatchSolution,
-    Engine,
-    Problems,
-    Questions,
-    Recorder,
-    Solution,
-    SolvedBlock,
-    SteppedMethod,
-    Stepper,
-    Stream,
-    Tolerance,
-    Track,
-    build_method,
-    method_options,
-    tolerances_by_finger,
-    travel_limits,
-)
+from casadi_ik.methods.registry import METHODS, build_method, method_options
+from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
+from casadi_ik.problem.questions import Questions, tolerances_by_finger
+from casadi_ik.problem.recorder import Recorder
+from casadi_ik.problem.solution import BatchSolution, Solution
+from casadi_ik.solving.alternatives.finder import Alternative
+from casadi_ik.solving.alternatives.tracking import Track, travel_limits
+from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.stepper import SteppedMethod, Stepper
+from casadi_ik.solving.stream import SolvedBlock, Stream
 
 Array = NDArray[np.float64]
 

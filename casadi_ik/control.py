@@ -17,15 +17,17 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError
 from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
 from casadi_ik.logs import McapRecorder
+from casadi_ik.methods.common.coupling_record import coupling_jacobian
+from casadi_ik.methods.screw_control.objectives import ScrewTask
+from casadi_ik.methods.screw_control.step import ScrewControlStep
+from casadi_ik.problem.problems import Problems, Tolerance
+from casadi_ik.problem.recorder import SolveBlock
+from casadi_ik.problem.solution import BatchSolution
+from casadi_ik.problem.status import Status
+from casadi_ik.problem.trace import TraceFormat
+from casadi_ik.problem.trajectory import Trajectory
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solvers import BatchSolution, Problems, Stepper, Tolerance
-from casadi_ik.solvers.method import TraceFormat
-from casadi_ik.solvers.recorder import SolveBlock
-from casadi_ik.solvers.trajectory import Trajectory
-from casadi_ik.steps.coupling_record import coupling_jacobian
-from casadi_ik.steps.screw_control import ScrewControlStep
-from casadi_ik.steps.screw_objectives import ScrewTask
-from casadi_ik.steps.status import Status
+from casadi_ik.solving.stepper import Stepper
 from casadi_ik.symbolic import dual_quaternion as dq
 
 Array = NDArray[np.float64]

@@ -22,7 +22,10 @@ from bench_logs import Dropped, Targets, cases, main
 from bench_report import Section
 
 import casadi_ik as ik
-from casadi_ik.logs import chunk, chunk_stream, mcap_file, writer
+from casadi_ik.logs.mcap import chunk
+from casadi_ik.logs.mcap import file as mcap_file
+from casadi_ik.logs.write import chunk_stream
+from casadi_ik.logs.write import recorder as writer
 
 WRITING = ("checksum", "compression", "writing to disk")
 """What is done to finished bytes, whoever has made them."""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from targets import random_arm_targets
 
 import casadi_ik as ik
-from casadi_ik.solvers.recorder import SolveBlock
+from casadi_ik.problem.recorder import SolveBlock
 
 METHODS: dict[str, dict[str, Any]] = {
     "hand-first": {},

@@ -24,7 +24,7 @@ from targets import any_configuration, random_arm_targets
 
 import casadi_ik as ik
 from casadi_ik.logs import EventKind, EventRules, Keep, McapRecorder
-from casadi_ik.solvers.recorder import SolveBlock
+from casadi_ik.problem.recorder import SolveBlock
 
 FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Thresholds are tried at these multiples of what is the rule."""

@@ -24,9 +24,9 @@ from peer_steps import Peer, Scipy
 from targets import random_arm_targets
 
 import casadi_ik as ik
-from casadi_ik.solvers import Problems
-from casadi_ik.solvers.verdict import judge
-from casadi_ik.steps.even_spread import evenly
+from casadi_ik.methods.common.even_spread import evenly
+from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.verdict import judge
 
 Array = NDArray[np.float64]
 Targets = tuple[Array, Array]

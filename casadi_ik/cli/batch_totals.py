@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from casadi_ik.solvers import SolvedBlock
+from casadi_ik.solving.stream import SolvedBlock
 
 ROWS_SHOWN = 12
 """How many unsolved rows are kept by number."""

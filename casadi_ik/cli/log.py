@@ -18,8 +18,8 @@ from rich.text import Text
 from casadi_ik import logs
 from casadi_ik.cli.answer import Answer
 from casadi_ik.cli.report import duration, fields, table
-from casadi_ik.logs.one_solve import happening
-from casadi_ik.logs.phrases import SERIOUS, plain_name, told
+from casadi_ik.logs.explain.phrases import SERIOUS, plain_name, told
+from casadi_ik.logs.read.one_solve import happening
 
 
 def info(arguments: argparse.Namespace) -> Answer:

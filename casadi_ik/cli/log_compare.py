@@ -12,8 +12,8 @@ from casadi_ik import logs
 from casadi_ik.cli.answer import Answer
 from casadi_ik.cli.report import table
 from casadi_ik.errors import InputError
-from casadi_ik.logs.compare import Matched, matched, side_by_side
-from casadi_ik.logs.one_solve import one_solve
+from casadi_ik.logs.explain.compare import Matched, matched, side_by_side
+from casadi_ik.logs.read.one_solve import one_solve
 
 SHOWN = 12
 """How many solves that only one method solved are named."""

@@ -17,8 +17,8 @@ from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import located
 from casadi_ik.cli.report import fields, files
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
-from casadi_ik.logs.finish import finish_log
-from casadi_ik.logs.merge import merge_logs
+from casadi_ik.logs.repair.finish import finish_log
+from casadi_ik.logs.repair.merge import merge_logs
 
 SUFFIXES = {".mcap": "viewer", ".parquet": "parquet", ".csv": "csv"}
 
@@ -38,8 +38,8 @@ def export(arguments: argparse.Namespace) -> Answer:
 
 def _view(arguments: argparse.Namespace, out: Path) -> Answer:
     with located("log export", (MissingExtraError,)):
-        from casadi_ik.logs.viewer import check_robot, write_view
-    from casadi_ik.logs.viewer_layout import layout_of, write_layout
+        from casadi_ik.logs.viewer.export import check_robot, write_view
+    from casadi_ik.logs.viewer.layout import layout_of, write_layout
 
     layout = out.with_suffix(".layout.json")
     check_outputs([("--out", out), ("the layout", layout)], inputs=[Path(arguments.file)])

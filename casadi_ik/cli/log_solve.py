@@ -15,8 +15,8 @@ from casadi_ik.cli.outputs import check_outputs
 from casadi_ik.cli.question import located
 from casadi_ik.cli.report import files, headline
 from casadi_ik.errors import MissingExtraError, UnknownNameError
-from casadi_ik.logs.one_solve import OneSolve, one_solve
-from casadi_ik.logs.why import explain
+from casadi_ik.logs.explain.why import explain
+from casadi_ik.logs.read.one_solve import OneSolve, one_solve
 
 
 def why(arguments: argparse.Namespace) -> Answer:

@@ -19,7 +19,8 @@ from casadi_ik.errors import (
 )
 from casadi_ik.files.shipped import resolve
 from casadi_ik.grasps import Grasp, load_grasp
-from casadi_ik.solvers import METHODS, Tolerance, fixed_array
+from casadi_ik.methods.registry import METHODS
+from casadi_ik.problem.problems import Tolerance, fixed_array
 
 
 @contextlib.contextmanager

@@ -14,7 +14,8 @@ from rich.text import Text
 
 from casadi_ik.api import Solver
 from casadi_ik.cli.batch_totals import BatchTotals
-from casadi_ik.solvers import Solution, Status
+from casadi_ik.problem.solution import Solution
+from casadi_ik.problem.status import Status
 
 AT_LIMIT = 1e-6
 """How near to a limit counts as at it [rad or m]."""

@@ -12,7 +12,9 @@ from typing import IO, Any
 import numpy as np
 
 from casadi_ik.cli.outputs import folder_of, write_output, writing
-from casadi_ik.solvers import BatchSolution, Diagnosis, Status
+from casadi_ik.problem.diagnosis import Diagnosis
+from casadi_ik.problem.solution import BatchSolution
+from casadi_ik.problem.status import Status
 
 STATUS = np.dtype(f"<U{max(len(status.name) for status in Status)}")
 """Names of statuses, as wide as the longest."""

@@ -19,7 +19,8 @@ from casadi_ik.cli.question import located, the_fixed, the_grasp, the_robot, the
 from casadi_ik.cli.report import solution_report
 from casadi_ik.errors import MissingExtraError
 from casadi_ik.grasps import Grasp, load_object
-from casadi_ik.solvers import Diagnosis, Solution
+from casadi_ik.problem.diagnosis import Diagnosis
+from casadi_ik.problem.solution import Solution
 
 Draw = Callable[[ArmHand, Solution, Grasp, Path], object]
 

@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from casadi_ik.grasps import Grasp
-from casadi_ik.solvers import Solution
+from casadi_ik.problem.solution import Solution
 from casadi_ik.views.picture import FAINT, INK
 
 OBJECT_COLOR = "#8cc4e8"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.logs import Table
-from casadi_ik.solvers import Tolerance
+from casadi_ik.problem.problems import Tolerance
 from casadi_ik.views.picture import DPI, FAINT, INK, new_figure, save_picture
 from casadi_ik.views.strips import draw_strip, events_strip, limits_strip, mark_events, runs
 

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Grasp, load_object
-from casadi_ik.solvers import Alternative, Solution
+from casadi_ik.problem.solution import Solution
+from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.views.captions import (
     MET_COLOR,
     MISSED_COLOR,

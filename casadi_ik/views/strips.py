@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from casadi_ik.logs import Table
-from casadi_ik.logs.traces import bits_of
+from casadi_ik.logs.events.traces import bits_of
 from casadi_ik.views.picture import INK
 
 LIMIT_COLOR = "#c2334d"

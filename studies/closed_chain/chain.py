@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import casadi_ik as ik
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.steps.arm_placement import ALLOWED, ITERATIONS, place_arm
+from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, place_arm
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.closed_chain import closed_chain, split
 from casadi_ik.symbolic.kinematics import Pose

@@ -10,7 +10,7 @@ import pytest
 from made_up_solves import T0
 
 from casadi_ik.logs import LogClock, McapRecorder
-from casadi_ik.solvers.recorder import SolveBlock
+from casadi_ik.problem.recorder import SolveBlock
 
 
 @pytest.fixture

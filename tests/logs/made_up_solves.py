@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.solvers import BatchSolution, Problems, Status, Tolerance
-from casadi_ik.solvers.method import TraceFormat
-from casadi_ik.solvers.recorder import SolveBlock
-from casadi_ik.steps.recorded_jacobian import RecordedJacobian
+from casadi_ik.problem.problems import Problems, Tolerance
+from casadi_ik.problem.recorder import SolveBlock
+from casadi_ik.problem.solution import BatchSolution
+from casadi_ik.problem.status import Status
+from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 
 FINGERS = ("thumb", "finger_2", "finger_3")
 PHASES = ("thumb reaching", "hand alignment", "refinement")

@@ -19,8 +19,8 @@ import casadi_ik as ik
 from casadi_ik.errors import InputError, LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs import EventRules, Keep, LogClock, McapRecorder
-from casadi_ik.solvers.method import TraceFormat
-from casadi_ik.solvers.recorder import Recorder
+from casadi_ik.problem.recorder import Recorder
+from casadi_ik.problem.trace import TraceFormat
 
 Write = Callable[..., Path]
 
@@ -37,7 +37,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
         left[0] -= done
         return done
 
-    monkeypatch.setattr("casadi_ik.logs.mcap_file.os.write", limited)
+    monkeypatch.setattr("casadi_ik.logs.mcap.file.os.write", limited)
 
 
 def record_many(path: Path, blocks: int) -> None:
@@ -110,7 +110,7 @@ def test_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         def refuse(*_: object) -> int:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-        monkeypatch.setattr("casadi_ik.logs.mcap_file.os.open", refuse)
+        monkeypatch.setattr("casadi_ik.logs.mcap.file.os.open", refuse)
     with pytest.raises(LogError, match="Permission denied"):
         McapRecorder(folder / "cup.mcap", robot_name="made_up")
     assert list(folder.iterdir()) == []
@@ -187,7 +187,7 @@ def test_an_interrupt_while_a_chunk_is_written(
             raise KeyboardInterrupt
         return done
 
-    monkeypatch.setattr("casadi_ik.logs.mcap_file.os.write", interrupted)
+    monkeypatch.setattr("casadi_ik.logs.mcap.file.os.write", interrupted)
     path = tmp_path / "cup.mcap"
     with pytest.raises(KeyboardInterrupt):
         record_many(path, 4)

@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs import EventKind, EventRules, detect_events
-from casadi_ik.logs.event_kinds import event_format
-from casadi_ik.logs.table import Part, Table
-from casadi_ik.solvers.method import TraceFormat
-from casadi_ik.steps.recorded_jacobian import RecordedJacobian
+from casadi_ik.logs.events.kinds import event_format
+from casadi_ik.logs.read.table import Part, Table
+from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 
 STORAGE = {"phase": "u1", "restart": "u4", "limit_mask": "u4", "active_mask": "u4"}
 Names = tuple[str, ...]

@@ -16,7 +16,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from casadi_ik.errors import LogError
 from casadi_ik.logs import McapRecorder
-from casadi_ik.logs.finish import finish_log
+from casadi_ik.logs.repair.finish import finish_log
 
 Write = Callable[..., Path]
 

@@ -16,11 +16,11 @@ from rosbags.highlevel import AnyReader
 import casadi_ik as ik
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.logs import EventKind, LogClock, Table
-from casadi_ik.logs.chunk_stream import CHUNK_SIZE
-from casadi_ik.logs.event_kinds import event_format
-from casadi_ik.logs.schema import KINDS, topic
-from casadi_ik.logs.solve_rows import solve_format
-from casadi_ik.solvers.recorder import SolveBlock
+from casadi_ik.logs.events.kinds import event_format
+from casadi_ik.logs.mcap.schema import KINDS, topic
+from casadi_ik.logs.write.chunk_stream import CHUNK_SIZE
+from casadi_ik.logs.write.solve_rows import solve_format
+from casadi_ik.problem.recorder import SolveBlock
 
 Write = Callable[..., Path]
 

@@ -17,9 +17,9 @@ from viewer_reader import Decoded, decode, draw
 
 import casadi_ik as ik
 from casadi_ik.errors import LogError
-from casadi_ik.logs.one_solve import OneSolve, one_solve
-from casadi_ik.logs.viewer import check_robot, write_view
-from casadi_ik.logs.viewer_layout import layout_of, shipped_layout, write_layout
+from casadi_ik.logs.read.one_solve import OneSolve, one_solve
+from casadi_ik.logs.viewer.export import check_robot, write_view
+from casadi_ik.logs.viewer.layout import layout_of, shipped_layout, write_layout
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.steps import coupling_record
+from casadi_ik.methods.common import coupling_record
 
 
 @pytest.fixture(scope="module")

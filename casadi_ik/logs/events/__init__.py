@@ -1,0 +1,1 @@
+"""What happens in an iteration that is worth a line of its own."""

@@ -1,0 +1,80 @@
+"""What can happen in an iteration that is worth a line of its own, and how it is stored."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.problem.trace import TraceFormat
+
+
+class EventKind(IntEnum):
+    """What happened; "value against threshold" is what the event's two numbers are."""
+
+    NEAR_SINGULAR = 0
+    """A Jacobian's smallest singular value has fallen below its threshold."""
+    ILL_CONDITIONED = 1
+    """A Jacobian's condition number has risen above its threshold."""
+    LIMIT_HIT = 2
+    """An actuator has come to a limit: its position, twice."""
+    LIMIT_LEFT = 3
+    """An actuator has left a limit: its position against that on the limit."""
+    ACTIVATED = 4
+    """Constraints have joined the active set: its size against that before."""
+    RELEASED = 5
+    """Constraints have left the active set: its size against that before."""
+    RESTART = 6
+    """A new start: its number against that before."""
+    PHASE_CHANGE = 7
+    """Another phase: its code against that before."""
+    STALL = 8
+    """The errors stand still: their relative spread against what counts as still."""
+    OSCILLATION = 9
+    """Actuators go to and fro without progress: the longest step against what counts as one."""
+
+
+SINGULAR = (EventKind.NEAR_SINGULAR, EventKind.ILL_CONDITIONED)
+"""The kinds that make a solve a singular one."""
+
+
+def jacobian_names(form: TraceFormat) -> tuple[str, ...]:
+    """Names of the Jacobians whose measures a trace holds; one per element of such a field."""
+    found: dict[str, None] = {}
+    for item in form.layout:
+        kind, _, name = item.name.partition("_")
+        if kind in ("sigma", "condition"):
+            labels = form.labels.get(item.name, ())
+            for i in range(item.size):
+                part = labels[i] if i < len(labels) else str(i)
+                found[f"{name}[{part}]" if item.shape else name] = None
+    return tuple(found)
+
+
+def mask_words(form: TraceFormat) -> int:
+    """How many 32-bit words a mask of all actuators has."""
+    sizes = {item.name: item.size for item in form.layout}
+    coordinates = -(-sizes.get("q", 1) // 32)
+    return max(coordinates, sizes.get("limit_mask", 1), sizes.get("active_mask", 1))
+
+
+def event_format(form: TraceFormat) -> TraceFormat:
+    """Layout and labels of the events of a method whose traces have the given format."""
+    words = mask_words(form)
+    joints = form.labels.get("q") or form.labels.get("limit_mask", ())
+    layout = Layout.record(
+        Field("value", (), "f8", "", "the number that made it an event"),
+        Field("threshold", (), "f8", "", "what it was compared with, or the value before"),
+        Field("solve_id", (), "u4"),
+        Field("iteration", (), "u4", "", "counted from 0"),
+        Field("joint_mask", () if words == 1 else (words,), "u4", "", "bit i: actuator i"),
+        Field("kind", (), "u1"),
+        Field("jacobian", (), "u1", "", "the Jacobian concerned"),
+        Field("phase", (), "u1"),
+    )
+    labels = {
+        "kind": tuple(kind.name for kind in EventKind),
+        "jacobian": ("none", *jacobian_names(form)),
+        "joint_mask": joints,
+        "phase": form.labels.get("phase", ()),
+    }
+    return TraceFormat(layout, labels)

@@ -1,0 +1,59 @@
+"""What a solve was asked besides its contacts: all that its answer follows from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.logs.events.traces import bits_of
+from casadi_ik.logs.read.table import Part, element_name
+from casadi_ik.problem.problems import Tolerance
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """The conditions of a solve; with its targets and the solver's options they repeat it.
+
+    Attributes:
+        tolerances: What counted as reached, by finger.
+        limits: "enforce" or "ignore".
+        seed: Of its random numbers, which follow from the number of the solve as well.
+        start: (n,) where it began [rad or m]; None in logs of earlier versions.
+        fixed: Actuators that were held, and where [rad or m].
+    """
+
+    tolerances: tuple[Tolerance, ...]
+    limits: str = "enforce"
+    seed: int = 0
+    start: NDArray[np.float64] | None = None
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+
+def asked_of(part: Part, metadata: Mapping[str, Any]) -> Asked:
+    """What the only solve of a part was asked.
+
+    Args:
+        part: A row of `solve_rows`; of logs of earlier versions the solver's settings are taken.
+        metadata: Of the log.
+    """
+    row, fingers = part.rows[0], part.labels["position_error"]
+    if "start" not in (part.rows.dtype.names or ()):
+        parameters = metadata.get("parameters", {})
+        known = parameters.get("tolerance", {})
+        tolerances = tuple(Tolerance(**known.get(finger, {})) for finger in fingers)
+        limits = parameters.get("limits", "enforce")
+        return Asked(tolerances, limits, int(metadata["seed"]))
+    names = part.labels["q"]
+    (held,) = bits_of(np.atleast_1d(row["fixed_mask"])[None])
+    pairs = zip(row["position_tolerance"].tolist(), row["angle_tolerance"].tolist(), strict=True)
+    return Asked(
+        tolerances=tuple(Tolerance(*pair) for pair in pairs),
+        limits="enforce" if row["limits_enforced"] else "ignore",
+        seed=int(row["seed"]),
+        start=row["start"],
+        fixed={element_name(names, int(i)): float(row["start"][i]) for i in np.flatnonzero(held)},
+    )

@@ -1,0 +1,1 @@
+"""Torn logs made whole, shards joined."""

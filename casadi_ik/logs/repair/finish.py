@@ -1,0 +1,119 @@
+"""Makes a log whole again whose writer was killed: nothing that was complete is lost."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from mcap.exceptions import McapError
+from mcap.records import Footer
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
+
+from casadi_ik.errors import LogError
+from casadi_ik.logs.mcap.data_section import HEAD, DataSection, scan
+
+try:
+    import fcntl
+except ImportError:  # Windows: no lock
+    fcntl = None
+
+_FOOTER_SIZE = HEAD.size + 20
+
+_UNCHECKED = 4
+"""Bytes at the footer's end that its checksum does not cover: the checksum."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What became of a log.
+
+    Attributes:
+        path: The file.
+        changed: False if it was whole already.
+        chunks: Complete chunks in it.
+        messages: Messages in it.
+        cut: Bytes of the torn tail that were cut away.
+    """
+
+    path: Path
+    changed: bool
+    chunks: int
+    messages: int
+    cut: int
+
+
+def finish_log(path: str | os.PathLike[str]) -> Finished:
+    """Repair a truncated log in place.
+
+    Every complete chunk is verified by its checksum; what is torn behind the last of them is cut,
+    and the end that was never written is written. A log that is whole is left as it is.
+
+    Args:
+        path: An MCAP file.
+
+    Raises:
+        LogError: The file is missing, cannot be written, is still being written, is no MCAP file,
+            or is damaged elsewhere than at its end. Then it has not been changed.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            section = scan(stream)
+            whole = section.closed and _ends_well(stream, section)
+        cut = 0 if whole else _close(path, section)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LogError(f"{path}: cannot finish the log: {reason}") from error
+    except LogError as error:
+        raise LogError(f"{path}: {error}") from error
+    summary = section.summary
+    return Finished(path, not whole, len(summary.chunks), sum(summary.counts.values()), cut)
+
+
+def _close(path: Path, section: DataSection) -> int:
+    """Cut what is torn and write the end; gives the bytes that were cut."""
+    end = section.end
+    indexes = section.owed_indexes()
+    tail = indexes + section.summary.ending(end + len(indexes))
+    with path.open("r+b") as stream:
+        if not _locked(stream) or stream.seek(0, os.SEEK_END) != section.size:
+            raise LogError("cannot finish the log: its writer is still at it")
+        stream.truncate(end)
+        stream.seek(end)
+        stream.write(tail)
+        stream.flush()
+        os.fsync(stream.fileno())
+    return section.size - end
+
+
+def _locked(stream: IO[bytes]) -> bool:
+    """Whether nobody else is writing."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _ends_well(stream: IO[bytes], section: DataSection) -> bool:
+    """Whether summary, footer and magic stand behind the data section and match their checksum."""
+    stream.seek(section.end)
+    tail = stream.read()
+    magic = len(MCAP0_MAGIC)
+    if len(tail) < _FOOTER_SIZE + magic or tail[-magic:] != MCAP0_MAGIC:
+        return False
+    stream.seek(-(_FOOTER_SIZE + magic), os.SEEK_END)
+    try:
+        footer = next(StreamReader(stream, skip_magic=True).records)
+    except (McapError, ValueError):
+        return False
+    if not isinstance(footer, Footer) or footer.summary_start < section.end:
+        return False
+    checked = tail[footer.summary_start - section.end : -magic - _UNCHECKED]
+    return not footer.summary_crc or zlib.crc32(checked) == footer.summary_crc

@@ -1,0 +1,1 @@
+"""A solve for Foxglove and Lichtblick."""

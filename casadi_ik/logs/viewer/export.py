@@ -1,0 +1,263 @@
+"""One solve as a file that Foxglove and Lichtblick play: robot, frames, contacts, phases, events.
+
+======================  ==========================  ================================================
+topic                   schema                      message
+======================  ==========================  ================================================
+``/robot_description``  std_msgs/msg/String         the robot as URDF, once
+``/tf``                 foxglove.FrameTransforms    every link under its parent, each iteration
+``/joint_states``       sensor_msgs/msg/JointState  joints after the couplings, each iteration
+``/ik/targets``         foxglove.SceneUpdate        the contacts asked for, once
+``/ik/contacts``        foxglove.SceneUpdate        where the fingertips are, each iteration
+``/ik/iteration``       as in the log               all that the log holds of each iteration
+``/ik/messages``        foxglove.Log                how it began, phases, events, how it ended
+======================  ==========================  ================================================
+
+An iteration takes 10 ms, and the first is at the time when the solve began.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import Writer
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.errors import LogError
+from casadi_ik.files.writing import written_whole
+from casadi_ik.logs.explain.phrases import SERIOUS, errors, told
+from casadi_ik.logs.mcap import schema
+from casadi_ik.logs.mcap.message import CDR_HEADER
+from casadi_ik.logs.read.one_solve import OneSolve
+from casadi_ik.logs.viewer.messages import (
+    JOINT_STATE,
+    STRING,
+    Array,
+    Color,
+    Schema,
+    along,
+    arrow,
+    cdr_message,
+    fox,
+    inverses,
+    quaternion_of,
+    quaternions,
+    sphere,
+    stamp_of,
+    vector_of,
+)
+
+ITERATION = 10_000_000
+"""Time between two iterations in the viewer [ns]."""
+
+TARGET, FREE = (0.94, 0.71, 0.0), (0.6, 0.6, 0.6)
+MET, MISSED = (0.12, 0.62, 0.33), (0.84, 0.18, 0.24)
+"""Of contacts: asked for, of a free finger; within tolerance, out of it."""
+
+
+def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) -> None:
+    """Write a viewer file.
+
+    Args:
+        path: The MCAP file; it is there when it is complete.
+        solve: The solve.
+        robot: The robot that it was solved for.
+
+    Raises:
+        LogError: The log has no iterations of the solve, or the file cannot be written.
+    """
+    if len(solve.rows) == 0:
+        raise LogError(
+            f"solve {solve.solve_id} of {solve.method}: the log kept no iterations of it"
+        )
+    try:
+        with written_whole(Path(path)) as part, part.open("xb") as stream:
+            writer = Writer(stream)
+            writer.start(profile="ros2", library="casadi_ik")
+            _View(writer, solve, robot).write()
+            writer.finish()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LogError(f"{path}: cannot write the viewer file: {reason}") from error
+
+
+def check_robot(robot: ArmHand, urdf: str, where: str) -> None:
+    """See to it that a robot is the one a log was written for.
+
+    Args:
+        robot: The robot.
+        urdf: The robot description attached to the log.
+        where: The log, for the message.
+
+    Raises:
+        LogError: They differ by more than rounding.
+    """
+    found, expected = (re.split(r'[\s"]+', text) for text in (robot.urdf(), urdf))
+    alike = len(found) == len(expected)
+    if not (alike and all(map(_same, found, expected))):
+        raise LogError(
+            f"{where}: the robot {robot.name!r} is not the one in the log (its URDF differs);"
+            " give the description that was solved for (--robot)"
+        )
+
+
+def _same(first: str, second: str) -> bool:
+    if first == second:
+        return True
+    try:
+        return bool(np.isclose(float(first), float(second), rtol=1e-9, atol=1e-9))
+    except ValueError:
+        return False
+
+
+class _View:
+    """The topics of one solve."""
+
+    def __init__(self, writer: Writer, solve: OneSolve, robot: ArmHand) -> None:
+        self.writer = writer
+        self.solve = solve
+        self.robot = robot
+        self.root = robot.description.root
+        self.q = solve.rows["q"].astype(float)
+        self.times = solve.started + ITERATION * np.arange(len(solve.rows))
+
+    def write(self) -> None:
+        """All topics, each in its order; a reader sorts by time."""
+        self._add(self._ros("/robot_description", STRING), 0, cdr_message(self.robot.urdf()))
+        self._targets()
+        self._transforms()
+        self._joint_states()
+        self._contacts()
+        self._iterations()
+        self._messages()
+
+    def _ros(self, topic: str, definition: tuple[str, str]) -> int:
+        name, text = definition
+        number = self.writer.register_schema(name, "ros2msg", text.encode())
+        return self.writer.register_channel(topic, "cdr", number, {"offered_qos_profiles": ""})
+
+    def _protobuf(self, topic: str, found: Schema) -> int:
+        number = self.writer.register_schema(found.name, found.encoding, found.data)
+        return self.writer.register_channel(topic, "protobuf", number)
+
+    def _add(self, channel: int, i: int, data: bytes) -> None:
+        time = int(self.times[i])
+        self.writer.add_message(channel, time, data, time, sequence=i)
+
+    def _transforms(self) -> None:
+        description, links = self.robot.description, self.robot.links(self.q)
+        poses = [
+            (joint.parent, joint.child, inverses(links[joint.parent]) @ links[joint.child])
+            for joint in description.joints
+        ]
+        poses += [
+            (finger.link, f"{finger.name}_contact", np.tile(finger.placement, (len(self.q), 1, 1)))
+            for finger in description.fingers
+        ]
+        frames = [
+            (parent, child, pose[:, :3, 3], quaternions(pose[:, :3, :3]))
+            for parent, child, pose in poses
+        ]
+        channel = self._protobuf("/tf", fox.FrameTransforms.get_schema())
+        for i, time in enumerate(self.times.tolist()):
+            stamp = stamp_of(time)
+            transforms = [
+                fox.FrameTransform(
+                    timestamp=stamp,
+                    parent_frame_id=parent,
+                    child_frame_id=child,
+                    translation=vector_of(positions[i]),
+                    rotation=quaternion_of(rotations[i]),
+                )
+                for parent, child, positions, rotations in frames
+            ]
+            self._add(channel, i, fox.FrameTransforms(transforms=transforms).encode())
+
+    def _joint_states(self) -> None:
+        joints = self.robot.joints(self.q)
+        positions = np.stack([np.atleast_1d(values) for values in joints.values()], axis=1)
+        channel = self._ros("/joint_states", JOINT_STATE)
+        none = np.zeros(0)
+        for i, time in enumerate(self.times.tolist()):
+            state = cdr_message(stamp_of(time), self.root, list(joints), positions[i], none, none)
+            self._add(channel, i, state)
+
+    def _targets(self) -> None:
+        solve = self.solve
+        turned = quaternions(along(solve.target_normals))
+        contacts = [
+            (f"{finger} target", solve.target_points[j], turned[j], TARGET)
+            for j, finger in enumerate(solve.fingers)
+            if not np.isnan(solve.target_points[j]).any()
+        ]
+        channel = self._protobuf("/ik/targets", fox.SceneUpdate.get_schema())
+        self._add(channel, 0, self._scene(0, contacts, thickness=0.008))
+
+    def _contacts(self) -> None:
+        solve = self.solve
+        points, normals = self.robot.contacts(self.q)
+        turned = quaternions(along(normals.reshape(-1, 3))).reshape(*normals.shape[:2], 4)
+        missed = (solve.rows["position_error"] > solve.position_tolerance) | (
+            solve.rows["angle_error"] > solve.angle_tolerance
+        )
+        channel = self._protobuf("/ik/contacts", fox.SceneUpdate.get_schema())
+        free = [bool(np.isnan(point).any()) for point in solve.target_points]
+        for i in range(len(self.q)):
+            colors = [
+                FREE if free[j] else MISSED if missed[i, j] else MET for j in range(len(free))
+            ]
+            contacts = list(zip(solve.fingers, points[i], turned[i], colors, strict=True))
+            self._add(channel, i, self._scene(i, contacts, thickness=0.004))
+
+    def _scene(
+        self, i: int, contacts: list[tuple[str, Array, Array, Color]], thickness: float
+    ) -> bytes:
+        """Contacts as points with arrows along their normals: name, point, rotation, colour."""
+        stamp = stamp_of(int(self.times[i]))
+        entities = [
+            fox.SceneEntity(
+                timestamp=stamp,
+                frame_id=self.root,
+                id=name,
+                spheres=[sphere(point, 2.5 * thickness, color)],
+                arrows=[] if np.isnan(turned).any() else [arrow(point, turned, thickness, color)],
+            )
+            for name, point, turned, color in contacts
+        ]
+        return fox.SceneUpdate(entities=entities).encode()
+
+    def _iterations(self) -> None:
+        solve = self.solve
+        name = schema.schema_name("iteration", solve.method, solve.layout, len(solve.fingers))
+        text = schema.schema_text(solve.layout, solve.labels)
+        channel = self._ros("/ik/iteration", (name, text))
+        for i, row in enumerate(solve.rows):
+            self._add(channel, i, CDR_HEADER + row.tobytes())
+
+    def _messages(self) -> None:
+        solve, last = self.solve, len(self.q) - 1
+        lines = [(0, fox.LogLevel.Info, f"{solve.method} on {solve.robot}, solve {solve.solve_id}")]
+        lines += [(each.first, fox.LogLevel.Info, each.phase) for each in solve.stretches]
+        lines += [
+            (
+                event.iteration,
+                fox.LogLevel.Warning if event.kind in SERIOUS else fox.LogLevel.Info,
+                told(event),
+            )
+            for event in solve.events
+            if event.kind != "PHASE_CHANGE"
+        ]
+        level = fox.LogLevel.Info if solve.success else fox.LogLevel.Error
+        lines.append((last, level, f"{solve.status} after {solve.iterations} iterations"))
+        for finger, position, angle, ok in zip(
+            solve.fingers, solve.position_error, solve.angle_error, solve.ok, strict=True
+        ):
+            level = fox.LogLevel.Info if ok else fox.LogLevel.Error
+            lines.append((last, level, f"{finger} off by {errors(float(position), float(angle))}"))
+        channel = self._protobuf("/ik/messages", fox.Log.get_schema())
+        for i, level, text in sorted(lines, key=lambda line: line[0]):
+            stamp = stamp_of(int(self.times[i]))
+            log = fox.Log(timestamp=stamp, level=level, message=text, name=f"iteration {i}")
+            self._add(channel, i, log.encode())

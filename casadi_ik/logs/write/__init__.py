@@ -1,0 +1,1 @@
+"""Solves on their way into a log."""

@@ -1,0 +1,110 @@
+"""Arm stage for arms without a closed form: damped least squares on the arm's joints.
+
+Starts are taken from a table of arm configurations in the order of how far their palm is from the
+one wanted. The next start is the nearest that is farther than the last one.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
+from casadi_ik.methods.common.contact_fit import LENGTH, Tried
+from casadi_ik.methods.common.even_spread import evenly
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.so3 import skew
+
+TABLE = 1024
+"""Configurations of the arm to start from."""
+
+STARTS = 22
+"""Of these, how many are tried for a palm pose; all rounds of a solve together try them all."""
+
+FAR = 1e30
+"""Farther than any palm."""
+
+PASSES = 2
+"""Corrections of the active set in a step."""
+
+
+def nearest_start(robot: RobotDescription) -> ca.Function:
+    """The next start for a palm pose.
+
+    Returns:
+        ``(rotation, origin, passed) -> (arm, distance)``: the configuration whose palm is nearest
+        of those farther than `passed`, and its distance.
+    """
+    columns = list(robot.arm_actuators)
+    spread = evenly(TABLE, len(columns))
+    arms = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
+    q = ca.SX.sym("q", len(columns))
+    palm = _palm(robot, q)
+    features = ca.Function("features", [q], [_features(palm.rotation, palm.origin)])
+    table = np.array(features(arms.T)).T
+    rotation, origin = ca.MX.sym("rotation", 3, 3), ca.MX.sym("origin", 3)
+    passed = ca.MX.sym("passed")
+    wanted = _features(rotation, origin)
+    distances = ca.DM((table**2).sum(axis=1)) - 2 * ca.DM(table) @ wanted
+    index, distance = _next_nearest(distances + ca.sumsqr(wanted), passed)
+    arm = ca.MX(ca.DM(arms.T))[:, index]
+    return ca.Function("nearest_start", [rotation, origin, passed], [ca.densify(arm), distance])
+
+
+def _next_nearest(distances: Expr, passed: Expr) -> tuple[Expr, Expr]:
+    """Index and distance of the nearest row beyond `passed`; of the nearest of all after the last.
+
+    As operations on whole vectors, since unrolled they would be most of the method's code.
+    """
+    beyond = distances > passed
+    over = 1 - ca.norm_inf(beyond)
+    masked = ca.if_else(ca.logic_or(beyond, ca.repmat(over, TABLE, 1)), distances, FAR)
+    nearest = ca.mmin(masked)
+    return ca.find(masked <= nearest), nearest
+
+
+def pose_step(
+    robot: RobotDescription, arm: Expr, palm: Pose, damping: Expr, p: dict[str, Expr]
+) -> Tried:
+    """One damped step of the arm (a, 1) towards a palm pose."""
+    columns = list(robot.arm_actuators)
+    bounds = Bounded(arm, p["lower"][columns], p["upper"][columns], first=0)
+    before = _error(_palm(robot, arm), palm)
+    damped = damped_step(pose_jacobian(robot, arm), before, damping, bounds, PASSES)
+    reached = clip(arm + damped.step, bounds)
+    there = _error(_palm(robot, reached), palm)
+    return Tried(reached, before, there, damped.promised, ca.mmax(ca.fabs(reached - arm)))
+
+
+def pose_jacobian(robot: RobotDescription, arm: Expr) -> Expr:
+    """Jacobian (12, a) of position / `LENGTH` and of the columns of the palm's rotation."""
+    body = actuated(robot, _whole(robot, arm))
+    linear, angular = body.palm_jacobian(robot.arm_actuators)
+    rotation = body.kinematics.palm.rotation
+    rows = [linear / LENGTH]
+    rows += [-skew(rotation[:, i]) @ angular for i in range(3)]
+    return ca.vertcat(*rows)
+
+
+def _features(rotation: Expr, origin: Expr) -> Expr:
+    """A palm pose as twelve numbers: origin / `LENGTH` and the columns of its rotation."""
+    return ca.vertcat(origin / LENGTH, ca.reshape(rotation, 9, 1))
+
+
+def _error(palm: Pose, wanted: Pose) -> Expr:
+    return _features(palm.rotation, palm.origin) - _features(wanted.rotation, wanted.origin)
+
+
+def _palm(robot: RobotDescription, arm: Expr) -> Pose:
+    return actuated(robot, _whole(robot, arm)).kinematics.palm
+
+
+def _whole(robot: RobotDescription, arm: Expr) -> Expr:
+    """Q with the hand at zero: it does not move the palm."""
+    q = ca.SX.zeros(len(robot.actuators), 1)
+    for i, column in enumerate(robot.arm_actuators):
+        q[column] = arm[i]
+    return q

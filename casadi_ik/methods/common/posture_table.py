@@ -1,0 +1,77 @@
+"""Which hand postures look like a grasp: a table of them, ranked by the shape of their contacts.
+
+Distances between contact points and angles of the normals do not change when the hand is moved as
+a whole. These invariants of a target are compared with those of many postures, so that the hand
+stage starts from postures that nearly fit, wherever the palm may be.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.kernels import LookupKernel
+from casadi_ik.methods.common.contact_shape import contact_shape
+from casadi_ik.methods.common.even_spread import evenly
+from casadi_ik.problem.problems import Array
+
+
+class PostureTable:
+    """Hand postures spread evenly over the limits.
+
+    Attributes:
+        postures: (t, k) positions of the hand's actuators.
+        lookup: Finds rows of them.
+    """
+
+    def __init__(
+        self,
+        robot: ArmHand,
+        hand: tuple[int, ...],
+        size: int,
+        at_limits: float = 0.0,
+        pull: float = 0.0,
+        compiled: bool = True,
+    ) -> None:
+        """Spread the postures and note the shape of their contacts.
+
+        Args:
+            robot: The robot.
+            hand: Positions in q of the hand's actuators.
+            size: Number of postures.
+            at_limits: Part of the range [0, 1) that is moved to the limits, half to either: hands
+                stand at their limits more often than an even spread would.
+            pull: How much the distance from a given posture counts besides the contacts' shape:
+                different hands may have contacts of nearly the same shape.
+            compiled: Whether lookups run in compiled code.
+        """
+        columns = list(hand)
+        q = np.tile(robot.home, (size, 1))
+        spread = (evenly(size, len(columns)) - 0.5) / (1 - at_limits) + 0.5
+        spread = np.clip(spread, 0.0, 1.0)
+        q[:, columns] = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
+        self.postures = q[:, columns]
+        self._pulled = pull > 0
+        half_ranges = (robot.upper - robot.lower)[columns] / 2
+        scales = np.sqrt(pull / len(columns)) / half_ranges
+        key = contact_shape(len(robot.fingers), scales if self._pulled else ())
+        contacts = robot.contacts(q)
+        rows = (*contacts, self.postures) if self._pulled else contacts
+        self.lookup = LookupKernel(key, rows, compiled)
+
+    def nearest(
+        self, points: Array, normals: Array, count: int, near: Array | None = None
+    ) -> Array:
+        """The postures whose contacts are shaped most like the targets, best first.
+
+        Args:
+            points: (k, f, 3) [m], NaN where free.
+            normals: (k, f, 3), NaN where free.
+            count: How many, at most the size of the table.
+            near: (k, hand) postures they should be near; needed by a table with a pull.
+
+        Returns:
+            (k, count, hand) postures.
+        """
+        asked = (points, normals, near) if self._pulled else (points, normals)
+        return self.postures[self.lookup(count, *asked)]

@@ -1,0 +1,118 @@
+"""Where a solve of the hand-first method begins: state and parameters from a target."""
+
+from __future__ import annotations
+
+import sys
+
+import casadi as ca
+
+from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.methods.hand_first.state import HandFirstLayouts
+from casadi_ik.problem.status import Phase
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.subexpressions import shared
+
+
+def terms(robot: RobotDescription) -> Layout:
+    """What all targets of a batch have in common."""
+    n, f = len(robot.actuators), len(robot.fingers)
+    return Layout(
+        (
+            Field("position_tolerance", (f,), unit="m"),
+            Field("angle_tolerance", (f,), unit="rad"),
+            Field("lower", (n,), doc="lower bounds of q"),
+            Field("upper", (n,), doc="upper bounds of q"),
+        )
+    )
+
+
+def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
+    """First state and parameters of the step.
+
+    Hand motors that move free fingers only stay where they are; every start is moved into the
+    bounds.
+
+    Returns:
+        points (f, 3) [m] and normals (f, 3), NaN where free, where the robot is (n, 1), the
+        `terms`, hand postures to try (candidates, hand) -> state, parameters.
+    """
+    robot = layouts.robot
+    f, n = len(robot.fingers), len(robot.actuators)
+    name = ca.Function.fix_name(f"hand_first_beginning_{robot.name}")
+    return FunctionGraph(
+        name,
+        lambda: _build(name, layouts),
+        {
+            "points": (f, 3),
+            "normals": (f, 3),
+            "here": (n, 1),
+            "terms": (terms(robot).size, 1),
+            "postures": (layouts.candidates, len(layouts.hand)),
+        },
+        ((layouts.state.size, 1), (layouts.parameters.size, 1)),
+        recipe(name, robot, layouts.candidates),
+    )
+
+
+def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
+    robot, hand = layouts.robot, list(layouts.hand)
+    f, n = len(robot.fingers), len(robot.actuators)
+    points, normals, here = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3), ca.SX.sym("q", n)
+    common = terms(robot)
+    given = common.symbols("terms")
+    t = common.unpack(given)
+    postures = ca.SX.sym("postures", layouts.candidates, len(hand))
+
+    known = ca.horzcat(*(_is_number(array[:, 0]) for array in (points, normals)))
+    needed = ca.vertcat(*(_mover(robot, actuator, known[:, 0]) for actuator in hand))
+    held = _bounded(here[hand], t, hand)
+    tried = [
+        ca.if_else(needed, _bounded(postures[i, :].T, t, hand), held)
+        for i in range(layouts.candidates)
+    ]
+    parameters = layouts.parameters.pack(
+        {
+            "points": _or_zero(points, known[:, 0]),
+            "normals": _or_zero(normals, known[:, 1]),
+            "weights": known,
+            "reach": 1.0,
+            "alone": 0.0,
+            "start": _bounded(here, t, list(range(n))),
+            "postures": ca.horzcat(*tried).T,
+            **t,
+        }
+    )
+    zero = {item.name: ca.SX.zeros(item.size) for item in layouts.state}
+    state = layouts.state.pack(
+        zero
+        | {
+            "q": here,
+            "best_q": here,
+            "phase": float(Phase.CANDIDATE),
+            "best_cost": sys.float_info.max,
+        }
+    )
+    inputs = [points, normals, here, given, postures]
+    return ca.Function(name, inputs, shared(state, parameters))
+
+
+def _is_number(x: Expr) -> Expr:
+    """1 where x is a number, 0 where NaN; written so that it is not simplified to 1."""
+    return ca.logic_or(x <= 0, x > 0)
+
+
+def _or_zero(x: Expr, known: Expr) -> Expr:
+    return ca.if_else(ca.repmat(known, 1, 3), x, 0.0)
+
+
+def _mover(robot: RobotDescription, actuator: int, known: Expr) -> Expr:
+    """1 if an actuator moves a finger that has a contact."""
+    moved = [i for i, f in enumerate(robot.finger_names) if actuator in robot.finger_actuators(f)]
+    return ca.mmax(ca.vertcat(ca.SX(0), known[moved]))
+
+
+def _bounded(q: Expr, t: dict[str, Expr], actuators: list[int]) -> Expr:
+    return ca.fmin(ca.fmax(q, t["lower"][actuators]), t["upper"][actuators])

@@ -1,0 +1,117 @@
+"""Hand stage: palm pose and hand posture that fit the contacts, without the arm.
+
+Three contacts with normals fix both: thirteen unknowns (palm 6, hand 7 for the Barrett) against
+fifteen equations. The palm's coordinates are its pose; a step turns and shifts it in its own frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from casadi_ik.methods.common.bounded_step import clip, damped_step
+from casadi_ik.methods.common.contact_fit import LENGTH, Tried, weighted_residual
+from casadi_ik.methods.common.palm_fit import HandContacts, hand_contacts
+from casadi_ik.methods.hand_first.state import HandFirstLayouts
+from casadi_ik.symbolic.se3 import compose, exp_se3
+from casadi_ik.symbolic.smooth import Expr, safe_norm
+from casadi_ik.symbolic.so3 import skew
+from casadi_ik.symbolic.srs_arm import SrsArm, reach
+
+PASSES = 2
+"""Corrections of the active set in a step."""
+
+
+@dataclass(frozen=True, eq=False)
+class PalmAndHand:
+    """The unknowns of the hand stage."""
+
+    rotation: Expr
+    origin: Expr
+    hand: Expr
+
+
+def fit_residual(contacts: HandContacts, x: PalmAndHand, p: dict[str, Expr]) -> Expr:
+    """Residual (6 f, 1) of `weighted_residual`, in the palm frame."""
+    f = len(contacts.points)
+    positions = [
+        contacts.points[i] - x.rotation.T @ (p["points"][i, :].T - x.origin) for i in range(f)
+    ]
+    normals = [contacts.normals[i] - x.rotation.T @ p["normals"][i, :].T for i in range(f)]
+    return weighted_residual(positions, normals, p["weights"])
+
+
+def fit_jacobian(contacts: HandContacts, x: PalmAndHand, p: dict[str, Expr]) -> Expr:
+    """Jacobian (6 f, 6 + k) over palm shift [m], palm turn [rad] (palm frame) and hand."""
+    positions, normals = [], []
+    for i in range(len(contacts.points)):
+        seen = x.rotation.T @ (p["points"][i, :].T - x.origin)
+        facing = x.rotation.T @ p["normals"][i, :].T
+        positions.append(ca.horzcat(ca.DM.eye(3), -skew(seen), contacts.point_jacobians[i]))
+        normals.append(ca.horzcat(ca.DM(3, 3), -skew(facing), contacts.normal_jacobians[i]))
+    return weighted_residual(positions, normals, p["weights"])
+
+
+def reach_row(
+    arm: SrsArm, columns: Sequence[int], x: PalmAndHand, p: dict[str, Expr]
+) -> tuple[Expr, Expr]:
+    """How far the wrist is out of the arm's reach, by `LENGTH`, and its slope (1, 6).
+
+    Where contacts leave the hand a freedom (three parallel fingers), it is spent on bringing the
+    wrist where the elbow can follow. Zero, with slope zero, within reach.
+    """
+    near, far = reach(arm, p["lower"][columns[3]], p["upper"][columns[3]])
+    wrist = ca.DM(arm.wrist_in_palm)
+    line = x.origin + x.rotation @ wrist - ca.DM(arm.shoulder)
+    distance = safe_norm(line)
+    beyond = distance - ca.fmin(ca.fmax(distance, near), far)
+    along = x.rotation.T @ line / distance
+    slope = ca.horzcat(along.T, ca.cross(wrist, along).T) * (ca.fabs(beyond) > 0)
+    return p["reach"] * beyond / LENGTH, p["reach"] * slope / LENGTH
+
+
+def fit_step(
+    layouts: HandFirstLayouts,
+    arm: SrsArm | None,
+    x: PalmAndHand,
+    damping: Expr,
+    p: dict[str, Expr],
+    q: Expr,
+) -> Tried:
+    """One damped step; it turns and shifts the palm along one screw.
+
+    With the palm on a screw, a palm that turns about the common axis of several joints while they
+    turn back leaves the contacts exactly alone: the long valleys of nearly singular hands are
+    straight.
+
+    Args:
+        layouts: Of the robot.
+        arm: An arm whose reach is to be kept to, if known.
+        x: Where the step begins.
+        damping: Scalar.
+        p: Parameters.
+        q: (n, 1) with the hand's part at `x.hand`.
+    """
+    before, jacobian = _rows(layouts, arm, x, p)
+    bounds = layouts.hand_bounds(q, p, first=6)
+    damped = damped_step(jacobian, before, damping, bounds, PASSES)
+    rotation, origin = compose((x.rotation, x.origin), exp_se3(damped.step[:6]))
+    reached = PalmAndHand(rotation, origin, clip(x.hand + damped.step[6:], bounds))
+    there, _ = _rows(layouts, arm, reached, p)
+    size = ca.mmax(ca.fabs(reached.hand - x.hand))
+    return Tried(reached, before, there, damped.promised, size)
+
+
+def _rows(
+    layouts: HandFirstLayouts, arm: SrsArm | None, x: PalmAndHand, p: dict[str, Expr]
+) -> tuple[Expr, Expr]:
+    """Residual and Jacobian of contacts and reach."""
+    contacts = hand_contacts(layouts.robot, x.hand, layouts.hand)
+    residual, jacobian = fit_residual(contacts, x, p), fit_jacobian(contacts, x, p)
+    if arm is None:
+        return residual, jacobian
+    beyond, slope = reach_row(arm, layouts.robot.arm_actuators, x, p)
+    slope = ca.horzcat(slope, ca.SX(1, len(layouts.hand)))
+    return ca.vertcat(residual, beyond), ca.vertcat(jacobian, slope)

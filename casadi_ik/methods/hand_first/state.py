@@ -1,0 +1,165 @@
+"""State, parameters and record of the hand-first method, shared by its stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.methods.common.bounded_step import Bounded
+from casadi_ik.methods.common.contact_fit import Judged, Tried, errors
+from casadi_ik.methods.common.coupling_record import coupling_fields, coupling_values
+from casadi_ik.methods.common.limits import bits
+from casadi_ik.problem.status import Phase
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.smooth import Expr
+
+STAGES = (Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT)
+"""The stages in the order of their codes."""
+
+STAGE_LABELS = tuple(stage.label for stage in STAGES)
+
+NOTHING = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class HandFirstLayouts:
+    """The three layouts for one robot.
+
+    Attributes:
+        robot: The description.
+        candidates: How many hand postures the stages may start from.
+        hand: Positions in q of the hand's actuators.
+    """
+
+    robot: RobotDescription
+    candidates: int
+
+    @cached_property
+    def hand(self) -> tuple[int, ...]:
+        """Positions in q of the hand's actuators."""
+        arm = set(self.robot.arm_actuators)
+        return tuple(i for i in range(len(self.robot.actuators)) if i not in arm)
+
+    @cached_property
+    def state(self) -> Layout:
+        """What an iteration hands to the next."""
+        n = len(self.robot.actuators)
+        return Layout(
+            (
+                Field("q", (n,), doc="arm and hand; while the hand is fitted only the hand's part"),
+                Field("palm_rotation", (3, 3)),
+                Field("palm_origin", (3,), unit="m"),
+                Field("phase"),
+                Field("candidate", doc="index of the hand posture started from"),
+                Field("damping"),
+                Field("growth", doc="factor of the damping if the next step gains nothing"),
+                Field("cost", doc="cost at q (or at palm and hand)"),
+                Field("fits", doc="1 if palm and hand meet the contacts"),
+                Field("waited", doc="evaluations in a row that gained little"),
+                Field("spent", doc="evaluations in this phase"),
+                Field("margin", doc="best margin of the arm so far, negative: a violation"),
+                Field("arm", (len(self.robot.arm_actuators),), doc="arm with the best margin"),
+                Field("starts", doc="starts of the numeric arm stage so far"),
+                Field("passed", doc="how far the palm of the last start was from the one wanted"),
+                Field("best_cost", doc="smallest cost of a whole configuration so far"),
+                Field("best_q", (n,), doc="the configuration it belongs to"),
+                Field("counts", (len(STAGES),), doc="iterations by stage, in the order of STAGES"),
+            )
+        )
+
+    @cached_property
+    def parameters(self) -> Layout:
+        """The problem and the numbers of the method."""
+        n, f = len(self.robot.actuators), len(self.robot.fingers)
+        return Layout(
+            (
+                Field("points", (f, 3), unit="m", doc="contact points, base frame; 0 if free"),
+                Field("normals", (f, 3), doc="outward pad normals, base frame; 0 if free"),
+                Field("weights", (f, 2), doc="1 where point, normal count, 0 where free"),
+                Field("position_tolerance", (f,), unit="m"),
+                Field("angle_tolerance", (f,), unit="rad"),
+                Field("lower", (n,), doc="lower bounds of q"),
+                Field("upper", (n,), doc="upper bounds of q"),
+                Field("reach", doc="weight of the arm's reach while the hand is fitted"),
+                Field("alone", doc="1 if a solve ends with the hand's fit, and the arm stays out"),
+                Field("start", (n,), doc="where a stage that needs a start begins"),
+                Field("postures", (self.candidates, len(self.hand)), doc="hand postures to try"),
+            )
+        )
+
+    @cached_property
+    def record(self) -> Layout:
+        """What is logged of an iteration."""
+        n, f = len(self.robot.actuators), len(self.robot.fingers)
+        return Layout.record(
+            Field("q", (n,), "f8", "rad or m", "actuator positions before the step"),
+            Field("cost", (), "f8", "", "squared residual before the step"),
+            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
+            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
+            Field("damping", (), "f4", "", "Levenberg-Marquardt damping of the step"),
+            Field("step_size", (), "f4", "rad or m", "largest motor change of the step tried"),
+            Field("margin", (), "f4", "", "best arm margin found (arm placement)"),
+            *coupling_fields(self.robot),
+            Field("limit_mask", (), "u4", "", "bit i: actuator i at a limit"),
+            Field("candidate", (), "u1", "", "hand posture started from"),
+            Field("accepted", (), "u1", "", "1 if the step lowered the cost"),
+            Field("phase", (), "u1"),
+            Field("status", (), "u1", "", "0 running, else the final status"),
+        )
+
+    def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> Bounded:
+        """Bounds of the hand's actuators."""
+        rows = list(self.hand)
+        return Bounded(q[rows], p["lower"][rows], p["upper"][rows], first)
+
+    def row(
+        self,
+        s: dict[str, Expr],
+        p: dict[str, Expr],
+        q: Expr,
+        phase: Phase,
+        status: Expr,
+        tried: Tried | None = None,
+        judged: Judged | None = None,
+        margin: Expr = NOTHING,
+    ) -> Expr:
+        """What is logged at q (n, 1).
+
+        Args:
+            s: State before the iteration.
+            p: Parameters.
+            q: The configuration.
+            phase: The stage.
+            status: Whether the solve goes on.
+            tried: The damped step, if the stage makes one.
+            judged: What was made of it.
+            margin: Of the arm, if the stage places it.
+        """
+        f = len(self.robot.fingers)
+        positions: Expr = [NOTHING] * f
+        angles: Expr = [NOTHING] * f
+        if tried is not None:
+            positions, chords = errors(tried.before, f)
+            angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
+            positions = ca.if_else(p["weights"][:, 0] > 0, positions, NOTHING)
+            angles = ca.if_else(p["weights"][:, 1] > 0, angles, NOTHING)
+        return self.record.pack(
+            {
+                "q": q,
+                "cost": ca.sumsqr(tried.before) if tried else NOTHING,
+                "position_error": positions,
+                "angle_error": angles,
+                "damping": s["damping"],
+                "step_size": tried.size if tried else NOTHING,
+                "margin": margin,
+                **coupling_values(self.robot, q),
+                "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
+                "candidate": s["candidate"],
+                "accepted": judged.accepted if judged else 0.0,
+                "phase": float(phase),
+                "status": status,
+            }
+        )

@@ -1,0 +1,291 @@
+"""The hand-first method as one step graph: the hand is fitted, then the arm follows.
+
+The contacts fix palm pose and hand posture without the arm; the arm then has a closed form. One
+iteration is one evaluation of whichever stage the solve is in:
+
+candidate   take the next hand posture of the list and the palm pose that suits it best;
+hand fit    one damped step of palm pose and hand posture;
+placement   try some swivels of the arm for that palm pose;
+refinement  one damped step of all motors, from the least violating arm, where the arm cannot
+            follow exactly or has no closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.kernels.step_graph import StepGraph
+from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, place_arm
+from casadi_ik.methods.common.contact_fit import EXACT, fresh_fit, judge, judge_contacts
+from casadi_ik.methods.common.numeric_arm import STARTS, nearest_start, pose_step
+from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
+from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
+from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts
+from casadi_ik.methods.hand_first.whole_fit import whole_step
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.srs_arm import SrsArm
+from casadi_ik.symbolic.subexpressions import shared
+
+
+class HandFirstStep:
+    """Builds the step graph for one robot.
+
+    Attributes:
+        layouts: State, parameters and record.
+    """
+
+    def __init__(self, robot: RobotDescription, arm: SrsArm | None, candidates: int) -> None:
+        """Remember what the graph is made of.
+
+        Args:
+            robot: The description.
+            arm: Constants of an S-R-S arm, or None: then refinement does the arm's work.
+            candidates: Hand postures a solve may start from.
+        """
+        self.robot = robot
+        self.arm = arm
+        self.layouts = HandFirstLayouts(robot, candidates)
+
+    def graph(self) -> StepGraph:
+        """The whole iteration."""
+        layouts = self.layouts
+        return StepGraph(
+            self._name,
+            self._iteration,
+            layouts.state,
+            layouts.parameters,
+            layouts.record,
+            stage="phase",
+            recipe=recipe(self._name, self.robot, layouts.candidates),
+        )
+
+    @property
+    def _name(self) -> str:
+        return ca.Function.fix_name(f"hand_first_{self.robot.name}")
+
+    def _iteration(self) -> ca.Function:
+        layouts = self.layouts
+        state = ca.MX.sym("state", layouts.state.size)
+        parameters = ca.MX.sym("parameters", layouts.parameters.size)
+        cases = [self._refinement(), self._candidate()]  # in the order of STAGES
+        if self.robot.arm_actuators:
+            placement = self._placement() if self.arm else self._numeric_placement()
+            cases += [self._hand_fit(), placement]
+        choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
+        phase = state[layouts.state.slice("phase")]
+        outputs = choose(phase - float(STAGES[0]), state, parameters)
+        return ca.Function(self._name, [state, parameters], list(outputs))
+
+    def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
+        state = self.layouts.state.symbols("state")
+        parameters = self.layouts.parameters.symbols("parameters")
+        return (
+            state,
+            parameters,
+            self.layouts.state.unpack(state),
+            self.layouts.parameters.unpack(parameters),
+        )
+
+    def _candidate(self) -> ca.Function:
+        """Take the next posture; after the last one the solve ends with the best it found."""
+        state, parameters, s, p = self._inputs()
+        layouts, count = self.layouts, self.layouts.candidates
+        hand = sum(
+            (ca.if_else(s["candidate"] == i, p["postures"][i, :].T, 0.0) for i in range(count)),
+            ca.SX.zeros(len(layouts.hand), 1),
+        )
+        exhausted = s["candidate"] >= count
+        q = self._with_hand(p["start"], hand)
+        rotation, origin = best_palm(hand_contacts(self.robot, hand, layouts.hand), p)
+        after = layouts.state.pack(
+            self._counted(s, Phase.CANDIDATE)
+            | {
+                "q": ca.if_else(exhausted, s["best_q"], q),
+                "palm_rotation": rotation,
+                "palm_origin": origin,
+                "phase": float(self._after_candidate),
+                "cost": 0.0,
+                "margin": -1e9,
+                "starts": 0.0,
+            }
+            | fresh_fit()
+        )
+        status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
+        record = self.layouts.row(s, p, q, Phase.CANDIDATE, status)
+        return ca.Function("candidate", [state, parameters], shared(after, record, status))
+
+    @property
+    def _after_candidate(self) -> Phase:
+        """A hand on a fixed base has no palm pose to fit."""
+        return Phase.HAND_FIT if self.robot.arm_actuators else Phase.REFINEMENT
+
+    def _hand_fit(self) -> ca.Function:
+        state, parameters, s, p = self._inputs()
+        columns = list(self.layouts.hand)
+        x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
+        tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
+        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        keep, reached = judged.accepted, tried.reached
+        # The last candidate goes on to the arm even if it does not fit: its arm and hand are the
+        # nearest there is, and refinement starts from them.
+        last = s["candidate"] + 1 >= self.layouts.candidates
+        onwards = ca.logic_or(judged.within, last)
+        ended = ca.logic_and(judged.settled, ca.logic_and(onwards, p["alone"] > 0))
+        after = self.layouts.state.pack(
+            self._counted(s, Phase.HAND_FIT)
+            | {
+                "q": self._with_hand(s["q"], ca.if_else(keep, reached.hand, x.hand)),
+                "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
+                "palm_origin": ca.if_else(keep, reached.origin, x.origin),
+                "phase": ca.if_else(
+                    judged.settled,
+                    ca.if_else(onwards, float(Phase.ARM_PLACEMENT), float(Phase.CANDIDATE)),
+                    float(Phase.HAND_FIT),
+                ),
+                "candidate": s["candidate"]
+                + ca.if_else(ca.logic_and(judged.settled, ca.logic_not(onwards)), 1.0, 0.0),
+                "fits": judged.within,
+            }
+            | judged.fit
+        )
+        fitted = ca.if_else(judged.within, float(Status.SOLVED), float(Status.STALLED))
+        status = ca.if_else(ended, fitted, float(Status.RUNNING))
+        record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged)
+        return ca.Function("hand_fit", [state, parameters], shared(after, record, status))
+
+    def _placement(self) -> ca.Function:
+        state = ca.MX.sym("state", self.layouts.state.size)
+        parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
+        s, p = self.layouts.state.unpack(state), self.layouts.parameters.unpack(parameters)
+        arm = list(self.robot.arm_actuators)
+        assert self.arm is not None
+        palm = Pose(s["palm_rotation"], s["palm_origin"])
+        found = place_arm(self.arm, palm, p["lower"][arm], p["upper"][arm], s["spent"])
+        outputs = self._place()(state, parameters, *found)
+        return ca.Function("placement", [state, parameters], list(outputs))
+
+    def _numeric_placement(self) -> ca.Function:
+        """A step towards the palm pose; the first of a start begins at a row of the table."""
+        state = ca.MX.sym("state", self.layouts.state.size)
+        parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
+        s = self.layouts.state.unpack(state)
+        begin = nearest_start(self.robot)
+        arm = ca.MX.sym("arm", len(self.robot.arm_actuators))
+        inputs = [ca.MX.sym("rotation", 3, 3), ca.MX.sym("origin", 3), ca.MX.sym("passed"), arm]
+        fresh = ca.Function("fresh", inputs, list(begin(*inputs[:3])))
+        same = ca.Function("same", inputs, [arm, inputs[2]])
+        now = s["q"][list(self.robot.arm_actuators)]
+        palm = (s["palm_rotation"], s["palm_origin"])
+        chosen = ca.Function.if_else("start", fresh, same)(s["spent"] < 1, *palm, s["passed"], now)
+        outputs = self._pose_step()(state, parameters, *chosen)
+        return ca.Function("placement", [state, parameters], list(outputs))
+
+    def _pose_step(self) -> ca.Function:
+        state, parameters, s, p = self._inputs()
+        rows = list(self.robot.arm_actuators)
+        arm, passed = ca.SX.sym("arm", len(rows)), ca.SX.sym("passed")
+        inside = ca.fmin(ca.fmax(arm, p["lower"][rows]), p["upper"][rows])
+        palm = Pose(s["palm_rotation"], s["palm_origin"])
+        tried = pose_step(self.robot, inside, palm, s["damping"], p)
+        judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
+        now = ca.if_else(judged.accepted, tried.reached, inside)
+        margin = -ca.sqrt(judged.cost)
+        better = margin > s["margin"]
+        best, best_margin = ca.if_else(better, now, s["arm"]), ca.fmax(margin, s["margin"])
+        exact = judged.cost < EXACT * EXACT
+        starts = s["starts"] + judged.settled
+        leave = ca.logic_or(exact, starts >= STARTS)
+        q = self._with_arm(s["q"], ca.if_else(leave, best, now))
+        after = self.layouts.state.pack(
+            self._counted(s, Phase.ARM_PLACEMENT)
+            | judged.fit
+            | {
+                "q": q,
+                "cost": s["cost"],
+                "phase": ca.if_else(leave, float(Phase.REFINEMENT), float(Phase.ARM_PLACEMENT)),
+                "margin": best_margin,
+                "arm": best,
+                "starts": starts,
+                "passed": passed,
+            }
+        )
+        solved = ca.logic_and(exact, s["fits"] > 0)
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        record = self.layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
+        inputs = [state, parameters, arm, passed]
+        return ca.Function("pose_step", inputs, shared(after, record, status))
+
+    def _place(self) -> ca.Function:
+        """Keep the best arm so far; take it if it is within limits."""
+        state, parameters, s, p = self._inputs()
+        n = len(self.robot.arm_actuators)
+        arm, margin = ca.SX.sym("arm", n), ca.SX.sym("margin")
+        better = margin > s["margin"]
+        best, best_margin = ca.if_else(better, arm, s["arm"]), ca.fmax(margin, s["margin"])
+        allowed = best_margin >= ALLOWED
+        spent = s["spent"] + 1
+        over = spent >= ITERATIONS
+        q = self._with_arm(s["q"], best)
+        q = ca.fmin(ca.fmax(q, p["lower"]), p["upper"])
+        # The last candidate is placed even if its hand does not fit.
+        solved = ca.logic_and(allowed, s["fits"] > 0)
+        leave = ca.logic_or(allowed, over)
+        after = self.layouts.state.pack(
+            self._counted(s, Phase.ARM_PLACEMENT)
+            | {
+                "q": ca.if_else(leave, q, s["q"]),
+                "phase": ca.if_else(leave, float(Phase.REFINEMENT), float(Phase.ARM_PLACEMENT)),
+                "spent": ca.if_else(leave, 0.0, spent),
+                "margin": best_margin,
+                "arm": best,
+            }
+        )
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        record = self.layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
+        return ca.Function("place", [state, parameters, arm, margin], shared(after, record, status))
+
+    def _refinement(self) -> ca.Function:
+        state, parameters, s, p = self._inputs()
+        tried = whole_step(self.robot, s["q"], s["damping"], p)
+        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        q = ca.if_else(judged.accepted, tried.reached, s["q"])
+        solved = ca.logic_and(judged.settled, judged.within)
+        failed = ca.logic_and(judged.settled, ca.logic_not(judged.within))
+        better = judged.cost < s["best_cost"]
+        after = self.layouts.state.pack(
+            self._counted(s, Phase.REFINEMENT)
+            | {
+                "q": q,
+                "phase": ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.REFINEMENT)),
+                "candidate": s["candidate"] + ca.if_else(failed, 1.0, 0.0),
+                "best_cost": ca.if_else(better, judged.cost, s["best_cost"]),
+                "best_q": ca.if_else(better, q, s["best_q"]),
+            }
+            | judged.fit
+        )
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged)
+        return ca.Function("refinement", [state, parameters], shared(after, record, status))
+
+    def _counted(self, s: dict[str, Expr], stage: Phase) -> dict[str, Expr]:
+        """The state with one more iteration spent in a stage."""
+        one = ca.DM([float(stage == other) for other in STAGES])
+        return s | {"counts": s["counts"] + one}
+
+    def _with_hand(self, q: Expr, hand: Expr) -> Expr:
+        return _with(q, self.layouts.hand, hand)
+
+    def _with_arm(self, q: Expr, arm: Expr) -> Expr:
+        return _with(q, self.robot.arm_actuators, arm)
+
+
+def _with(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
+    """Replace some of the entries of q."""
+    places = {row: i for i, row in enumerate(rows)}
+    return ca.vertcat(*(values[places[i]] if i in places else q[i] for i in range(q.numel())))

@@ -1,0 +1,1 @@
+"""The whole arm-hand as one nonlinear program, the slow reference."""

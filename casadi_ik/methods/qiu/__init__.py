@@ -1,0 +1,1 @@
+"""The methods of Qiu & Kermani 2021."""

@@ -1,0 +1,232 @@
+"""The enhanced method of Qiu & Kermani 2021 as one step graph: thumb first, then the hand.
+
+Phase 1, thumb reaching: palm orientation, thumb point and thumb normal in a hierarchy.
+Phase 2, hand alignment, every iteration: (1) the other fingers' own inverse kinematics, (2) the
+closed chain moves the palm to where they would reach, (3) the thumb is brought back to its
+contact. A row of the record describes the configuration q it holds: in phase 1 the one the step
+starts from, in phase 2 the one after the fingers' step, which is where the method decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.kernels.step_graph import StepGraph
+from casadi_ik.methods.common.limits import kept_within
+from casadi_ik.methods.qiu.enhanced_state import EnhancedLayouts
+from casadi_ik.methods.qiu.finger_step import finger_step_function
+from casadi_ik.methods.qiu.hierarchy import combine
+from casadi_ik.methods.qiu.palm_estimate import palm_orientation
+from casadi_ik.methods.qiu.palm_motion import palm_motion
+from casadi_ik.methods.qiu.tasks import (
+    MILLIMETRE,
+    Task,
+    TaskSolver,
+    contact_tasks,
+    damped,
+    palm_orientation_task,
+    selective,
+    weighted,
+    weighted_damped,
+)
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.target import contact_errors, targets, within_tolerance
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.closed_chain import closed_chain
+from casadi_ik.symbolic.measures import condition_number, singular_values
+from casadi_ik.symbolic.smooth import safe_norm
+from casadi_ik.symbolic.subexpressions import shared
+
+
+class EnhancedStep(EnhancedLayouts):
+    """Builds the step graph of an enhanced method for one robot."""
+
+    def graph(self) -> StepGraph:
+        """The whole iteration; compilable unless the finger step calls Ipopt."""
+        return StepGraph(
+            self._name,
+            self._iteration,
+            self.state,
+            self.parameters,
+            self.record,
+            self.options.finger_step != "ipopt",
+            stage="phase",
+            recipe=recipe(self._name, self.robot, self.options),
+        )
+
+    @property
+    def _name(self) -> str:
+        return ca.Function.fix_name(f"enhanced_{self.options.steps}_{self.robot.name}")
+
+    def _iteration(self) -> ca.Function:
+        state = ca.MX.sym("state", self.state.size)
+        parameters = ca.MX.sym("parameters", self.parameters.size)
+        fingers = finger_step_function(self.robot, self.options.finger_step)
+        seen = self._palm_view()(state, parameters)
+        closed = fingers(state[self.state.slice("q")], *seen)
+        align = ca.Function(
+            "align", [state, parameters], list(self._align()(state, parameters, closed))
+        )
+        choose = ca.Function.if_else("phase", self._reach(), align)
+        in_reaching = state[self.state.slice("phase")] < Phase.HAND_ALIGNMENT
+        outputs = choose(in_reaching, state, parameters)
+        return ca.Function(self._name, [state, parameters], list(outputs))
+
+    def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
+        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
+        return state, parameters, self.state.unpack(state), self.parameters.unpack(parameters)
+
+    def _palm_view(self) -> ca.Function:
+        """Targets of the fingers but the thumb, seen from the palm: what eq. (5) works with."""
+        state, parameters, s, p = self._inputs()
+        palm = actuated(self.robot, s["q"]).kinematics.palm
+        goals = [goal for name, goal in targets(self.robot, p).items() if name != self.robot.thumb]
+        points = ca.horzcat(*(palm.inverse_apply(goal.point) for goal in goals))
+        normals = ca.horzcat(*(palm.rotation.T @ goal.normal for goal in goals))
+        return ca.Function("palm_view", [state, parameters], [points, normals])
+
+    def _reach(self) -> ca.Function:
+        """One iteration of thumb reaching (section II-B)."""
+        state, parameters, s, p = self._inputs()
+        robot, body, goals = self.robot, actuated(self.robot, s["q"]), targets(self.robot, p)
+        columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
+        palm = palm_orientation_task(
+            body, palm_orientation(robot, goals), columns, self.options.palm_error == "euler"
+        )
+        position, normal = contact_tasks(body, robot.thumb, goals[robot.thumb], columns)
+        tasks = [palm, position, normal] if self.options.palm_task else [position, normal]
+        step = self._spread(self._combined(tasks, self._reaching(p)), columns)
+        q_next = self._moved(s["q"], step, p)
+
+        positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
+        thumb = robot.finger_names.index(robot.thumb)
+        # In units of the thumb's tolerances, so that they can be summed.
+        errors = ca.vertcat(
+            positions[thumb] / p["position_tolerance"][thumb],
+            angles[thumb] / p["angle_tolerance"][thumb],
+        )
+        if self.options.palm_task:
+            errors = ca.vertcat(errors, safe_norm(palm.error) / p["angle_tolerance"][thumb])
+        within, summed = ca.mmax(errors) <= 1, ca.sum1(errors)
+        better = summed < 0.99 * s["best"]
+        waited = ca.if_else(better, 0.0, s["waited"] + 1)
+        enough = ca.logic_or(
+            waited >= p["reaching_patience"], s["reached"] + 1 >= p["reaching_iterations"]
+        )
+        finished = ca.logic_or(within, enough)
+        after = self.state.pack(
+            {
+                "q": ca.if_else(within, s["q"], q_next),
+                "phase": ca.if_else(finished, float(Phase.HAND_ALIGNMENT), s["phase"]),
+                "best": ca.if_else(better, summed, s["best"]),
+                "waited": ca.if_else(finished, 0.0, waited),
+                "reached": s["reached"] + 1,
+            }
+        )
+        status = ca.SX(float(Status.RUNNING))
+        record = self.row(
+            s["q"],
+            positions,
+            angles,
+            step_size=_largest(q_next - s["q"]),
+            status=status,
+            phase=Phase.THUMB_REACHING,
+            palm_error=safe_norm(palm.error),
+            sigma_thumb=_smallest(position.jacobian) * MILLIMETRE,
+            sigma_palm=_smallest(palm.jacobian[:, : len(robot.arm_actuators)]),
+        )
+        return ca.Function("reach", [state, parameters], shared(after, record, status))
+
+    def _align(self) -> ca.Function:
+        """One iteration of hand alignment (section II-C), after the fingers' own step."""
+        state, parameters, s, p = self._inputs()
+        closed = ca.SX.sym("closed", len(self.robot.actuators))
+        robot, body, goals = self.robot, actuated(self.robot, closed), targets(self.robot, p)
+        positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
+        solved = within_tolerance(positions, angles, p)
+
+        others = {name: goal for name, goal in goals.items() if name != robot.thumb}
+        translation, rotation = palm_motion(body, others)
+        chain = closed_chain(body, self.chain, MILLIMETRE, self.options.platform)
+        moved = closed
+        if self.options.closed_chain:
+            motion = self._palm_tasks(chain.J_cc, translation, rotation, p)
+            active = self._combined(motion, self._chain_solver(p))
+            moved = self._moved(closed, chain.motor_steps(active, closed.numel()), p)
+
+        columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
+        keep = contact_tasks(actuated(robot, moved), robot.thumb, goals[robot.thumb], columns)
+        step = self._spread(self._combined(keep, self._reaching(p)), columns)
+        q_next = self._moved(moved, step, p)
+
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        after = self.state.pack(s | {"q": ca.if_else(solved, closed, q_next)})
+        thumb_linear, _ = body.contact_jacobian(robot.thumb, columns)
+        spectrum = singular_values(chain.H_p)
+        record = self.row(
+            closed,
+            positions,
+            angles,
+            step_size=_largest(q_next - s["q"]),
+            status=status,
+            phase=Phase.HAND_ALIGNMENT,
+            palm_motion=ca.vertcat(safe_norm(translation), safe_norm(rotation)),
+            sigma_thumb=_smallest(thumb_linear),
+            sigma_closed_chain=ca.mmin(spectrum),
+            condition_closed_chain=condition_number(spectrum),
+        )
+        return ca.Function("align_rest", [state, parameters, closed], shared(after, record, status))
+
+    def _palm_tasks(
+        self, J_cc: ca.SX, translation: ca.SX, rotation: ca.SX, p: dict[str, ca.SX]
+    ) -> list[Task]:
+        """What the closed chain is to do: position, then orientation, or both as one."""
+        if self.options.chain_tasks == "successive":
+            return [
+                Task(J_cc[:3, :], translation, is_position=True),
+                Task(J_cc[3:, :], rotation, is_position=False),
+            ]
+        lever = p["chain_lever"]
+        stacked = ca.vertcat(J_cc[:3, :], lever * J_cc[3:, :])
+        return [Task(stacked, ca.vertcat(translation, lever * rotation), is_position=True)]
+
+    def _combined(self, tasks: Sequence[Task], solve: TaskSolver) -> ca.SX:
+        """One step for all tasks, the highest first, as in the paper by successive projection."""
+        return combine(tasks, [solve(task) for task in tasks], "successive")
+
+    def _reaching(self, p: dict[str, ca.SX]) -> TaskSolver:
+        """Solves the tasks of the serial chain."""
+        if self.options.steps == "dls":
+            return damped(p["reaching_damping"])
+        return selective(p["reaching_gamma"], p["longest_error"], p["widest_error"])
+
+    def _chain_solver(self, p: dict[str, ca.SX]) -> TaskSolver:
+        """Solves the tasks of the closed chain, weighted."""
+        if self.options.steps == "dls":
+            return weighted_damped(p["chain_damping"], p["weights"])
+        solver = selective(p["chain_gamma"], p["longest_error"], p["widest_error"])
+        return weighted(solver, p["weights"])
+
+    def _spread(self, step: ca.SX, columns: tuple[int, ...]) -> ca.SX:
+        """A step of some actuators as a step of all (n, 1)."""
+        full = ca.SX.zeros(len(self.robot.actuators), 1)
+        for i, column in enumerate(columns):
+            full[column] = step[i]
+        return full
+
+    def _moved(self, q: ca.SX, step: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        """Take a step from q: capped, and kept within limits if they are enforced."""
+        q_next = q + step * ca.fmin(1.0, p["step_cap"] / ca.fmax(_largest(step), 1e-12))
+        return kept_within(self.robot, q_next, p["enforce_limits"])
+
+
+def _smallest(jacobian: ca.SX) -> ca.SX:
+    return ca.mmin(singular_values(jacobian))
+
+
+def _largest(step: ca.SX) -> ca.SX:
+    """Largest change of any motor."""
+    return ca.mmax(ca.fabs(step))

@@ -1,0 +1,168 @@
+"""State, parameters and record of the enhanced methods, and the numbers that go in and come out."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.methods.common.limits import limit_mask
+from casadi_ik.methods.qiu.finger_step import planar_fingers
+from casadi_ik.methods.qiu.parameters import QiuParameters
+from casadi_ik.problem.status import Phase
+from casadi_ik.problem.target import target_fields
+from casadi_ik.problem.trace import RecordedJacobian
+from casadi_ik.robots.description import Array, RobotDescription
+from casadi_ik.symbolic.closed_chain import VIRTUAL, split
+from casadi_ik.symbolic.smooth import Expr
+
+Counts = NDArray[np.int64]
+
+NOT_MEASURED = float("nan")
+
+
+class EnhancedLayouts:
+    """The three layouts for one robot.
+
+    Attributes:
+        robot: The description.
+        options: The structural choices and the numbers.
+        chain: Active and passive joints of the closed chain.
+        state: What an iteration hands to the next.
+        parameters: The problem and the numbers of the method.
+        record: What is logged of an iteration.
+    """
+
+    def __init__(self, robot: RobotDescription, options: QiuParameters) -> None:
+        """Lay out state, parameters and record.
+
+        Args:
+            robot: The description.
+            options: The structural choices; numbers are parameters of the graph.
+
+        Raises:
+            UnsupportedError: The robot is not of the kind the method needs.
+        """
+        n, f = len(robot.actuators), len(robot.fingers)
+        self.robot = robot
+        self.options = options
+        self.chain = split(robot, options.borrowed)
+        planar_fingers(robot)  # refused now rather than when the graph is built
+        self.state = Layout(
+            (
+                Field("q", (n,)),
+                Field("phase"),
+                Field("best", doc="smallest summed error of thumb reaching so far"),
+                Field("waited", doc="iterations since `best` fell"),
+                Field("reached", doc="iterations spent in thumb reaching"),
+            )
+        )
+        self.parameters = Layout(
+            (
+                *target_fields(robot),
+                Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not"),
+                Field("reaching_damping"),
+                Field("chain_damping"),
+                Field("chain_lever", unit="mm"),
+                Field("reaching_gamma"),
+                Field("chain_gamma"),
+                Field("longest_error", unit="mm"),
+                Field("widest_error", unit="rad"),
+                Field("weights", (len(self.chain.active),)),
+                Field("reaching_patience"),
+                Field("reaching_iterations"),
+                Field("step_cap"),
+            )
+        )
+        self.record = Layout.record(
+            Field("q", (n,), "f8", "rad or m", "actuator positions"),
+            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
+            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
+            Field("palm_error", (), "f4", "rad", "palm orientation task error (phase 1)"),
+            Field("palm_motion", (2,), "f4", "mm, rad", "palm motion demanded (phase 2)"),
+            Field("step_size", (), "f4", "rad or m", "largest motor change of this iteration"),
+            Field("sigma_thumb", (), "f4", "m", "smallest singular value, thumb point Jacobian"),
+            Field("sigma_palm", (), "f4", "", "smallest singular value, palm task (phase 1)"),
+            Field("sigma_closed_chain", (), "f4", "", "smallest singular value of H_p (phase 2)"),
+            Field("condition_closed_chain", (), "f4", "", "condition number of H_p (phase 2)"),
+            Field("limit_mask", (), "u4", "", "bit i: actuator i at or beyond a limit"),
+            Field("phase", (), "u1", "", "1 thumb reaching, 2 hand alignment"),
+            Field("status", (), "u1", "", "0 running, else the final status"),
+        )
+
+    @property
+    def jacobians(self) -> dict[str, RecordedJacobian]:
+        """The Jacobians in the record.
+
+        The paper names no thresholds; these are ours. A metre of the thumb's tip asks for more
+        than 20 rad of some joint, a rad of the palm for more than 2 rad, the platform for passive
+        joints that move 100 times as far as it turns. H_p has lengths in millimetres: its condition
+        number is above 400 everywhere.
+        """
+        names = self.robot.actuator_names
+        arm = tuple(names[i] for i in self.robot.arm_actuators)
+        thumb = tuple(names[i] for i in self.robot.finger_actuators(self.robot.thumb))
+        passive = tuple(names[i] for i in self.chain.passive if i != VIRTUAL)
+        return {
+            "thumb": RecordedJacobian(arm + thumb, singular=0.05),
+            "palm": RecordedJacobian(arm, singular=0.5),
+            "closed_chain": RecordedJacobian(passive, singular=0.01, condition=1e5),
+        }
+
+    def parameter_values(
+        self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool
+    ) -> dict[str, float | list[float] | Array]:
+        """Values of all parameter fields but the targets."""
+        options = self.options
+        given = {
+            "position_tolerance": position_tolerance,
+            "angle_tolerance": angle_tolerance,
+            "enforce_limits": float(enforce_limits),
+            "weights": [
+                options.virtual_weight if column == VIRTUAL else options.joint_weight
+                for column in self.chain.active
+            ],
+        }
+        named = (name for name in self.parameters.names if hasattr(options, name))
+        return given | {name: float(getattr(options, name)) for name in named}
+
+    def first_state(self) -> dict[str, float]:
+        """Values of all state fields but q."""
+        return {
+            "phase": float(Phase.THUMB_REACHING),
+            "best": float(np.finfo(float).max),
+            "waited": 0.0,
+            "reached": 0.0,
+        }
+
+    def phase_counts(self, states: Array, iterations: Counts) -> dict[Phase, Counts]:
+        """Iterations by phase (k,) from the last states (k, ns) and all iterations (k,)."""
+        reached = states[:, self.state.slice("reached")][:, 0].astype(np.int64)
+        return {Phase.THUMB_REACHING: reached, Phase.HAND_ALIGNMENT: iterations - reached}
+
+    def row(
+        self, q: Expr, positions: Expr, angles: Expr, *, phase: Phase, **measured: Expr
+    ) -> ca.SX:
+        """What is logged of an iteration.
+
+        Args:
+            q: (n, 1) the configuration the row describes.
+            positions: (f, 1) its errors [m].
+            angles: (f, 1) [rad].
+            phase: The phase.
+            measured: The other fields; those that the phase does not have are left out.
+        """
+        values: dict[str, Expr] = {
+            "q": q,
+            "position_error": positions,
+            "angle_error": angles,
+            "palm_error": NOT_MEASURED,
+            "palm_motion": [NOT_MEASURED, NOT_MEASURED],
+            "sigma_palm": NOT_MEASURED,
+            "sigma_closed_chain": NOT_MEASURED,
+            "condition_closed_chain": NOT_MEASURED,
+            "limit_mask": limit_mask(self.robot, q),
+            "phase": float(phase),
+        }
+        return self.record.pack(values | measured)

@@ -1,0 +1,278 @@
+"""The other fingers' inverse kinematics in the palm frame (Qiu & Kermani 2021, eqs. 4 and 5).
+
+Eq. (4): the desired normal gives the spread and the sum of the flexions. Eq. (5): with both held,
+the flexions that bring the contact point closest to its place, within limits. Two solvers of
+eq. (5) give the same answer: Ipopt on the constrained minimisation as the paper states it, and a
+closed form, since with the sum held the contact runs on a circle.
+
+What the paper leaves open and how it is read here: fingers that share a spread motor agree on the
+mean of their demands, weighted by the squared length of the demanded normal's part across the
+spread axis (what the normal loses by a wrong spread); a demand outside the limits is moved to the
+nearest attainable normal. A normal leaves two spreads half a turn apart; taken is the one at which
+the pad faces the side it faces in the middle of its flexion range (for the Barrett hand: flexion
+sums up to 140 of 188 deg).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from casadi_ik.problem.target import Target
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.planar_finger import PlanarFinger, planar_finger
+from casadi_ik.symbolic.smooth import Expr
+
+UNDECIDED = 1e-12
+"""Weight of the present spread: decides only where no normal demands one."""
+
+IPOPT_OPTIONS = {
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "print_time": False,
+    "ipopt.tol": 1e-12,
+    "ipopt.compl_inf_tol": 1e-12,
+    "ipopt.constr_viol_tol": 1e-12,
+    "ipopt.dual_inf_tol": 1e-10,
+    "ipopt.mu_init": 1e-6,
+    "ipopt.mu_target": 0.0,
+    "ipopt.bound_relax_factor": 1e-12,
+    "ipopt.honor_original_bounds": "yes",
+    "ipopt.max_iter": 200,
+    "error_on_fail": False,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Demand:
+    """What eq. (4) asks of one finger, and what eq. (5) has to reach.
+
+    Attributes:
+        finger: The finger's constants.
+        spread: Spread joint angle [rad], scalar.
+        flexion_sum: Sum of the flexions [rad], scalar, attainable within limits.
+        reach: (2, 1) where the second flexion axis has to be, seen from the first, in the
+            finger's plane: components along z and x of the finger frame [m].
+        first_limits: (2, 1) limits of the first flexion that leave the second within its own.
+    """
+
+    finger: PlanarFinger
+    spread: Expr
+    flexion_sum: Expr
+    reach: Expr
+    first_limits: Expr
+
+
+def demands(
+    robot: RobotDescription,
+    fingers: Sequence[PlanarFinger],
+    q: Expr,
+    goals: dict[str, Target],
+) -> list[Demand]:
+    """Eq. (4) for every finger.
+
+    Args:
+        robot: The description.
+        fingers: The fingers to close.
+        q: (n, 1) present actuator positions.
+        goals: Targets in the palm frame.
+    """
+    local = [_in_finger_frame(finger, goals[finger.name]) for finger in fingers]
+    spreads = _spreads(robot, fingers, q, local)
+    return [
+        _demand(finger, goal, spread)
+        for finger, goal, spread in zip(fingers, local, spreads, strict=True)
+    ]
+
+
+def closed_form(demand: Demand) -> tuple[Expr, Expr]:
+    """Eq. (5) in closed form: the two flexions [rad].
+
+    The second axis runs on a circle about the first; its nearest point to `reach` is in the same
+    direction, and the distance grows with the angle from there, so the limits simply clamp.
+    """
+    z, x = float(demand.finger.middle[2]), float(demand.finger.middle[0])
+    angle = ca.atan2(
+        z * demand.reach[1] - x * demand.reach[0], z * demand.reach[0] + x * demand.reach[1]
+    )
+    lower, upper = demand.first_limits[0], demand.first_limits[1]
+    middle = (lower + upper) / 2
+    first = clamp(middle + wrap(angle - middle), lower, upper)
+    return first, demand.flexion_sum - first
+
+
+class IpoptFinger:
+    """Eq. (5) by Ipopt on a CasADi graph, for one finger; exact Hessian, lengths in millimetres.
+
+    The far side of the circle is a local minimum as well where it lies within the limits, so Ipopt
+    starts from whichever of the ends and the middle of the range is best.
+    """
+
+    def __init__(self, finger: PlanarFinger) -> None:
+        """Build the program: variables the two flexions, parameters what `Demand` holds."""
+        x = ca.SX.sym("flexion", 2)
+        p = ca.SX.sym("p", 3)
+        flexion_sum, reach = p[0], p[1:]
+        program = {
+            "x": x,
+            "p": p,
+            "f": _squared_distance(finger, x[0], reach),
+            "g": x[0] + x[1] - flexion_sum,
+        }
+        name = ca.Function.fix_name(f"finger_{finger.name}")
+        self._solver = ca.nlpsol(name, "ipopt", program, IPOPT_OPTIONS)
+        self._limits = finger.flexion_limits
+
+    def __call__(self, demand: Demand) -> tuple[Expr, Expr]:
+        """Solve eq. (5): the two flexions [rad] for a demand of MX or DM."""
+        solution = self._solver(
+            x0=_best_start(demand),
+            p=ca.vertcat(demand.flexion_sum, demand.reach),
+            lbx=self._limits[:, 0],
+            ubx=self._limits[:, 1],
+            lbg=0,
+            ubg=0,
+        )
+        return solution["x"][0], solution["x"][1]
+
+
+def _squared_distance(finger: PlanarFinger, first: Expr, reach: Expr) -> Expr:
+    """What eq. (5) minimises [mm^2], over the first flexion [rad]."""
+    z, x = float(finger.middle[2]), float(finger.middle[0])
+    c, s = ca.cos(first), ca.sin(first)
+    place = ca.vertcat(c * z - s * x, s * z + c * x)
+    return ca.sumsqr((place - reach) * 1e3)
+
+
+def _best_start(demand: Demand) -> Expr:
+    """The best pair of flexions (2, 1) among the ends and the middle of the first one's range."""
+    lower, upper = demand.first_limits[0], demand.first_limits[1]
+    best, least = lower, _squared_distance(demand.finger, lower, demand.reach)
+    for first in ((lower + upper) / 2, upper):
+        distance = _squared_distance(demand.finger, first, demand.reach)
+        best = ca.if_else(distance < least, first, best)
+        least = ca.fmin(distance, least)
+    return ca.vertcat(best, demand.flexion_sum - best)
+
+
+def planar_fingers(robot: RobotDescription) -> list[PlanarFinger]:
+    """The fingers that the step closes: all but the thumb.
+
+    Raises:
+        UnsupportedError: One of them is not planar; the message says how.
+    """
+    return [planar_finger(robot, name) for name in robot.finger_names if name != robot.thumb]
+
+
+def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
+    """The whole finger step as a Function, to be called inside a step graph.
+
+    Args:
+        robot: The description; its fingers but the thumb must be planar.
+        solver: "ipopt" or "closed-form".
+
+    Returns:
+        ``(q (n, 1), points (3, k), normals (3, k)) -> q' (n, 1)``: targets of the fingers but the
+        thumb, in order, in the palm frame.
+
+    Raises:
+        UnsupportedError: A finger is not planar.
+    """
+    fingers = planar_fingers(robot)
+    kind: Any = ca.MX if solver == "ipopt" else ca.SX
+    q = kind.sym("q", len(robot.actuators))
+    points = kind.sym("points", 3, len(fingers))
+    normals = kind.sym("normals", 3, len(fingers))
+    goals = {finger.name: Target(points[:, i], normals[:, i]) for i, finger in enumerate(fingers)}
+    entries = [q[i] for i in range(q.numel())]
+    for demand in demands(robot, fingers, q, goals):
+        finger = demand.finger
+        if solver == "ipopt":
+            first, second = IpoptFinger(finger)(demand)
+        else:
+            first, second = closed_form(demand)
+        entries[finger.flexion[0]], entries[finger.flexion[1]] = first, second
+        if finger.spread is not None:
+            entries[finger.spread] = (demand.spread - finger.offset) / finger.ratio
+    return ca.Function(
+        "finger_step",
+        [q, points, normals],
+        [ca.vertcat(*entries)],
+        ["q", "points", "normals"],
+        ["q_next"],
+    )
+
+
+def clamp(value: Expr, lower: Expr, upper: Expr) -> Expr:
+    """Value moved into [lower, upper]."""
+    return ca.fmin(ca.fmax(value, lower), upper)
+
+
+def wrap(angle: Expr) -> Expr:
+    """Angle moved by full turns into [-pi, pi] [rad]."""
+    return ca.atan2(ca.sin(angle), ca.cos(angle))
+
+
+def _in_finger_frame(finger: PlanarFinger, goal: Target) -> Target:
+    rotation = ca.DM(finger.frame[:3, :3].T)
+    origin = ca.DM(finger.frame[:3, 3])
+    return Target(rotation @ (goal.point - origin), rotation @ goal.normal)
+
+
+def _spreads(
+    robot: RobotDescription,
+    fingers: Sequence[PlanarFinger],
+    q: Expr,
+    local: Sequence[Target],
+) -> list[Expr]:
+    """Spread joint angle of every finger; fingers on one motor agree on one."""
+    agreed: dict[int, Expr] = {}
+    for motor in {finger.spread for finger in fingers if finger.spread is not None}:
+        total, weights = UNDECIDED * q[motor], UNDECIDED
+        lower, upper = _spread_range(robot, fingers, motor)
+        for finger, goal in zip(fingers, local, strict=True):
+            if finger.spread == motor:
+                middle = float(finger.spread_limits.mean())
+                across = ca.atan2(finger.facing * goal.normal[1], finger.facing * goal.normal[0])
+                angle = middle + wrap(across - middle)
+                weight = goal.normal[0] ** 2 + goal.normal[1] ** 2
+                total += weight * (angle - finger.offset) / finger.ratio
+                weights += weight
+        agreed[motor] = clamp(total / weights, lower, upper)
+    return [
+        0.0 if finger.spread is None else finger.ratio * agreed[finger.spread] + finger.offset
+        for finger in fingers
+    ]
+
+
+def _spread_range(
+    robot: RobotDescription, fingers: Sequence[PlanarFinger], motor: int
+) -> tuple[float, float]:
+    """Limits of a spread motor that keep it and every joint on it within theirs."""
+    lower, upper = float(robot.lower[motor]), float(robot.upper[motor])
+    for finger in fingers:
+        if finger.spread == motor:
+            ends = (finger.spread_limits - finger.offset) / finger.ratio
+            lower, upper = max(lower, float(ends.min())), min(upper, float(ends.max()))
+    return lower, upper
+
+
+def _demand(finger: PlanarFinger, goal: Target, spread: Expr) -> Demand:
+    """The attainable flexion sum closest to the normal, and the reach it leaves to eq. (5)."""
+    c, s = ca.cos(spread), ca.sin(spread)
+    (low_1, high_1), (low_2, high_2) = finger.flexion_limits
+    across = c * goal.normal[0] + s * goal.normal[1]
+    middle = (low_1 + low_2 + high_1 + high_2) / 2
+    angle = ca.atan2(across, goal.normal[2]) - finger.normal_angle
+    flexion_sum = clamp(middle + wrap(angle - middle), low_1 + low_2, high_1 + high_2)
+    x = c * goal.point[0] + s * goal.point[1] - finger.proximal[0]
+    z = goal.point[2] - finger.proximal[2]
+    c, s = ca.cos(flexion_sum), ca.sin(flexion_sum)
+    tip_z, tip_x = float(finger.tip[2]), float(finger.tip[0])
+    # Rotation about +y by the flexion takes z towards x.
+    reach = ca.vertcat(z - (c * tip_z - s * tip_x), x - (s * tip_z + c * tip_x))
+    limits = ca.vertcat(ca.fmax(low_1, flexion_sum - high_2), ca.fmin(high_1, flexion_sum - low_2))
+    return Demand(finger, spread, flexion_sum, reach, limits)

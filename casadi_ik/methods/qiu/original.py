@@ -1,0 +1,254 @@
+"""The original methods of Qiu & Kermani 2021's comparison: all contacts in one hierarchy."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.kernels.step_graph import StepGraph
+from casadi_ik.methods.common.limits import kept_within, limit_mask
+from casadi_ik.methods.qiu.hierarchy import combine
+from casadi_ik.methods.qiu.palm_estimate import palm_orientation, thumb_first
+from casadi_ik.methods.qiu.parameters import OriginalParameters
+from casadi_ik.methods.qiu.tasks import (
+    Task,
+    contact_tasks,
+    damped,
+    palm_orientation_task,
+    selective,
+)
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.target import contact_errors, target_fields, targets, within_tolerance
+from casadi_ik.problem.trace import RecordedJacobian
+from casadi_ik.robots.description import Array, RobotDescription
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.linear_algebra import damped_pinv_times
+from casadi_ik.symbolic.subexpressions import shared
+
+
+class OriginalStep:
+    """Builds the step graph of an original method for one robot.
+
+    Attributes:
+        options: The structural choices; numbers are parameters of the graph.
+        state: Layout of the state.
+        parameters: Layout of the parameters.
+        record: Layout of the record: q and its errors before the step.
+    """
+
+    def __init__(self, robot: RobotDescription, options: OriginalParameters) -> None:
+        """Lay out state, parameters and record."""
+        n, f = len(robot.actuators), len(robot.fingers)
+        self.robot = robot
+        self.options = options
+        self.state = Layout((Field("q", (n,)),))
+        self.parameters = Layout(
+            (
+                *target_fields(robot),
+                Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not"),
+                Field("damping"),
+                Field("gamma"),
+                Field("longest_error", unit="mm"),
+                Field("widest_error", unit="rad"),
+            )
+        )
+        self.record = Layout.record(
+            Field("q", (n,), "f8", "rad or m", "actuator positions"),
+            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
+            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
+            Field("step_size", (), "f4", "rad or m", "largest motor change of this iteration"),
+            Field("limit_mask", (), "u4", "", "bit i: actuator i at or beyond a limit"),
+            Field("phase", (), "u1"),
+            Field("status", (), "u1", "", "0 running, else the final status"),
+        )
+
+    @property
+    def jacobians(self) -> dict[str, RecordedJacobian]:
+        """The Jacobians in the record: none."""
+        return {}
+
+    def graph(self) -> StepGraph:
+        """The whole iteration.
+
+        What repeats, the solving of a task, is a function that is called: written out once per
+        task it made the C compiler slow. Only the columns of the actuators that move a task are
+        worked on.
+        """
+        return StepGraph(
+            self._name,
+            self._iteration,
+            self.state,
+            self.parameters,
+            self.record,
+            recipe=recipe(self._name, self.robot, self.options),
+        )
+
+    @property
+    def _name(self) -> str:
+        return ca.Function.fix_name(f"original_{self.options.steps}_{self.robot.name}")
+
+    def _iteration(self) -> ca.Function:
+        state = ca.MX.sym("state", self.state.size)
+        parameters = ca.MX.sym("parameters", self.parameters.size)
+        errors, *pairs = self._view()(state, parameters)
+        if self.options.projection == "stacked":
+            step = self._stacked()(parameters, *pairs)
+        else:
+            # Instruction fetch bounds an iteration: tasks of one size share one function.
+            sizes = {len(columns) for _, columns in self._kinds}
+            solve = {size: self._solve(size) for size in sorted(sizes)}
+            place = self.parameters.slice
+            longest = {True: place("longest_error"), False: place("widest_error")}
+            steps = [
+                solve[len(columns)](parameters, parameters[longest[is_position]], pair)
+                for (is_position, columns), pair in zip(self._kinds, pairs, strict=True)
+            ]
+            step = self._combined()(*pairs, *steps)
+        outputs = self._ending()(state, parameters, errors, step)
+        return ca.Function(self._name, [state, parameters], list(outputs))
+
+    def parameter_values(
+        self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool
+    ) -> dict[str, float | Array]:
+        """Values of all parameter fields but the targets."""
+        given = {
+            "position_tolerance": position_tolerance,
+            "angle_tolerance": angle_tolerance,
+            "enforce_limits": float(enforce_limits),
+        }
+        named = (name for name in self.parameters.names if hasattr(self.options, name))
+        return given | {name: float(getattr(self.options, name)) for name in named}
+
+    def first_state(self) -> dict[str, float]:
+        """Values of all state fields but q."""
+        return {}
+
+    def phase_counts(
+        self, states: Array, iterations: NDArray[np.int64]
+    ) -> dict[Phase, NDArray[np.int64]]:
+        """Iterations by phase (k,): there is but one."""
+        del states
+        return {Phase.HIERARCHY: iterations}
+
+    def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
+        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
+        return state, parameters, self.state.unpack(state), self.parameters.unpack(parameters)
+
+    @cached_property
+    def _kinds(self) -> list[tuple[bool, tuple[int, ...]]]:
+        """Of every task by priority, whether it is a position, and the actuators that move it."""
+        robot, arm = self.robot, self.robot.arm_actuators
+        movers = [(*arm, *robot.finger_actuators(name)) for name in thumb_first(robot)]
+        if self.options.order == "per-finger":
+            kinds = [(kind, columns) for columns in movers for kind in (True, False)]
+        else:
+            kinds = [(kind, columns) for kind in (True, False) for columns in movers]
+        return [(False, arm), *kinds] if self._turns_palm else kinds
+
+    @property
+    def _turns_palm(self) -> bool:
+        return self.options.palm_task and bool(self.robot.arm_actuators)
+
+    def _view(self) -> ca.Function:
+        """Errors (f, 2) of all fingers in point and normal, then all tasks by priority.
+
+        A task is its Jacobian over the actuators that move it, and its error, [J, e] (3, k + 1).
+        """
+        state, parameters, s, p = self._inputs()
+        robot, goals, body = self.robot, targets(self.robot, p), actuated(self.robot, s["q"])
+        arm = robot.arm_actuators
+        pairs = [
+            contact_tasks(body, name, goals[name], (*arm, *robot.finger_actuators(name)))
+            for name in thumb_first(robot)
+        ]
+        if self.options.order == "per-finger":
+            tasks = [task for pair in pairs for task in pair]
+        else:
+            tasks = [point for point, _ in pairs] + [normal for _, normal in pairs]
+        if self._turns_palm:
+            euler = self.options.palm_error == "euler"
+            desired = palm_orientation(robot, goals)
+            tasks.insert(0, palm_orientation_task(body, desired, arm, euler))
+        errors = ca.horzcat(*contact_errors(body.kinematics, goals, robot.finger_names))
+        seen = [ca.densify(ca.horzcat(task.jacobian, task.error)) for task in tasks]
+        return ca.Function("view", [state, parameters], shared(errors, *seen))
+
+    def _solve(self, count: int) -> ca.Function:
+        """The step of one task alone over the actuators that move it, errors not above `longest`.
+
+        SDLS needs that, DLS does not look at it.
+        """
+        _, parameters, _, p = self._inputs()
+        longest, pair = ca.SX.sym("longest"), ca.SX.sym("pair", 3, count + 1)
+        if self.options.steps == "dls":
+            solver = damped(p["damping"])
+        else:
+            solver = selective(p["gamma"], longest, longest)
+        step = solver(Task(pair[:, :-1], pair[:, -1], is_position=True))
+        return ca.Function(f"solve_{count}", [parameters, longest, pair], shared(step))
+
+    def _pairs(self) -> tuple[list[ca.SX], list[Task]]:
+        """Symbols of all [J, e], and the tasks over all actuators that they stand for."""
+        n, pairs, tasks = len(self.robot.actuators), [], []
+        for i, (is_position, columns) in enumerate(self._kinds):
+            pair = ca.SX.sym(f"pair_{i}", 3, len(columns) + 1)
+            pairs.append(pair)
+            tasks.append(Task(_spread(pair[:, :-1], columns, n), pair[:, -1], is_position))
+        return pairs, tasks
+
+    def _stacked(self) -> ca.Function:
+        """One step for all tasks as one, without priorities."""
+        _, parameters, _, p = self._inputs()
+        pairs, tasks = self._pairs()
+        J = ca.vertcat(*(task.jacobian for task in tasks))
+        e = ca.vertcat(*(task.error for task in tasks))
+        step = damped_pinv_times(ca.densify(J), e, p["damping"])
+        return ca.Function("stacked", [parameters, *pairs], shared(step))
+
+    def _combined(self) -> ca.Function:
+        """One step from those of all tasks."""
+        n, (pairs, tasks) = len(self.robot.actuators), self._pairs()
+        given, steps = [], []
+        for i, (_, columns) in enumerate(self._kinds):
+            given.append(ca.SX.sym(f"step_{i}", len(columns)))
+            steps.append(_spread(given[i].T, columns, n).T)
+        damping = self.options.damping if self.options.projectors == "damped" else None
+        step = ca.densify(combine(tasks, steps, self.options.projection, damping))
+        return ca.Function("combined", [*pairs, *given], shared(step))
+
+    def _ending(self) -> ca.Function:
+        """Take the step, or end."""
+        state, parameters, s, p = self._inputs()
+        errors = ca.SX.sym("errors", len(self.robot.fingers), 2)
+        step = ca.SX.sym("step", len(self.robot.actuators))
+        robot, q, positions, angles = self.robot, s["q"], errors[:, 0], errors[:, 1]
+        solved = within_tolerance(positions, angles, p)
+        q_next = kept_within(robot, q + step, p["enforce_limits"])
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        after = self.state.pack({"q": ca.if_else(solved, q, q_next)})
+        record = self.record.pack(
+            {
+                "q": q,
+                "position_error": positions,
+                "angle_error": angles,
+                "step_size": ca.mmax(ca.fabs(q_next - q)),
+                "limit_mask": limit_mask(robot, q),
+                "phase": float(Phase.HIERARCHY),
+                "status": status,
+            }
+        )
+        return ca.Function(
+            "ending", [state, parameters, errors, step], shared(after, record, status)
+        )
+
+
+def _spread(matrix: ca.SX, columns: tuple[int, ...], n: int) -> ca.SX:
+    """A matrix (r, k) as the given columns of one with n, the others structurally zero."""
+    wide = ca.SX(matrix.shape[0], n)
+    wide[:, list(columns)] = matrix
+    return wide

@@ -1,0 +1,1 @@
+"""The screw control law of Chandra et al. 2019."""

@@ -1,0 +1,1 @@
+"""The arm starts at the estimated palm, then the closed chain of arm and thumb (ours)."""

@@ -1,0 +1,212 @@
+"""A Gauss-Newton step along the closed chain of arm and thumb, within the joint limits.
+
+The thumb's contact is a constraint, the other fingers are what is left to minimise:
+
+    y = J_t^# e_t + N z,    z = argmin |J_o (J_t^# e_t + N z) - e_o|^2 + damping^2 |z|^2
+
+with J_t the thumb's five rows (point and normal), N the projector into their null space (the
+motions of the closed chain, one dimension per mobility, together with the other fingers' own
+joints) and J_o the rows of the other fingers. No active joints have to be chosen, so there is no
+H_p that could be singular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+
+from casadi_ik.methods.common.contact_fit import LENGTH
+from casadi_ik.methods.thumb_first.proxqp import proxqp
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated
+from casadi_ik.symbolic.directions import normal_error, perpendicular
+from casadi_ik.symbolic.linear_algebra import damped_pinv_times, project_to_null_space
+from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.subexpressions import shared
+
+THUMB_DAMPING = 0.01
+"""Least damping [-] of the thumb's rows, 1 mm per rad: J_t^# stays finite where J_t is singular."""
+
+PROJECTOR_DAMPING = 1e-5
+"""Damping [-] of the projector N: what it leaks is below rounding of what the contacts need."""
+
+ROUNDING = 1e-9
+"""A limit may be passed by this much [scaled motor units] before its motor is fixed."""
+
+PASSES = 8
+"""Joints that may be fixed at their limits one by one in a step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Contacts linearised at a configuration: errors and what moves them.
+
+    Attributes:
+        thumb: (5, n) rows of the thumb, positions by `LENGTH`, normals in rad.
+        thumb_error: (5, 1) what is left.
+        others: (5 (f - 1), n) rows of the other fingers.
+        others_error: (5 (f - 1), 1).
+    """
+
+    thumb: Expr
+    thumb_error: Expr
+    others: Expr
+    others_error: Expr
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Where a step may go.
+
+    Attributes:
+        lower: (n, 1) smallest change of every motor, <= 0.
+        upper: (n, 1) largest, >= 0.
+        damping: Of z.
+    """
+
+    lower: Expr
+    upper: Expr
+    damping: Expr
+
+
+StepSolver = Callable[[Linear, Room], tuple[Expr, Expr]]
+"""Gives the step (n, 1) and which motors it holds at their limits (n, 1)."""
+
+
+def motor_scales(robot: RobotDescription) -> ca.DM:
+    """(n, 1) what counts as a unit of each motor: 1 rad, or the range of a slider."""
+    ranges = [actuator.upper - actuator.lower for actuator in robot.actuators]
+    units = [actuator.unit for actuator in robot.actuators]
+    return ca.DM([1.0 if u == "rad" else r for u, r in zip(units, ranges, strict=True)])
+
+
+def contact_residuals(
+    robot: RobotDescription, q: Expr, p: dict[str, Expr]
+) -> tuple[list[Expr], list[Expr]]:
+    """What is left of every contact: points (3, 1) by `LENGTH`, normals (3, 1) [rad]; 0 if free."""
+    return _residuals(actuated(robot, q), p)
+
+
+def _residuals(body: ActuatedKinematics, p: dict[str, Expr]) -> tuple[list[Expr], list[Expr]]:
+    positions, angles = [], []
+    for i, name in enumerate(body.robot.finger_names):
+        point, normal = body.kinematics.contact(name)
+        positions.append(p["weights"][i, 0] * (p["points"][i, :].T - point) / LENGTH)
+        angles.append(p["weights"][i, 1] * normal_error(normal, p["normals"][i, :].T))
+    return positions, angles
+
+
+def linearised(robot: RobotDescription, q: Expr, p: dict[str, Expr]) -> Linear:
+    """The contacts at q (n, 1); rows of what is free are zero."""
+    body, scales = actuated(robot, q), motor_scales(robot)
+    positions, angles = _residuals(body, p)
+    rows: dict[bool, list[Expr]] = {True: [], False: []}
+    errors: dict[bool, list[Expr]] = {True: [], False: []}
+    for i, name in enumerate(robot.finger_names):
+        linear, angular = body.contact_jacobian(name, range(q.numel()))
+        _, normal = body.kinematics.contact(name)
+        first = perpendicular(normal)
+        across = ca.horzcat(first, ca.cross(normal, first)).T
+        moved = ca.vertcat(
+            p["weights"][i, 0] * linear / LENGTH, p["weights"][i, 1] * (across @ angular)
+        )
+        rows[name == robot.thumb].append(ca.sparsify(moved) * ca.repmat(scales.T, 5, 1))
+        errors[name == robot.thumb] += [positions[i], across @ angles[i]]
+    n = q.numel()
+    return Linear(
+        ca.vertcat(*rows[True]),
+        ca.vertcat(*errors[True]),
+        ca.vertcat(ca.SX(0, n), *rows[False]),
+        ca.vertcat(ca.SX(0, 1), *errors[False]),
+    )
+
+
+def thumb_step(linear: Linear, damping: Expr) -> Expr:
+    """J_t^# e_t: the shortest step (n, 1) that serves the thumb alone, damped."""
+    return damped_pinv_times(linear.thumb, linear.thumb_error, ca.fmax(THUMB_DAMPING, damping))
+
+
+def free_step(linear: Linear, damping: Expr) -> Expr:
+    """The step (n, 1) without limits."""
+    first = thumb_step(linear, damping)
+    if linear.others.shape[0] == 0:
+        return first
+    # J_o N; its transpose is in the range of N, so what it gives needs no further projection.
+    within = project_to_null_space(linear.thumb, linear.others.T, PROJECTOR_DAMPING).T
+    rest = linear.others_error - linear.others @ first
+    return first + damped_pinv_times(within, rest, damping)
+
+
+def freezing(linear: Linear, room: Room) -> tuple[Expr, Expr]:
+    """Within the limits: what violates them most is fixed there, and the step is solved again.
+
+    Args:
+        linear: Of MX symbols, since further passes are only made where they are needed.
+        room: Likewise.
+
+    Returns:
+        The step (n, 1) and 1 for every motor that was fixed (n, 1).
+    """
+    problem = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
+    problem += [room.lower, room.upper, room.damping]
+    once = _solved_and_fixed([matrix.sparsity() for matrix in problem])
+    step, held, values, over = once(*problem, room.lower >= room.upper, room.lower)
+    symbols = [ca.MX.sym("x", once.sparsity_in(i)) for i in range(once.n_in())]
+    inputs = [*symbols, ca.MX.sym("step", *step.shape)]
+    again = ca.Function("again", inputs, list(once(*symbols)))
+    same = ca.Function("same", inputs, [inputs[-1], symbols[-2], symbols[-1], ca.MX(0)])
+    choose = ca.Function.if_else("fix_another", again, same)
+    for _ in range(PASSES - 1):
+        step, held, values, over = choose(over, *problem, held, values, step)
+    return ca.fmin(ca.fmax(step, room.lower), room.upper), held
+
+
+def _solved_and_fixed(sparsities: list[ca.Sparsity]) -> ca.Function:
+    """``(problem, held, values) -> (step, held', values', over)``; over: one more was fixed."""
+    n = sparsities[0].size2()
+    thumb, thumb_error, others, others_error, lower, upper, damping = (
+        ca.SX.sym("x", sparsity) for sparsity in sparsities
+    )
+    held, values = ca.SX.sym("held", n), ca.SX.sym("values", n)
+    free, fixed = (1 - held).T, held * values
+    masked = Linear(
+        thumb * ca.repmat(free, thumb.shape[0], 1),
+        thumb_error - thumb @ fixed,
+        others * ca.repmat(free, others.shape[0], 1),
+        others_error - others @ fixed,
+    )
+    step = free_step(masked, damping) + fixed
+    beyond = ca.fmax(lower - step, step - upper) * (1 - held)
+    worst = ca.mmax(beyond)
+    over = worst > ROUNDING
+    fix = ca.logic_and(over, beyond >= worst)
+    outputs = [
+        step,
+        ca.if_else(fix, 1.0, held),
+        ca.if_else(fix, ca.if_else(step > upper, upper, lower), values),
+        over,
+    ]
+    inputs = [thumb, thumb_error, others, others_error, lower, upper, damping, held, values]
+    return ca.Function("solved_and_fixed", inputs, shared(*map(ca.densify, outputs)))
+
+
+def quadratic_program(linear: Linear, room: Room) -> tuple[Expr, Expr]:
+    """The same problem as a quadratic program within the limits, by ProxQP.
+
+    The thumb's rows are equations; where the limits leave no solution, ProxQP takes the nearest
+    that there is, so that the thumb still comes first. Returns as `freezing`.
+    """
+    m, n = linear.thumb.shape
+    demanded = linear.thumb @ thumb_step(linear, room.damping)
+    hessian = linear.others.T @ linear.others + room.damping**2 * ca.DM.eye(n)
+    gradient = -linear.others.T @ linear.others_error
+    program = (hessian, gradient, linear.thumb, demanded, room.lower, room.upper)
+    found = proxqp(n, m)(*map(ca.densify, program))
+    step = ca.fmin(ca.fmax(found, room.lower), room.upper)
+    return step, ca.logic_or(step <= room.lower, step >= room.upper)
+
+
+STEP_SOLVERS: dict[str, StepSolver] = {"freeze": freezing, "proxqp": quadratic_program}
+"""By the name of `ThumbFirstParameters.step`."""

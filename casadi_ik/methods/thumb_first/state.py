@@ -1,0 +1,141 @@
+"""State, parameters and record of the thumb-first method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.methods.common.limits import bits
+from casadi_ik.methods.thumb_first.merit import Merit
+from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
+from casadi_ik.problem.status import Phase
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.smooth import Expr
+
+STAGES = (Phase.HAND_ALIGNMENT, Phase.CANDIDATE, Phase.ARM_PLACEMENT)
+"""What an iteration may be, the most frequent first."""
+
+NOTHING = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class ThumbFirstLayouts:
+    """The three layouts for one robot.
+
+    Attributes:
+        robot: The description.
+        options: Numbers and choices.
+    """
+
+    robot: RobotDescription
+    options: ThumbFirstParameters
+
+    @cached_property
+    def hand(self) -> tuple[int, ...]:
+        """Positions in q of the hand's actuators."""
+        arm = set(self.robot.arm_actuators)
+        return tuple(i for i in range(len(self.robot.actuators)) if i not in arm)
+
+    @cached_property
+    def state(self) -> Layout:
+        """What an iteration hands to the next."""
+        n = len(self.robot.actuators)
+        return Layout(
+            (
+                Field("q", (n,)),
+                Field("palm_rotation", (3, 3), doc="estimated palm pose of this start"),
+                Field("palm_origin", (3,), unit="m"),
+                Field("passed", doc="how far the last arm of the table was from the palm wanted"),
+                Field("phase"),
+                Field("start", doc="number of the palm estimate begun from"),
+                Field("damping"),
+                Field("growth", doc="placement: factor of the damping if the next step is vain"),
+                Field("cost", doc="placement: squared distance from the palm pose"),
+                Field("waited", doc="iterations in a row that gained little"),
+                Field("spent", doc="iterations in this phase"),
+                Field("best_cost", doc="smallest summed squares of the contacts so far"),
+                Field("best_q", (n,), doc="the configuration it belongs to"),
+                Field("counts", (len(STAGES),), doc="iterations by stage, in the order of STAGES"),
+            )
+        )
+
+    @cached_property
+    def parameters(self) -> Layout:
+        """The problem and the numbers of the method."""
+        n, f = len(self.robot.actuators), len(self.robot.fingers)
+        return Layout(
+            (
+                Field("points", (f, 3), unit="m", doc="contact points, base frame; 0 if free"),
+                Field("normals", (f, 3), doc="outward pad normals, base frame; 0 if free"),
+                Field("weights", (f, 2), doc="1 where point, normal count, 0 where free"),
+                Field("position_tolerance", (f,), unit="m"),
+                Field("angle_tolerance", (f,), unit="rad"),
+                Field("lower", (n,), doc="lower bounds of q"),
+                Field("upper", (n,), doc="upper bounds of q"),
+                Field("postures", (self.options.starts, len(self.hand)), doc="hands to begin with"),
+                Field("given", doc="how many of them are there"),
+                Field("first_damping"),
+                Field("step_cap"),
+            )
+        )
+
+    @cached_property
+    def record(self) -> Layout:
+        """What is logged of an iteration: where it led, and the step that led there."""
+        n, f = len(self.robot.actuators), len(self.robot.fingers)
+        return Layout.record(
+            Field("q", (n,), "f8", "rad or m", "actuator positions after the iteration"),
+            Field("cost", (), "f8", "", "summed squares of all contacts there (0.1 m, rad)"),
+            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
+            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
+            Field("damping", (), "f4", "", "damping of the step tried"),
+            Field("step_size", (), "f4", "rad or m", "largest motor change of the step tried"),
+            Field("manipulability", (), "f4", "", "of the thumb's five rows: 0 where singular"),
+            Field("held_mask", (), "u4", "", "bit i: actuator i fixed at its limit by the step"),
+            Field("limit_mask", (), "u4", "", "bit i: actuator i at a limit"),
+            Field("start", (), "u1", "", "number of the palm estimate begun from"),
+            Field("accepted", (), "u1", "", "1 if the step lowered the cost"),
+            Field("phase", (), "u1"),
+            Field("status", (), "u1", "", "0 running, else the final status"),
+        )
+
+    def row(
+        self,
+        s: dict[str, Expr],
+        p: dict[str, Expr],
+        q: Expr,
+        phase: Phase,
+        status: Expr,
+        there: Merit,
+        **measured: Expr,
+    ) -> Expr:
+        """What is logged of an iteration.
+
+        Args:
+            s: State before it.
+            p: Parameters.
+            q: (n, 1) where it led.
+            phase: What it was.
+            status: Whether the solve goes on.
+            there: The contacts at q.
+            measured: The other fields; those that the phase does not have are left out.
+        """
+        values: dict[str, Expr] = {
+            "q": q,
+            "cost": there.cost,
+            "position_error": ca.if_else(p["weights"][:, 0] > 0, there.positions, NOTHING),
+            "angle_error": ca.if_else(p["weights"][:, 1] > 0, there.angles, NOTHING),
+            "damping": NOTHING,
+            "step_size": NOTHING,
+            "manipulability": NOTHING,
+            "held_mask": 0.0,
+            "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
+            "start": s["start"],
+            "accepted": 0.0,
+            "phase": float(phase),
+            "status": status,
+        }
+        return self.record.pack(values | measured)

@@ -1,0 +1,280 @@
+"""The thumb-first method as one step graph: arm start, then along the closed chain.
+
+The idea of Qiu & Kermani 2021 without its two flaws. Not the palm's pose is demanded, averaged
+over the fingers, but every finger's own contact; and the closed chain is the null space of the
+thumb's five rows, not a choice of active joints whose complement may be singular. One iteration:
+
+candidate  take the next hand posture, the palm pose that brings it closest to the contacts and
+           the arm for that palm (in closed form, or the nearest of a table);
+placement  arms without a closed form only: a damped step towards that palm pose;
+alignment  one Gauss-Newton step of the other fingers along the closed chain, limits kept; taken
+           if it lowers the summed squares of all contacts, else tried again with more damping.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.kernels.step_graph import StepGraph
+from casadi_ik.methods.common.arm_placement import place_arm
+from casadi_ik.methods.common.contact_fit import DAMPING_START, fresh_fit, judge
+from casadi_ik.methods.common.limits import bits
+from casadi_ik.methods.common.numeric_arm import nearest_start, pose_step
+from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
+from casadi_ik.methods.thumb_first.closed_chain_step import (
+    STEP_SOLVERS,
+    Linear,
+    Room,
+    linearised,
+    motor_scales,
+)
+from casadi_ik.methods.thumb_first.merit import Merit, merit
+from casadi_ik.methods.thumb_first.state import STAGES, ThumbFirstLayouts
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.linear_algebra import det_spd
+from casadi_ik.symbolic.smooth import Expr, safe_sqrt
+from casadi_ik.symbolic.srs_arm import SrsArm
+from casadi_ik.symbolic.subexpressions import shared
+
+EASED, TIGHTENED = 1 / 3, 4.0
+"""Factors of the damping after a step that lowered the cost and after one that did not."""
+
+DAMPING_FLOOR, DAMPING_CEILING = 1e-6, 100.0
+"""Bounds of the damping; at the ceiling a step leads nowhere."""
+
+GAIN, PATIENCE, BUDGET = 0.9, 12, 100
+"""A start is given up after PATIENCE iterations in a row that leave more than GAIN of the cost,
+and after BUDGET iterations in any case."""
+
+
+@dataclass(frozen=True, eq=False)
+class ThumbFirstStep(ThumbFirstLayouts):
+    """Builds the step graph for one robot.
+
+    Without an arm the palm is fixed: the same step then moves the fingers alone.
+
+    Attributes:
+        arm: Constants of an S-R-S arm, or None: then the arm's start is found numerically.
+    """
+
+    arm: SrsArm | None
+
+    def graph(self) -> StepGraph:
+        """The whole iteration; compilable unless the step is ProxQP's."""
+        return StepGraph(
+            self._name,
+            self._iteration,
+            self.state,
+            self.parameters,
+            self.record,
+            self.options.step != "proxqp",
+            stage="phase",
+            recipe=recipe(self._name, self.robot, self.options),
+        )
+
+    @property
+    def _name(self) -> str:
+        return ca.Function.fix_name(f"thumb_first_{self.robot.name}")
+
+    def _iteration(self) -> ca.Function:
+        state = ca.MX.sym("state", self.state.size)
+        parameters = ca.MX.sym("parameters", self.parameters.size)
+        stages = {Phase.CANDIDATE: self._candidate(), Phase.HAND_ALIGNMENT: self._alignment()}
+        # Only arms without a closed form are placed step by step; nobody else gets there.
+        numeric = self.arm is None and self.robot.arm_actuators
+        stages[Phase.ARM_PLACEMENT] = self._placement() if numeric else stages[Phase.CANDIDATE]
+        cases = [stages[phase] for phase in STAGES]
+        stage = sum(
+            (
+                i * (state[self.state.slice("phase")] == float(phase))
+                for i, phase in enumerate(STAGES)
+            ),
+            ca.MX(0),
+        )
+        choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
+        outputs = choose(stage, state, parameters)
+        return ca.Function(self._name, [state, parameters], list(outputs))
+
+    def _vectors(self, kind: type[ca.SX] | type[ca.MX]) -> tuple[Expr, Expr, dict, dict]:
+        state = kind.sym("state", self.state.size)
+        parameters = kind.sym("parameters", self.parameters.size)
+        return state, parameters, self.state.unpack(state), self.parameters.unpack(parameters)
+
+    def _candidate(self) -> ca.Function:
+        """The next start: hand, palm and arm."""
+        state, parameters, s, p = self._vectors(ca.MX)
+        hand, rotation, origin = self._guess()(state, parameters)
+        columns = list(self.robot.arm_actuators)
+        arm, passed = s["q"][columns], s["passed"]
+        if self.arm is not None:
+            lower, upper = p["lower"][columns], p["upper"][columns]
+            arm, _ = place_arm(self.arm, Pose(rotation, origin), lower, upper, ca.MX(0))
+        elif columns:
+            # Another start gets another arm as well: the next nearest of the table.
+            arm, passed = nearest_start(self.robot)(rotation, origin, passed)
+        outputs = self._begin()(state, parameters, hand, rotation, origin, arm, passed)
+        return ca.Function("candidate", [state, parameters], list(outputs))
+
+    def _guess(self) -> ca.Function:
+        """Hand posture of this start and the palm pose that brings it closest to the contacts."""
+        state, parameters, s, p = self._vectors(ca.SX)
+        hand = sum(
+            (
+                ca.if_else(s["start"] == i, p["postures"][i, :].T, 0.0)
+                for i in range(self.options.starts)
+            ),
+            ca.SX.zeros(len(self.hand), 1),
+        )
+        rotation, origin = best_palm(hand_contacts(self.robot, hand, self.hand), p)
+        return ca.Function("guess", [state, parameters], shared(hand, rotation, origin))
+
+    def _begin(self) -> ca.Function:
+        state, parameters, s, p = self._vectors(ca.SX)
+        hand, arm = (
+            ca.SX.sym("hand", len(self.hand)),
+            ca.SX.sym("arm", len(self.robot.arm_actuators)),
+        )
+        rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
+        passed = ca.SX.sym("passed")
+        started = ca.SX.zeros(s["q"].numel(), 1)
+        started[list(self.hand)] = hand
+        started[list(self.robot.arm_actuators)] = arm
+        started = ca.fmin(ca.fmax(started, p["lower"]), p["upper"])
+        exhausted = s["start"] >= p["given"]
+        q = ca.if_else(exhausted, s["best_q"], started)
+        numeric = self.arm is None and self.robot.arm_actuators
+        after = self._next(
+            s,
+            Phase.CANDIDATE,
+            fresh_fit(),
+            q=q,
+            palm_rotation=rotation,
+            palm_origin=origin,
+            passed=passed,
+            phase=float(Phase.ARM_PLACEMENT if numeric else Phase.HAND_ALIGNMENT),
+            damping=DAMPING_START if numeric else p["first_damping"],
+        )
+        status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
+        record = self.row(s, p, q, Phase.CANDIDATE, status, merit(self.robot, q, p))
+        inputs = [state, parameters, hand, rotation, origin, arm, passed]
+        return ca.Function("begin", inputs, shared(after, record, status))
+
+    def _placement(self) -> ca.Function:
+        """A step of the arm alone towards the estimated palm pose."""
+        state, parameters, s, p = self._vectors(ca.SX)
+        columns = list(self.robot.arm_actuators)
+        palm = Pose(s["palm_rotation"], s["palm_origin"])
+        tried = pose_step(self.robot, s["q"][columns], palm, s["damping"], p)
+        judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
+        q = ca.SX(s["q"])
+        q[columns] = ca.if_else(judged.accepted, tried.reached, s["q"][columns])
+        after = self._next(
+            s,
+            Phase.ARM_PLACEMENT,
+            judged.fit,
+            q=q,
+            phase=ca.if_else(
+                judged.settled, float(Phase.HAND_ALIGNMENT), float(Phase.ARM_PLACEMENT)
+            ),
+            damping=ca.if_else(judged.settled, p["first_damping"], judged.fit["damping"]),
+        )
+        status = ca.SX(float(Status.RUNNING))
+        record = self.row(
+            s,
+            p,
+            q,
+            Phase.ARM_PLACEMENT,
+            status,
+            merit(self.robot, q, p),
+            damping=s["damping"],
+            step_size=tried.size,
+            accepted=judged.accepted,
+        )
+        return ca.Function("placement", [state, parameters], shared(after, record, status))
+
+    def _alignment(self) -> ca.Function:
+        state, parameters, _, _ = self._vectors(ca.MX)
+        *problem, lower, upper, damping = self._problem()(state, parameters)
+        solve = STEP_SOLVERS[self.options.step]
+        step, held = solve(Linear(*problem), Room(lower, upper, damping))
+        outputs = self._take()(state, parameters, problem[0], step, held)
+        return ca.Function("alignment", [state, parameters], list(outputs))
+
+    def _problem(self) -> ca.Function:
+        """The Gauss-Newton problem at q, in units of `motor_scales`."""
+        state, parameters, s, p = self._vectors(ca.SX)
+        linear = linearised(self.robot, s["q"], p)
+        scales = motor_scales(self.robot)
+        lower, upper = (p["lower"] - s["q"]) / scales, (p["upper"] - s["q"]) / scales
+        outputs = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
+        outputs += [lower, upper, s["damping"]]
+        return ca.Function("problem", [state, parameters], shared(*outputs))
+
+    def _take(self) -> ca.Function:
+        """Take the step if it lowers the cost; decide whether the solve is at its end."""
+        state, parameters, s, p = self._vectors(ca.SX)
+        n = s["q"].numel()
+        step, held = ca.SX.sym("step", n), ca.SX.sym("held", n)
+        thumb = ca.SX.sym("thumb", linearised(self.robot, s["q"], p).thumb.sparsity())
+        size = ca.mmax(ca.fabs(step))
+        capped = (
+            motor_scales(self.robot) * step * ca.fmin(1.0, p["step_cap"] / ca.fmax(size, 1e-12))
+        )
+        tried = ca.fmin(ca.fmax(s["q"] + capped, p["lower"]), p["upper"])
+        before, there = (merit(self.robot, q, p) for q in (s["q"], tried))
+        accepted = there.cost < before.cost
+        q = ca.if_else(accepted, tried, s["q"])
+        left = Merit(
+            ca.if_else(accepted, there.positions, before.positions),
+            ca.if_else(accepted, there.angles, before.angles),
+            ca.if_else(accepted, there.cost, before.cost),
+        )
+        cost = left.cost
+        solved = ca.logic_and(
+            ca.mmax(left.positions - p["position_tolerance"]) <= 0,
+            ca.mmax(left.angles - p["angle_tolerance"]) <= 0,
+        )
+        waited = ca.if_else(cost > GAIN * before.cost, s["waited"] + 1, 0.0)
+        stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > DAMPING_CEILING)
+        over = ca.logic_or(waited >= PATIENCE, s["spent"] + 1 >= BUDGET)
+        over = ca.logic_or(over, stuck)
+        better = cost < s["best_cost"]
+        after = self._next(
+            s,
+            Phase.HAND_ALIGNMENT,
+            {},
+            q=q,
+            phase=ca.if_else(over, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT)),
+            start=s["start"] + ca.if_else(ca.logic_and(over, ca.logic_not(solved)), 1.0, 0.0),
+            damping=ca.fmax(s["damping"] * ca.if_else(accepted, EASED, TIGHTENED), DAMPING_FLOOR),
+            waited=waited,
+            spent=s["spent"] + 1,
+            best_cost=ca.if_else(better, cost, s["best_cost"]),
+            best_q=ca.if_else(better, q, s["best_q"]),
+        )
+        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+        record = self.row(
+            s,
+            p,
+            q,
+            Phase.HAND_ALIGNMENT,
+            status,
+            left,
+            damping=s["damping"],
+            step_size=ca.mmax(ca.fabs(tried - s["q"])),
+            manipulability=safe_sqrt(det_spd(thumb @ thumb.T)),
+            held_mask=bits(held),
+            accepted=accepted,
+        )
+        inputs = [state, parameters, thumb, step, held]
+        return ca.Function("take", inputs, shared(after, record, status))
+
+    def _next(
+        self, s: dict[str, Expr], stage: Phase, fit: dict[str, Expr], **changed: Expr
+    ) -> Expr:
+        one = ca.DM([float(stage == other) for other in STAGES])
+        return self.state.pack(s | {"counts": s["counts"] + one} | fit | changed)

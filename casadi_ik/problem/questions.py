@@ -1,0 +1,111 @@
+"""How a solver's questions become problems: grasps or arrays, tolerances, limits, what is held."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.errors import InputError
+from casadi_ik.grasps import Grasp, Tolerance
+from casadi_ik.problem.problems import Array, Problems, fixed_array, target_arrays
+
+
+@dataclass(frozen=True, eq=False)
+class Questions:
+    """What all questions of a solver share.
+
+    Attributes:
+        robot: The robot.
+        tolerances: By finger, in the robot's order.
+        enforce_limits: Whether limits are part of being solved.
+    """
+
+    robot: ArmHand
+    tolerances: Mapping[str, Tolerance]
+    enforce_limits: bool
+
+    def of_arrays(
+        self, points: ArrayLike, normals: ArrayLike, fixed: Array | None, first_row: int = 0
+    ) -> Problems:
+        """Targets as arrays.
+
+        Args:
+            points: (k, f, 3) [m].
+            normals: (k, f, 3).
+            fixed: See `Problems`.
+            first_row: Number of the first target.
+
+        Raises:
+            InputError: See `target_arrays`.
+        """
+        p, n = target_arrays(points, normals, len(self.robot.fingers), first_row)
+        tolerances = tuple(self.tolerances.values())
+        return Problems(p, n, tolerances, self.enforce_limits, first_row, fixed)
+
+    def of_grasps(self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None) -> Problems:
+        """Grasps, at least one, that share the tolerances of the first.
+
+        Args:
+            grasps: The grasps.
+            fixed: Held actuators by name.
+
+        Raises:
+            InputError: Something else than a grasp, one with a finger that the robot has not, or
+                see `held`.
+        """
+        fingers = self.robot.fingers
+        for grasp in grasps:
+            if not isinstance(grasp, Grasp):
+                raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
+        # Contacts are checked when they are made.
+        points, normals = zip(*(grasp.arrays(fingers) for grasp in grasps), strict=True)
+        own, usual = grasps[0].contacts, self.tolerances
+        tolerances = tuple(
+            (own[name].tolerance if name in own else None) or usual[name] for name in fingers
+        )
+        held = self.held(fixed)
+        return Problems(
+            np.array(points), np.array(normals), tolerances, self.enforce_limits, fixed=held
+        )
+
+    def held(self, fixed: Mapping[str, float] | None) -> Array | None:
+        """Held actuators as an array; see `fixed_array`."""
+        robot = self.robot
+        return fixed_array(fixed or {}, robot.actuators, robot.lower, robot.upper)
+
+    def start(self, q0: ArrayLike | None) -> Array:
+        """One configuration (n,) to start from; None is the robot's home.
+
+        Raises:
+            InputError: Not one configuration.
+        """
+        start = self.robot.configuration(q0, "q0")
+        if start.ndim != 1:
+            raise InputError(f"q0: found shape {start.shape}, expected ({len(start[0])},)")
+        return start
+
+
+def tolerances_by_finger(
+    tolerance: Tolerance | Mapping[str, Tolerance] | None, fingers: Sequence[str]
+) -> dict[str, Tolerance]:
+    """The tolerance of every finger; what is not said is the default.
+
+    Raises:
+        InputError: No tolerance, or one for a finger that is not among them.
+    """
+    if tolerance is None or isinstance(tolerance, Tolerance):
+        return dict.fromkeys(fingers, tolerance or Tolerance())
+    if not isinstance(tolerance, Mapping):
+        raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance, or one by finger")
+    for name, one in tolerance.items():
+        if name not in fingers:
+            raise InputError(
+                f"tolerance.{name}: no such finger; the robot's fingers: {', '.join(fingers)}"
+            )
+        if not isinstance(one, Tolerance):
+            raise InputError(f"tolerance.{name}: found {one!r}, expected a Tolerance")
+    return {name: tolerance.get(name, Tolerance()) for name in fingers}

@@ -1,0 +1,73 @@
+"""What a solver hands over about its solves, and to whom: plain arrays and one protocol.
+
+The solvers own this contract and know nothing of files; the logs implement it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.solution import BatchSolution
+from casadi_ik.problem.trace import TraceFormat
+
+
+@dataclass(frozen=True, eq=False)
+class SolveBlock:
+    """k solves of one method, numbered one after the other, with everything that is kept of them.
+
+    Attributes:
+        method: Name of the method.
+        robot: Name of the robot.
+        fingers: Finger names, the order of every (k, f) array.
+        format: How the rows are to be read.
+        first: Number of the first solve; solves are unique per method in one log.
+        problems: The targets.
+        starts: Where each solve began, (k, n).
+        seed: Of the random numbers.
+        batch: What became of them.
+        rows: The iterations of all solves, one solve after the other, (sum of
+            `BatchSolution.iterations`,) of the format's layout.
+        started: When each solve began, (k,) [ns since the Unix epoch].
+    """
+
+    method: str
+    robot: str
+    fingers: tuple[str, ...]
+    format: TraceFormat
+    first: int
+    problems: Problems
+    starts: NDArray[np.float64]
+    seed: int
+    batch: BatchSolution
+    rows: NDArray[Any]
+    started: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.batch)
+
+
+class Recorder(Protocol):
+    """Whoever keeps what happened in the solves."""
+
+    def record(self, block: SolveBlock) -> None:
+        """Take finished solves; the caller leaves the arrays alone from then on."""
+        ...
+
+    def close(self) -> None:
+        """Nothing more will come; what was taken is now kept for good."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None: ...

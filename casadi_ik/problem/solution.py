@@ -1,0 +1,178 @@
+"""The answer: configuration, status, and a verdict on every contact."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.grasps import Tolerance
+from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.diagnosis import Diagnosis
+from casadi_ik.problem.problems import Array
+from casadi_ik.problem.status import Status
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What became of one grasp.
+
+    Attributes:
+        success: Every contact within tolerance, and every actuator and joint within its limits
+            unless limits are ignored. Recomputed from q, whatever the method says.
+        status: How the solve ended.
+        q: (n,) actuator positions reached [rad or m].
+        iterations: Iterations over all phases and restarts.
+        restarts: How often the method began anew.
+        time: Seconds the solve took; in a batch its share of the time.
+        contacts: Verdict by finger.
+        phases: Iterations by phase name, in the order of the phases.
+        limits_ok: Whether every actuator and joint is within its limits.
+        method: Name of the method.
+        robot: Name of the robot.
+        actuators: Names of the entries of q.
+        diagnosis: Why it is not solved; None if it is, or if no diagnosis was asked for.
+    """
+
+    success: bool
+    status: Status
+    q: Array
+    iterations: int
+    restarts: int
+    time: float
+    contacts: Mapping[str, ContactVerdict]
+    phases: Mapping[str, int]
+    limits_ok: bool
+    method: str
+    robot: str
+    actuators: tuple[str, ...]
+    diagnosis: Diagnosis | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class BatchSolution:
+    """What became of a batch of k targets; the fields of `Solution` as arrays.
+
+    Attributes:
+        success: (k,) bool.
+        status: (k,) codes of `Status`.
+        q: (k, n) actuator positions [rad or m].
+        iterations: (k,).
+        restarts: (k,).
+        time: (k,) seconds per solve; solves made side by side share the time.
+        position_error: (k, f) [m], NaN where free.
+        angle_error: (k, f) [rad], NaN where free.
+        ok: (k, f) bool.
+        limits_ok: (k,) bool.
+        phases: (k,) iterations by phase name.
+        tolerances: When a contact counted as reached, by finger.
+        diagnoses: Why each target is not solved (None if it is); empty if not asked for.
+    """
+
+    success: NDArray[np.bool_]
+    status: NDArray[np.int64]
+    q: Array
+    iterations: NDArray[np.int64]
+    restarts: NDArray[np.int64]
+    time: Array
+    position_error: Array
+    angle_error: Array
+    ok: NDArray[np.bool_]
+    limits_ok: NDArray[np.bool_]
+    phases: Mapping[str, NDArray[np.int64]]
+    tolerances: tuple[Tolerance, ...]
+    diagnoses: tuple[Diagnosis | None, ...] = ()
+
+    @classmethod
+    def invalid(
+        cls, count: int, n: int, tolerances: tuple[Tolerance, ...], diagnosed: bool
+    ) -> BatchSolution:
+        """Rows for targets that could not be asked: status INVALID, NaN for every number."""
+        f = len(tolerances)
+        none = np.zeros(count, dtype=np.int64)
+        return cls(
+            success=np.zeros(count, dtype=bool),
+            status=np.full(count, int(Status.INVALID), dtype=np.int64),
+            q=np.full((count, n), np.nan),
+            iterations=none,
+            restarts=none,
+            time=np.zeros(count),
+            position_error=np.full((count, f), np.nan),
+            angle_error=np.full((count, f), np.nan),
+            ok=np.zeros((count, f), dtype=bool),
+            limits_ok=np.zeros(count, dtype=bool),
+            phases={},
+            tolerances=tolerances,
+            diagnoses=(None,) * count if diagnosed else (),
+        )
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @classmethod
+    def joined(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
+        """One batch after the other, at least one.
+
+        A phase that a part does not know counts 0 iterations there.
+        """
+        first = parts[0]
+        if len(parts) == 1:
+            return first
+        arrays = {
+            item.name: np.concatenate([getattr(part, item.name) for part in parts])
+            for item in fields(cls)
+            if isinstance(getattr(first, item.name), np.ndarray)
+        }
+        none = [np.zeros(len(part), dtype=np.int64) for part in parts]
+        names = dict.fromkeys(chain.from_iterable(part.phases for part in parts))
+        phases = {
+            name: np.concatenate(
+                [part.phases.get(name, no) for part, no in zip(parts, none, strict=True)]
+            )
+            for name in names
+        }
+        diagnoses = tuple(chain.from_iterable(part.diagnoses for part in parts))
+        return replace(first, **arrays, phases=phases, diagnoses=diagnoses)
+
+    @property
+    def status_names(self) -> NDArray[np.str_]:
+        """(k,) names of the statuses."""
+        return np.array([status.name for status in sorted(Status)])[self.status - min(Status)]
+
+    def solution(
+        self,
+        row: int,
+        method: str,
+        robot: str,
+        actuators: tuple[str, ...],
+        fingers: tuple[str, ...],
+    ) -> Solution:
+        """One row as a `Solution`."""
+        verdicts = zip(
+            self.position_error[row].tolist(),
+            self.angle_error[row].tolist(),
+            self.ok[row].tolist(),
+            self.tolerances,
+            strict=True,
+        )
+        contacts = {
+            name: ContactVerdict(*verdict) for name, verdict in zip(fingers, verdicts, strict=True)
+        }
+        return Solution(
+            success=bool(self.success[row]),
+            status=Status(int(self.status[row])),
+            q=self.q[row],
+            iterations=int(self.iterations[row]),
+            restarts=int(self.restarts[row]),
+            time=float(self.time[row]),
+            contacts=contacts,
+            phases={name: int(counts[row]) for name, counts in self.phases.items()},
+            limits_ok=bool(self.limits_ok[row]),
+            method=method,
+            robot=robot,
+            actuators=actuators,
+            diagnosis=self.diagnoses[row] if self.diagnoses else None,
+        )

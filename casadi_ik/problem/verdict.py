@@ -1,0 +1,91 @@
+"""The verdict: is it solved? Recomputed from q alone, whatever a method believes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.problems import Array, Problems
+
+LIMIT_SLACK = 1e-9
+"""Rounding allowed at a limit [rad or m]: a coupling's arithmetic may end a hair beyond it."""
+
+TOLERANCE_SLACK = 1e-9
+"""Relative rounding allowed at a tolerance, so that graph and verdict agree on its edge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """How k configurations meet their targets; arrays as in `BatchSolution`."""
+
+    position_error: Array
+    angle_error: Array
+    ok: NDArray[np.bool_]
+    limits_ok: NDArray[np.bool_]
+
+    @property
+    def all_ok(self) -> NDArray[np.bool_]:
+        """(k,) whether every contact is met."""
+        met: NDArray[np.bool_] = np.logical_and.reduce(self.ok, axis=1)
+        return met
+
+    def solved(self, limits: bool) -> NDArray[np.bool_]:
+        """(k,) whether every contact is met and, if asked, the robot's limits are kept."""
+        return self.all_ok & self.limits_ok if limits else self.all_ok
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedVerdict:
+    """How one configuration meets all contacts of its target."""
+
+    contacts: Sequence[ContactVerdict]
+    limits_ok: bool
+
+
+def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
+    """Compare configurations with their targets.
+
+    Args:
+        robot: The robot.
+        problems: k targets, or one that all configurations are compared with.
+        q: (k, n) configurations.
+    """
+    points, normals = problems.points, problems.normals
+    if len(problems) == 1:
+        points, normals = points[0], normals[0]
+    position, angle, beyond = robot.deviations(q, points, normals)
+    slack = 1 + TOLERANCE_SLACK
+    placed = position <= problems.position_tolerance * slack
+    faced = angle <= problems.angle_tolerance * slack
+    ok = placed & faced
+    if not ok.all():
+        # Free is what the target leaves out; an error that is NaN for another reason is no success.
+        ok = (placed | np.isnan(points[..., 0])) & (faced | np.isnan(normals[..., 0]))
+    return Verdict(position, angle, ok, beyond <= LIMIT_SLACK)
+
+
+def judge_one(robot: ArmHand, problems: Problems, q: Array) -> SolvedVerdict | None:
+    """The verdict on one configuration if everything asked is there and met; None: ask `judge`.
+
+    Args:
+        robot: The robot.
+        problems: One target.
+        q: (n,).
+    """
+    position, angle, beyond = robot.deviations(q, problems.points[0], problems.normals[0])
+    limits_ok = bool(beyond <= LIMIT_SLACK)
+    if problems.enforce_limits and not limits_ok:
+        return None
+    contacts = []
+    slack = 1 + TOLERANCE_SLACK
+    errors = zip(position.tolist(), angle.tolist(), problems.tolerances, strict=True)
+    for distance, turn, tolerance in errors:
+        if not (distance <= tolerance.position * slack and turn <= tolerance.angle * slack):
+            return None
+        contacts.append(ContactVerdict(distance, turn, True, tolerance))
+    return SolvedVerdict(contacts, limits_ok)

@@ -1,0 +1,1 @@
+"""Batches, streams and single steps of any method."""

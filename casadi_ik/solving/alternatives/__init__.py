@@ -1,0 +1,1 @@
+"""Several solutions of a grasp, and moving grasps."""

@@ -1,0 +1,243 @@
+"""Several solutions of one grasp: hand postures, arm branches, and which of them to prefer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.errors import InputError
+from casadi_ik.grasps import Tolerance
+from casadi_ik.kernels import FunctionKernel
+from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.verdict import judge
+from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
+from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.measures import manipulability
+
+PREFERENCES = ("limits", "manipulability", "q0")
+"""What may be preferred: distance from the limits, manipulability, closeness to q0."""
+
+DISTINCT = 0.05
+"""Configurations count as different if a motor differs by this part of its range."""
+
+ARMS = 64
+"""Random arms that an arm without a closed form is solved from."""
+
+CLOSE = 1e-7
+"""Tolerance [m, rad] that hand postures are brought to first, so that equals are seen as equal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """One of several solutions of a grasp.
+
+    Attributes:
+        q: (n,) actuator positions [rad or m], within limits unless they are ignored.
+        contacts: Verdict by finger; all are met.
+        posture: Number of the hand posture, the same for all solutions that share it.
+        branch: How the arm is bent and how far its elbow may swing; None for an arm without a
+            closed form, and for a hand without an arm.
+        swivel: The swivel [rad] of q within `branch.swivel`, or None.
+        margin: Smallest distance of any actuator from its limits as a part of half its range: 1
+            in the middle of the range, 0 at a limit.
+        manipulability: Yoshikawa's measure of the arm [m^3]; 0 for a hand without an arm.
+        distance: Euclidean distance from q0, every actuator as a part of its range.
+    """
+
+    q: Array
+    contacts: Mapping[str, ContactVerdict]
+    posture: int
+    branch: ArmBranch | None
+    swivel: float | None
+    margin: float
+    manipulability: float
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    q: Array
+    posture: int
+    branch: ArmBranch | None = None
+    swivel: float | None = None
+
+
+class AlternativeFinder:
+    """Finds all solutions of grasps on one robot.
+
+    Attributes:
+        robot: The robot.
+    """
+
+    def __init__(self, robot: ArmHand, method: HandFirstMethod, compiled: bool = True) -> None:
+        """Take the robot and hand-first on it."""
+        self.robot = robot
+        self._trials = Trials(robot, method)
+        self._compiled = compiled
+        self._arm = list(robot.description.arm_actuators)
+        self._hand = list(method.step.layouts.hand)
+
+    @cached_property
+    def _branches(self) -> ArmBranches | None:
+        arm = self._trials.method.step.arm
+        return None if arm is None else ArmBranches(arm, self._compiled)
+
+    @cached_property
+    def _manipulability(self) -> FunctionKernel:
+        q = ca.SX.sym("q", len(self.robot.actuators))
+        linear, angular = actuated(self.robot.description, q).palm_jacobian(self._arm)
+        measure = manipulability(ca.vertcat(linear, angular))
+        return FunctionKernel(ca.Function("arm_manipulability", [q], [measure]), self._compiled)
+
+    def find(
+        self, problems: Problems, q0: Array, seed: int, limit: int, prefer: str
+    ) -> tuple[Alternative, ...]:
+        """All solutions of one target, best first.
+
+        Args:
+            problems: One target.
+            q0: (n,) where the robot is.
+            seed: Of the starts of arms without a closed form.
+            limit: How many at most.
+            prefer: One of `PREFERENCES`.
+
+        Raises:
+            InputError: Bad limit or preference.
+        """
+        if not isinstance(limit, (int, np.integer)) or limit < 1:
+            raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
+        if prefer not in PREFERENCES:
+            raise InputError(f"prefer: found {prefer!r}, expected one of {', '.join(PREFERENCES)}")
+        limits = self._trials.limits(problems)
+        found: list[_Found] = []
+        for number, q in enumerate(self._postures(problems, q0, limits)):
+            found += self._arms(problems, q, number, limits, q0, seed, prefer)
+        if not found:
+            return ()
+        q = np.stack([item.q for item in found])
+        solved = self._trials.solved(problems, q, problems.enforce_limits)
+        keys = np.stack([self._score(q, q0, prefer), self._margins(q, self._arm)])
+        order = [i for i in np.lexsort(-keys[::-1]) if solved[i]][:limit]
+        return tuple(self._described(problems, found[i], q0) for i in order)
+
+    def _postures(self, problems: Problems, q0: Array, limits: Bounds) -> list[Array]:
+        """Solutions (n,) with different hands, from every candidate of every round."""
+        trials, method = self._trials, self._trials.method
+        rounds = range(method.options.rounds)
+        postures = np.concatenate([method.postures(problems, number)[0] for number in rounds])
+        starts = np.tile(limits.clip(q0), (len(postures), 1))
+        asked = repeated(problems, len(postures))
+        states, parameters = trials.posture_rows(asked, starts, postures)
+        loose = parameters.copy()
+        trials.set_tolerance(parameters, CLOSE)
+        q = trials.run(states, parameters)
+        exact = replace(problems, tolerance=Tolerance(10 * CLOSE, 10 * CLOSE))
+        kept = q[trials.solved(exact, q, problems.enforce_limits)]
+        if not len(kept):
+            # Reachable thanks to the tolerances only, if at all.
+            q = np.concatenate([q, trials.run(states, loose)])
+            kept = q[trials.solved(problems, q, problems.enforce_limits)]
+        return _distinct(kept, self._parts(kept, self._hand))
+
+    def _arms(
+        self,
+        problems: Problems,
+        q: Array,
+        posture: int,
+        limits: Bounds,
+        q0: Array,
+        seed: int,
+        prefer: str,
+    ) -> list[_Found]:
+        """Every arm that brings the hand of q where it is."""
+        if not self._arm:
+            return [_Found(q, posture)]
+        if self._branches is None:
+            return [_Found(arm, posture) for arm in self._searched(problems, q, seed)]
+        palm = self.robot.palm(q)
+        lower, upper = limits.lower[self._arm], limits.upper[self._arm]
+
+        def with_arm(arms: Array) -> Array:
+            whole = np.tile(q, (len(arms), 1))
+            whole[:, self._arm] = arms
+            return limits.clip(whole)
+
+        found = []
+        for branch in self._branches.find(palm, lower, upper):
+            arm, swivel = self._branches.best(
+                palm, branch, lambda arms: self._score(with_arm(arms), q0, prefer, self._arm)
+            )
+            found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
+        return found or [_Found(q, posture)]
+
+    def _searched(self, problems: Problems, q: Array, seed: int) -> list[Array]:
+        """Different arms found from random ones, the hand starting as in q."""
+        starts = self.robot.random(np.random.default_rng(seed), ARMS)
+        starts[:, self._hand] = q[self._hand]
+        starts[0] = q
+        ends = Descent(self._trials, problems).run(np.zeros(ARMS, np.intp), starts)
+        ends = np.concatenate([q[None], ends])
+        same = (np.abs(self._parts(ends - q, self._hand)) < DISTINCT).all(axis=1)
+        kept = ends[same & self._trials.solved(problems, ends, problems.enforce_limits)]
+        return _distinct(kept, self._parts(kept, self._arm))
+
+    def _parts(self, q: Array, columns: list[int]) -> Array:
+        """Some columns of configurations as parts of their ranges."""
+        return q[:, columns] / (self.robot.upper - self.robot.lower)[columns]
+
+    def _margins(self, q: Array, columns: list[int]) -> Array:
+        half = (self.robot.upper - self.robot.lower)[columns] / 2
+        inside = np.minimum(q - self.robot.lower, self.robot.upper - q)[:, columns] / half
+        return inside.min(axis=1) if columns else np.ones(len(q))
+
+    def _score(self, q: Array, q0: Array, prefer: str, columns: list[int] | None = None) -> Array:
+        """(k,) what is preferred, higher is better; margins over some actuators only."""
+        every = list(range(q.shape[1]))
+        if prefer == "limits":
+            return self._margins(q, every if columns is None else columns)
+        if prefer == "q0":
+            return -np.linalg.norm(self._parts(q - q0, every), axis=1)
+        return self._measured(q)
+
+    def _measured(self, q: Array) -> Array:
+        return self._manipulability(q)[0] if self._arm else np.zeros(len(q))
+
+    def _described(self, problems: Problems, found: _Found, q0: Array) -> Alternative:
+        q = found.q[None]
+        verdict = judge(self.robot, problems, q)
+        contacts = {
+            name: ContactVerdict(
+                float(verdict.position_error[0, i]),
+                float(verdict.angle_error[0, i]),
+                bool(verdict.ok[0, i]),
+                problems.tolerances[i],
+            )
+            for i, name in enumerate(self.robot.fingers)
+        }
+        return Alternative(
+            q=found.q,
+            contacts=contacts,
+            posture=found.posture,
+            branch=found.branch,
+            swivel=found.swivel,
+            margin=float(self._score(q, q0, "limits")[0]),
+            manipulability=float(self._measured(q)[0]),
+            distance=float(-self._score(q, q0, "q0")[0]),
+        )
+
+
+def _distinct(q: Array, parts: Array) -> list[Array]:
+    """Configurations whose parts differ from all that come before them."""
+    kept: list[int] = []
+    for i in range(len(q)):
+        if all(np.abs(parts[i] - parts[j]).max() > DISTINCT for j in kept):
+            kept.append(i)
+    return [q[i] for i in kept]

@@ -1,0 +1,1 @@
+"""Why a grasp cannot be solved."""

@@ -1,0 +1,273 @@
+"""Finds out why grasps cannot be solved: by solving them again with less asked."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.grasps import Tolerance
+from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.problem.diagnosis import (
+    ArmReach,
+    Diagnosis,
+    HandFit,
+    Lazy,
+    NearContact,
+    Reason,
+    Remedies,
+)
+from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.verdict import Verdict, judge
+from casadi_ik.solving.diagnosis.minimax import MARGIN, Closest, closest
+from casadi_ik.solving.diagnosis.palm_free import HandFits, PalmFree
+from casadi_ik.solving.diagnosis.remedies import RemedyFinder
+from casadi_ik.solving.trials import Descent, Rows, Trials
+
+TOGETHER = 64
+"""Targets that are diagnosed in the same runs of the compiled loop."""
+
+PLACED = 2
+"""Fitted hands that the arm follows, besides what hand-first came to."""
+
+SEARCHES = ((8.0, 24, 4), (4.0, 96, 8), (1.5, 256, 32))
+"""If the contacts are missed by less than a factor, so many further starts are tried, whatever hand
+and reach say, and so many of the minima they lead to are followed."""
+
+ALIKE = 3
+"""Every third of these starts has a hand that looks like the grasp, the others the nearest."""
+
+CERTAIN = 1.1
+"""If hand and arm-hand both miss the contacts by this factor where they come closest, no arm is
+looked for that would help a hand that does not fit."""
+
+BARELY = 2.0
+"""If they are missed by less than this, limits are lifted that nothing presses against, too."""
+
+AT_LIMIT = 1e-6
+"""How near to a limit counts as at it [rad or m]."""
+
+REAL = 1e-3
+"""How far an arm's reach has to be missed to be the reason [m]."""
+
+
+class Diagnostician:
+    """Diagnoses grasps on one robot, whichever method failed.
+
+    Attributes:
+        robot: The robot.
+        method: Hand-first on that robot.
+    """
+
+    def __init__(self, robot: ArmHand, method: HandFirstMethod) -> None:
+        """Keep robot and method; nothing is built before the first diagnosis."""
+        self.robot = robot
+        self.method = method
+        self._trials = Trials(robot, method)
+        self._palm_free = PalmFree(self._trials)
+
+    def diagnose(self, problems: Problems, q0: Array, nearest: Array | None) -> list[Diagnosis]:
+        """Diagnose k targets; each as if it were alone.
+
+        Args:
+            problems: The targets.
+            q0: (k, n) starts.
+            nearest: (k, n) what hand-first came to; None if another method was asked.
+        """
+        self.method.prepare()
+        known = np.zeros(len(problems), dtype=bool)
+        clock = _Clock(np.zeros(len(problems)))
+        if nearest is None:
+            nearest = self.method.run(problems, q0, 0, trace=False).q
+            known = judge(self.robot, problems, nearest).solved(problems.enforce_limits)
+            clock.lap(np.arange(len(problems)))
+        found: dict[int, Diagnosis] = {}
+        for row in np.flatnonzero(known).tolist():
+            one = problems.rows(slice(row, row + 1))
+            (near,) = self._nearest(one, nearest[row : row + 1])
+            found[row] = _reachable(one, nearest[row], near, clock.seconds[row])
+        rest = np.flatnonzero(~known)
+        for start in range(0, len(rest), TOGETHER):
+            rows = rest[start : start + TOGETHER]
+            some, spent = problems.rows(rows), clock.seconds[rows]
+            whys = self._together(some, q0[rows], nearest[rows], _Clock(spent))
+            found |= zip(rows.tolist(), whys, strict=True)
+        return [found[row] for row in range(len(problems))]
+
+    def _together(
+        self, problems: Problems, q0: Array, nearest: Array, clock: _Clock
+    ) -> Iterator[Diagnosis]:
+        """Diagnose targets that hand-first did not solve."""
+        every = np.arange(len(problems))
+        descent = Descent(self._trials, problems)
+        evidence, fits = self._hands(problems, q0)
+        refused = [_refused(*item) for item in evidence]
+        targets, ends = self._placed(fits)
+        targets, ends = np.concatenate([every, targets]), np.concatenate([nearest, ends])
+        best = closest(descent, targets, ends, PLACED + 1)
+        clock.lap(every)
+        # Where neither the hand nor the reach says no, only searching can.
+        unsure = np.array([reason is None for reason in refused])
+        certain = self._certain(problems, fits, best)
+        for below, count, followed in SEARCHES:
+            rows = np.flatnonzero(unsure | ((best.ratio < below) & ~certain))
+            rows = rows[~self._solved(problems.rows(rows), best.fair[rows])]
+            if len(rows):
+                some, found = problems.rows(rows), best.rows(rows)
+                best.put(rows, self._search(some, found, count, followed))
+                clock.lap(rows)
+            unsure[:] = False
+        fair = judge(self.robot, problems, best.fair)
+        solved, enough = fair.solved(problems.enforce_limits), _enough(problems, fair)
+        near = self._nearest(problems, np.where(solved[:, None], best.fair, best.q))
+        held = self._at_limit(best.q)
+        pressed = held | self._at_limit(best.fair) | (best.ratio <= BARELY)[:, None]
+        clock.lap(every)
+        for i in every.tolist():
+            if solved[i]:
+                yield _reachable(problems, best.fair[i], near[i], clock.seconds[i])
+                continue
+            hand, reach = evidence[i]
+            one, hand_only = problems.rows(slice(i, i + 1)), refused[i] is Reason.HAND
+            remedies = RemedyFinder(self._trials, one, q0[i], best.q[i], pressed[i], hand_only)
+            reason = refused[i]
+            if reason is None:
+                reason = Reason.LIMITS if remedies.lifting_helps() else Reason.NOT_FOUND
+            names = zip(self.robot.actuators, held[i].tolist(), strict=True)
+            clock.lap(every[i : i + 1])
+            yield Diagnosis(
+                reason=reason,
+                established=reason is not Reason.NOT_FOUND and bool(best.ratio[i] >= MARGIN),
+                hand=hand,
+                reach=reach,
+                active=tuple(name for name, at in names if at and problems.enforce_limits),
+                enough=enough[i],
+                nearest=near[i],
+                q=best.q[i],
+                time=float(clock.seconds[i]),
+                lazy=Lazy(remedies.find),
+            )
+
+    def _hands(
+        self, problems: Problems, q0: Array
+    ) -> tuple[Sequence[tuple[HandFit | None, ArmReach | None]], HandFits | None]:
+        """What the hand alone says of each target; nothing if there is no arm."""
+        if not self.robot.description.arm_actuators:
+            return [(None, None)] * len(problems), None
+        fits = self._palm_free.fits(problems, q0)
+        return self._palm_free.evidence(problems, fits), fits
+
+    def _certain(
+        self, problems: Problems, fits: HandFits | None, best: Closest
+    ) -> NDArray[np.bool_]:
+        """(k,) whether the hand alone already says no, however the arm holds it."""
+        if fits is None:
+            return np.zeros(len(problems), dtype=bool)
+        return np.minimum(fits.ratio(problems), best.ratio) >= CERTAIN
+
+    def _placed(self, fits: HandFits | None) -> tuple[Rows, Array]:
+        """Configurations (m, n) that the best fits of each target lead to, and their targets."""
+        if fits is None:
+            return np.zeros(0, np.intp), np.zeros((0, len(self.robot.actuators)))
+        rows = fits.best(PLACED)
+        return fits.targets[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
+
+    def _search(self, problems: Problems, best: Closest, count: int, followed: int) -> Closest:
+        """The closest to each target from random arms, with hands of all kinds.
+
+        The hands are those that came closest so far, and some that look like the grasp. A hand
+        without an arm is started at random itself.
+        """
+        targets = np.repeat(np.arange(len(problems)), count + 2)
+        random = self.robot.random(np.random.default_rng(count), count)
+        starts = np.tile(random, (len(problems), 1, 1))
+        if self.robot.description.arm_actuators:
+            hand = list(self.method.step.layouts.hand)
+            starts[:, ::2, hand] = best.fair[:, None, hand]
+            starts[:, 1::2, hand] = best.q[:, None, hand]
+            starts[:, ::ALIKE, hand] = self._alike(problems, -(-count // ALIKE))
+        starts = np.concatenate([best.q[:, None], best.fair[:, None], starts], axis=1)
+        descent = Descent(self._trials, problems)
+        ends = descent.run(targets, starts.reshape(len(targets), -1))
+        return closest(descent, targets, ends, followed)
+
+    def _alike(self, problems: Problems, count: int) -> Array:
+        """(k, count, hand) postures that look like the grasps, in turns."""
+        options = self.method.options
+        rounds = range(min(options.rounds, -(-count // options.candidates)))
+        found = [self.method.postures(problems, number) for number in rounds]
+        postures = np.concatenate(found, axis=1)
+        return postures[:, np.arange(count) % postures.shape[1]]
+
+    def _solved(self, problems: Problems, q: Array) -> NDArray[np.bool_]:
+        if not len(q):
+            return np.zeros(0, dtype=bool)
+        return judge(self.robot, problems, q).solved(problems.enforce_limits)
+
+    def _nearest(self, problems: Problems, q: Array) -> list[dict[str, NearContact]]:
+        """The contacts of configurations (k, n), beside those asked for."""
+        points, normals = self.robot.contacts(q)
+        position_error, angle_error = self.robot.errors(q, problems.points, problems.normals)
+        columns = points, normals, position_error, angle_error
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        return [
+            {
+                name: NearContact(tuple(point), tuple(normal), position, angle)
+                for name, point, normal, position, angle in zip(
+                    self.robot.fingers, *row, strict=True
+                )
+            }
+            for row in rows
+        ]
+
+    def _at_limit(self, q: Array) -> NDArray[np.bool_]:
+        return (q - self.robot.lower <= AT_LIMIT) | (self.robot.upper - q <= AT_LIMIT)
+
+
+class _Clock:
+    """Seconds (k,) spent on each of the targets that are worked on together."""
+
+    def __init__(self, seconds: Array) -> None:
+        self.seconds = seconds
+        self._now = time.perf_counter()
+
+    def lap(self, targets: Rows) -> None:
+        """Share the time since the last lap among some targets."""
+        before, self._now = self._now, time.perf_counter()
+        self.seconds[targets] += (self._now - before) / len(targets)
+
+
+def _refused(hand: HandFit | None, reach: ArmReach | None) -> Reason | None:
+    if hand is not None and not hand.fits:
+        return Reason.HAND
+    if reach is not None and abs(reach.excess) > REAL:
+        return Reason.REACH
+    return None
+
+
+def _enough(problems: Problems, fair: Verdict) -> list[Tolerance]:
+    """Tolerances that were kept to, no smaller than those asked for."""
+    least = problems.largest_tolerance
+    position = np.nanmax(fair.position_error, axis=1, initial=least.position)
+    angle = np.nanmax(fair.angle_error, axis=1, initial=least.angle)
+    return [Tolerance(*pair) for pair in zip(position.tolist(), angle.tolist(), strict=True)]
+
+
+def _reachable(
+    problems: Problems, q: Array, near: dict[str, NearContact], seconds: float
+) -> Diagnosis:
+    return Diagnosis(
+        reason=Reason.REACHABLE,
+        established=False,
+        hand=None,
+        reach=None,
+        active=(),
+        enough=problems.largest_tolerance,
+        nearest=near,
+        q=q,
+        time=float(seconds),
+        lazy=Lazy(Remedies),
+    )

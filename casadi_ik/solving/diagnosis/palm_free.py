@@ -1,0 +1,217 @@
+"""The hand with its palm free to move: how well it fits contacts, and where it takes the wrist."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.methods.common.contact_fit import LENGTH, fresh_fit
+from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.diagnosis import ArmReach, HandFit
+from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.status import Phase
+from casadi_ik.problem.verdict import judge
+from casadi_ik.solving.trials import NEVER, Rows, Trials, allowed, smallest
+from casadi_ik.symbolic.srs_arm import SrsArm, reach
+
+FIRST = 4
+"""Hand postures tried for every target; where none of them fits, two rounds of them."""
+
+SLID = 2
+"""Hands that fit but are out of the arm's reach, and are slid towards it."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandFits:
+    """Hand postures that were fitted to targets without the arm, each with a palm pose.
+
+    Attributes:
+        targets: (m,) number of the target.
+        states: (m, ...) of the loop, where the arm would be placed next.
+        parameters: (m, ...) of the loop.
+        position_error: (m, f) [m], NaN where free.
+        angle_error: (m, f) [rad], NaN where free.
+        met: (m, f) within tolerance, or free.
+        cost: (m,) squared residual, as in the hand stage.
+        distance: (m,) of the wrist from the shoulder [m]; NaN for an arm without a closed form.
+        outside: (m,) how far the wrist is from what the arm can span [m], 0 within.
+    """
+
+    targets: Rows
+    states: Array
+    parameters: Array
+    position_error: Array
+    angle_error: Array
+    met: NDArray[np.bool_]
+    cost: Array
+    distance: Array
+    outside: Array
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(m,) every contact within tolerance."""
+        return np.all(self.met, axis=1)
+
+    def without(self) -> Rows:
+        """Targets without a fit that the arm reaches."""
+        return np.setdiff1d(self.targets, self.targets[self.ok & (self.outside == 0)])
+
+    def ratio(self, problems: Problems) -> Array:
+        """(k,) by which factor the tolerances would have to grow at least, near any of the fits."""
+        cost = self.cost[smallest(self.targets, self.cost, 1)]
+        return np.sqrt(cost / (allowed(problems) ** 2).sum(axis=(1, 2)))
+
+    def best(self, most: int) -> Rows:
+        """Rows of each target that fit best with regard to the arm's reach."""
+        return smallest(self.targets, self.cost + (self.outside / LENGTH) ** 2, most)
+
+    @classmethod
+    def joined(cls, parts: Sequence[HandFits]) -> HandFits:
+        """One after the other."""
+        names = [item.name for item in fields(cls)]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+class PalmFree:
+    """Fits the hand alone to targets, whatever the arm could do."""
+
+    def __init__(self, trials: Trials) -> None:
+        """Ask the loop's hand stage."""
+        self._trials = trials
+        self._arm = trials.method.step.arm
+
+    @cached_property
+    def _palm(self) -> Array:
+        """(4, 4) where the palm is with the arm at zero."""
+        robot = self._trials.robot
+        return robot.palm(np.zeros(len(robot.actuators)))
+
+    def evidence(self, problems: Problems, fits: HandFits) -> list[tuple[HandFit, ArmReach | None]]:
+        """What the fits say of each target: the best one, and the one nearest to the arm's range.
+
+        Nothing is said of the reach where no hand fits, or of an arm without a closed form.
+        """
+        best = smallest(fits.targets, np.where(fits.ok, 0.0, 1.0 + fits.cost), 1)
+        nearest = smallest(fits.targets, np.where(fits.ok, fits.outside, np.inf), 1)
+        columns = fits.position_error, fits.angle_error, fits.met
+        found = []
+        for row, near in zip(best.tolist(), nearest.tolist(), strict=True):
+            values = zip(
+                self._trials.robot.fingers,
+                *(column[row].tolist() for column in columns),
+                problems.tolerances,
+                strict=True,
+            )
+            contacts = {
+                name: ContactVerdict(position, angle, ok, tolerance)
+                for name, position, angle, ok, tolerance in values
+            }
+            hand, arm = HandFit(bool(fits.ok[row]), contacts), None
+            if hand.fits and self._arm is not None:
+                arm = ArmReach(float(fits.distance[near]), *self._span(problems, self._arm))
+            found.append((hand, arm))
+        return found
+
+    def fits(self, problems: Problems, q0: Array) -> HandFits:
+        """Fit some postures to each of k targets, more where none of them fits.
+
+        Args:
+            problems: The targets.
+            q0: (k, n) where what is free stays.
+        """
+        method, every = self._trials.method, np.arange(len(problems))
+        nearest = method.postures(problems, 0)
+        fits = self._fitted(problems, q0, every, nearest[:, :FIRST])
+        without = fits.without()
+        if len(without):
+            wide = method.postures(problems.rows(without), 1)
+            more = np.concatenate([nearest[without, FIRST:], wide], axis=1)
+            fits = HandFits.joined([fits, self._fitted(problems, q0, without, more)])
+        rows = np.flatnonzero(fits.ok & np.isin(fits.targets, fits.without()))
+        rows = rows[smallest(fits.targets[rows], fits.outside[rows], SLID)]
+        if len(rows):
+            fits = HandFits.joined([fits, self._slid(problems, fits, rows)])
+        return fits
+
+    def _fitted(self, problems: Problems, q0: Array, chosen: Rows, postures: Array) -> HandFits:
+        """Fit postures (c, p, hand) to c of the targets."""
+        trials = self._trials
+        targets = np.repeat(chosen, postures.shape[1])
+        start = q0[targets]
+        states, parameters = trials.posture_rows(
+            problems.rows(targets), start, postures.reshape(len(start), -1)
+        )
+        parameters[:, trials.parameters.slice("alone")] = 1.0
+        parameters[:, trials.parameters.slice("reach")] = 0.0
+        return self._run(problems, targets, states, parameters)
+
+    def _slid(self, problems: Problems, fits: HandFits, rows: Rows) -> HandFits:
+        """Spend what freedom the contacts leave on the arm's reach.
+
+        The reach weighs so little that a hand without a freedom stays within the tolerance.
+        """
+        trials = self._trials
+        states, parameters = fits.states[rows], fits.parameters[rows]
+        for name, value in ({"phase": Phase.HAND_FIT} | fresh_fit()).items():
+            states[:, trials.state.slice(name)] = value
+        loose = parameters[:, trials.parameters.slice("position_tolerance")].min(axis=1)
+        weight = np.sqrt(np.minimum(loose / (3 * fits.outside[rows]), 1.0))
+        parameters[:, trials.parameters.slice("reach")] = weight[:, None]
+        trials.set_tolerance(parameters, NEVER)
+        slid = self._run(problems, fits.targets[rows], states, parameters)
+        return replace(slid, parameters=fits.parameters[rows])
+
+    def _run(self, problems: Problems, targets: Rows, states: Array, parameters: Array) -> HandFits:
+        """Run the hand stage of some rows to its end and judge what it came to."""
+        trials = self._trials
+        states = trials.method.run_rows(states, parameters).states
+        # From here on the rows may go on to the arm.
+        parameters[:, trials.parameters.slice("alone")] = 0.0
+        rotation = states[:, trials.state.slice("palm_rotation")].reshape(-1, 3, 3)
+        origin = states[:, trials.state.slice("palm_origin")]
+        hand = states[:, trials.state.slice("q")].copy()
+        hand[:, list(trials.robot.description.arm_actuators)] = 0.0
+        seen = self._seen(problems.rows(targets), rotation, origin)
+        verdict = judge(trials.robot, seen, hand)
+        position, angle, met = verdict.position_error, verdict.angle_error, verdict.ok
+        squares = (position / LENGTH) ** 2, (2 * np.sin(angle / 2)) ** 2
+        distance, outside = self._wrist(problems, rotation, origin)
+        return HandFits(
+            targets=targets,
+            states=states,
+            parameters=parameters,
+            position_error=position,
+            angle_error=angle,
+            met=met,
+            cost=np.nan_to_num(squares).sum(axis=(0, 2)),
+            distance=distance,
+            outside=outside,
+        )
+
+    def _seen(self, asked: Problems, rotation: Array, origin: Array) -> Problems:
+        """Targets moved with their palm poses to where the palm is with the arm at zero."""
+        palm = self._palm
+        turn = np.einsum("ij,kmj->kim", palm[:3, :3], rotation)
+        points = np.einsum("kij,kfj->kfi", turn, asked.points - origin[:, None]) + palm[:3, 3]
+        normals = np.einsum("kij,kfj->kfi", turn, asked.normals)
+        return replace(asked, points=points, normals=normals)
+
+    def _wrist(self, problems: Problems, rotation: Array, origin: Array) -> tuple[Array, Array]:
+        """(m,) distance of the wrist from the shoulder, and from what the arm can span [m]."""
+        if self._arm is None:
+            return np.full(len(origin), np.nan), np.zeros(len(origin))
+        wrist = origin + rotation @ self._arm.wrist_in_palm
+        distance = np.linalg.norm(wrist - self._arm.shoulder, axis=1)
+        near, far = self._span(problems, self._arm)
+        return distance, np.maximum(np.maximum(distance - far, near - distance), 0.0)
+
+    def _span(self, problems: Problems, arm: SrsArm) -> tuple[float, float]:
+        """Smallest and largest distance of the wrist from the shoulder [m]."""
+        limits = self._trials.limits(problems)
+        elbow = self._trials.robot.description.arm_actuators[3]
+        near, far = reach(arm, limits.lower[elbow], limits.upper[elbow])
+        return float(near), float(far)

@@ -1,0 +1,126 @@
+"""What would make a grasp solvable: limits lifted, fingers or normals left free."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.problem.diagnosis import Freed, Relief, Remedies
+from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.solving.diagnosis.reliefs import Lift, lifts, relieve
+from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
+
+
+@dataclass(frozen=True, eq=False)
+class RemedyFinder:
+    """Solves a grasp again with less asked, and proves what helps by a solution.
+
+    Attributes:
+        trials: The loop.
+        problems: One target.
+        q0: (n,) start.
+        q: (n,) the nearest configuration that was found.
+        pressed: (n,) actuators whose limit alone may be what blocks.
+        hand_only: Whether the arm cannot help, because the hand does not fit.
+    """
+
+    trials: Trials
+    problems: Problems
+    q0: Array
+    q: Array
+    pressed: NDArray[np.bool_]
+    hand_only: bool
+
+    def find(self) -> Remedies:
+        """Everything that helps."""
+        return Remedies(tuple(self._reliefs()), tuple(self._freed()))
+
+    def lifting_helps(self) -> bool:
+        """Whether lifting limits helps at all: there are reliefs."""
+        tried = self._lifts()
+        if not tried:
+            return False
+        asked, bounds = repeated(self.problems, len(tried)), self._lifted(tried)
+        if self._solves(asked, self._descended(asked, bounds), bounds).any():
+            return True
+        # Lifted all together they help if any of them does.
+        last = Bounds(bounds.lower[-1:], bounds.upper[-1:])
+        found = self.trials.search(self.problems, self.q0, last)
+        return bool(self._solves(self.problems, found, last)[0])
+
+    def _reliefs(self) -> Iterator[Relief]:
+        tried = self._lifts()
+        asked = repeated(self.problems, len(tried))
+        solutions = self._solutions(asked, self._lifted(tried))
+        solved = [(tried[i], q) for i, q in solutions.items()]
+        return relieve(self.trials, self.problems, self._limits, solved, self.q)
+
+    def _freed(self) -> Iterator[Freed]:
+        freeings = self._freeings()
+        if freeings:
+            asked = replace(
+                self.problems,
+                points=np.concatenate([problems.points for _, _, problems in freeings]),
+                normals=np.concatenate([problems.normals for _, _, problems in freeings]),
+            )
+            for i, q in self._solutions(asked, self._limits.tiled(len(asked))).items():
+                part, finger, _ = freeings[i]
+                yield Freed(part, finger, q)
+
+    @property
+    def _limits(self) -> Bounds:
+        return self.trials.limits(self.problems)
+
+    def _lifts(self) -> list[Lift]:
+        if not self.problems.enforce_limits:
+            return []
+        movable = self._limits.lower < self._limits.upper
+        return lifts(self.trials.robot, movable, movable & self.pressed, self.hand_only)
+
+    def _lifted(self, tried: list[Lift]) -> Bounds:
+        bounds = self._limits.tiled(len(tried))
+        for i, lift in enumerate(tried):
+            lift.widen(self.trials.robot, bounds, i)
+        return bounds
+
+    def _freeings(self) -> list[tuple[str, str, Problems]]:
+        """The target with a finger, a normal or all normals left free."""
+        problems, found = self.problems, []
+        known = ~np.isnan(problems.points[0, :, 0])
+        faced = ~np.isnan(problems.normals[0, :, 0])
+        for i, name in enumerate(self.trials.robot.fingers):
+            points, normals = problems.points.copy(), problems.normals.copy()
+            normals[0, i] = np.nan
+            if faced[i]:
+                found.append(("normal", name, replace(problems, normals=normals)))
+            if known[i] and known.sum() > 1:
+                points[0, i] = np.nan
+                found.append(("finger", name, replace(problems, points=points, normals=normals)))
+        if faced.sum() > 1:
+            none = np.full_like(problems.normals, np.nan)
+            found.append(("normal", "all", replace(problems, normals=none)))
+        return found
+
+    def _solutions(self, asked: Problems, bounds: Bounds) -> dict[int, Array]:
+        """Solutions by row: from the nearest configuration, else by a search."""
+        q = self._descended(asked, bounds)
+        ok = self._solves(asked, q, bounds)
+        rest = np.flatnonzero(~ok)
+        if len(rest):
+            left = Bounds(bounds.lower[rest], bounds.upper[rest])
+            some = asked.rows(rest)
+            q[rest] = self.trials.search(some, self.q0, left)
+            ok[rest] = self._solves(some, q[rest], left)
+        return {int(i): q[i] for i in np.flatnonzero(ok)}
+
+    def _descended(self, asked: Problems, bounds: Bounds) -> Array:
+        rows = np.arange(len(asked))
+        starts = np.tile(self.q, (len(rows), 1))
+        return Descent(self.trials, asked).run(rows, starts, bounds)
+
+    def _solves(self, asked: Problems, q: Array, bounds: Bounds) -> NDArray[np.bool_]:
+        inside = (bounds.beyond(q) == 0).all(axis=1)
+        return np.logical_and(inside, self.trials.solved(asked, q, limits=False))

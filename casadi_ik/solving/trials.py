@@ -1,0 +1,209 @@
+"""Runs of the hand-first loop with other bounds, weights and starts: what a diagnosis asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.kernels.layout import Layout
+from casadi_ik.methods.common.contact_fit import LENGTH, fresh_fit
+from casadi_ik.methods.hand_first.method import UNBOUNDED, HandFirstMethod
+from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.status import Phase
+from casadi_ik.problem.verdict import judge
+
+NEVER = 1e-12
+"""A tolerance that nothing meets: the loop then goes on to the minimum."""
+
+ALIKE = 1.001
+"""Two values of a row that differ by less than this factor count as the same."""
+
+Rows = NDArray[np.intp]
+"""Numbers of targets, one per row of something."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Bounds of the actuators, (n,) or (k, n)."""
+
+    lower: Array
+    upper: Array
+
+    def clip(self, q: Array) -> Array:
+        """Configurations moved into the bounds."""
+        return np.clip(q, self.lower, self.upper)
+
+    def tiled(self, count: int) -> Bounds:
+        """The same bounds for k configurations."""
+        return Bounds(np.tile(self.lower, (count, 1)), np.tile(self.upper, (count, 1)))
+
+    def beyond(self, q: Array) -> Array:
+        """Signed distance from the bounds: > 0 above, < 0 below, 0 within."""
+        return np.maximum(q - self.upper, 0.0) - np.maximum(self.lower - q, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """The loop of the hand-first method, asked in other ways.
+
+    Attributes:
+        robot: The robot.
+        method: The method on that robot.
+    """
+
+    robot: ArmHand
+    method: HandFirstMethod
+
+    @cached_property
+    def state(self) -> Layout:
+        """Layout of the loop's state."""
+        return self.method.step.layouts.state
+
+    @cached_property
+    def parameters(self) -> Layout:
+        """Layout of the loop's parameters."""
+        return self.method.step.layouts.parameters
+
+    def limits(self, problems: Problems) -> Bounds:
+        """The bounds (n,) that a solution has to keep."""
+        return Bounds(*problems.bounds(self.robot.description, UNBOUNDED))
+
+    def search(self, problems: Problems, start: Array, bounds: Bounds) -> Array:
+        """The first round of hand-first for each of k targets.
+
+        Args:
+            problems: The targets.
+            start: (n,).
+            bounds: (k, n).
+
+        Returns:
+            (k, n) configurations.
+        """
+        starts = bounds.clip(start)
+        postures = self.method.postures(problems, 0)
+        states, parameters = self.method.rows(problems, starts, postures)
+        self.set_bounds(parameters, bounds)
+        return self.run(states, parameters)
+
+    def posture_rows(
+        self, problems: Problems, start: Array, postures: Array
+    ) -> tuple[Array, Array]:
+        """Rows of the loop that know a single hand posture each.
+
+        Args:
+            problems: k targets.
+            start: (k, n).
+            postures: (k, hand).
+        """
+        states, parameters = self.method.rows(problems, start, postures[:, None])
+        states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
+        return states, parameters
+
+    def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:
+        """(k,) whether configurations meet their targets, and if asked the robot's limits."""
+        return judge(self.robot, problems, q).solved(limits)
+
+    def set_bounds(self, parameters: Array, bounds: Bounds) -> None:
+        """Put bounds into rows of parameters."""
+        parameters[:, self.parameters.slice("lower")] = bounds.lower
+        parameters[:, self.parameters.slice("upper")] = bounds.upper
+
+    def set_tolerance(self, parameters: Array, tolerance: float) -> None:
+        """Put one tolerance [m, rad] of all contacts into rows of parameters."""
+        parameters[:, self.parameters.slice("position_tolerance")] = tolerance
+        parameters[:, self.parameters.slice("angle_tolerance")] = tolerance
+
+    def run(self, states: Array, parameters: Array) -> Array:
+        """(k, n) configurations that rows lead to."""
+        return self.method.run_rows(states, parameters).states[:, self.state.slice("q")]
+
+
+class Descent:
+    """Refinement of the whole arm-hand from given configurations.
+
+    Attributes:
+        trials: The loop.
+        problems: k targets.
+    """
+
+    def __init__(self, trials: Trials, problems: Problems) -> None:
+        """Lay out a row per target, for any number of runs."""
+        self.trials = trials
+        self.problems = problems
+        self._states, self._parameters = refinement_rows(trials, problems)
+
+    def run(
+        self, targets: Rows, q: Array, bounds: Bounds | None = None, weights: Array | None = None
+    ) -> Array:
+        """Refine.
+
+        Args:
+            targets: (m,) number of the target of each row.
+            q: (m, n) starts.
+            bounds: (n,) or (m, n); None keeps to the limits.
+            weights: (m, f, 2) of points and normals; None counts all alike. With weights the loop
+                does not stop at the tolerance.
+
+        Returns:
+            (m, n) configurations.
+        """
+        trials = self.trials
+        states, parameters = self._states[targets], self._parameters[targets]
+        bounds = bounds or trials.limits(self.problems)
+        start = bounds.clip(q)
+        states[:, trials.state.slice("q")] = start
+        states[:, trials.state.slice("best_q")] = start
+        trials.set_bounds(parameters, bounds)
+        if weights is not None:
+            parameters[:, trials.parameters.slice("weights")] *= weights.reshape(len(q), -1)
+            trials.set_tolerance(parameters, NEVER)
+        return trials.run(states, parameters)
+
+    def misses(self, targets: Rows, q: Array) -> Array:
+        """(m, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
+        points, normals = self.problems.points[targets], self.problems.normals[targets]
+        position, angle = self.trials.robot.errors(q, points, normals)
+        return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
+
+
+def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:
+    """States and parameters of the loop that begin with the refinement of the whole arm-hand."""
+    count, hand = len(problems), len(trials.method.step.layouts.hand)
+    home = np.tile(trials.robot.home, (count, 1))
+    states, parameters = trials.posture_rows(problems, home, np.zeros((count, hand)))
+    for name, value in ({"phase": Phase.REFINEMENT} | fresh_fit()).items():
+        states[:, trials.state.slice(name)] = value
+    return states, parameters
+
+
+def repeated(problems: Problems, count: int) -> Problems:
+    """One target, several times."""
+    return problems.rows(np.zeros(count, dtype=np.intp))
+
+
+def allowed(problems: Problems) -> Array:
+    """(k, f, 2) the residuals that the tolerances allow, as `Descent.misses`; 0 where free."""
+    known = [~np.isnan(problems.points[..., 0]), ~np.isnan(problems.normals[..., 0])]
+    tolerated = [problems.position_tolerance / LENGTH, 2 * np.sin(problems.angle_tolerance / 2)]
+    return np.stack(known, axis=2) * np.stack(tolerated, axis=1)
+
+
+def smallest(targets: Rows, values: Array, most: int) -> Rows:
+    """Rows with the smallest values of each target that differ, target by target, best first.
+
+    Args:
+        targets: (m,) number of the target of each row.
+        values: (m,) >= 0.
+        most: How many rows of a target at most.
+    """
+    order = np.lexsort((values, targets))
+    owner, value = targets[order], values[order]
+    fresh = np.ones(len(order), dtype=bool)
+    fresh[1:] = (owner[1:] != owner[:-1]) | (value[1:] > value[:-1] * ALIKE)
+    order, owner = order[fresh], owner[fresh]
+    rank = np.arange(len(order)) - np.searchsorted(owner, owner)
+    return order[rank < most]

@@ -1,1 +1,0 @@
-"""One iteration of each method, as a graph."""

@@ -1,0 +1,333 @@
+"""What every method promises on every shipped robot."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from pinocchio_oracle import PinocchioRobot, verdict
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError, UnknownNameError, UnsupportedError
+from casadi_ik.kernels.lanes import LANES
+from casadi_ik.methods.registry import build_method, method_summary
+
+PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
+ROBOTS = ik.shipped_names("arm_hands")
+SLOW = {("original-dls", "baxter_ar10"), ("original-sdls", "baxter_ar10")}
+"""A hierarchy of ten contact tasks on 17 motors: minutes to compile, and never at the contacts."""
+
+CASES = [(m, r) for m in ik.METHODS for r in ROBOTS if (m, r) not in SLOW]
+
+
+@dataclasses.dataclass
+class Case:
+    """A method on a robot and a few of its targets."""
+
+    robot: ik.ArmHand
+    method: str
+    points: np.ndarray
+    normals: np.ndarray
+    solvers: dict
+
+    def solver(self, **options) -> ik.Solver:
+        """A solver, built once per set of options."""
+        key = repr(sorted(options.items()))
+        if key not in self.solvers:
+            if self.method in PAPER:
+                options = {"finger_step": "closed-form"} | options
+            self.solvers[key] = ik.Solver(self.robot, self.method, **options)
+        return self.solvers[key]
+
+    def grasp(self, row: int = 0) -> ik.Grasp:
+        return ik.Grasp(
+            {
+                finger: ik.Contact(self.points[row, i], self.normals[row, i])
+                for i, finger in enumerate(self.robot.fingers)
+            }
+        )
+
+
+@pytest.fixture(scope="module", params=CASES, ids="-".join)
+def case(request) -> Case:
+    method, name = request.param
+    robot = ik.load_robot(name)
+    rng = np.random.default_rng(7)
+    n = len(robot.actuators)
+    # Near enough to home for every method to have a fair chance, and different enough to be work.
+    spread = 0.05 * (robot.upper - robot.lower)
+    q = robot.home + rng.uniform(-1, 1, (8, n)) * spread
+    points, normals = robot.contacts(np.clip(q, robot.lower, robot.upper))
+    case = Case(robot, method, points, normals, {})
+    try:
+        case.solver()
+    except UnsupportedError as error:
+        if name not in str(error):
+            raise
+        pytest.skip(str(error))
+    return case
+
+
+def fields_equal(a: ik.BatchSolution, b: ik.BatchSolution, rows=slice(None)) -> None:
+    """Everything but the time is the same."""
+    for item in dataclasses.fields(ik.BatchSolution):
+        left, right = getattr(a, item.name), getattr(b, item.name)
+        if item.name == "phases":
+            assert set(left) == set(right)
+            for name in left:
+                np.testing.assert_array_equal(left[name][rows], right[name])
+        elif item.name != "time":
+            np.testing.assert_array_equal(left[rows], right, err_msg=item.name)
+
+
+def test_fields_of_a_solution(case):
+    robot = case.robot
+    solution = case.solver().solve(case.grasp())
+    assert isinstance(solution, ik.Solution)
+    assert isinstance(solution.success, bool)
+    assert isinstance(solution.status, ik.Status)
+    assert solution.status is not ik.Status.RUNNING
+    assert solution.success == (solution.status is ik.Status.SOLVED)
+    assert solution.q.shape == (len(robot.actuators),)
+    assert solution.iterations == sum(solution.phases.values()) >= 1
+    assert solution.restarts >= 0
+    assert solution.time > 0
+    assert tuple(solution.contacts) == robot.fingers
+    assert solution.actuators == robot.actuators
+    assert (solution.method, solution.robot) == (case.method, robot.name)
+    for contact in solution.contacts.values():
+        within = contact.position_error <= 5e-3 and contact.angle_error <= math.radians(3)
+        assert contact.ok == within
+
+
+def test_fields_of_a_batch(case):
+    k, f, n = len(case.points), len(case.robot.fingers), len(case.robot.actuators)
+    batch = case.solver().solve_batch(case.points, case.normals)
+    assert len(batch) == k
+    shapes = {
+        "q": (k, n), "position_error": (k, f), "angle_error": (k, f), "ok": (k, f),
+    }  # fmt: skip
+    for item in dataclasses.fields(ik.BatchSolution):
+        if item.name not in ("phases", "diagnoses", "tolerances"):
+            assert getattr(batch, item.name).shape == shapes.get(item.name, (k,)), item.name
+    assert batch.status_names.shape == (k,)
+    assert set(batch.status_names) <= {status.name for status in ik.Status}
+    np.testing.assert_array_equal(sum(batch.phases.values()), batch.iterations)
+    np.testing.assert_array_equal(batch.success, batch.status_names == "SOLVED")
+
+
+def test_success_is_what_pinocchio_says(case):
+    """The verdict recomputed from q alone through the written URDF, both readings of limits."""
+    oracle, robot = PinocchioRobot(case.robot), case.robot
+    for limits in ("enforce", "ignore"):
+        batch = case.solver(limits=limits).solve_batch(case.points, case.normals)
+        for row, q in enumerate(batch.q):
+            position, angle = verdict(oracle, q, case.points[row], case.normals[row])
+            np.testing.assert_allclose(batch.position_error[row], position, atol=1e-11)
+            np.testing.assert_allclose(batch.angle_error[row], angle, atol=1e-11)
+            theta = oracle.configuration(q)
+            inside = np.all(theta >= oracle.model.lowerPositionLimit - 1e-9)
+            inside &= np.all(theta <= oracle.model.upperPositionLimit + 1e-9)
+            inside &= np.all(q >= robot.lower - 1e-9) and np.all(q <= robot.upper + 1e-9)
+            assert batch.limits_ok[row] == inside
+            ok = np.all(position <= 5e-3) and np.all(angle <= math.radians(3))
+            assert batch.success[row] == (ok and (inside or limits == "ignore"))
+
+
+def test_targets_near_home_are_solved(case):
+    batch = case.solver().solve_batch(case.points, case.normals)
+    least = 0 if case.method.startswith("original") else 6
+    assert batch.success.sum() >= least, batch.status_names
+
+
+def test_the_same_seed_gives_the_same_answer(case):
+    solver = case.solver()
+    first = solver.solve_batch(case.points, case.normals, seed=3)
+    fields_equal(first, solver.solve_batch(case.points, case.normals, seed=3))
+
+
+def test_a_batch_is_its_single_solves(case):
+    solver = case.solver()
+    # A Contact makes its normal unit once more, which may move the last bit.
+    points, normals = case.grasp().arrays(case.robot.fingers)
+    batch = solver.solve_batch(points[None], normals[None], seed=2)
+    single = solver.solve(case.grasp(), seed=2)
+    np.testing.assert_array_equal(batch.q[0], single.q)
+    assert batch.status[0] == single.status
+    assert batch.iterations[0] == single.iterations
+    if case.method in PAPER:  # no random numbers: any row is its own solve
+        whole = solver.solve_batch(case.points, case.normals)
+        for row in range(3):
+            alone = solver.solve_batch(case.points[row : row + 1], case.normals[row : row + 1])
+            np.testing.assert_array_equal(whole.q[row], alone.q[0])
+
+
+def test_a_batch_goes_side_by_side(case):
+    """No line of any shipped method's code is refused by the rewriting."""
+    options = {"finger_step": "closed-form"} if case.method.startswith("enhanced") else {}
+    kernel = getattr(build_method(case.method, case.robot.description, options), "kernel", None)
+    if kernel is None or not kernel.compiled:
+        pytest.skip("no compiled loop")
+    assert kernel.lanes == LANES
+
+
+def test_threads_change_nothing(case):
+    solver = case.solver()
+    one = solver.solve_batch(case.points, case.normals, jobs=1, seed=1)
+    fields_equal(one, solver.solve_batch(case.points, case.normals, jobs=2, seed=1))
+    fields_equal(one, solver.solve_batch(case.points, case.normals, jobs=50, seed=1))
+
+
+def test_starts_row_by_row(case):
+    solver, robot = case.solver(), case.robot
+    k = len(case.points)
+    q0 = np.tile(robot.home, (k, 1))
+    home = solver.solve_batch(case.points, case.normals)
+    fields_equal(home, solver.solve_batch(case.points, case.normals, q0=q0))
+    fields_equal(home, solver.solve_batch(case.points, case.normals, q0=robot.home))
+    before = q0.copy()
+    q0[1] = 0.5 * (robot.lower + robot.upper)
+    moved = solver.solve_batch(case.points, case.normals, q0=q0)
+    np.testing.assert_array_equal(moved.q[0], home.q[0])
+    np.testing.assert_array_equal(before[0], q0[0], "starts are not written to")
+
+
+def test_an_empty_batch(case):
+    f = len(case.robot.fingers)
+    batch = case.solver().solve_batch(np.empty((0, f, 3)), np.empty((0, f, 3)), jobs=2)
+    assert len(batch) == 0
+    assert batch.q.shape == (0, len(case.robot.actuators))
+
+
+def test_unreachable_contacts_are_a_status(case):
+    solution = case.solver().solve_batch(case.points[:1] + 10.0, case.normals[:1])
+    assert not solution.success[0]
+    assert solution.status_names[0] in {"STALLED", "ITERATION_LIMIT", "UNREACHABLE"}
+    assert np.all(np.isfinite(solution.q))
+
+
+def test_a_log_changes_no_number(case, tmp_path):
+    solver = case.solver()
+    path = tmp_path / "solve.mcap"
+    plain = solver.solve_batch(case.points, case.normals, seed=4)
+    logged = solver.solve_batch(case.points, case.normals, seed=4, log=path)
+    fields_equal(plain, logged)
+    log = ik.logs.open(path)
+    solves = log.solves().rows
+    np.testing.assert_array_equal(solves["solve_id"], np.arange(len(case.points)))
+    np.testing.assert_array_equal(solves["q"], plain.q)
+    np.testing.assert_array_equal(solves["iterations"], plain.iterations)
+    np.testing.assert_array_equal(solves["success"], plain.success)
+    np.testing.assert_array_equal(solves["target_points"], case.points)
+    assert [row["status"] for row in log.solves().records()] == plain.status_names.tolist()
+    found = log.iterations()
+    np.testing.assert_array_equal(np.bincount(found.solve_id), plain.iterations)
+    assert log.attachment("robot.urdf").decode() == case.robot.urdf()
+    parameters = log.metadata["parameters"]
+    assert parameters["method"] == case.method
+    assert parameters["limits"] == "enforce"
+
+
+def test_bad_input_leaves_no_log(case, tmp_path):
+    path = tmp_path / "solve.mcap"
+    with pytest.raises(InputError):
+        case.solver().solve_batch(case.points, case.normals, q0=[1.0], log=path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"q0": np.zeros(3)}, r"q0: found shape \(3,\), expected"),
+        ({"q0": "home"}, "q0: found 'home', expected numbers"),
+        ({"jobs": 0}, "jobs: found 0, expected an integer >= 1"),
+        ({"jobs": 1.5}, "jobs: found 1.5, expected an integer"),
+        ({"jobs": "all"}, "jobs: found 'all'"),
+        ({"seed": -1}, "seed: found -1, expected an integer >= 0"),
+        ({"seed": None}, "seed: found None"),
+        ({"points": np.zeros((8, 1, 3))}, r"points: found shape \(8, 1, 3\)"),
+        ({"normals": None}, "normals: "),
+    ],
+)
+def test_bad_arguments(case, change, says):
+    arguments = {"points": case.points, "normals": case.normals} | change
+    with pytest.raises(InputError, match=says) as caught:
+        case.solver().solve_batch(**arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_starts_as_many_as_targets(case):
+    q0 = np.tile(case.robot.home, (3, 1))
+    with pytest.raises(
+        InputError, match="q0: found 3 rows for 8 targets, expected as many, or one"
+    ):
+        case.solver().solve_batch(case.points, case.normals, q0=q0)
+    q0[1, 2] = np.nan
+    with pytest.raises(InputError, match="q0: holds NaN or infinity"):
+        case.solver().solve_batch(case.points[:3], case.normals[:3], q0=q0)
+
+
+def test_a_grasp_of_another_hand(case):
+    with pytest.raises(InputError, match=r"contacts\.pinky: no such finger; the robot's fingers: "):
+        case.solver().solve(ik.Grasp({"pinky": ik.Contact([0, 0, 1])}))
+    with pytest.raises(InputError, match="grasp: found str, expected a Grasp"):
+        case.solver().solve("cup")
+
+
+def test_parameters_say_everything(case):
+    found = case.solver().parameters
+    assert found["method"] == case.method
+    assert found["tolerance"] == {
+        name: {"position": 5e-3, "angle": math.radians(3)} for name in case.robot.fingers
+    }
+    assert found["limits"] == "enforce"
+    assert isinstance(found["options"], dict)
+    assert case.method in repr(case.solver())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "says"),
+    [
+        ({"method": "newton"}, UnknownNameError, "method 'newton' does not exist; methods: "),
+        ({"limits": "maybe"}, InputError, "limits: found 'maybe', expected one of enforce, ignore"),
+        ({"tolerance": 5e-3}, InputError, "tolerance: found 0.005, expected a Tolerance"),
+        (
+            {"method": "enhanced-dls", "options": {"speed": 3}},
+            UnknownNameError,
+            "option 'speed' does not exist for method 'enhanced-dls'; options: reaching_damping",
+        ),
+        (
+            {"method": "enhanced-dls", "finger_step": "fmincon"},
+            InputError,
+            "finger_step: found 'fmincon', expected one of ipopt, closed-form",
+        ),
+        (
+            {"method": "enhanced-dls", "options": {"chain_damping": "big"}},
+            InputError,
+            "chain_damping: found 'big', expected a number > 0",
+        ),
+        (
+            {"method": "enhanced-dls", "options": {"borrowed": 7}},
+            UnsupportedError,
+            "cannot borrow 7 arm joints",
+        ),
+    ],
+)
+def test_bad_solvers(robot, arguments, error, says):
+    with pytest.raises(error) as caught:
+        ik.Solver(robot, **arguments)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_name_is_no_robot():
+    with pytest.raises(InputError, match="robot: found 'kuka_lwr_barrett', expected what load_rob"):
+        ik.Solver("kuka_lwr_barrett")
+
+
+def test_every_method_has_a_summary():
+    for method in ik.METHODS:
+        assert "\n" not in method_summary(method)
+        assert len(method_summary(method)) > 20

@@ -1,0 +1,208 @@
+"""The thumb-first method: it solves from one start, within limits, and its trace says how."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from robot_variants import derived_robot, thumb_of
+from targets import shipped_hands
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError
+from casadi_ik.methods.thumb_first.method import ThumbFirstMethod
+from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
+from casadi_ik.problem.problems import Problems, Tolerance, fixed_array, target_arrays
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.solving.engine import Engine
+
+PAPER = Tolerance()
+EXACT = Tolerance(1e-6, 1e-6)
+
+
+@pytest.fixture(scope="module")
+def method(robot) -> ThumbFirstMethod:
+    return ThumbFirstMethod(robot.description, ThumbFirstParameters())
+
+
+@pytest.fixture(scope="module")
+def once(robot) -> ThumbFirstMethod:
+    return ThumbFirstMethod(robot.description, ThumbFirstParameters(starts=1))
+
+
+def problems(robot, q, tolerance=PAPER, enforce=True, fixed=None) -> Problems:
+    points, normals = target_arrays(*robot.contacts(q), len(robot.fingers))
+    return Problems(points, normals, tolerance, enforce, fixed=fixed)
+
+
+def solve(robot, method, asked) -> ik.BatchSolution:
+    return Engine(robot, method).solve(asked, None, 0)
+
+
+def bent(robot, rng, count):
+    """The shipped grasps' hands with the distal joints at 25 to 45 deg, on random arms."""
+    q = shipped_hands(robot, rng, count)
+    distal = [i for i, name in enumerate(robot.actuators) if name.endswith("_distal")]
+    q[:, distal] = np.radians(rng.uniform(25, 45, (count, len(distal))))
+    return q
+
+
+@pytest.mark.parametrize("hands", [shipped_hands, bent])
+def test_one_start_is_nearly_always_enough(robot, once, rng, hands):
+    batch = solve(robot, once, problems(robot, hands(robot, rng, 1200)))
+    assert batch.success.mean() >= 0.995
+    assert batch.limits_ok.all()
+    assert not batch.restarts.any()
+
+
+@pytest.mark.parametrize("tolerance", [PAPER, EXACT], ids=["paper", "exact"])
+@pytest.mark.parametrize("hands", [shipped_hands, bent])
+def test_other_starts_do_the_rest(robot, method, rng, hands, tolerance):
+    batch = solve(robot, method, problems(robot, hands(robot, rng, 300), tolerance))
+    assert batch.success.all()
+
+
+@pytest.mark.parametrize(("tolerance", "least"), [(PAPER, 0.995), (EXACT, 0.98)])
+def test_hands_that_are_no_grasps(robot, method, rng, tolerance, least):
+    batch = solve(robot, method, problems(robot, robot.random(rng, 300), tolerance))
+    assert batch.success.mean() >= least
+
+
+def test_limits_ignored(robot, method, rng):
+    batch = solve(robot, method, problems(robot, robot.random(rng, 100), enforce=False))
+    assert batch.success.all()
+
+
+def test_trace_of_a_solve(robot, method, rng):
+    """A start, then steps along the chain; only steps that lower the cost are taken."""
+    asked = problems(robot, robot.random(rng, 60), EXACT)
+    outcome = method.run(asked, np.tile(robot.home, (60, 1)), 0, True)
+    rejected = 0
+    for row, trace in enumerate(outcome.trace):
+        assert len(trace) == outcome.iterations[row]
+        assert trace["phase"][0] == Phase.CANDIDATE
+        assert trace["status"][-1] == outcome.status[row] == Status.SOLVED
+        np.testing.assert_array_equal(trace["q"][-1], outcome.q[row])
+        assert trace["position_error"][-1].max() <= 1e-6
+        assert np.isnan(trace["manipulability"][0])
+        points, _ = robot.contacts(trace["q"])
+        distances = np.linalg.norm(points - asked.points[row], axis=2)
+        np.testing.assert_allclose(trace["position_error"], distances, rtol=1e-5, atol=1e-9)
+        assert ((trace["q"] >= robot.lower) & (trace["q"] <= robot.upper)).all()
+        for before, after in pairwise(trace):
+            if after["phase"] != Phase.HAND_ALIGNMENT:
+                # The first start is a round of its own, which says so if it ends in vain.
+                vain = before["status"] == Status.STALLED
+                assert after["start"] == before["start"] + (0 if vain else 1)
+                continue
+            assert after["start"] == before["start"]
+            assert after["manipulability"] >= 0
+            if after["accepted"]:
+                assert after["cost"] < before["cost"]
+            else:
+                rejected += 1
+                np.testing.assert_array_equal(after["q"], before["q"])
+    assert rejected > 0
+
+
+def test_out_of_reach_the_best_is_kept(robot, method, rng):
+    asked = problems(robot, robot.random(rng, 10))
+    far = Problems(asked.points + np.array([3.0, 0, 0]), asked.normals, PAPER, True)
+    batch = solve(robot, method, far)
+    assert not batch.success.any()
+    assert (batch.status == Status.STALLED).all()
+    assert (batch.restarts == method.options.starts - 1).all()
+    assert batch.limits_ok.all()
+
+
+@pytest.mark.parametrize("free", ["finger", "normal", "thumb", "all normals"])
+def test_partial_grasps(robot, method, rng, free):
+    """What is free has no rows, the thumb's contact too: the chain is then open."""
+    points, normals = robot.contacts(robot.random(rng, 100))
+    rows, finger = np.arange(100), rng.integers(0, 3, 100)
+    if free == "finger":
+        points[rows, finger] = normals[rows, finger] = np.nan
+    elif free == "normal":
+        normals[rows, finger] = np.nan
+    elif free == "thumb":
+        thumb = robot.fingers.index(robot.thumb)
+        points[:, thumb] = normals[:, thumb] = np.nan
+    else:
+        normals[:] = np.nan
+    asked = Problems(*target_arrays(points, normals, 3), PAPER, True)
+    batch = solve(robot, method, asked)
+    assert batch.success.mean() >= 0.93
+    assert batch.limits_ok.all()
+
+
+def test_locked_actuators_stay(robot, method, rng):
+    for name in ("lwr_joint_3", "bh_spread", "bh_thumb_distal"):
+        q = robot.random(rng, 25)
+        i = robot.actuators.index(name)
+        q[:, i] = value = rng.uniform(robot.lower[i], robot.upper[i])
+        fixed = fixed_array({name: value}, robot.actuators, robot.lower, robot.upper)
+        batch = solve(robot, method, problems(robot, q, fixed=fixed))
+        assert batch.success.mean() >= 0.9, name
+        np.testing.assert_array_equal(batch.q[:, i], value)
+
+
+def test_the_start_chooses_between_hands(robot, once, rng):
+    """Of several hands for the same contacts, the one near q0 is begun with."""
+    q = robot.random(rng, 200)
+    asked = problems(robot, q)
+    batches = [Engine(robot, once).solve(asked, q0, 0) for q0 in (robot.home, q)]
+    hand = list(once.step.hand)
+    from_home, from_truth = (np.abs(batch.q - q)[:, hand].max(axis=1) for batch in batches)
+    assert np.median(from_truth) < np.median(from_home)
+
+
+def test_an_arm_without_a_closed_form(tmp_path_factory):
+    robot = derived_robot(tmp_path_factory.mktemp("offset"), elbow_offset=0.045)
+    other = ThumbFirstMethod(robot.description, ThumbFirstParameters())
+    assert other.step.arm is None
+    batch = solve(robot, other, problems(robot, robot.random(np.random.default_rng(5), 200)))
+    assert batch.success.mean() >= 0.95
+    assert batch.phases["arm-placement"].all()
+
+
+def test_without_an_arm_the_palm_is_fixed(coupled_robot, rng):
+    method = ThumbFirstMethod(coupled_robot.description, ThumbFirstParameters())
+    q = coupled_robot.random(rng, 100)
+    batch = solve(coupled_robot, method, problems(coupled_robot, q))
+    assert batch.success.mean() >= 0.95
+    assert not batch.phases["arm-placement"].any()
+
+
+def test_proxqp_solves_as_well(robot, once, rng):
+    """The quadratic program takes the same way: nothing is lost by fixing joints one by one."""
+    asked = problems(robot, shipped_hands(robot, rng, 60))
+    program = ThumbFirstMethod(robot.description, ThumbFirstParameters(starts=1, step="proxqp"))
+    one, other = solve(robot, once, asked), solve(robot, program, asked)
+    assert not program.kernel.compiled
+    np.testing.assert_array_equal(one.success, other.success)
+    assert other.limits_ok.all()
+    assert np.mean(one.iterations == other.iterations) > 0.8
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"step": "newton"}, "step: found 'newton', expected one of freeze, proxqp"),
+        ({"starts": 0}, "starts: found 0, expected a whole number >= 1"),
+        ({"table": 8}, "table: found 8, expected at least starts = 32"),
+        ({"step_cap": 0.0}, "step_cap: found 0.0, expected a number > 0"),
+    ],
+)
+def test_parameters_are_checked(robot, options, says):
+    with pytest.raises(InputError, match=says):
+        ik.Solver(robot, "thumb-first", options=options)
+
+
+@pytest.mark.parametrize("joints", [1, 3, 4])
+def test_thumbs_of_any_number_of_joints(tmp_path, rng, joints):
+    robot = thumb_of(tmp_path, joints)
+    method = ThumbFirstMethod(robot.description, ThumbFirstParameters(starts=8), compiled=False)
+    batch = solve(robot, method, problems(robot, robot.random(rng, 20)))
+    assert batch.success.mean() >= 0.9
+    assert batch.limits_ok.all()

@@ -1,0 +1,222 @@
+"""The whole arm-hand as one program: its derivatives, its solutions, its iterates."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from toy_robots import replace, write_coupled_robot
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError
+from casadi_ik.methods.hand_first.whole_fit import whole_residual
+from casadi_ik.methods.ipopt.parameters import IpoptParameters
+from casadi_ik.methods.ipopt.watch import EXACT
+from casadi_ik.methods.ipopt.whole_nlp import LENGTH, WholeNlp, contact_errors, limited_joints
+from casadi_ik.problem.status import Status
+
+
+class Program:
+    """The program on a robot, and targets that a configuration reaches."""
+
+    def __init__(self, robot, **options):
+        self.robot = robot
+        self.nlp = WholeNlp(robot.description, IpoptParameters(**options))
+
+    def targets(self, q, weights=1.0):
+        points, normals = self.robot.contacts(q)
+        weights = np.broadcast_to(weights, (len(points), 2))
+        return self.nlp.parameters.pack({"points": points, "normals": normals, "weights": weights})
+
+    def solve(self, start, parameters):
+        return self.nlp.solve(start, parameters, self.robot.lower, self.robot.upper)
+
+
+@pytest.fixture(scope="module")
+def program(robot):
+    return Program(robot)
+
+
+@pytest.fixture(scope="module")
+def coupled(coupled_robot):
+    return Program(coupled_robot)
+
+
+def middle(robot, rng, part=0.6):
+    """A configuration well within the limits."""
+    centre, half = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
+    return centre + part * half * rng.uniform(-1, 1, len(centre))
+
+
+def test_residual_is_that_of_the_other_methods(robot, program, rng):
+    """The reference has its own residual; it had better be the same question."""
+    q, p = (
+        robot.random(rng, 1)[0],
+        program.targets(robot.random(rng, 1)[0], [[1, 1], [1, 0], [0, 0]]),
+    )
+    symbols = ca.SX.sym("q", len(q))
+    other = whole_residual(robot.description, symbols, program.nlp.parameters.unpack(ca.SX(p)))
+    other = ca.Function("other", [symbols], [other])
+    np.testing.assert_allclose(program.nlp.residual(q, p), other(q), atol=1e-14)
+
+
+def test_errors_of_a_residual_are_distances_and_angles(robot, program, rng):
+    q, goal = robot.random(rng, 2)
+    residual = np.array(program.nlp.residual(q, program.targets(goal))).ravel()
+    distances, angles = contact_errors(residual[None])
+    points, normals = robot.contacts(q)
+    target_points, target_normals = robot.contacts(goal)
+    expected = np.linalg.norm(points - target_points, axis=1)
+    assert expected.min() > LENGTH / 100
+    np.testing.assert_allclose(distances[0], expected, rtol=1e-12)
+    cosine = np.sum(normals * target_normals, axis=1)
+    np.testing.assert_allclose(angles[0], np.arccos(cosine), rtol=1e-9)
+
+
+@pytest.mark.parametrize("which", ["program", "coupled"])
+def test_derivatives_are_central_differences(which, request, rng):
+    """Gradient, Jacobian and the exact Hessian of the Lagrangian, couplings included."""
+    program = request.getfixturevalue(which)
+    robot, nlp = program.robot, program.nlp
+    targets = program.targets(middle(robot, rng))
+    p = np.concatenate([targets, middle(robot, rng), [0.1]])  # targets, start, pull
+    size = nlp.program["x"].numel()
+    metres = np.array([actuator.unit == "m" for actuator in robot.description.actuators])
+    scale = np.where(metres, robot.upper - robot.lower, 1.0)
+    x = np.concatenate([middle(robot, rng) / scale, rng.normal(size=size - len(scale))])
+    rows = nlp.program["g"].numel()
+    multipliers = rng.normal(size=rows)
+    lagrangian = nlp.program["f"] + ca.dot(ca.DM(multipliers), nlp.program["g"])
+    inputs = [nlp.program["x"], nlp.program["p"]]
+    hessian, gradient = ca.hessian(lagrangian, nlp.program["x"])
+    constraints = ca.Function("g", inputs, [nlp.program["g"]])
+    values = ca.Function("l", inputs, [lagrangian, ca.densify(gradient), ca.densify(hessian)])
+    jacobian = ca.Function("j", inputs, [ca.densify(ca.jacobian(nlp.program["g"], inputs[0]))])
+    value, slope, curvature = (np.array(out) for out in values(x, p))
+    assert np.abs(value).max() > 0.1
+    h = 1e-6
+    for i in range(size):
+        ahead, behind = (x + sign * h * np.eye(size)[i] for sign in (1, -1))
+        upper, lower = values(ahead, p), values(behind, p)
+        found = [
+            (np.array(a) - np.array(b)).ravel() / (2 * h) for a, b in zip(upper, lower, strict=True)
+        ]
+        np.testing.assert_allclose(slope[i], found[0], atol=1e-6)
+        np.testing.assert_allclose(curvature[:, i], found[1], atol=1e-6)
+        column = (constraints(ahead, p) - constraints(behind, p)) / (2 * h)
+        np.testing.assert_allclose(
+            np.array(jacobian(x, p))[:, i], np.array(column).ravel(), atol=1e-6
+        )
+
+
+def test_ipopt_is_given_the_exact_hessian(robot, program):
+    """Ipopt's own counters: the graph of the Hessian is called, in every iteration."""
+    start = robot.home
+    goal = np.clip(start + 0.1, robot.lower, robot.upper)
+    run = program.solve(start, program.targets(goal))
+    stats = program.nlp._solvers[0.1].stats()
+    assert stats["n_call_nlp_hess_l"] == len(run.path) - 1 > 2
+
+
+def test_rows_of_a_run(robot, program):
+    goal = np.clip(robot.home + 0.15, robot.lower, robot.upper)
+    parameters = program.targets(goal)
+    run = program.solve(robot.home, parameters)
+    assert run.cost < EXACT**2
+    np.testing.assert_allclose(run.path[0], robot.home, atol=1e-7)
+    np.testing.assert_allclose(run.path[-1], run.q, atol=1e-12)
+    for q, residual in zip(run.path, run.residuals, strict=True):
+        np.testing.assert_allclose(
+            program.nlp.residual(q, parameters), residual[:, None], atol=1e-12
+        )
+    assert np.all((run.path >= robot.lower) & (run.path <= robot.upper))
+    rows = len(run.path)
+    for column in (run.barrier, run.infeasibility, run.regularization):
+        assert column.shape == (rows,)
+        assert np.all(np.isfinite(column))
+    assert np.all(np.diff(run.barrier) <= 0)
+
+
+def test_a_start_at_the_solution_is_left_where_it_is(robot, program, rng):
+    for q in robot.random(rng, 5):
+        run = program.solve(q, program.targets(q))
+        assert len(run.path) == 1
+        np.testing.assert_array_equal(run.q, q)
+        assert np.all(np.isnan(run.barrier))
+
+
+def test_a_start_close_to_the_solution_stays_close(robot, program, rng):
+    """A small barrier and a slight pull: no detour along the arm's self-motion."""
+    rows, moved = [], []
+    for _ in range(10):
+        q = middle(robot, rng)
+        start = q + 1e-3 * rng.normal(size=len(q))
+        run = program.solve(start, program.targets(q))
+        assert run.cost < EXACT**2
+        rows.append(len(run.path))
+        moved.append(np.abs(run.q - start).max())
+    assert np.mean(rows) < 10
+    assert max(moved) < 0.02
+
+
+def test_joint_limits_that_motors_imply_are_no_constraints(robot, coupled_robot):
+    """Spread joints follow their motor within its range; a four-bar may go anywhere."""
+    assert limited_joints(robot.description) == []
+    names = [
+        coupled_robot.description.joint_names[i] for i in limited_joints(coupled_robot.description)
+    ]
+    assert "left_3" in names
+    assert "left_spread" not in names
+
+
+def test_joint_limits_are_kept(tmp_path, rng):
+    """A four-bar that stops before its motor does: only a constraint can keep it there."""
+    path = write_coupled_robot(tmp_path)
+    replace(
+        tmp_path / "parts" / "hand.yaml",
+        "limits: [-0.1, 1], source",
+        "limits: [-0.1, 0.25], source",
+    )
+    robot = ik.load_robot(path)
+    program = Program(robot)
+    q = robot.random(rng, 20)
+    beyond = np.asarray(robot.joints(q)["left_3"]) > 0.25
+    assert 3 <= beyond.sum() <= 18
+    start = (robot.lower + robot.upper) / 2
+    slider = robot.actuators.index("screw_2")
+    start[slider] = robot.lower[slider] + 0.002
+    assert robot.joints(start)["left_3"] < 0.25
+    for goal, out in zip(q, beyond, strict=True):
+        run = program.solve(start, program.targets(goal))
+        assert run.inside
+        assert robot.joints(run.q)["left_3"] <= 0.25 + 1e-9
+        assert (run.cost > 1e-6) == out
+
+
+def test_budget(robot, program, rng):
+    short = Program(robot, max_iterations=3)
+    run = short.solve(robot.home, short.targets(middle(robot, rng)))
+    assert run.status is Status.ITERATION_LIMIT
+    assert len(run.path) == 4
+
+
+def test_numbers_that_are_not_finite_are_a_status(robot, program):
+    run = program.solve(robot.home, program.targets(robot.home) * 1e200)
+    assert run.status is not Status.SOLVED
+    assert np.all(np.isfinite(run.q))
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"restarts": -1}, "restarts: found -1, expected a whole number >= 0"),
+        ({"restarts": True}, "restarts: found True"),
+        ({"max_iterations": 0}, "max_iterations: found 0, expected a whole number >= 1"),
+        ({"optimality": 0}, "optimality: found 0, expected a number > 0"),
+        ({"optimality": "small"}, "optimality: found 'small'"),
+        ({"optimality": float("nan")}, "optimality: found nan"),
+    ],
+)
+def test_bad_parameters(options, says):
+    with pytest.raises(InputError, match=says):
+        IpoptParameters(**options)

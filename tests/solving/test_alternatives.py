@@ -1,0 +1,188 @@
+"""Several solutions of one grasp: that they are solutions, all of them, and ranked as asked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robot_variants import derived_robot
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.solving.alternatives.branches import ArmBranches
+from casadi_ik.solving.alternatives.finder import DISTINCT
+from casadi_ik.symbolic.srs_arm import srs_arm
+
+ARM = slice(0, 7)
+
+
+@pytest.fixture(scope="module")
+def robot() -> ik.ArmHand:
+    return ik.load_robot("kuka_lwr_barrett")
+
+
+@pytest.fixture(scope="module")
+def solver(robot) -> ik.Solver:
+    return ik.Solver(robot)
+
+
+@pytest.fixture(scope="module")
+def branches(robot) -> ArmBranches:
+    return ArmBranches(srs_arm(robot.description))
+
+
+def grasp(robot, q) -> ik.Grasp:
+    points, normals = robot.contacts(q)
+    return ik.Grasp(
+        {name: ik.Contact(points[i], normals[i]) for i, name in enumerate(robot.fingers)}
+    )
+
+
+def margin(robot, arms):
+    return np.minimum(arms - robot.lower[ARM], robot.upper[ARM] - arms).min(axis=-1)
+
+
+def contains(interval, swivels):
+    start, end = interval
+    return np.mod(swivels - start, 2 * np.pi) <= end - start
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_intervals_are_all_allowed_swivels_and_no_others(robot, branches, seed):
+    """Against a scan of the whole circle, a branch at a time."""
+    q = robot.random(np.random.default_rng(seed), 1)[0]
+    palm = robot.palm(q)
+    found = branches.find(palm, robot.lower[ARM], robot.upper[ARM])
+    psi = np.linspace(0, 2 * np.pi, 721)[:-1] + 1e-4
+    kinds = [(s, e, w) for s in (1, -1) for e in (1, -1) for w in (1, -1)]
+    allowed_anywhere = 0
+    for kind in kinds:
+        of_kind = [b for b in found if (b.shoulder, b.elbow, b.wrist) == kind]
+        whole = ik.ArmBranch(*kind, (0.0, 2 * np.pi))
+        arms = branches.arms(palm, whole, psi)
+        reached = np.isfinite(arms).all(axis=1)
+        inside = np.any([contains(b.swivel, psi) for b in of_kind] or [psi < 0], axis=0)
+        np.testing.assert_array_equal(inside, reached & (margin(robot, arms) >= 0))
+        allowed_anywhere += int(inside.sum())
+    assert allowed_anywhere > 0
+    # The configuration itself is one of them.
+    near = [branches.arms(palm, b, np.linspace(*b.swivel, 2000)) for b in found]
+    assert min(np.abs(arms - q[ARM]).max(axis=1).min() for arms in near) < 0.02
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_interval_ends_where_a_joint_meets_its_limit(robot, branches, seed):
+    q = robot.random(np.random.default_rng(seed), 1)[0]
+    palm = robot.palm(q)
+    for branch in branches.find(palm, robot.lower[ARM], robot.upper[ARM]):
+        if branch.swivel[1] - branch.swivel[0] > 2 * np.pi - 1e-9:
+            continue
+        ends = branches.arms(palm, branch, np.array(branch.swivel))
+        np.testing.assert_allclose(margin(robot, ends), 0, atol=1e-7)
+
+
+def test_they_are_solutions_and_they_differ(robot, solver):
+    points_asked = robot.random(np.random.default_rng(11), 5)
+    for q in points_asked:
+        found = solver.solve_all(grasp(robot, q), limit=100)
+        assert len(found) > 3
+        configurations = np.stack([one.q for one in found])
+        points, normals = robot.contacts(q)
+        batch = robot.contacts(configurations)
+        assert np.abs(batch[0] - points).max() < 1e-5
+        assert np.abs(batch[1] - normals).max() < 1e-4
+        assert (configurations >= robot.lower - 1e-9).all()
+        assert (configurations <= robot.upper + 1e-9).all()
+        for one in found:
+            assert all(contact.ok for contact in one.contacts.values())
+            assert contains(one.branch.swivel, one.swivel)
+        keys = {(one.posture, one.branch) for one in found}
+        assert len(keys) == len(found)
+        span = (robot.upper - robot.lower)[7:]
+        hands = {one.posture: one.q[7:] for one in found}
+        for a in hands:
+            for b in hands:
+                assert a == b or np.abs((hands[a] - hands[b]) / span).max() > DISTINCT
+
+
+@pytest.mark.parametrize(
+    ("prefer", "measure"),
+    [
+        ("limits", lambda one: one.margin),
+        ("manipulability", lambda one: one.manipulability),
+        ("q0", lambda one: -one.distance),
+    ],
+)
+def test_the_preferred_comes_first(robot, solver, prefer, measure):
+    q = robot.random(np.random.default_rng(21), 1)[0]
+    every = solver.solve_all(grasp(robot, q), limit=100, prefer=prefer, q0=q)
+    values = [measure(one) for one in every]
+    assert values == sorted(values, reverse=True)
+    others = [p for p in ("limits", "manipulability", "q0") if p != prefer]
+    for other in others:
+        for one in solver.solve_all(grasp(robot, q), limit=100, prefer=other, q0=q):
+            assert measure(one) <= values[0] + 1e-3 * abs(values[0])
+    few = solver.solve_all(grasp(robot, q), limit=2, prefer=prefer, q0=q)
+    assert [one.branch for one in few] == [one.branch for one in every[:2]]
+
+
+def test_the_robot_is_close_to_itself(robot, solver):
+    q = robot.random(np.random.default_rng(31), 1)[0]
+    nearest = solver.solve_all(grasp(robot, q), prefer="q0", q0=q)[0]
+    assert nearest.distance < 0.01
+    np.testing.assert_allclose(nearest.q, q, atol=0.05)
+
+
+def test_manipulability_is_yoshikawas(robot, solver):
+    q = robot.random(np.random.default_rng(41), 1)[0]
+    one = solver.solve_all(grasp(robot, q), prefer="q0", q0=q)[0]
+    step, columns = 1e-6, []
+    palm = robot.palm(one.q)
+    for i in range(7):
+        ends = [robot.palm(one.q + sign * step * np.eye(14)[i]) for sign in (1, -1)]
+        rate = (ends[0] - ends[1]) / (2 * step)
+        spin = rate[:3, :3] @ palm[:3, :3].T
+        columns.append([*rate[:3, 3], spin[2, 1], spin[0, 2], spin[1, 0]])
+    J = np.array(columns).T
+    assert one.manipulability == pytest.approx(np.sqrt(np.linalg.det(J @ J.T)), rel=1e-4)
+
+
+def test_a_held_elbow_leaves_single_swivels(robot, solver):
+    q = robot.random(np.random.default_rng(51), 1)[0]
+    fixed = {"lwr_joint_3": float(q[2])}
+    found = solver.solve_all(grasp(robot, q), fixed=fixed)
+    assert found
+    for one in found:
+        assert one.q[2] == pytest.approx(q[2], abs=1e-9)
+        assert one.branch.swivel[1] - one.branch.swivel[0] < 1e-6
+
+
+def test_an_arm_without_a_closed_form(tmp_path_factory):
+    robot = derived_robot(tmp_path_factory.mktemp("offset"), elbow_offset=0.045)
+    q = robot.random(np.random.default_rng(5), 1)[0]
+    found = ik.Solver(robot).solve_all(grasp(robot, q), seed=1)
+    assert len(found) > 1
+    assert all(one.branch is None and one.swivel is None for one in found)
+    reached = robot.contacts(np.stack([one.q for one in found]))
+    np.testing.assert_allclose(
+        reached[0], np.tile(robot.contacts(q)[0], (len(found), 1, 1)), atol=5e-3
+    )
+
+
+def test_none_where_there_is_none(robot, solver):
+    points, normals = robot.contacts(robot.home)
+    far = ik.Grasp(
+        {n: ik.Contact(points[i] + [5.0, 0, 0], normals[i]) for i, n in enumerate(robot.fingers)}
+    )
+    assert solver.solve_all(far) == ()
+
+
+def test_what_is_refused(robot, solver):
+    asked = grasp(robot, robot.home)
+    with pytest.raises(InputError, match="limit: found 0, expected an integer >= 1"):
+        solver.solve_all(asked, limit=0)
+    with pytest.raises(InputError, match="prefer: found 'speed', expected one of limits, manip"):
+        solver.solve_all(asked, prefer="speed")
+    with pytest.raises(InputError, match=r"q0: found shape \(2, 14\), expected \(14,\)"):
+        solver.solve_all(asked, q0=np.zeros((2, 14)))
+    with pytest.raises(UnsupportedError, match="method 'ipopt' gives one solution; several need"):
+        ik.Solver(robot, "ipopt").solve_all(asked)

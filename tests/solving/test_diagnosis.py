@@ -1,0 +1,327 @@
+"""The diagnosis of what cannot be solved: right reasons, right numbers, never a false alarm."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+import casadi_ik as ik
+from casadi_ik.problem.solution import BatchSolution
+
+Array = NDArray[np.float64]
+STARTS = 2
+
+
+@pytest.fixture(scope="module")
+def solver(robot: ik.ArmHand) -> ik.Solver:
+    """Hand-first with the usual tolerance."""
+    return ik.Solver(robot)
+
+
+@pytest.fixture(scope="module")
+def cup(robot: ik.ArmHand) -> tuple[Array, Array]:
+    """Contacts that can be reached."""
+    return ik.load_grasp("cup").arrays(robot.fingers)
+
+
+def diagnosed(solver: ik.Solver, points: Array, normals: Array) -> ik.Diagnosis:
+    """The diagnosis of a target that is to be called unreachable."""
+    batch = solver.solve_batch(points[None], normals[None], diagnose=True)
+    assert batch.status_names.tolist() == ["UNREACHABLE"]
+    (diagnosis,) = batch.diagnoses
+    assert diagnosis is not None
+    assert diagnosis.established
+    return diagnosis
+
+
+def at_limits(robot: ik.ArmHand, rng: np.random.Generator, count: int, part: float) -> Array:
+    """Configurations with a part of the actuators at their limits."""
+    q = robot.random(rng, count)
+    chance = rng.random(q.shape)
+    q = np.where(chance < part / 2, robot.lower, q)
+    return np.where(chance > 1 - part / 2, robot.upper, q)
+
+
+def stretched(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """The same with the arm at 99.9 % of its length."""
+    q, a, b = at_limits(robot, rng, count, 0.3), 0.4, 0.39
+    cosine = ((0.999 * (a + b)) ** 2 - a * a - b * b) / (2 * a * b)
+    q[:, 3] = np.arccos(cosine) * rng.choice([-1, 1], count)
+    return q
+
+
+def moved_within(
+    targets: tuple[Array, Array], rng: np.random.Generator, part: float
+) -> tuple[Array, Array]:
+    """Contacts moved by a part of the tolerance: only the tolerance makes them reachable."""
+    points, normals = targets
+    shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
+    points = points + part * 5e-3 * shift / np.linalg.norm(shift, axis=2, keepdims=True)
+    turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
+    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    angle = part * np.deg2rad(3)
+    return points, normals * np.cos(angle) + turn * np.sin(angle)
+
+
+def test_solved_has_none(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
+    assert solver.solve(ik.load_grasp("cup")).diagnosis is None
+    assert solver.solve_batch(cup[0][None], cup[1][None]).diagnoses == ()
+    assert solver.solve_batch(cup[0][None], cup[1][None], diagnose=True).diagnoses == (None,)
+
+
+def test_contacts_too_far_apart(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
+    points, normals = cup
+    spread = points + 0.25 * np.array([[0, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    diagnosis = diagnosed(solver, spread, normals)
+    assert diagnosis.reason is ik.Reason.HAND
+    assert diagnosis.hand is not None
+    assert not diagnosis.hand.fits
+    assert max(c.position_error for c in diagnosis.hand.contacts.values()) > 0.05
+    assert "do not fit the hand" in diagnosis.lines[0]
+    assert "mm" in diagnosis.lines[1]
+
+
+@pytest.mark.parametrize(("shift", "distance"), [((3.0, 0, 0), 3.0), ((0, 0, 40.0), 40.0)])
+def test_too_far(
+    solver: ik.Solver, cup: tuple[Array, Array], shift: Array, distance: float
+) -> None:
+    diagnosis = diagnosed(solver, cup[0] + np.array(shift), cup[1])
+    assert diagnosis.reason is ik.Reason.REACH
+    assert diagnosis.reach is not None
+    assert diagnosis.reach.farthest == pytest.approx(0.79)
+    assert diagnosis.reach.excess == pytest.approx(distance - 0.79, abs=0.8)
+    assert diagnosis.reliefs == diagnosis.freed == ()
+    assert "too far for the arm by" in diagnosis.lines[1]
+
+
+def test_object_in_the_shoulder(
+    solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array, Array]
+) -> None:
+    """The elbow would have to bend farther than it can; lifting its limit proves it."""
+    points = cup[0] - cup[0].mean(axis=0) + [0, 0, 0.31]
+    diagnosis = diagnosed(solver, points, cup[1])
+    assert diagnosis.reason is ik.Reason.REACH
+    assert diagnosis.reach is not None
+    assert diagnosis.reach.nearest == pytest.approx(0.395, abs=1e-3)
+    assert diagnosis.reach.excess < -0.1
+    assert [relief.lifted for relief in diagnosis.reliefs if relief.lifted in robot.actuators] == [
+        "lwr_joint_4"
+    ]
+
+
+def test_normal_that_faces_away(
+    solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array, Array]
+) -> None:
+    points, normals = cup
+    normals = normals * np.array([[-1], [1], [1]])
+    diagnosis = diagnosed(solver, points, normals)
+    assert diagnosis.reason is ik.Reason.HAND
+    assert {(item.part, item.finger) for item in diagnosis.freed} >= {
+        ("normal", "thumb"),
+        ("finger", "thumb"),
+    }
+    for item in diagnosis.freed:
+        p, n = robot.contacts(item.q)
+        rest = [i for i, name in enumerate(robot.fingers) if name != item.finger]
+        assert np.linalg.norm((p - points)[rest], axis=1).max() <= 5e-3 * (1 + 1e-9)
+        if item.finger != "all":
+            assert np.linalg.norm((n - normals)[rest], axis=1).max() <= np.deg2rad(3)
+
+
+def test_one_limit_blocks(solver: ik.Solver, robot: ik.ArmHand) -> None:
+    """An actuator 5 deg beyond its limit and all others mid-range; brute force finds no other way.
+
+    Every relief is proved by its solution, and asks for no more than those 5 degrees.
+    """
+    rng = np.random.default_rng(3)
+    middle, half = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
+    names, blocked = ["lwr_joint_4", "bh_thumb_proximal", "bh_finger_2_distal"], 0
+    for name in names:
+        j = robot.actuators.index(name)
+        for _ in range(4):
+            q = middle + 0.5 * half * rng.uniform(-1, 1, len(half))
+            q[j] = robot.upper[j] + np.deg2rad(5)
+            points, normals = robot.contacts(q)
+            strict = ik.Solver(robot, tolerance=ik.Tolerance(5e-4, np.deg2rad(0.3)))
+            batch = strict.solve_batch(points[None], normals[None], diagnose=True)
+            if batch.success[0]:
+                continue
+            diagnosis = batch.diagnoses[0]
+            assert diagnosis is not None
+            best = best_of_restarts(robot, points, normals, q)
+            assert np.linalg.norm(residual(best, robot, points, normals)) > 1e-2
+            assert diagnosis.established
+            (relief,) = (item for item in diagnosis.reliefs if item.lifted == name)
+            assert list(relief.beyond) == [name]
+            assert 0 < relief.beyond[name] <= np.deg2rad(5.3)
+            assert np.linalg.norm(robot.contacts(relief.q)[0] - points, axis=1).max() <= 5.01e-4
+            assert f"{name} " in "\n".join(diagnosis.lines)
+            blocked += 1
+            break
+    assert blocked == len(names)
+
+
+def test_barely_reachable_is_never_unreachable(solver: ik.Solver, robot: ik.ArmHand) -> None:
+    rng = np.random.default_rng(11)
+    for q in (
+        at_limits(robot, rng, 2000, 0.4),
+        at_limits(robot, rng, 1000, 0.8),
+        stretched(robot, rng, 2000),
+    ):
+        batch = solver.solve_batch(*robot.contacts(q), diagnose=True)
+        assert batch.success.all(), batch.status_names[~batch.success]
+
+
+def test_reachable_thanks_to_tolerance(solver: ik.Solver, robot: ik.ArmHand) -> None:
+    rng = np.random.default_rng(12)
+    for q in (at_limits(robot, rng, 250, 0.3), stretched(robot, rng, 250)):
+        targets = moved_within(robot.contacts(q), rng, 0.99)
+        batch = solver.solve_batch(*targets, diagnose=True)
+        assert "UNREACHABLE" not in batch.status_names
+        assert batch.success.mean() > 0.99
+
+
+def test_agrees_with_brute_force(solver: ik.Solver, robot: ik.ArmHand) -> None:
+    """Whole grasps shifted, contacts shifted, normals turned: about half can be reached."""
+    rng = np.random.default_rng(13)
+    points, normals = robot.contacts(robot.random(rng, 40))
+    points[:16] += rng.normal(0, 0.3, (16, 1, 3))
+    points[16:28] += rng.normal(0, 0.008, (12, 3, 3))
+    normals[28:] += rng.normal(0, 0.25, (12, 3, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    batch = solver.solve_batch(points, normals, diagnose=True)
+    unreachable = np.flatnonzero(batch.status_names == "UNREACHABLE")
+    assert 10 <= len(unreachable) <= 36
+    assert len(unreachable) + batch.success.sum() >= 38
+    ratios = []
+    for row in unreachable:
+        diagnosis = batch.diagnoses[row]
+        assert diagnosis is not None
+        target = points[row], normals[row]
+        best = best_of_restarts(robot, *target, diagnosis.q)
+        assert largest_part(robot, *target, best) > 1
+        found = np.linalg.norm(residual(best, robot, *target))
+        ratios.append(np.linalg.norm(residual(diagnosis.q, robot, *target)) / found)
+    assert np.median(ratios) < 1.01
+    assert np.quantile(ratios, 0.9) < 1.5
+
+
+def test_other_methods_ask_hand_first(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
+    """Not converging says nothing about reach."""
+    options = {"max_iterations": 2}
+    paper = ik.Solver(robot, "enhanced-dls", finger_step="closed-form", options=options)
+    solution = paper.solve(ik.load_grasp("cup"))
+    assert not solution.success
+    assert solution.status is not ik.Status.UNREACHABLE
+    assert solution.diagnosis is not None
+    assert solution.diagnosis.reason is ik.Reason.REACHABLE
+    assert "hand-first solves it" in solution.diagnosis.lines[1]
+    far = paper.solve_batch(cup[0][None] + 3.0, cup[1][None], diagnose=True)
+    assert far.status_names.tolist() == ["UNREACHABLE"]
+
+
+def test_nearest_contacts(solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
+    """They are where the robot can be, and the tolerance said to be enough is."""
+    diagnosis = diagnosed(solver, cup[0] + [0.5, 0, 0], cup[1])
+    points, normals = robot.contacts(diagnosis.q)
+    for i, name in enumerate(robot.fingers):
+        near = diagnosis.nearest[name]
+        np.testing.assert_allclose(near.point, points[i])
+        np.testing.assert_allclose(near.normal, normals[i])
+        assert near.position_error == pytest.approx(
+            np.linalg.norm(points[i] - cup[0][i] - [0.5, 0, 0])
+        )
+    assert np.all((diagnosis.q >= robot.lower) & (diagnosis.q <= robot.upper))
+    enough = replace(diagnosis.enough, position=diagnosis.enough.position * 1.001)
+    enough = replace(enough, angle=enough.angle * 1.001)
+    again = ik.Solver(robot, tolerance=enough).solve_batch(
+        cup[0][None] + [0.5, 0, 0], cup[1][None], diagnose=True
+    )
+    assert again.success.all()
+
+
+def test_same_twice(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
+    def once() -> BatchSolution:
+        return solver.solve_batch(cup[0][None] + [0.5, 0.2, 0], cup[1][None], diagnose=True)
+
+    one, other = once().diagnoses[0], once().diagnoses[0]
+    assert one is not None
+    assert other is not None
+    assert one.lines == other.lines
+    np.testing.assert_array_equal(one.q, other.q)
+
+
+def impossible(robot: ik.ArmHand, count: int) -> tuple[Array, Array]:
+    """Targets of several kinds, most of them out of reach."""
+    rng = np.random.default_rng(21)
+    points, normals = robot.contacts(robot.random(rng, 4 * count))
+    points[:count] += [1.0, 0, 0]
+    points[count : 2 * count] += rng.normal(0, 0.02, (count, 3, 3))
+    points[2 * count : 3 * count] *= 1.15
+    normals[3 * count :, 0] *= -1
+    return points, normals
+
+
+def test_in_a_batch_as_alone(solver: ik.Solver, robot: ik.ArmHand) -> None:
+    points, normals = impossible(robot, 4)
+    whole = solver.solve_batch(points, normals, diagnose=True)
+    threads = solver.solve_batch(points, normals, diagnose=True, jobs=2)
+    assert (~whole.success).sum() >= 10
+    for row, one in enumerate(whole.diagnoses):
+        target = points[row : row + 1], normals[row : row + 1]
+        alone = solver.solve_batch(*target, diagnose=True).diagnoses[0]
+        for other in (alone, threads.diagnoses[row]):
+            assert (one is None) == (other is None)
+            if one is None or other is None:
+                continue
+            assert one.lines == other.lines
+            np.testing.assert_array_equal(one.q, other.q)
+
+
+def test_pickled_with_what_would_help(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
+    normals = cup[1] * np.array([[-1], [1], [1]])
+    diagnosis = diagnosed(solver, cup[0], normals)
+    copy = pickle.loads(pickle.dumps(diagnosis))
+    assert copy.freed
+    assert [item.finger for item in copy.freed] == [item.finger for item in diagnosis.freed]
+    assert copy.lines == diagnosis.lines
+    assert copy.nearest == diagnosis.nearest
+
+
+def residual(q: Array, robot: ik.ArmHand, points: Array, normals: Array) -> Array:
+    """Errors of the points by 0.1 m, and of the normals."""
+    p, n = robot.contacts(q)
+    return np.concatenate([((p - points) / 0.1).ravel(), (n - normals).ravel()])
+
+
+def parts(q: Array, robot: ik.ArmHand, points: Array, normals: Array) -> Array:
+    """Every error as a part of its tolerance."""
+    p, n = robot.contacts(q)
+    angles = 2 * np.arcsin(np.linalg.norm(n - normals, axis=1) / 2)
+    return np.concatenate([np.linalg.norm(p - points, axis=1) / 5e-3, angles / np.deg2rad(3)])
+
+
+def largest_part(robot: ik.ArmHand, points: Array, normals: Array, q: Array) -> float:
+    """The largest error as a part of its tolerance, made small from q by a high power."""
+    limits = robot.lower, robot.upper
+    size = parts(q, robot, points, normals).max()
+    fair = least_squares(
+        lambda x: (parts(x, robot, points, normals) / size) ** 4, q, bounds=limits, max_nfev=40
+    )
+    return float(parts(fair.x, robot, points, normals).max())
+
+
+def best_of_restarts(robot: ik.ArmHand, points: Array, normals: Array, q: Array) -> Array:
+    """The best that scipy finds from random starts and from a given configuration."""
+    limits = robot.lower, robot.upper
+    starts = [*robot.random(np.random.default_rng(0), STARTS), np.clip(q, *limits)]
+    results = [
+        least_squares(residual, start, bounds=limits, max_nfev=40, args=(robot, points, normals))
+        for start in starts
+    ]
+    return min(results, key=lambda result: result.cost).x

@@ -1,0 +1,134 @@
+"""A moving grasp: followed without jumps where that can be, within the motors' velocities."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.solving.alternatives.tracking import LEAP
+
+
+@pytest.fixture(scope="module")
+def robot() -> ik.ArmHand:
+    return ik.load_robot("kuka_lwr_barrett")
+
+
+@pytest.fixture(scope="module")
+def solver(robot) -> ik.Solver:
+    return ik.Solver(robot)
+
+
+def grasps(robot, path) -> list[ik.Grasp]:
+    """The contacts of configurations (k, n), which need not be within limits."""
+    points, normals = robot.contacts(path)
+    return [
+        ik.Grasp({name: ik.Contact(p[i], n[i]) for i, name in enumerate(robot.fingers)})
+        for p, n in zip(points, normals, strict=True)
+    ]
+
+
+def largest_step(robot, track) -> float:
+    """As a part of the motor's range."""
+    return float((np.abs(np.diff(track.q, axis=0)) / (robot.upper - robot.lower)).max())
+
+
+def smooth_path(robot, seed, count=60):
+    """Between two random configurations not too far apart, within limits."""
+    rng = np.random.default_rng(seed)
+    start = robot.random(rng, 1)[0]
+    middle = (robot.lower + robot.upper) / 2
+    end = start + 0.25 * (robot.random(rng, 1)[0] - start) + 0.1 * (middle - start)
+    return start + np.linspace(0, 1, count)[:, None] * (end - start)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_grasp_that_moves_smoothly_is_followed_smoothly(robot, solver, seed):
+    track = solver.track(grasps(robot, smooth_path(robot, seed)))
+    assert track.success.all()
+    assert track.jumps == ()
+    assert largest_step(robot, track) <= LEAP
+    assert len(track) == 60
+    assert np.nanmax(track.position_error) <= 5e-3
+
+
+def test_it_begins_where_the_robot_is(robot, solver):
+    path = smooth_path(robot, 3)
+    track = solver.track(grasps(robot, path), q0=path[0])
+    assert track.success.all()
+    np.testing.assert_allclose(track.q[0], path[0], atol=0.05)
+
+
+def test_a_jump_that_cannot_be_avoided_is_reported(robot, solver):
+    """Joint 7 turns twice, which no arm can follow; every grasp on the way can be reached."""
+    turns = np.linspace(-2 * np.pi, 2 * np.pi, 160)
+    path = np.tile(robot.home, (len(turns), 1))
+    path[:, 6] = turns
+    track = solver.track(grasps(robot, path))
+    assert track.success.all()
+    assert track.jumps
+    for jump in track.jumps:
+        i = robot.actuators.index(jump.actuator)
+        step = track.q[jump.index] - track.q[jump.index - 1]
+        assert step[i] == pytest.approx(jump.size)
+        assert abs(jump.size) > LEAP * (robot.upper - robot.lower)[i]
+        assert set(jump.at_limit) <= set(robot.actuators)
+    assert any(jump.at_limit for jump in track.jumps)
+    # Everywhere else it moves less.
+    steps = (np.abs(np.diff(track.q, axis=0)) / (robot.upper - robot.lower)).max(axis=1)
+    jumped = [jump.index - 1 for jump in track.jumps]
+    assert np.delete(steps, jumped).max() < steps[jumped].min()
+
+
+def test_motors_keep_their_velocities_and_catch_up(robot, solver):
+    """A grasp too fast for the motors is met late, and met again once it stands still."""
+    path = smooth_path(robot, 1, count=10)
+    path = np.concatenate([path, np.tile(path[-1], (200, 1))])
+    velocity, period = 0.2, 0.05
+    track = solver.track(grasps(robot, path), q0=path[0], period=period, velocity=velocity)
+    assert np.abs(np.diff(track.q, axis=0)).max() <= velocity * period * (1 + 1e-9)
+    assert track.success[0]
+    assert not track.success[5]
+    assert track.success[-1]
+    assert track.jumps == ()
+
+
+def test_the_robots_own_velocities(robot, solver):
+    period = 1e-3
+    own = np.array([actuator.velocity for actuator in robot.description.actuators])
+    path = smooth_path(robot, 2, count=20)
+    track = solver.track(grasps(robot, path), q0=path[0], period=period)
+    assert (np.abs(np.diff(track.q, axis=0)) <= own * period * (1 + 1e-9)).all()
+
+
+def test_a_grasp_out_of_reach_is_come_near_to(robot, solver):
+    """On the way out of the workspace and back: the contacts are missed there and met again."""
+    points, normals = robot.contacts(robot.home)
+    away = 0.8 * np.sin(np.linspace(0, np.pi, 40))
+    moving = [
+        ik.Grasp(
+            {n: ik.Contact(points[i] - [s, 0, 0], normals[i]) for i, n in enumerate(robot.fingers)}
+        )
+        for s in away
+    ]
+    reachable = [solver.solve(one, diagnose=False).success for one in moving]
+    assert not all(reachable)
+    track = solver.track(moving)
+    assert track.success[0]
+    assert track.success[-1]
+    np.testing.assert_array_equal(track.success, reachable)
+
+
+def test_what_is_refused(robot, solver):
+    moving = grasps(robot, np.tile(robot.home, (2, 1)))
+    with pytest.raises(InputError, match="grasps: found none, expected at least one"):
+        solver.track([])
+    with pytest.raises(InputError, match="velocity: given without a period, expected both"):
+        solver.track(moving, velocity=1.0)
+    with pytest.raises(InputError, match="period and velocity: found -1 and None, expected"):
+        solver.track(moving, period=-1)
+    with pytest.raises(InputError, match=r"expected a number and 14 numbers \(or one\)"):
+        solver.track(moving, period=1.0, velocity=[1.0, 2.0])
+    with pytest.raises(UnsupportedError, match="method 'ipopt' gives one solution"):
+        ik.Solver(robot, "ipopt").track(moving)
