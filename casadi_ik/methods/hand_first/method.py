@@ -11,29 +11,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import FunctionKernel, LoopKernel, LoopResult
 from casadi_ik.kernels.rows import opaque
+from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
-from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.methods.hand_first.restarts import LATER, VALLEYS, Restarts
 from casadi_ik.methods.hand_first.state import STAGE_LABELS, HandFirstLayouts
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.problems import Array, Problems
-from casadi_ik.problem.status import Status
+from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RESTART, TraceFormat, trace_format
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
-
-AT_LIMITS = 0.5
-"""Part of the range that the wide table moves to the limits."""
 
 MAX_ITERATIONS = 100_000
 """Far above what the stages' own budgets allow: the loop always ends by a status."""
@@ -65,22 +62,14 @@ class HandFirstMethod:
         return LoopKernel(self.step.graph(), self._compiled)
 
     @cached_property
-    def table(self) -> PostureTable:
-        """The hand postures that targets are compared with."""
-        return self._table(self.options.table)
-
-    @cached_property
-    def wide_table(self) -> PostureTable:
-        """Many more postures, a good part of them at limits, for targets the first round misses."""
-        return self._table(self.options.wide_table, AT_LIMITS)
-
-    def _table(self, size: int, at_limits: float = 0.0) -> PostureTable:
+    def restarts(self) -> Restarts:
+        """The hand postures that rounds begin from."""
         hand = self.step.layouts.hand
-        return PostureTable(ArmHand(self._robot), hand, size, at_limits, compiled=self._compiled)
+        return Restarts(self._robot, hand, self.options, self._compiled)
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
-        _ = self.kernel, self.table, self._beginning
+        _ = self.kernel, self.restarts.table, self._beginning
 
     @property
     def trace_format(self) -> TraceFormat:
@@ -99,9 +88,10 @@ class HandFirstMethod:
         collected = _Collected(self.step.layouts)
         left, waiting, here = problems, np.arange(len(problems)), q0
         done: Array | None = None
-        for number in range(self.options.rounds):
+        for number in range(self.options.rounds + LATER):
             begin = time.perf_counter()
-            states, parameters = self.rows(left, here, self.postures(left, number))
+            best = collected.best(waiting) if number else here
+            states, parameters = self._round(left, here, best, number)
             if done is not None:
                 # It goes on where the last round stopped in the numeric arm's list of starts.
                 states[:, passed] = done
@@ -122,7 +112,7 @@ class HandFirstMethod:
         try:
             first = self._singles.pop()
         except IndexError:
-            first = FirstRound(self.table, self._beginning, self.kernel, self.step.layouts)
+            first = FirstRound(self.restarts.table, self._beginning, self.kernel, self.step.layouts)
         found = first(problems, q0, self._terms(problems), MAX_ITERATIONS)
         self._singles.append(first)
         return found
@@ -150,15 +140,34 @@ class HandFirstMethod:
         return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
 
     def postures(self, problems: Problems, number: int) -> Array:
-        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
+        """Candidates (k, candidates, hand) of a round whose postures look like the targets.
 
         Args:
             problems: k targets.
-            number: The round.
+            number: The round, below `options.rounds`.
         """
-        count = self.options.candidates
-        table, wanted = (self.wide_table, number * count) if number else (self.table, count)
-        return table.nearest(problems.points, problems.normals, wanted)[:, -count:]
+        return self.restarts.from_tables(problems, number)
+
+    def _round(
+        self, problems: Problems, q0: Array, best: Array, number: int
+    ) -> tuple[Array, Array]:
+        """States and parameters of a round; `best` (k, n) is what the ones before came to."""
+        later, hand = number - self.options.rounds, list(self.step.layouts.hand)
+        if later < 0:
+            return self.rows(problems, q0, self.postures(problems, number))
+        if later < VALLEYS:
+            return self.rows(problems, q0, self.restarts.along_valley(problems, best, later))
+        anywhere = self.restarts.anywhere(problems, later - VALLEYS)
+        states, parameters = self.rows(problems, q0, anywhere[None, :, hand])
+        # The first of them begins as a whole: what stands in the way may be arm and hand together.
+        layouts = self.step.layouts
+        lower = parameters[:, layouts.parameters.slice("lower")]
+        upper = parameters[:, layouts.parameters.slice("upper")]
+        states[:, layouts.state.slice("q")] = np.clip(anywhere[0], lower, upper)
+        states[:, layouts.state.slice("phase")] = float(Phase.REFINEMENT)
+        for name, value in fresh_fit().items():
+            states[:, layouts.state.slice(name)] = value
+        return states, parameters
 
     def _terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms."""
@@ -202,6 +211,10 @@ class _Collected:
             self._time[targets] += result.time + share
         self._rounds.append(result.rows if result.rows is not None else np.zeros(0))
         self._targets.append(np.repeat(targets, result.iterations))
+
+    def best(self, targets: NDArray[np.intp]) -> Array:
+        """(k, n) what some targets have come to so far."""
+        return self._q[targets]
 
     def outcome(self, trace: bool) -> Outcome:
         """What became of the batch."""
