@@ -23,7 +23,6 @@ but the kinematics.
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +30,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.kernels.forks import ForkSafeLock
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.ipopt.interrupts import interrupt_afterwards
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
@@ -142,7 +142,7 @@ class WholeNlp:
         self._watch = Watch(n + self._rows, rows.numel(), self.program["p"].numel())
         self._solvers = {mu: self._solver(mu, options) for mu in (COLD, WARM)}
         # Ipopt's callback hands its rows to this object, so one solve at a time.
-        self._lock = threading.Lock()
+        self._lock = ForkSafeLock()
 
     def _solver(self, barrier: float, options: IpoptParameters) -> ca.Function:
         settings: dict[str, Any] = {
