@@ -158,10 +158,6 @@ def _has_owners() -> bool:
     return hasattr(os, "getuid")
 
 
-def _user() -> int:
-    return os.getuid()
-
-
 def _others(found: os.stat_result, sticky: bool) -> str:
     """Who else could change it, in words.
 
@@ -169,7 +165,7 @@ def _others(found: os.stat_result, sticky: bool) -> str:
         found: Of a folder or file.
         sticky: Whether it is enough that others cannot move what it holds.
     """
-    if found.st_uid not in (_user(), ROOT) and not (sticky and _hidden_owner(found.st_uid)):
+    if found.st_uid not in (os.getuid(), ROOT) and not (sticky and _hidden_owner(found.st_uid)):
         return f"belongs to another user (uid {found.st_uid})"
     kept = sticky and found.st_mode & stat.S_ISVTX
     if found.st_mode & stat.S_IWOTH and not kept:
