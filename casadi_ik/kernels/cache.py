@@ -19,6 +19,7 @@ from pathlib import Path
 
 import casadi as ca
 
+from casadi_ik.files.leftovers import tidy
 from casadi_ik.kernels.codegen import library_source
 from casadi_ik.kernels.compiler import (
     Compiler,
@@ -30,7 +31,6 @@ from casadi_ik.kernels.folders import (
     own_file,
     private_directory,
     reason,
-    tidy,
     trusted_cache,
     warn_once,
     workshop,
@@ -176,7 +176,8 @@ def _built(
     announce(stem.rpartition("-")[0], len(source))
     for place in _places(directory):
         try:
-            tidy(place)
+            tidy(place, "build-*", 1)
+            tidy(place, ".*.part", -2)
             library = _compiled(place, stem, source, compiler, symbol)
             break
         except (OSError, UnloadableError) as error:

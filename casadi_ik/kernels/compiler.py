@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shlex
@@ -11,12 +12,15 @@ import struct
 import subprocess
 import sys
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 from casadi_ik.errors import KernelError
+from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.folders import NO_ROOM
+from casadi_ik.kernels.outcome import SLICE
 
 # No contraction: with fused multiply-adds the iterates would differ from the VM's. Errno of sqrt
 # and friends is never read, and without it they are single instructions of the same value. All
@@ -74,18 +78,20 @@ class Compiler:
             KernelError: The compiler refused; the message has the first lines of its complaint.
             UnloadableError: It did not, but what it made is no library or lacks the symbol.
             OSError: The disk is full.
+            KeyboardInterrupt: Ctrl-C reached the compiler.
+            CancelledError: This thread has been told to stop.
         """
         command = [*self.command, *self.flags, "-o", str(library), str(source), "-lm"]
         place = {"TMPDIR": str(library.parent), "LC_ALL": "C"}
         try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, errors="replace", env=os.environ | place
-            )
+            done = _run(command, os.environ | place)
         except OSError as error:
             raise KernelError(f"compiler {self.command[0]} cannot be run: {error}") from error
         if done.returncode == 0 and library.is_file():
             self._check(library, symbol)
             return
+        if done.returncode == -signal.SIGINT:
+            raise KeyboardInterrupt
         if _full(library.parent, done.stderr):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(library.parent))
         lines = done.stderr.splitlines()
@@ -124,6 +130,31 @@ class Compiler:
             f"(CC=... names another compiler, CC=none does without): "
             f"{complaint[:SHOWN_CHARACTERS]}"
         )
+
+
+def _run(
+    command: Sequence[str], environment: Mapping[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end, or until this thread has been told to stop."""
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        env=environment,
+    )
+    with process:
+        try:
+            while True:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    out, complaint = process.communicate(timeout=SLICE)
+                    break
+                stop_if_cancelled()
+        except BaseException:
+            process.kill()
+            raise
+    return subprocess.CompletedProcess(command, process.returncode, out, complaint)
 
 
 def _cut(library: Path) -> bool:

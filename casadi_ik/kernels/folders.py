@@ -18,16 +18,12 @@ import shutil
 import stat
 import sys
 import tempfile
-import time
 import warnings
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 ROOT = 0
-
-HOUR, DAY = 3600.0, 86400.0
-"""Ages [s] from which what a killed process left is removed: once it is gone, or anyway."""
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT) if hasattr(errno, "EDQUOT") else (errno.ENOSPC,)
 
@@ -227,35 +223,3 @@ def workshop(directory: Path) -> Iterator[Path]:
         yield place
     finally:
         shutil.rmtree(place, ignore_errors=True)
-
-
-def tidy(directory: Path) -> None:
-    """Remove what killed compilations left: of processes that are gone, or too old anyway.
-
-    The process could run on another machine that shares the folder, so its number alone does not
-    count: nothing younger than an hour is touched.
-    """
-    for pattern, place in (("build-*", 1), (".*.part", -2)):
-        for path in directory.glob(pattern):
-            words = path.name.replace(".", "-").split("-")
-            with contextlib.suppress(OSError, ValueError, IndexError):
-                age = time.time() - path.lstat().st_mtime
-                if age < HOUR or (age < DAY and _alive(words[place])):
-                    continue
-                if path.is_dir() and not path.is_symlink():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    path.unlink()
-
-
-def _alive(word: str) -> bool:
-    """Whether a process of that number runs; so it is said of what is no number."""
-    if not word.isdigit() or os.name != "posix":
-        return True
-    try:
-        os.kill(int(word), 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        pass
-    return True

@@ -30,6 +30,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.forks import ForkSafeLock
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.ipopt.interrupts import interrupt_afterwards
@@ -177,7 +178,9 @@ class WholeNlp:
 
         Raises:
             KeyboardInterrupt: Ctrl-C while Ipopt was at work.
+            CancelledError: This thread has been told to stop.
         """
+        stop_if_cancelled()
         enforced = bool(np.all(lower >= self._lower))
         joints = (self._joint_lower, self._joint_upper)
         if not enforced:
