@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.kernels.layout import Field
+from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.directions import angle_between
 from casadi_ik.symbolic.kinematics import Kinematics
@@ -23,6 +24,16 @@ def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
         Field("position_tolerance", (f,), unit="m"),
         Field("angle_tolerance", (f,), unit="rad"),
     )
+
+
+def target_values(problems: Problems) -> dict[str, Array]:
+    """Values of `target_fields` for a batch: targets (k, f, 3), tolerances (f,)."""
+    return {
+        "points": problems.points,
+        "normals": problems.normals,
+        "position_tolerance": problems.position_tolerance,
+        "angle_tolerance": problems.angle_tolerance,
+    }
 
 
 @dataclass(frozen=True, eq=False)
