@@ -43,7 +43,7 @@ __all__ = [
     "load_grasp",
     "load_robot",
     "logs",
-    "shipped_grasps",
     "register_method",
+    "shipped_grasps",
     "shipped_names",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from functools import cached_property
 
@@ -19,7 +18,6 @@ from casadi_ik.methods.thumb_first.step import ThumbFirstStep
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.target import target_values
-from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
@@ -65,14 +63,6 @@ class ThumbFirstMethod(LoopedMethod):
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table."""
         _ = self.kernel, self.table
-
-    @property
-    def trace_format(self) -> TraceFormat:
-        """How its traces are to be read."""
-        form = super().trace_format
-        return dataclasses.replace(
-            form, labels={**form.labels, "held_mask": self.robot.actuator_names}
-        )
 
     def begin(
         self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
