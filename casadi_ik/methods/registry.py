@@ -140,7 +140,7 @@ def method_summary(name: str) -> str:
 
 
 def option_names(name: str) -> tuple[str, ...]:
-    """Fields of a method's parameter record that can be chosen.
+    """Names of the parameters that `Solver`'s options can set.
 
     Raises:
         UnknownNameError: No such method.
