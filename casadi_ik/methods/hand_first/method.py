@@ -18,6 +18,7 @@ from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
+from casadi_ik.problem.contacts.kinds import usual
 from casadi_ik.problem.method import Quick
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase
@@ -52,7 +53,9 @@ class HandFirstMethod(LoopedMethod):
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
         self.rounds = options.rounds
-        self.step = HandFirstStep(robot, _closed_form(robot), options.candidates)
+        self.step = HandFirstStep(
+            robot, _closed_form(robot), options.candidates, usual(len(robot.fingers))
+        )
         self._singles: list[FirstRound] = []
 
     def step_graph(self) -> StepGraph:

@@ -15,6 +15,7 @@ from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.methods.thumb_first.state import STAGES
 from casadi_ik.methods.thumb_first.step import ThumbFirstStep
+from casadi_ik.problem.contacts.kinds import usual
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.target import target_values
@@ -46,7 +47,7 @@ class ThumbFirstMethod(LoopedMethod):
         super().__init__(robot, options, compiled)
         self.options: ThumbFirstParameters = options
         self.rounds = 1 if options.starts == 1 else 2
-        self.step = ThumbFirstStep(robot, options, _closed_form(robot))
+        self.step = ThumbFirstStep(robot, options, usual(len(robot.fingers)), _closed_form(robot))
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""
