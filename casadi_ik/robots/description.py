@@ -78,6 +78,9 @@ class Finger:
         placement: (4, 4) pose of the contact frame in that link.
         normal: (3,) outward pad normal, unit, in the contact frame.
         joints: Names of the movable joints from the palm to the contact, in order.
+        tangent: (3,) second axis of the pad, unit, in the contact frame and orthogonal to the
+            normal: what a contact's tangent turns about the normal. If the description names
+            none, the contact frame's x axis made orthogonal to the normal.
     """
 
     name: str
@@ -85,6 +88,7 @@ class Finger:
     placement: Array
     normal: Array
     joints: tuple[str, ...]
+    tangent: Array
 
 
 @dataclass(frozen=True, eq=False)

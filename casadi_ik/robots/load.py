@@ -11,6 +11,7 @@ from casadi_ik.errors import DescriptionError, UnknownNameError
 from casadi_ik.files.reading import (
     Frame,
     T,
+    Vector,
     convert,
     frame_matrix,
     read_yaml,
@@ -36,6 +37,9 @@ from casadi_ik.robots.schema import (
     JointEntry,
     LinkFrame,
 )
+
+ALONG = 0.995
+"""Cosine with the normal above which the contact frame's x axis is no tangent."""
 
 JOINT_TYPES = ("revolute", "prismatic", "fixed")
 
@@ -261,9 +265,31 @@ def _fingers(
             link = by_child[link].parent
         normal = np.asarray(entry.normal, dtype=float) / length
         fingers.append(
-            Finger(name, entry.link, _freeze(_pose(entry)), _freeze(normal), tuple(chain[::-1]))
+            Finger(
+                name,
+                entry.link,
+                _freeze(_pose(entry)),
+                _freeze(normal),
+                tuple(chain[::-1]),
+                _freeze(_tangent(entry.tangent, normal, where)),
+            )
         )
     return tuple(fingers)
+
+
+def _tangent(given: Vector | None, normal: Array, where: str) -> Array:
+    """The pad's second axis (3,): what is given, else x (y if the normal is along x)."""
+    along = given
+    if given is None:
+        along = (1.0, 0.0, 0.0) if abs(normal[0]) < ALONG else (0.0, 1.0, 0.0)
+    across = np.asarray(along, dtype=float)
+    across = across - normal * (normal @ across)
+    length = float(np.linalg.norm(across))
+    if not length > 1e-3 * float(np.linalg.norm(np.asarray(along))):
+        raise DescriptionError(
+            f"{where}.tangent: found {list(along or ())}, expected a direction across the normal"
+        )
+    return across / length
 
 
 def _home(

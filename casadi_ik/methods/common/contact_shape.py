@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.recipe import recipe
-
-LENGTH = 0.1
-"""Distances are divided by this [m], so that they weigh like the cosines."""
+from casadi_ik.problem.contacts.conditions import LENGTH
 
 
 def contact_shape(f: int, scales: Sequence[float] | NDArray = ()) -> FunctionGraph:

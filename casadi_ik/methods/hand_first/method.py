@@ -2,108 +2,104 @@
 
 from __future__ import annotations
 
-import dataclasses
-import time
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.kernels import FunctionKernel, LoopKernel, LoopResult
-from casadi_ik.kernels.rows import opaque
+from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
+from casadi_ik.methods.common.looped_method import Counts, LoopedMethod, Start
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.restarts import LATER, VALLEYS, Restarts
-from casadi_ik.methods.hand_first.state import STAGE_LABELS, HandFirstLayouts
+from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
-from casadi_ik.problem.method import Outcome, Quick
+from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.method import Quick
 from casadi_ik.problem.problems import Array, Problems
-from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.trace import RESTART, TraceFormat, trace_format
+from casadi_ik.problem.status import Phase
+from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
 
-MAX_ITERATIONS = 100_000
-"""Far above what the stages' own budgets allow: the loop always ends by a status."""
 
-
-class HandFirstMethod:
+class HandFirstMethod(LoopedMethod):
     """`hand-first`: contacts fix palm and hand, the arm follows in closed form.
 
+    A round takes other hand postures, see `Restarts`; nearly all targets need one round only.
+
     Attributes:
-        name: Name of the method.
-        options: Its numbers.
+        step: Its step for this robot.
     """
 
     name = "hand-first"
+    takes_free_contacts = True
+    takes_fixed_actuators = True
 
     def __init__(
         self, robot: RobotDescription, options: HandFirstParameters, compiled: bool = True
     ) -> None:
         """Recognise the arm and lay out the step."""
-        self.options = options
-        self._robot = robot
-        self._compiled = compiled
-        self.step = HandFirstStep(robot, _closed_form(robot), options.candidates)
+        super().__init__(robot, options, compiled)
+        self.options: HandFirstParameters = options
+        self.rounds = options.rounds + LATER
+        self.step = HandFirstStep(
+            robot, _closed_form(robot), options.candidates, usual(len(robot.fingers))
+        )
         self._singles: list[FirstRound] = []
 
-    @cached_property
-    def kernel(self) -> LoopKernel:
-        """The compiled loop."""
-        return LoopKernel(self.step.graph(), self._compiled)
+    def step_graph(self) -> StepGraph:
+        """The whole iteration."""
+        return self.step.graph()
 
     @cached_property
-    def restarts(self) -> Restarts:
+    def hands(self) -> Restarts:
         """The hand postures that rounds begin from."""
-        hand = self.step.layouts.hand
-        return Restarts(self._robot, hand, self.options, self._compiled)
+        return Restarts(self.robot, self.step.layouts.hand, self.options, self._compiled)
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
-        _ = self.kernel, self.restarts.table, self._beginning
+        _ = self.kernel, self.hands.table, self._beginning
 
     @property
-    def trace_format(self) -> TraceFormat:
-        """How its traces are to be read."""
-        return trace_format(self.step.layouts.record, self._robot, coupling_jacobian(self._robot))
+    def jacobians(self) -> Mapping[str, RecordedJacobian]:
+        """Those of the couplings."""
+        return coupling_jacobian(self.robot)
 
-    @property
-    def parameters(self) -> Mapping[str, Any]:
-        """The parameter record as a plain mapping."""
-        return dataclasses.asdict(self.options)
+    def begin(
+        self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
+    ) -> Start:
+        """Start with the hand postures of the round; what was found before is kept."""
+        states, parameters = self._round(problems, q0, number, last)
+        if last is not None:
+            layout = self.step.layouts.state
+            # `passed`: it goes on where it stopped in the numeric arm's list of starts.
+            for name in ("passed", "best_cost", "best_q", "counts"):
+                states[:, layout.slice(name)] = last[:, layout.slice(name)]
+            states[:, layout.slice("earlier")] = number * self.options.candidates
+        return states, parameters
 
-    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
-        """Solve a batch; see `Method.run`. No random numbers are drawn."""
-        del seed
-        passed = self.step.layouts.state.slice("passed")
-        collected = _Collected(self.step.layouts)
-        left, waiting, here = problems, np.arange(len(problems)), q0
-        done: Array | None = None
-        for number in range(self.options.rounds + LATER):
-            begin = time.perf_counter()
-            best = collected.best(waiting) if number else here
-            states, parameters = self._round(left, here, best, number)
-            if done is not None:
-                # It goes on where the last round stopped in the numeric arm's list of starts.
-                states[:, passed] = done
-            result = self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
-            besides = time.perf_counter() - begin - result.time.sum()
-            collected.take(waiting, result, besides / max(len(left), 1))
-            missed = np.flatnonzero(result.status != Status.SOLVED)
-            if not len(missed):
-                break
-            left, waiting, here = left.rows(missed), waiting[missed], here[missed]
-            done = result.states[missed, passed]
-        return collected.outcome(trace)
+    def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
+        """The step counts them."""
+        del iterations
+        counts = states[:, self.step.layouts.state.slice("counts")].astype(np.int64)
+        return {stage: counts[:, i] for i, stage in enumerate(STAGES)}
+
+    def restarts(self, states: Array) -> Counts:
+        """Hand postures tried but the first."""
+        layout = self.step.layouts.state
+        earlier, candidate = (
+            states[:, layout.slice(name).start].astype(np.int64)
+            for name in ("earlier", "candidate")
+        )
+        return earlier + np.minimum(candidate, self.options.candidates - 1)
 
     def quick(self, problems: Problems, q0: Array) -> Quick | None:
         """The first round of one target; see `QuickMethod.quick`."""
@@ -112,8 +108,8 @@ class HandFirstMethod:
         try:
             first = self._singles.pop()
         except IndexError:
-            first = FirstRound(self.restarts.table, self._beginning, self.kernel, self.step.layouts)
-        found = first(problems, q0, self._terms(problems), MAX_ITERATIONS)
+            first = FirstRound(self.hands.table, self._beginning, self.kernel, self.step.layouts)
+        found = first(problems, q0, self._terms(problems), self.max_iterations)
         self._singles.append(first)
         return found
 
@@ -137,7 +133,7 @@ class HandFirstMethod:
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
-        return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
+        return self.kernel.run(states, parameters, self.max_iterations, trace)
 
     def postures(self, problems: Problems, number: int) -> Array:
         """Candidates (k, candidates, hand) of a round whose postures look like the targets.
@@ -146,23 +142,20 @@ class HandFirstMethod:
             problems: k targets.
             number: The round, below `options.rounds`.
         """
-        return self.restarts.from_tables(problems, number)
+        return self.hands.from_tables(problems, number)
 
-    def _round(
-        self, problems: Problems, q0: Array, best: Array, number: int
-    ) -> tuple[Array, Array]:
-        """States and parameters of a round; `best` (k, n) is what the ones before came to."""
-        later, hand = number - self.options.rounds, list(self.step.layouts.hand)
-        if later < 0:
+    def _round(self, problems: Problems, q0: Array, number: int, last: Array | None) -> Start:
+        """What a round begins with, the memory of those before aside."""
+        later, layouts = number - self.options.rounds, self.step.layouts
+        if later < 0 or last is None:
             return self.rows(problems, q0, self.postures(problems, number))
         if later < VALLEYS:
-            return self.rows(problems, q0, self.restarts.along_valley(problems, best, later))
-        anywhere = self.restarts.anywhere(problems, later - VALLEYS)
-        states, parameters = self.rows(problems, q0, anywhere[None, :, hand])
+            best = last[:, layouts.state.slice("best_q")]
+            return self.rows(problems, q0, self.hands.along_valley(problems, best, later))
+        anywhere = self.hands.anywhere(problems, later - VALLEYS)
+        states, parameters = self.rows(problems, q0, anywhere[None][:, :, list(layouts.hand)])
         # The first of them begins as a whole: what stands in the way may be arm and hand together.
-        layouts = self.step.layouts
-        lower = parameters[:, layouts.parameters.slice("lower")]
-        upper = parameters[:, layouts.parameters.slice("upper")]
+        lower, upper = (parameters[:, layouts.parameters.slice(end)] for end in ("lower", "upper"))
         states[:, layouts.state.slice("q")] = np.clip(anywhere[0], lower, upper)
         states[:, layouts.state.slice("phase")] = float(Phase.REFINEMENT)
         for name, value in fresh_fit().items():
@@ -171,71 +164,12 @@ class HandFirstMethod:
 
     def _terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms."""
-        bounds = problems.bounds(self._robot, UNBOUNDED)
+        bounds = problems.bounds(self.robot, UNBOUNDED)
         return np.concatenate([problems.position_tolerance, problems.angle_tolerance, *bounds])
 
     @cached_property
     def _beginning(self) -> FunctionKernel:
         return FunctionKernel(beginning(self.step.layouts), self._compiled)
-
-
-class _Collected:
-    """Results of a batch whose targets may take several rounds; the best of a target is kept."""
-
-    def __init__(self, layouts: HandFirstLayouts) -> None:
-        self._layouts = layouts
-        self._rounds: list[NDArray[Any]] = []
-        self._targets: list[NDArray[np.intp]] = []
-
-    def take(self, targets: NDArray[np.intp], result: LoopResult, share: float) -> None:
-        """Take a round of some targets, the first time of all; `share` of them is time besides."""
-        state, before = self._layouts.state, self._layouts.candidates * len(self._rounds)
-        states = result.states
-        q, cost = states[:, state.slice("q")], states[:, state.slice("best_cost").start]
-        counts = states[:, state.slice("counts")].astype(np.int64)
-        candidate = states[:, state.slice("candidate").start].astype(np.int64)
-        restarts = before + np.minimum(candidate, self._layouts.candidates - 1)
-        status = result.status.astype(np.int64)
-        status[status < 0] = Status.INVALID
-        if result.rows is not None:
-            result.rows[RESTART.name] += before
-        if not self._rounds:
-            # A copy: the states are much larger and need not stay.
-            self._q, self._cost, self._counts = q.copy(), cost.copy(), counts
-            self._restarts, self._status, self._time = restarts, status, result.time + share
-        else:
-            better = (status == Status.SOLVED) | (cost < self._cost[targets])
-            self._q[targets[better]], self._cost[targets[better]] = q[better], cost[better]
-            self._counts[targets] += counts
-            self._restarts[targets], self._status[targets] = restarts, status
-            self._time[targets] += result.time + share
-        self._rounds.append(result.rows if result.rows is not None else np.zeros(0))
-        self._targets.append(np.repeat(targets, result.iterations))
-
-    def best(self, targets: NDArray[np.intp]) -> Array:
-        """(k, n) what some targets have come to so far."""
-        return self._q[targets]
-
-    def outcome(self, trace: bool) -> Outcome:
-        """What became of the batch."""
-        return Outcome(
-            q=self._q,
-            status=self._status,
-            iterations=self._counts.sum(axis=1),
-            restarts=self._restarts,
-            time=self._time,
-            phases={label: self._counts[:, i] for i, label in enumerate(STAGE_LABELS)},
-            rows=self._rows if trace else None,
-        )
-
-    @property
-    def _rows(self) -> NDArray[Any]:
-        """The records of all rounds, target by target."""
-        if len(self._rounds) == 1:
-            return self._rounds[0]
-        order = np.argsort(np.concatenate(self._targets), kind="stable")
-        rows = np.concatenate(list(map(opaque, self._rounds)))
-        return np.take(rows, order).view(self._rounds[0].dtype)
 
 
 def _closed_form(robot: RobotDescription) -> SrsArm | None:
