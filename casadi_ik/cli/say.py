@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 
-from casadi_ik.cli.parser import PROGRAM
+PROGRAM = "casadi-ik"
+"""What the command is called."""
 
 
 def say(kind: str, text: str) -> None:
