@@ -31,13 +31,36 @@ SIMILAR = 0.25
 POOL = 3
 """From so many times as many postures as are wanted those that differ are taken."""
 
-STRIDES = (0.05, -0.05, 0.15, -0.15, 0.4, -0.4, 1.0, -1.0)
-"""How far along a valley a hand begins anew [rad of the motor that moves most]."""
+STRIDES = (
+    0.05,
+    -0.05,
+    0.1,
+    -0.1,
+    0.2,
+    -0.2,
+    0.4,
+    -0.4,
+    0.03,
+    -0.03,
+    0.15,
+    -0.15,
+    0.3,
+    -0.3,
+    0.8,
+    -0.8,
+)
+"""How far along a valley a hand begins anew [rad of the motor that moves most], round by round."""
+
+AT_END = 1e-6
+"""A motor this near to a limit [rad or m] stays there while its hand moves along a valley."""
+
+HELD = 1e6
+"""What holds a motor at its limit, in a matrix of squared slopes of order one."""
 
 NUDGE = 1e-6
 """Difference [rad or m] from which slopes are taken."""
 
-VALLEYS = 2
+VALLEYS = 3
 """Rounds along the directions in which the contacts move least, after those of the tables."""
 
 LATER = VALLEYS + 2
@@ -94,7 +117,8 @@ class Restarts:
         if not number:
             return self.table.nearest(points, normals, count)
         # Where limits are ignored a hand may stand on either side of them.
-        table = self.wide_table if problems.enforce_limits else self.free_table
+        free = not problems.enforce_limits and number % 2
+        table = self.free_table if free else self.wide_table
         wanted = number * count
         return table.varied(points, normals, wanted, POOL * wanted, SIMILAR)[:, -count:]
 
@@ -104,7 +128,7 @@ class Restarts:
         Args:
             problems: k targets.
             q: (k, n) where it did.
-            which: 0: along the direction in which the contacts move least; 1: the one after it.
+            which: The round. Even ones keep motors at a limit there; odd ones do not.
         """
         size = self._size
         columns = self._hand
@@ -113,10 +137,15 @@ class Restarts:
             # The palm follows as well as it can: what is left of a motor's motion counts.
             base = np.linalg.qr(rigid)[0]
             slopes = slopes - base @ (base.transpose(0, 2, 1) @ slopes)
-        _, _, directions = np.linalg.svd(slopes, full_matrices=True)
-        chosen = directions[:, -1 - min(which, len(columns) - 1)]
+        squares = slopes.transpose(0, 2, 1) @ slopes
+        if which % 2 == 0:
+            ends = np.minimum(q - self._robot.lower, self._robot.upper - q)[:, columns]
+            held = ends < AT_END
+            squares += np.eye(len(columns)) * (held * HELD)[:, None]
+        chosen = np.linalg.eigh(squares)[1][:, :, 0]
         chosen = chosen / np.abs(chosen).max(axis=1, keepdims=True)
-        strides = np.resize(STRIDES, self._options.candidates)
+        first = (which + 1) // 2 * self._options.candidates
+        strides = np.resize(np.roll(STRIDES, -first), self._options.candidates)
         return q[:, None, columns] + strides[:, None] * (chosen * size)[:, None]
 
     def anywhere(self, problems: Problems, number: int) -> Array:
