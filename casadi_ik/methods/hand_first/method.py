@@ -35,6 +35,10 @@ UNBOUNDED = 1e3
 AT_LIMITS = 0.5
 """Part of the range that the wide table moves to the limits."""
 
+CARRIED = ("passed", "near", "balanced")
+"""What a round leaves to the next: how far the numeric arm's list of starts is through, and which
+fits were balanced in vain."""
+
 MAX_ITERATIONS = 100_000
 """Far above what the stages' own budgets allow: the loop always ends by a status."""
 
@@ -95,7 +99,7 @@ class HandFirstMethod:
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch; see `Method.run`. No random numbers are drawn."""
         del seed
-        passed = self.step.layouts.state.slice("passed")
+        carried = [self.step.layouts.state.slice(name).start for name in CARRIED]
         collected = _Collected(self.step.layouts)
         left, waiting, here = problems, np.arange(len(problems)), q0
         done: Array | None = None
@@ -103,8 +107,7 @@ class HandFirstMethod:
             begin = time.perf_counter()
             states, parameters = self.rows(left, here, self.postures(left, number))
             if done is not None:
-                # It goes on where the last round stopped in the numeric arm's list of starts.
-                states[:, passed] = done
+                states[:, carried] = done
             result = self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
             besides = time.perf_counter() - begin - result.time.sum()
             collected.take(waiting, result, besides / max(len(left), 1))
@@ -112,7 +115,7 @@ class HandFirstMethod:
             if not len(missed):
                 break
             left, waiting, here = left.rows(missed), waiting[missed], here[missed]
-            done = result.states[missed, passed]
+            done = result.states[np.ix_(missed, carried)]
         return collected.outcome(trace)
 
     def quick(self, problems: Problems, q0: Array) -> Quick | None:
