@@ -36,6 +36,7 @@ from casadi_ik.methods.hand_first.balance_stage import balance_stage
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts
 from casadi_ik.methods.hand_first.whole_fit import whole_step
+from casadi_ik.problem.contacts.kinds import Kinds, suffix
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose
@@ -51,17 +52,20 @@ class HandFirstStep:
         layouts: State, parameters and record.
     """
 
-    def __init__(self, robot: RobotDescription, arm: SrsArm | None, candidates: int) -> None:
+    def __init__(
+        self, robot: RobotDescription, arm: SrsArm | None, candidates: int, kinds: Kinds
+    ) -> None:
         """Remember what the graph is made of.
 
         Args:
             robot: The description.
             arm: Constants of an S-R-S arm, or None: then refinement does the arm's work.
             candidates: Hand postures a solve may start from.
+            kinds: Of the contacts, by finger.
         """
         self.robot = robot
         self.arm = arm
-        self.layouts = HandFirstLayouts(robot, candidates)
+        self.layouts = HandFirstLayouts(robot, candidates, kinds)
 
     def graph(self) -> StepGraph:
         """The whole iteration."""
@@ -73,12 +77,12 @@ class HandFirstStep:
             layouts.parameters,
             layouts.record,
             stage="phase",
-            recipe=recipe(self._name, self.robot, layouts.candidates),
+            recipe=recipe(self._name, self.robot, layouts.candidates, layouts.kinds),
         )
 
     @property
     def _name(self) -> str:
-        return ca.Function.fix_name(f"hand_first_{self.robot.name}")
+        return ca.Function.fix_name(f"hand_first_{self.robot.name}{suffix(self.layouts.kinds)}")
 
     def _iteration(self) -> ca.Function:
         layouts = self.layouts
@@ -122,7 +126,9 @@ class HandFirstStep:
         )
         exhausted = s["candidate"] >= count
         q = self._with_hand(p["start"], hand)
-        rotation, origin = best_palm(hand_contacts(self.robot, hand, layouts.hand), p)
+        rotation, origin = best_palm(
+            hand_contacts(self.robot, hand, layouts.hand), layouts.contacts, p
+        )
         after = layouts.state.pack(
             self.layouts.counted(s, Phase.CANDIDATE)
             | {
@@ -150,7 +156,7 @@ class HandFirstStep:
         columns = list(self.layouts.hand)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
-        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        judged = judge_contacts(s, p, tried, self.layouts.contacts)
         keep, reached = judged.accepted, tried.reached
         # The last candidate goes on to the arm even if it does not fit: its arm and hand are the
         # nearest there is, and refinement starts from them.
@@ -158,7 +164,7 @@ class HandFirstStep:
         onwards = ca.logic_or(judged.within, last)
         # Nor does one that fits nearly have to fit: it is balanced with the arm.
         near = ca.logic_and(
-            worth_balancing(self._left(judged, tried), len(self.robot.fingers), p),
+            worth_balancing(self._left(judged, tried), self.layouts.contacts, p),
             ca.logic_and(differs(judged.cost, s["near"]), ca.logic_not(p["alone"])),
         )
         near = ca.logic_and(near, judged.settled)
@@ -280,12 +286,12 @@ class HandFirstStep:
 
     def _refinement(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
-        tried = whole_step(self.robot, s["q"], s["damping"], p)
-        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        tried = whole_step(self.robot, self.layouts.contacts, s["q"], s["damping"], p)
+        judged = judge_contacts(s, p, tried, self.layouts.contacts)
         q = ca.if_else(judged.accepted, tried.reached, s["q"])
         solved = ca.logic_and(judged.settled, judged.within)
         unsolved = ca.logic_and(judged.settled, ca.logic_not(judged.within))
-        near = worth_balancing(self._left(judged, tried), len(self.robot.fingers), p)
+        near = worth_balancing(self._left(judged, tried), self.layouts.contacts, p)
         near = ca.logic_and(near, differs(judged.cost, s["balanced"]))
         near = ca.logic_and(near, unsolved)
         failed = ca.logic_and(unsolved, ca.logic_not(near))
@@ -313,7 +319,7 @@ class HandFirstStep:
     def _left(self, judged: Judged, tried: Tried) -> Expr:
         """Residual of the contacts after a step was judged."""
         left = ca.if_else(judged.accepted, tried.there, tried.before)
-        return left[: 6 * len(self.robot.fingers)]
+        return left[: self.layouts.contacts.size]
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
         return _with(q, self.layouts.hand, hand)
