@@ -29,6 +29,10 @@ from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
 
+CARRIED = ("passed", "near", "balanced", "best_cost", "best_q", "counts")
+"""What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
+were balanced in vain, and what was found."""
+
 
 class HandFirstMethod(LoopedMethod):
     """`hand-first`: contacts fix palm and hand, the arm follows in closed form.
@@ -80,8 +84,7 @@ class HandFirstMethod(LoopedMethod):
         states, parameters = self._round(problems, q0, number, last)
         if last is not None:
             layout = self.step.layouts.state
-            # `passed`: it goes on where it stopped in the numeric arm's list of starts.
-            for name in ("passed", "best_cost", "best_q", "counts"):
+            for name in CARRIED:
                 states[:, layout.slice(name)] = last[:, layout.slice(name)]
             states[:, layout.slice("earlier")] = number * self.options.candidates
         return states, parameters
