@@ -9,10 +9,25 @@ import casadi as ca
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.bounded_step import Bounded
-from casadi_ik.methods.common.contact_fit import Judged, Tried, errors
+from casadi_ik.methods.common.contact_fit import Judged, Tried
 from casadi_ik.methods.common.coupling_record import coupling_fields, coupling_values
 from casadi_ik.methods.common.limits import bits
+from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.status import Phase
+from casadi_ik.problem.trace import (
+    ACCEPTED,
+    ANGLE_ERROR,
+    COST,
+    DAMPING,
+    LIMIT_MASK,
+    PHASE,
+    POSITION_ERROR,
+    RESTART,
+    STATUS,
+    STEP_SIZE,
+    Q,
+)
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
 
@@ -31,11 +46,18 @@ class HandFirstLayouts:
     Attributes:
         robot: The description.
         candidates: How many hand postures the stages may start from.
+        kinds: Of the contacts, by finger.
         hand: Positions in q of the hand's actuators.
     """
 
     robot: RobotDescription
     candidates: int
+    kinds: Kinds
+
+    @cached_property
+    def contacts(self) -> ContactRows:
+        """The contacts' rows."""
+        return ContactRows(self.kinds)
 
     @cached_property
     def hand(self) -> tuple[int, ...]:
@@ -54,6 +76,7 @@ class HandFirstLayouts:
                 Field("palm_origin", (3,), unit="m"),
                 Field("phase"),
                 Field("candidate", doc="index of the hand posture started from"),
+                Field("earlier", doc="hand postures tried in earlier rounds"),
                 Field("damping"),
                 Field("growth", doc="factor of the damping if the next step gains nothing"),
                 Field("cost", doc="cost at q (or at palm and hand)"),
@@ -76,9 +99,7 @@ class HandFirstLayouts:
         n, f = len(self.robot.actuators), len(self.robot.fingers)
         return Layout(
             (
-                Field("points", (f, 3), unit="m", doc="contact points, base frame; 0 if free"),
-                Field("normals", (f, 3), doc="outward pad normals, base frame; 0 if free"),
-                Field("weights", (f, 2), doc="1 where point, normal count, 0 where free"),
+                *self.contacts.fields,
                 Field("position_tolerance", (f,), unit="m"),
                 Field("angle_tolerance", (f,), unit="rad"),
                 Field("lower", (n,), doc="lower bounds of q"),
@@ -93,21 +114,21 @@ class HandFirstLayouts:
     @cached_property
     def record(self) -> Layout:
         """What is logged of an iteration."""
-        n, f = len(self.robot.actuators), len(self.robot.fingers)
+        robot = self.robot
         return Layout.record(
-            Field("q", (n,), "f8", "rad or m", "actuator positions before the step"),
-            Field("cost", (), "f8", "", "squared residual before the step"),
-            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
-            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
-            Field("damping", (), "f4", "", "Levenberg-Marquardt damping of the step"),
-            Field("step_size", (), "f4", "rad or m", "largest motor change of the step tried"),
+            Q.of(robot, "actuator positions before the step; where the arm is placed, after it"),
+            COST.of(robot, "squared residual before the step"),
+            POSITION_ERROR.of(robot),
+            ANGLE_ERROR.of(robot),
+            DAMPING.of(robot, "Levenberg-Marquardt damping of the step"),
+            STEP_SIZE.of(robot, "largest motor change of the step tried"),
             Field("margin", (), "f4", "", "best arm margin found (arm placement)"),
-            *coupling_fields(self.robot),
-            Field("limit_mask", (), "u4", "", "bit i: actuator i at a limit"),
-            Field("candidate", (), "u1", "", "hand posture started from"),
-            Field("accepted", (), "u1", "", "1 if the step lowered the cost"),
-            Field("phase", (), "u1"),
-            Field("status", (), "u1", "", "0 running, else the final status"),
+            *coupling_fields(robot),
+            LIMIT_MASK.of(robot),
+            RESTART.of(robot, "hand posture started from, counted from 0"),
+            ACCEPTED.of(robot),
+            PHASE.of(robot),
+            STATUS.of(robot),
         )
 
     def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> Bounded:
@@ -142,7 +163,7 @@ class HandFirstLayouts:
         positions: Expr = [NOTHING] * f
         angles: Expr = [NOTHING] * f
         if tried is not None:
-            positions, chords = errors(tried.before, f)
+            positions, chords = self.contacts.errors(tried.before)
             angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
             positions = ca.if_else(p["weights"][:, 0] > 0, positions, NOTHING)
             angles = ca.if_else(p["weights"][:, 1] > 0, angles, NOTHING)
@@ -157,7 +178,7 @@ class HandFirstLayouts:
                 "margin": margin,
                 **coupling_values(self.robot, q),
                 "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
-                "candidate": s["candidate"],
+                "restart": s["earlier"] + s["candidate"],
                 "accepted": judged.accepted if judged else 0.0,
                 "phase": float(phase),
                 "status": status,
