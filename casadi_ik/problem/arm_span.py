@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from casadi_ik.problem.hand_motors import OUTWARDS
+from casadi_ik.problem.hand_motors import OUTWARDS, motor_ends
 from casadi_ik.problem.joint_frames import link_frames, placed
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.robots.description import Joint, RobotDescription
@@ -82,7 +82,7 @@ class ArmSpan:
             lower, upper = joint.lower - OUTWARDS, joint.upper + OUTWARDS
         if joint.name in self.robot.actuator_names:
             i = self.robot.actuator_index(joint.name)
-            ends = problems.bounds(self.robot, np.inf)
+            ends = motor_ends(self.robot, problems)
             lower = max(lower, ends[0][i] - OUTWARDS)
             upper = min(upper, ends[1][i] + OUTWARDS)
         return float(lower), float(upper)

@@ -34,6 +34,18 @@ def finger_joints(robot: RobotDescription) -> tuple[str, ...]:
     return tuple(name for name in robot.joint_names if name in used)
 
 
+def motor_ends(robot: RobotDescription, problems: Problems) -> tuple[Array, Array]:
+    """(n,) lower and upper ends of all motors, as the verdict has them: each by itself.
+
+    `RobotDescription.lower` leaves out what is of no use to a method; a proof must not.
+    """
+    lower, upper = robot.strokes if problems.enforce_limits else robot.mechanical
+    if problems.fixed is None:
+        return lower, upper
+    free = np.isnan(problems.fixed)
+    return np.where(free, lower, problems.fixed), np.where(free, upper, problems.fixed)
+
+
 def motor_box(robot: RobotDescription, problems: Problems) -> Array:
     """(2, h) lower and upper ends of the motors of the hand.
 
@@ -41,7 +53,7 @@ def motor_box(robot: RobotDescription, problems: Problems) -> Array:
     turns until everything repeats. A motor whose motion never repeats is `ENDLESS`.
     """
     names = hand_motors(robot)
-    lower, upper = problems.bounds(robot, np.inf)
+    lower, upper = motor_ends(robot, problems)
     columns = [robot.actuator_index(name) for name in names]
     ends = np.stack([lower[columns] - OUTWARDS, upper[columns] + OUTWARDS])
     for i in np.flatnonzero(np.isinf(ends).any(axis=0)):

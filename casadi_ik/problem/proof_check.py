@@ -18,6 +18,7 @@ from casadi_ik.problem.hand_motors import (
     hand_motors,
     joint_limits,
     motor_box,
+    motor_ends,
 )
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.robots.description import RobotDescription
@@ -207,7 +208,7 @@ class _Search:
             assert general is not None
             return general.shoulder, general.wrist, *general.span(self.asked)
         elbow = self.robot.arm_actuators[3]
-        lower, upper = self.asked.bounds(self.robot, 1e3)
+        lower, upper = (np.clip(end, -1e3, 1e3) for end in motor_ends(self.robot, self.asked))
         ends = reach(arm, lower[elbow] - OUTWARDS, upper[elbow] + OUTWARDS)
         near, far = (float(end) for end in ends)
         return arm.shoulder, arm.wrist_in_palm, near - SLACK, far + SLACK

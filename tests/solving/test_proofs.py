@@ -190,7 +190,9 @@ def test_what_is_not_proved_is_not_unreachable(
     monkeypatch.setattr(
         solver._engine.diagnostician._prover, "prove", lambda problems: [None] * len(problems)
     )
-    solution = solver.solve(ik.load_grasp("cup").at(_shifted(0.6)))
+    points, normals = ik.load_grasp("cup").arrays(robot.fingers)
+    far = {n: ik.Contact(points[i] - [1, 0, 0], normals[i]) for i, n in enumerate(robot.fingers)}
+    solution = solver.solve(ik.Grasp(far))
     assert solution.status is ik.Status.NOT_FOUND
     diagnosis = solution.diagnosis
     assert diagnosis is not None
@@ -198,12 +200,6 @@ def test_what_is_not_proved_is_not_unreachable(
     assert diagnosis.searches > 2
     assert diagnosis.lines[0] == f"likely: {ik.Reason.REACH}"
     assert any(line.startswith("not proved; no solution from") for line in diagnosis.lines)
-
-
-def _shifted(x: float) -> Array:
-    pose = np.eye(4)
-    pose[0, 3] = x
-    return pose
 
 
 def test_codes_of_the_log_stay() -> None:
