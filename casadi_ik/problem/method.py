@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.rows import split_rows
+from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.trace import TraceFormat
 
@@ -54,7 +55,7 @@ class Quick:
 
 
 class Method(Protocol):
-    """A named way to solve, built for one robot."""
+    """A named way to solve, built for one robot and kinds of contact."""
 
     name: str
 
@@ -72,8 +73,15 @@ class Method(Protocol):
         """Build and compile what `run` needs; afterwards `run` may be called by several threads."""
         ...
 
+    def for_kinds(self, kinds: Kinds) -> Self:
+        """The same method for contacts of other kinds; itself for its own, and if it has only one.
+
+        What it cannot take, it refuses in `run`, target by target.
+        """
+        ...
+
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
-        """Solve a batch.
+        """Solve a batch of targets of its kinds.
 
         Args:
             problems: The targets.

@@ -81,7 +81,7 @@ def judge_one(robot: ArmHand, problems: Problems, q: Array) -> SolvedVerdict | N
         problems: One target.
         q: (n,).
     """
-    (position,), (angle,), (beyond,) = deviations(robot, problems, q[None])
+    position, angle, beyond = deviations(robot, problems, q)
     limits_ok = bool(beyond <= LIMIT_SLACK)
     if problems.enforce_limits and not limits_ok:
         return None
@@ -101,11 +101,11 @@ def deviations(robot: ArmHand, problems: Problems, q: Array) -> tuple[Array, Arr
     Args:
         robot: The robot.
         problems: k targets, or one for all.
-        q: (k, n); NaN gives NaN.
+        q: (k, n) or (n,); NaN gives NaN.
 
     Returns:
-        (k, f) distances [m] from the point, line or plane; (k, f) angles [rad] between the
-        normals, or between the whole frames where there is a tangent; NaN where free; (k,) by how
+        (k, f) or (f,) distances [m] from the point, line or plane; as many angles [rad] between the
+        normals, or between the whole frames where there is a tangent; NaN where free; (k,) or () by how
         much the worst actuator or joint is beyond its limits [rad or m].
     """
     points, normals = problems.points, problems.normals

@@ -14,6 +14,7 @@ from casadi_ik.kernels import REPEATED, LoopKernel
 from casadi_ik.methods.qiu.enhanced import EnhancedStep
 from casadi_ik.methods.qiu.original import OriginalStep
 from casadi_ik.methods.qiu.parameters import OriginalParameters, QiuParameters
+from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Status
@@ -58,6 +59,10 @@ class QiuMethod:
     def parameters(self) -> Mapping[str, Any]:
         """The parameter record as a plain mapping."""
         return dataclasses.asdict(self.options)
+
+    def for_kinds(self, kinds: Kinds) -> QiuMethod:  # noqa: ARG002
+        """Itself: it knows points with normals only, and refuses all else in `start`."""
+        return self
 
     def prepare(self) -> None:
         """Build and compile the loop."""
@@ -125,10 +130,19 @@ class QiuMethod:
     def _check(self, problems: Problems) -> None:
         if problems.fixed is not None:
             raise UnsupportedError(f"method {self.name!r} cannot keep actuators fixed")
+        for name, array in problems.more.items():
+            given = np.argwhere(~np.isnan(array[..., 0]))
+            if len(given):
+                row, finger = problems.number(int(given[0, 0])), given[0, 1]
+                raise RowError(
+                    f"method {self.name!r} needs point and normal of every finger and knows no "
+                    f"{name}; row {row} has one for {self._robot.finger_names[finger]!r}",
+                    row,
+                )
         for name, array in (("contact", problems.points), ("normal", problems.normals)):
             free = np.argwhere(np.isnan(array[..., 0]))
             if len(free):
-                row, finger = problems.first_row + int(free[0, 0]), free[0, 1]
+                row, finger = problems.number(int(free[0, 0])), free[0, 1]
                 raise RowError(
                     f"method {self.name!r} needs a {name} for every finger; row {row} has none for "
                     f"{self._robot.finger_names[finger]!r}",

@@ -17,7 +17,7 @@ from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.methods.thumb_first.state import STAGES
 from casadi_ik.methods.thumb_first.step import ThumbFirstStep
-from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase, Status
@@ -44,11 +44,16 @@ class ThumbFirstMethod:
     name = "thumb-first"
 
     def __init__(
-        self, robot: RobotDescription, options: ThumbFirstParameters, compiled: bool = True
+        self,
+        robot: RobotDescription,
+        options: ThumbFirstParameters,
+        compiled: bool = True,
+        kinds: Kinds | None = None,
     ) -> None:
-        """Recognise the arm and lay out the step."""
+        """Recognise the arm and lay out the step; point and normal if no kinds are given."""
         self.options = options
-        self.step = ThumbFirstStep(robot, options, usual(len(robot.fingers)), _closed_form(robot))
+        self._kinds = kinds or usual(len(robot.fingers))
+        self.step = ThumbFirstStep(robot, options, self._kinds, _closed_form(robot))
         self._robot = robot
         self._compiled = compiled
 
@@ -64,6 +69,12 @@ class ThumbFirstMethod:
         return PostureTable(
             robot, self.step.hand, options.table, pull=options.pull, compiled=self._compiled
         )
+
+    def for_kinds(self, kinds: Kinds) -> ThumbFirstMethod:
+        """The same for contacts of other kinds."""
+        if kinds == self._kinds:
+            return self
+        return ThumbFirstMethod(self._robot, self.options, self._compiled, kinds)
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table."""
@@ -101,8 +112,10 @@ class ThumbFirstMethod:
         postures[:, :starts] = found
         known = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
         values: dict[str, Any] = {
-            "points": np.nan_to_num(problems.points),
-            "normals": np.nan_to_num(problems.normals),
+            **{
+                f"{name}s": np.nan_to_num(problems.vectors(f"{name}s"))
+                for name in self.step.contacts.data
+            },
             "weights": np.stack(known, axis=2),
             "position_tolerance": problems.position_tolerance,
             "angle_tolerance": problems.angle_tolerance,
