@@ -95,20 +95,20 @@ def test_traces(robot, method, rng):
     for row, trace in enumerate(outcome.trace):
         assert len(trace) == outcome.iterations[row]
         assert trace["phase"][0] == Phase.CANDIDATE
-        assert trace["candidate"][0] == 0
+        assert trace["restart"][0] == 0
         assert trace["status"][-1] == outcome.status[row] == Status.SOLVED
         # A round that ends in vain says so, and the next one begins with other candidates.
         vain = trace["status"][:-1] == Status.STALLED
         assert not trace["status"][:-1][~vain].any()
         assert (trace["phase"][:-1][vain] == Phase.CANDIDATE).all()
-        assert (np.diff(trace["candidate"].astype(int)) >= 0).all()
+        assert (np.diff(trace["restart"].astype(int)) >= 0).all()
         for stage in order:
             assert np.sum(trace["phase"] == stage) == outcome.phases[stage.label][row]
         for one, following in pairwise(trace):
             if following["phase"] == Phase.CANDIDATE:
-                assert one["candidate"] != following["candidate"] or one["status"]
+                assert one["restart"] != following["restart"] or one["status"]
                 continue
-            assert one["candidate"] == following["candidate"]
+            assert one["restart"] == following["restart"]
             assert order[following["phase"]] - order[one["phase"]] in (0, 1)
             if one["phase"] != following["phase"] or not np.isfinite(one["cost"]):
                 continue

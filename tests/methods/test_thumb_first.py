@@ -94,9 +94,9 @@ def test_trace_of_a_solve(robot, method, rng):
             if after["phase"] != Phase.HAND_ALIGNMENT:
                 # The first start is a round of its own, which says so if it ends in vain.
                 vain = before["status"] == Status.STALLED
-                assert after["start"] == before["start"] + (0 if vain else 1)
+                assert after["restart"] == before["restart"] + (0 if vain else 1)
                 continue
-            assert after["start"] == before["start"]
+            assert after["restart"] == before["restart"]
             assert after["manipulability"] >= 0
             if after["accepted"]:
                 assert after["cost"] < before["cost"]

@@ -1,21 +1,22 @@
 """Finds in traces what is worth a line of its own, going by the names of the fields.
 
-==========================  ============================================================
-field                       events
-==========================  ============================================================
-``phase``                   PHASE_CHANGE
-``restart``, ``candidate``  RESTART (counters)
-``limit_mask``              LIMIT_HIT, LIMIT_LEFT (one bit per actuated coordinate)
-``active_mask``             ACTIVATED, RELEASED (one bit per constraint)
-``sigma_<jacobian>``        NEAR_SINGULAR (smallest singular value; NaN while not computed)
-``condition_<jacobian>``    ILL_CONDITIONED (condition number; NaN while not computed)
-``cost``, or else           STALL, and the progress that OSCILLATION asks for
-``position_error`` and
-``angle_error``
-``q``                       OSCILLATION
-==========================  ============================================================
+========================  ==============================================================
+standard field            events
+========================  ==============================================================
+``PHASE``                 PHASE_CHANGE
+``RESTART``               RESTART
+``LIMIT_MASK``            LIMIT_HIT, LIMIT_LEFT
+``ACTIVE_MASK``           ACTIVATED, RELEASED
+``sigma_<jacobian>``      NEAR_SINGULAR (smallest singular value; NaN while not measured)
+``condition_<jacobian>``  ILL_CONDITIONED (condition number; NaN while not measured)
+``COST``, or else         STALL, and the progress that OSCILLATION asks for
+``POSITION_ERROR`` and
+``ANGLE_ERROR``
+``Q``                     OSCILLATION
+========================  ==============================================================
 
-Fields that a layout does not have give no events. All solves of a block are looked at in one go.
+The standard fields are those of `casadi_ik.problem.trace`. One that a layout does not have gives
+no events. All solves of a block are looked at in one go.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from casadi_ik.logs.events.rules import EventRules
 from casadi_ik.logs.events.singular import jacobians, near_singular, nearest_singular
 from casadi_ik.logs.events.standstill import oscillations, stalls
 from casadi_ik.logs.events.traces import Bools, Rows, Traces, Words, bits_of, words_of
-from casadi_ik.problem.trace import TraceFormat
+from casadi_ik.problem.trace import ACTIVE_MASK, LIMIT_MASK, PHASE, RESTART, TraceFormat
 
 
 def detect_events(
@@ -60,21 +61,18 @@ def detect_events(
 
 
 def _collect(collected: _Collected, traces: Traces, rules: EventRules) -> None:
-    for name, kind in (
-        ("phase", EventKind.PHASE_CHANGE),
-        *((name, EventKind.RESTART) for name in traces.starts_fields),
-    ):
-        if name in traces.names:
-            codes = traces.column(name)
+    for field, kind in ((PHASE, EventKind.PHASE_CHANGE), (RESTART, EventKind.RESTART)):
+        if field.name in traces.names:
+            codes = traces.column(field.name)
             row = np.flatnonzero((codes[1:] != codes[:-1]) & ~traces.first[1:]) + 1
             collected.add(row, kind, codes[row], codes[row - 1])
-    if "limit_mask" in traces.names:
+    if LIMIT_MASK.name in traces.names:
         for kind, change in limit_changes(traces, rules.limit_slack):
             joints = np.zeros((len(change.row), collected.words), np.uint32)
             joints[np.arange(len(joints)), change.bit >> 5] = 1 << (change.bit & 31)
             collected.add(change.row, kind, change.value, change.limit, joints)
-    if "active_mask" in traces.names:
-        mask = traces.mask("active_mask")
+    if ACTIVE_MASK.name in traces.names:
+        mask = traces.mask(ACTIVE_MASK.name)
         before = traces.before(mask, mask[traces.firsts])
         changes = ((EventKind.ACTIVATED, mask & ~before), (EventKind.RELEASED, before & ~mask))
         for kind, joints in changes:
@@ -86,7 +84,7 @@ def _collect(collected: _Collected, traces: Traces, rules: EventRules) -> None:
         for kind, row, value, threshold in near_singular(traces, jacobian, rules):
             collected.add(row, kind, value, threshold, collected.mask(jacobian.joints), number)
     row, value = stalls(traces, rules)
-    at_limit = traces.matrix("limit_mask")[row] if "limit_mask" in traces.names else 0
+    at_limit = traces.matrix(LIMIT_MASK.name)[row] if LIMIT_MASK.name in traces.names else 0
     number = nearest_singular(traces, known, row, rules)
     collected.add(row, EventKind.STALL, value, rules.stall_change, at_limit, number)
     row, value, swinging = oscillations(traces, rules)
@@ -148,6 +146,6 @@ class _Collected:
         solve = self._traces.solve[row]
         events["solve_id"] = solve
         events["iteration"] = row - self._traces.starts[solve]
-        if "phase" in self._traces.names:
-            events["phase"] = self._traces.column("phase")[row]
+        if PHASE.name in self._traces.names:
+            events["phase"] = self._traces.column(PHASE.name)[row]
         return events

@@ -5,7 +5,16 @@ from __future__ import annotations
 from enum import IntEnum
 
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.problem.trace import TraceFormat
+from casadi_ik.problem.trace import (
+    ACTIVE_MASK,
+    CONDITION,
+    LIMIT_MASK,
+    PHASE,
+    SIGMA,
+    WORD,
+    Q,
+    TraceFormat,
+)
 
 
 class EventKind(IntEnum):
@@ -41,8 +50,8 @@ def jacobian_names(form: TraceFormat) -> tuple[str, ...]:
     """Names of the Jacobians whose measures a trace holds; one per element of such a field."""
     found: dict[str, None] = {}
     for item in form.layout:
-        kind, _, name = item.name.partition("_")
-        if kind in ("sigma", "condition"):
+        name = item.name.removeprefix(SIGMA).removeprefix(CONDITION)
+        if name != item.name:
             labels = form.labels.get(item.name, ())
             for i in range(item.size):
                 part = labels[i] if i < len(labels) else str(i)
@@ -53,14 +62,15 @@ def jacobian_names(form: TraceFormat) -> tuple[str, ...]:
 def mask_words(form: TraceFormat) -> int:
     """How many 32-bit words a mask of all actuators has."""
     sizes = {item.name: item.size for item in form.layout}
-    coordinates = -(-sizes.get("q", 1) // 32)
-    return max(coordinates, sizes.get("limit_mask", 1), sizes.get("active_mask", 1))
+    coordinates = -(-sizes.get(Q.name, 1) // WORD)
+    masks = (sizes.get(mask.name, 1) for mask in (LIMIT_MASK, ACTIVE_MASK))
+    return max(coordinates, *masks)
 
 
 def event_format(form: TraceFormat) -> TraceFormat:
     """Layout and labels of the events of a method whose traces have the given format."""
     words = mask_words(form)
-    joints = form.labels.get("q") or form.labels.get("limit_mask", ())
+    joints = form.labels.get(Q.name) or form.labels.get(LIMIT_MASK.name, ())
     layout = Layout.record(
         Field("value", (), "f8", "", "the number that made it an event"),
         Field("threshold", (), "f8", "", "what it was compared with, or the value before"),
@@ -75,6 +85,6 @@ def event_format(form: TraceFormat) -> TraceFormat:
         "kind": tuple(kind.name for kind in EventKind),
         "jacobian": ("none", *jacobian_names(form)),
         "joint_mask": joints,
-        "phase": form.labels.get("phase", ()),
+        "phase": form.labels.get(PHASE.name, ()),
     }
     return TraceFormat(layout, labels)

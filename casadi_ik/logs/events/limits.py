@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.logs.events.kinds import EventKind
 from casadi_ik.logs.events.traces import Bools, Rows, Traces, places_of
+from casadi_ik.problem.trace import LIMIT_MASK, Q
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ def limit_changes(traces: Traces, slack: float) -> Iterator[tuple[EventKind, Lim
     Before the first row of a solve no bit counts as set, so a start on a limit is a hit. A bit
     that goes while the coordinate stays within `slack` of where it was is no leaving.
     """
-    mask = traces.mask("limit_mask")
+    mask = traces.mask(LIMIT_MASK.name)
     before = traces.before(mask, 0)
     row, bit = places_of(mask & ~before)
     hit = LimitChanges.at(traces, row, bit, row)
@@ -83,7 +84,7 @@ def _follow(
     start = np.repeat(ends - counts, counts)
     row = place - start + np.repeat(traces.starts[solve], counts)
     bits = np.repeat(bit, counts)
-    words = traces.matrix("limit_mask")[row, bits // 32]
+    words = traces.matrix(LIMIT_MASK.name)[row, bits // 32]
     on = (words >> (bits % 32).astype(np.uint32)) & np.uint32(1) > 0
     last = row[np.maximum.accumulate(np.where(on, place, start))]
     away = ~on & ~(np.abs(_q(traces, row, bits) - _q(traces, last, bits)) <= slack)
@@ -99,9 +100,9 @@ def _follow(
 
 def _q(traces: Traces, row: Rows, bit: Rows) -> NDArray[np.float64]:
     """Coordinates (e,); NaN where the trace has none."""
-    if "q" not in traces.names:
+    if Q.name not in traces.names:
         return np.full(len(row), np.nan)
-    q: NDArray[Any] = traces.matrix("q")
+    q: NDArray[Any] = traces.matrix(Q.name)
     known = bit < q.shape[1]
     if known.all():
         return q[row, bit]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from casadi_ik.logs.events.kinds import EventKind, jacobian_names
 from casadi_ik.logs.events.rules import EventRules
 from casadi_ik.logs.events.traces import Rows, Traces, entries
-from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
+from casadi_ik.problem.trace import CONDITION, SIGMA, RecordedJacobian, TraceFormat
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Measured:
         joints: Actuators whose motion it maps.
         singular: Threshold of its smallest singular value.
         condition: Threshold of its condition number.
-        columns: Field and column of "sigma" and of "condition", as far as there are any.
+        columns: Field and column of `SIGMA` and of `CONDITION`, as far as there are any.
     """
 
     joints: tuple[str, ...]
@@ -36,9 +36,10 @@ def jacobians(form: TraceFormat, rules: EventRules) -> list[Measured]:
     """The Jacobians of a trace in the order of `jacobian_names`."""
     found: dict[str, Measured] = {}
     for item in form.layout:
-        kind, _, name = item.name.partition("_")
-        if kind not in ("sigma", "condition"):
+        kind = SIGMA if item.name.startswith(SIGMA) else CONDITION
+        if not item.name.startswith(kind):
             continue
+        name = item.name.removeprefix(kind)
         known = form.jacobians.get(name, RecordedJacobian())
         one = TraceFormat(type(form.layout)((item,)), form.labels)
         for column, label in enumerate(jacobian_names(one)):
@@ -65,12 +66,12 @@ def near_singular(
     Returns:
         Kind, rows (e,), the numbers there (e,), the threshold.
     """
-    if "sigma" in jacobian.columns and jacobian.singular > 0:
-        value, limit = _column(traces, jacobian, "sigma"), jacobian.singular
+    if SIGMA in jacobian.columns and jacobian.singular > 0:
+        value, limit = _column(traces, jacobian, SIGMA), jacobian.singular
         row = entries(traces, value < limit, ~(value <= limit * rules.release))
         yield EventKind.NEAR_SINGULAR, row, value[row].astype(float), limit
-    if "condition" in jacobian.columns and jacobian.condition < math.inf:
-        value, limit = _column(traces, jacobian, "condition"), jacobian.condition
+    if CONDITION in jacobian.columns and jacobian.condition < math.inf:
+        value, limit = _column(traces, jacobian, CONDITION), jacobian.condition
         row = entries(traces, value > limit, ~(value >= limit / rules.release))
         yield EventKind.ILL_CONDITIONED, row, value[row].astype(float), limit
 
@@ -84,8 +85,8 @@ def nearest_singular(
     """
     distance = np.full((len(row), len(known) + 1), rules.release)
     for number, jacobian in enumerate(known, start=1):
-        if "sigma" in jacobian.columns and jacobian.singular > 0:
-            value = _column(traces, jacobian, "sigma")[row] / jacobian.singular
+        if SIGMA in jacobian.columns and jacobian.singular > 0:
+            value = _column(traces, jacobian, SIGMA)[row] / jacobian.singular
             distance[:, number] = np.where(np.isnan(value), np.inf, value)
         else:
             distance[:, number] = np.inf

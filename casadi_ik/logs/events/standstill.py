@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.logs.events.rules import EventRules
 from casadi_ik.logs.events.traces import Bools, Rows, Traces, over_window
+from casadi_ik.problem.trace import ANGLE_ERROR, COST, POSITION_ERROR, Q
 
 
 def stalls(traces: Traces, rules: EventRules) -> tuple[Rows, NDArray[np.float64]]:
@@ -51,9 +52,9 @@ def oscillations(traces: Traces, rules: EventRules) -> tuple[Rows, NDArray[np.fl
     """
     window = rules.oscillation_window
     traces, number = _longer(traces, window)
-    if "q" not in traces.names or not len(traces):
+    if Q.name not in traces.names or not len(traces):
         return np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 0), dtype=bool)
-    steps = np.diff(traces.columns("q"), axis=1)
+    steps = np.diff(traces.columns(Q.name), axis=1)
     up, down = steps > rules.oscillation_step, steps < -rules.oscillation_step
     turning = (up[:, 1:] & down[:, :-1]) | (down[:, 1:] & up[:, :-1])
     swinging = over_window(turning, window - 1, largest=False)
@@ -85,9 +86,9 @@ def _begins(holds: Bools) -> Rows:
 
 def _errors(traces: Traces) -> list[NDArray[Any]]:
     """What a solve brings down, (columns, m) per unit; a column that is never a number is zero."""
-    names = ("cost",) if "cost" in traces.names else ("position_error", "angle_error")
+    fields = (COST,) if COST.name in traces.names else (POSITION_ERROR, ANGLE_ERROR)
     found = []
-    for name in names:
+    for name in (field.name for field in fields):
         if name in traces.names:
             errors = np.abs(traces.columns(name))
             missing = np.isnan(errors)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.problem.trace import TraceFormat
+from casadi_ik.problem.trace import PHASE, RESTART, TraceFormat
 
 Bools = NDArray[np.bool_]
 Rows = NDArray[np.intp]
@@ -66,16 +66,11 @@ class Traces:
     def piece(self) -> NDArray[np.int32]:
         """(m,) number of the stretch of one solve, phase and start that a row belongs to."""
         new = self.first.copy()
-        for name in ("phase", *self.starts_fields):
+        for name in (PHASE.name, RESTART.name):
             if name in self.names:
                 codes = self.column(name)
                 new[1:] |= codes[1:] != codes[:-1]
         return np.cumsum(new, dtype=np.int32)
-
-    @cached_property
-    def starts_fields(self) -> tuple[str, ...]:
-        """Fields that count the starts of a solve."""
-        return tuple(name for name in ("restart", "candidate") if name in self.names)
 
     def matrix(self, name: str) -> NDArray[Any]:
         """A field of all rows, (m, size); a view."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
+from casadi_ik.problem.trace import WORD
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
 
@@ -21,5 +22,9 @@ def limit_mask(robot: RobotDescription, q: Expr) -> Expr:
 
 
 def bits(flags: Expr) -> Expr:
-    """Bit i is set where flag i (n, 1) is."""
-    return ca.dot(flags, ca.DM([2.0**i for i in range(flags.numel())]))
+    """Bit i is set where flag i (n, 1) is; a word (1, 1) for every `WORD` of them."""
+    n = flags.numel()
+    words = [flags[first : min(first + WORD, n)] for first in range(0, n, WORD)]
+    return ca.vertcat(
+        *(ca.dot(word, ca.DM([2.0**i for i in range(word.numel())])) for word in words)
+    )

@@ -26,7 +26,7 @@ from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Status
-from casadi_ik.problem.trace import TraceFormat, trace_format
+from casadi_ik.problem.trace import RESTART, TraceFormat, trace_format
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
@@ -202,7 +202,7 @@ class _Collected:
         status = result.status.astype(np.int64)
         status[status < 0] = Status.INVALID
         if result.rows is not None:
-            result.rows["candidate"] += before
+            result.rows[RESTART.name] += before
         if not self._rounds:
             # A copy: the states are much larger and need not stay.
             self._q, self._cost, self._counts = q.copy(), cost.copy(), counts

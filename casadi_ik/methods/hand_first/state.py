@@ -15,6 +15,19 @@ from casadi_ik.methods.common.limits import bits
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.status import Phase
+from casadi_ik.problem.trace import (
+    ACCEPTED,
+    ANGLE_ERROR,
+    COST,
+    DAMPING,
+    LIMIT_MASK,
+    PHASE,
+    POSITION_ERROR,
+    RESTART,
+    STATUS,
+    STEP_SIZE,
+    Q,
+)
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
 
@@ -100,21 +113,21 @@ class HandFirstLayouts:
     @cached_property
     def record(self) -> Layout:
         """What is logged of an iteration."""
-        n, f = len(self.robot.actuators), len(self.robot.fingers)
+        robot = self.robot
         return Layout.record(
-            Field("q", (n,), "f8", "rad or m", "actuator positions before the step"),
-            Field("cost", (), "f8", "", "squared residual before the step"),
-            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
-            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
-            Field("damping", (), "f4", "", "Levenberg-Marquardt damping of the step"),
-            Field("step_size", (), "f4", "rad or m", "largest motor change of the step tried"),
+            Q.of(robot, "actuator positions before the step; where the arm is placed, after it"),
+            COST.of(robot, "squared residual before the step"),
+            POSITION_ERROR.of(robot),
+            ANGLE_ERROR.of(robot),
+            DAMPING.of(robot, "Levenberg-Marquardt damping of the step"),
+            STEP_SIZE.of(robot, "largest motor change of the step tried"),
             Field("margin", (), "f4", "", "best arm margin found (arm placement)"),
-            *coupling_fields(self.robot),
-            Field("limit_mask", (), "u4", "", "bit i: actuator i at a limit"),
-            Field("candidate", (), "u1", "", "hand posture started from"),
-            Field("accepted", (), "u1", "", "1 if the step lowered the cost"),
-            Field("phase", (), "u1"),
-            Field("status", (), "u1", "", "0 running, else the final status"),
+            *coupling_fields(robot),
+            LIMIT_MASK.of(robot),
+            RESTART.of(robot, "hand posture started from, counted from 0"),
+            ACCEPTED.of(robot),
+            PHASE.of(robot),
+            STATUS.of(robot),
         )
 
     def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> Bounded:
@@ -164,7 +177,7 @@ class HandFirstLayouts:
                 "margin": margin,
                 **coupling_values(self.robot, q),
                 "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
-                "candidate": s["candidate"],
+                "restart": s["candidate"],
                 "accepted": judged.accepted if judged else 0.0,
                 "phase": float(phase),
                 "status": status,

@@ -19,7 +19,20 @@ from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.trace import TraceFormat, trace_format
+from casadi_ik.problem.trace import (
+    ANGLE_ERROR,
+    COST,
+    LIMIT_MASK,
+    PHASE,
+    POSITION_ERROR,
+    RESTART,
+    STATUS,
+    STEP_SIZE,
+    Q,
+    TraceFormat,
+    packed,
+    trace_format,
+)
 from casadi_ik.robots.description import RobotDescription
 
 AT_LIMIT = 1e-6
@@ -64,20 +77,20 @@ class IpoptMethod:
     @cached_property
     def record(self) -> Layout:
         """What is logged of an iteration."""
-        n, f = len(self._robot.actuators), len(self._robot.fingers)
+        robot = self._robot
         return Layout.record(
-            Field("q", (n,), "f8", "rad or m", "actuator positions before the step"),
-            Field("cost", (), "f8", "", "squared residual before the step"),
+            Q.of(robot, "actuator positions before the step"),
+            COST.of(robot, "squared residual before the step"),
             Field("barrier", (), "f8", "", "Ipopt's barrier parameter mu"),
-            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
-            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
+            POSITION_ERROR.of(robot),
+            ANGLE_ERROR.of(robot),
             Field("infeasibility", (), "f4", "", "largest violation of a constraint (inf_pr)"),
             Field("regularization", (), "f4", "", "added to the diagonal of the Hessian"),
-            Field("step_size", (), "f4", "rad or m", "largest motor change of the step"),
-            Field("limit_mask", (), "u4", "", "bit i: actuator i at a limit"),
-            Field("restart", (), "u4", "", "number of the start, 0 that from q0"),
-            Field("phase", (), "u1"),
-            Field("status", (), "u1", "", "0 running, else the final status"),
+            STEP_SIZE.of(robot, "largest motor change of the step"),
+            LIMIT_MASK.of(robot),
+            RESTART.of(robot, "number of the start, 0 that from q0"),
+            PHASE.of(robot),
+            STATUS.of(robot),
         )
 
     @property
@@ -164,7 +177,7 @@ class IpoptMethod:
         for name in ("barrier", "infeasibility", "regularization"):
             rows[name] = np.concatenate([getattr(run, name) for run in runs])
         rows["step_size"] = np.concatenate([_step_sizes(run.path) for run in runs])
-        rows["limit_mask"] = at_limit @ (1 << np.arange(q.shape[1]))
+        rows["limit_mask"] = packed(at_limit)
         rows["restart"] = np.repeat(np.arange(len(runs)), [len(run.path) for run in runs])
         rows["phase"] = Phase.WHOLE_SYSTEM
         rows["status"][-1:] = max(status, 0)

@@ -12,7 +12,16 @@ from casadi_ik.methods.qiu.finger_step import planar_fingers
 from casadi_ik.methods.qiu.parameters import QiuParameters
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.target import target_fields
-from casadi_ik.problem.trace import RecordedJacobian
+from casadi_ik.problem.trace import (
+    ANGLE_ERROR,
+    LIMIT_MASK,
+    PHASE,
+    POSITION_ERROR,
+    STATUS,
+    STEP_SIZE,
+    Q,
+    RecordedJacobian,
+)
 from casadi_ik.robots.description import Array, RobotDescription
 from casadi_ik.symbolic.closed_chain import VIRTUAL, split
 from casadi_ik.symbolic.smooth import Expr
@@ -44,7 +53,7 @@ class EnhancedLayouts:
         Raises:
             UnsupportedError: The robot is not of the kind the method needs.
         """
-        n, f = len(robot.actuators), len(robot.fingers)
+        n = len(robot.actuators)
         self.robot = robot
         self.options = options
         self.chain = split(robot, options.borrowed)
@@ -76,19 +85,19 @@ class EnhancedLayouts:
             )
         )
         self.record = Layout.record(
-            Field("q", (n,), "f8", "rad or m", "actuator positions"),
-            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
-            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
+            Q.of(robot),
+            POSITION_ERROR.of(robot),
+            ANGLE_ERROR.of(robot),
             Field("palm_error", (), "f4", "rad", "palm orientation task error (phase 1)"),
             Field("palm_motion", (2,), "f4", "mm, rad", "palm motion demanded (phase 2)"),
-            Field("step_size", (), "f4", "rad or m", "largest motor change of this iteration"),
+            STEP_SIZE.of(robot, "largest motor change of this iteration"),
             Field("sigma_thumb", (), "f4", "m", "smallest singular value, thumb point Jacobian"),
             Field("sigma_palm", (), "f4", "", "smallest singular value, palm task (phase 1)"),
             Field("sigma_closed_chain", (), "f4", "", "smallest singular value of H_p (phase 2)"),
             Field("condition_closed_chain", (), "f4", "", "condition number of H_p (phase 2)"),
-            Field("limit_mask", (), "u4", "", "bit i: actuator i at or beyond a limit"),
-            Field("phase", (), "u1", "", "1 thumb reaching, 2 hand alignment"),
-            Field("status", (), "u1", "", "0 running, else the final status"),
+            LIMIT_MASK.of(robot),
+            PHASE.of(robot),
+            STATUS.of(robot),
         )
 
     @property

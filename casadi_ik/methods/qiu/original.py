@@ -25,7 +25,16 @@ from casadi_ik.methods.qiu.tasks import (
 from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.target import contact_errors, target_fields, targets
-from casadi_ik.problem.trace import RecordedJacobian
+from casadi_ik.problem.trace import (
+    ANGLE_ERROR,
+    LIMIT_MASK,
+    PHASE,
+    POSITION_ERROR,
+    STATUS,
+    STEP_SIZE,
+    Q,
+    RecordedJacobian,
+)
 from casadi_ik.robots.description import Array, RobotDescription
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times
@@ -44,7 +53,7 @@ class OriginalStep:
 
     def __init__(self, robot: RobotDescription, options: OriginalParameters) -> None:
         """Lay out state, parameters and record."""
-        n, f = len(robot.actuators), len(robot.fingers)
+        n = len(robot.actuators)
         self.robot = robot
         self.options = options
         self.state = Layout((Field("q", (n,)),))
@@ -59,13 +68,13 @@ class OriginalStep:
             )
         )
         self.record = Layout.record(
-            Field("q", (n,), "f8", "rad or m", "actuator positions"),
-            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
-            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
-            Field("step_size", (), "f4", "rad or m", "largest motor change of this iteration"),
-            Field("limit_mask", (), "u4", "", "bit i: actuator i at or beyond a limit"),
-            Field("phase", (), "u1"),
-            Field("status", (), "u1", "", "0 running, else the final status"),
+            Q.of(robot),
+            POSITION_ERROR.of(robot),
+            ANGLE_ERROR.of(robot),
+            STEP_SIZE.of(robot, "largest motor change of this iteration"),
+            LIMIT_MASK.of(robot),
+            PHASE.of(robot),
+            STATUS.of(robot),
         )
 
     @property

@@ -24,6 +24,7 @@ from casadi_ik.methods.common.coupling_record import coupling_fields, coupling_v
 from casadi_ik.methods.common.limits import kept_within, limit_mask
 from casadi_ik.methods.screw_control.objectives import ScrewTask, rows, tip, values
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.trace import LIMIT_MASK, STATUS, STEP_SIZE, Q
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.measures import singular_values
 from casadi_ik.symbolic.smooth import safe_norm
@@ -70,17 +71,16 @@ class ScrewControlStep:
     @cached_property
     def record(self) -> Layout:
         """What is logged of a step; everything but `step_size` is from before it."""
-        n = len(self.robot.actuators)
         return Layout.record(
-            Field("q", (n,), "f8", "rad or m", "actuator positions"),
+            Q.of(self.robot),
             Field("point", (3,), "f8", "m", "contact point in the frame of the target"),
             Field("error", (self._graph_rows,), "f8", "m, rad", "rows of the task"),
             Field("error_norm", (), "f8", "", "norm of the rows; of a pose Chandra eq. (17)"),
-            Field("step_size", (), "f4", "rad or m", "largest actuator change of this step"),
+            STEP_SIZE.of(self.robot, "largest actuator change of this step"),
             Field("sigma_task", (), "f4", "", "smallest singular value of the scaled Jacobian"),
             *coupling_fields(self.robot),
-            Field("limit_mask", (), "u4", "", "bit i: actuator i at or beyond a limit"),
-            Field("status", (), "u1", "", "0 running, else the final status"),
+            LIMIT_MASK.of(self.robot),
+            STATUS.of(self.robot),
         )
 
     @cached_property

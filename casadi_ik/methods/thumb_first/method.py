@@ -83,10 +83,7 @@ class ThumbFirstMethod:
     @property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        form = trace_format(self.step.record, self._robot)
-        return dataclasses.replace(
-            form, labels={**form.labels, "held_mask": self._robot.actuator_names}
-        )
+        return trace_format(self.step.record, self._robot)
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -14,6 +14,20 @@ from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.status import Phase
+from casadi_ik.problem.trace import (
+    ACCEPTED,
+    ACTIVE_MASK,
+    ANGLE_ERROR,
+    COST,
+    DAMPING,
+    LIMIT_MASK,
+    PHASE,
+    POSITION_ERROR,
+    RESTART,
+    STATUS,
+    STEP_SIZE,
+    Q,
+)
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
 
@@ -92,21 +106,21 @@ class ThumbFirstLayouts:
     @cached_property
     def record(self) -> Layout:
         """What is logged of an iteration: where it led, and the step that led there."""
-        n, f = len(self.robot.actuators), len(self.robot.fingers)
+        robot = self.robot
         return Layout.record(
-            Field("q", (n,), "f8", "rad or m", "actuator positions after the iteration"),
-            Field("cost", (), "f8", "", "summed squares of all contacts there (0.1 m, rad)"),
-            Field("position_error", (f,), "f4", "m", "distance of every finger from its contact"),
-            Field("angle_error", (f,), "f4", "rad", "angle of every finger from its normal"),
-            Field("damping", (), "f4", "", "damping of the step tried"),
-            Field("step_size", (), "f4", "rad or m", "largest motor change of the step tried"),
+            Q.of(robot, "actuator positions after the iteration"),
+            COST.of(robot, "summed squares of all contacts there (0.1 m, rad)"),
+            POSITION_ERROR.of(robot),
+            ANGLE_ERROR.of(robot),
+            DAMPING.of(robot, "damping of the step tried"),
+            STEP_SIZE.of(robot, "largest motor change of the step tried"),
             Field("manipulability", (), "f4", "", "of the thumb's rows: 0 where singular"),
-            Field("held_mask", (), "u4", "", "bit i: actuator i fixed at its limit by the step"),
-            Field("limit_mask", (), "u4", "", "bit i: actuator i at a limit"),
-            Field("start", (), "u1", "", "number of the palm estimate begun from"),
-            Field("accepted", (), "u1", "", "1 if the step lowered the cost"),
-            Field("phase", (), "u1"),
-            Field("status", (), "u1", "", "0 running, else the final status"),
+            ACTIVE_MASK.of(robot),
+            LIMIT_MASK.of(robot),
+            RESTART.of(robot, "number of the palm estimate begun from, counted from 0"),
+            ACCEPTED.of(robot),
+            PHASE.of(robot),
+            STATUS.of(robot),
         )
 
     def row(
@@ -138,9 +152,9 @@ class ThumbFirstLayouts:
             "damping": NOTHING,
             "step_size": NOTHING,
             "manipulability": NOTHING,
-            "held_mask": 0.0,
+            "active_mask": ca.DM.zeros(LIMIT_MASK.of(self.robot).size, 1),
             "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
-            "start": s["start"],
+            "restart": s["start"],
             "accepted": 0.0,
             "phase": float(phase),
             "status": status,

@@ -270,7 +270,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             damping=s["damping"],
             step_size=ca.mmax(ca.fabs(tried - s["q"])),
             manipulability=safe_sqrt(det_spd(thumb @ thumb.T)),
-            held_mask=bits(held),
+            active_mask=bits(held),
             accepted=accepted,
         )
         inputs = [state, parameters, thumb, step, held]

@@ -1,0 +1,152 @@
+"""The standard fields of a trace: every method has them, they are true, and events follow."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from targets import (
+    any_configuration,
+    near_limits_on_singular_arms,
+    random_arm_targets,
+    singular,
+)
+from trace_checks import Kept, check_trace
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError
+from casadi_ik.kernels.layout import Layout
+from casadi_ik.logs import EventKind, detect_events
+from casadi_ik.problem.recorder import SolveBlock
+from casadi_ik.problem.trace import (
+    ACCEPTED,
+    ACTIVE_MASK,
+    COST,
+    DAMPING,
+    RESTART,
+    STANDARD,
+    StandardField,
+    trace_format,
+)
+
+REQUIRED = {field for field in STANDARD if field.required}
+PAPER = {"finger_step": "closed-form", "max_iterations": 400}
+METHODS: Mapping[str, tuple[set[StandardField], dict[str, Any]]] = {
+    "hand-first": ({COST, DAMPING, RESTART, ACCEPTED}, {}),
+    "thumb-first": ({COST, DAMPING, ACTIVE_MASK, RESTART, ACCEPTED}, {"starts": 4}),
+    "enhanced-dls": (set(), PAPER),
+    "enhanced-sdls": (set(), PAPER),
+    "original-dls": (set(), PAPER),
+    "original-sdls": (set(), PAPER),
+    "ipopt": ({COST, RESTART}, {"restarts": 2}),
+}
+"""Of each method: which optional fields it records, and options that keep the runs short."""
+
+
+def run(robot: ik.ArmHand, method: str) -> SolveBlock:
+    """From near home to out of reach: shipped grasps, random, at limits and singular."""
+    rng = np.random.default_rng(12)
+    grasps = random_arm_targets(robot, ("cup", "mug"), 4, rng)
+    # The original methods converge from next to the target only.
+    near = robot.home + rng.normal(size=(4, len(robot.home))) * [[0.02], [0.02], [1e-3], [1e-3]]
+    hard = (any_configuration, near_limits_on_singular_arms, singular)
+    q = [np.clip(near, robot.lower, robot.upper), *(draw(robot, rng, 6) for draw in hard)]
+    points, normals = (
+        np.concatenate([first, second])
+        for first, second in zip(grasps, robot.contacts(np.concatenate(q)), strict=True)
+    )
+    points[-2:] += np.array([0.6, 0.0, 0.0])
+    kept, options = Kept(), METHODS[method][1]
+    known = {name: value for name, value in options.items() if name != "finger_step"}
+    solver = ik.Solver(
+        robot, method, options=known, finger_step=options.get("finger_step", "closed-form")
+    )
+    solver.solve_batch(points, normals, seed=3, log=kept)
+    return joined(kept.blocks)
+
+
+def joined(blocks: list[SolveBlock]) -> SolveBlock:
+    """Blocks of one method as one."""
+    return dataclasses.replace(
+        blocks[0],
+        problems=dataclasses.replace(
+            blocks[0].problems,
+            points=np.concatenate([block.problems.points for block in blocks]),
+            normals=np.concatenate([block.problems.normals for block in blocks]),
+        ),
+        starts=np.concatenate([block.starts for block in blocks]),
+        batch=ik.BatchSolution.joined([block.batch for block in blocks]),
+        rows=np.concatenate([block.rows for block in blocks]),
+        started=np.concatenate([block.started for block in blocks]),
+    )
+
+
+@pytest.fixture(scope="module")
+def blocks(robot) -> dict[str, SolveBlock]:
+    """A seeded run of every method on the shipped robot."""
+    return {method: run(robot, method) for method in ik.METHODS}
+
+
+def test_every_method_is_here():
+    assert tuple(METHODS) == ik.METHODS
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_records_the_standard_fields(blocks, method):
+    names = {field.name for field in REQUIRED | METHODS[method][0]}
+    found = set(blocks[method].format.layout.names) & {field.name for field in STANDARD}
+    assert found == names
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_a_trace_says_is_true(robot, blocks, method):
+    check_trace(robot, blocks[method])
+
+
+CASES = [
+    (method, field)
+    for method, (optional, _) in METHODS.items()
+    for field in STANDARD
+    if field in REQUIRED | optional
+]
+
+
+@pytest.mark.parametrize(
+    ("method", "field"), CASES, ids=[f"{method}-{field.name}" for method, field in CASES]
+)
+def test_a_field_that_is_zero_is_noticed(robot, blocks, method, field):
+    rows = blocks[method].rows.copy()
+    rows[field.name] = 0
+    with pytest.raises(AssertionError):
+        check_trace(robot, dataclasses.replace(blocks[method], rows=rows))
+
+
+@pytest.mark.parametrize("field", STANDARD, ids=lambda field: field.name)
+def test_a_field_of_another_kind_is_refused(robot, blocks, field):
+    layout = blocks["thumb-first"].format.layout
+    other = "u1" if field.dtype != "u1" else "f8"
+    changed = Layout.record(
+        *(dataclasses.replace(f, dtype=other) if f.name == field.name else f for f in layout)
+    )
+    with pytest.raises(InputError, match=f"{field.name!r} has dtype {other!r}, expected"):
+        trace_format(changed, robot.description)
+    without = Layout(tuple(f for f in layout if f.name != field.name))
+    if field.required:
+        with pytest.raises(InputError, match=f"no field {field.name!r}"):
+            trace_format(without, robot.description)
+    else:
+        assert field.name not in trace_format(without, robot.description).labels
+
+
+def test_every_kind_of_event_is_produced(blocks):
+    """Each kind by some method: names that differ between methods and events would hide one."""
+    found = {}
+    for method, block in blocks.items():
+        events = detect_events(block.format, block.rows, block.batch.iterations)
+        found[method] = {EventKind(kind) for kind in np.unique(events["kind"])}
+    assert set.union(*found.values()) == set(EventKind)
+    assert {EventKind.ACTIVATED, EventKind.RELEASED, EventKind.RESTART} <= found["thumb-first"]
+    assert EventKind.RESTART in found["hand-first"] & found["ipopt"]

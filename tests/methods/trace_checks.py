@@ -1,0 +1,264 @@
+"""What a trace has to agree with: everything in it that can be had in another way is had so.
+
+Each check needs nothing of the method but what its standard fields promise; where methods differ
+in what a row tells (`Promise`), that is said here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import casadi_ik as ik
+from casadi_ik.problem.recorder import SolveBlock
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.trace import (
+    ACCEPTED,
+    ACTIVE_MASK,
+    ANGLE_ERROR,
+    COST,
+    DAMPING,
+    LIMIT_MASK,
+    PHASE,
+    POSITION_ERROR,
+    RESTART,
+    STATUS,
+    STEP_SIZE,
+    Q,
+)
+
+Array = NDArray[np.float64]
+
+LENGTH = 0.1
+"""Position errors weigh in a cost by this [m]."""
+
+
+class Kept:
+    """A recorder that keeps the blocks in memory."""
+
+    def __init__(self) -> None:
+        self.blocks: list[SolveBlock] = []
+
+    def record(self, block: SolveBlock) -> None:
+        self.blocks.append(block)
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error) -> None:
+        """Nothing to do."""
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What the rows of a method tell.
+
+    Attributes:
+        whole: Phases whose errors are those of the row's q (elsewhere the palm is not the arm's).
+        step: Phases whose `STEP_SIZE` is that of the step between two rows in them.
+        before: Whether a row's q is the one the step starts from, otherwise where it led.
+        slack: How near a limit counts as on it [rad or m].
+        thumb_weight: Of the thumb's squares in the cost.
+        normals: How the angle counts in the cost: its "chord" or itself, "angle".
+    """
+
+    whole: tuple[Phase, ...]
+    step: tuple[Phase, ...]
+    before: bool = True
+    slack: float = 0.0
+    thumb_weight: float = 1.0
+    normals: str = "chord"
+
+
+HIERARCHY = Promise((Phase.HIERARCHY,), (Phase.HIERARCHY,))
+ENHANCED = Promise((Phase.THUMB_REACHING, Phase.HAND_ALIGNMENT), (Phase.THUMB_REACHING,))
+PROMISES = {
+    "hand-first": Promise((Phase.REFINEMENT,), (Phase.REFINEMENT, Phase.HAND_FIT)),
+    "thumb-first": Promise(
+        (Phase.CANDIDATE, Phase.HAND_ALIGNMENT),
+        (Phase.HAND_ALIGNMENT,),
+        before=False,
+        thumb_weight=4.0,
+        normals="angle",
+    ),
+    "enhanced-dls": ENHANCED,
+    "enhanced-sdls": ENHANCED,
+    "original-dls": HIERARCHY,
+    "original-sdls": HIERARCHY,
+    "ipopt": Promise((Phase.WHOLE_SYSTEM,), (Phase.WHOLE_SYSTEM,), slack=1e-6),
+}
+
+
+def check_trace(robot: ik.ArmHand, block: SolveBlock) -> None:
+    """All checks on the trace of a block.
+
+    Raises:
+        AssertionError: Something in it does not agree with the rest.
+    """
+    promise, names = PROMISES[block.method], block.format.layout.names
+    _check_errors(robot, block, promise)
+    _check_step(block, promise)
+    _check_limits(robot, block, promise)
+    _check_phases(block)
+    _check_status(block)
+    if COST.name in names:
+        _check_cost(block, promise)
+    if RESTART.name in names:
+        _check_restarts(block)
+    if ACCEPTED.name in names:
+        _check_accepted(block, promise)
+    if ACTIVE_MASK.name in names:
+        _check_active(block)
+
+
+def _solves(block: SolveBlock) -> Iterator[tuple[int, np.ndarray]]:
+    ends = np.cumsum(block.batch.iterations)
+    for row, (end, count) in enumerate(zip(ends, block.batch.iterations, strict=True)):
+        yield row, block.rows[end - count : end]
+
+
+def _of_solve(block: SolveBlock) -> NDArray[np.int64]:
+    return np.repeat(np.arange(len(block)), block.batch.iterations)
+
+
+def _in(block: SolveBlock, phases: tuple[Phase, ...]) -> NDArray[np.bool_]:
+    return np.isin(block.rows[PHASE.name], [int(phase) for phase in phases])
+
+
+def _check_errors(robot: ik.ArmHand, block: SolveBlock, promise: Promise) -> None:
+    """Distances and angles are those of the row's q."""
+    wanted = _in(block, promise.whole)
+    assert wanted.any()
+    rows, of_solve = block.rows[wanted], _of_solve(block)[wanted]
+    points, normals = robot.contacts(rows[Q.name].astype(float))
+    goal = block.problems.points[of_solve], block.problems.normals[of_solve]
+    distance = np.linalg.norm(points - goal[0], axis=2)
+    turned = np.linalg.norm(np.cross(normals, goal[1]), axis=2)
+    angle = np.arctan2(turned, np.sum(normals * goal[1], axis=2))
+    np.testing.assert_allclose(rows[POSITION_ERROR.name], distance, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(rows[ANGLE_ERROR.name], angle, rtol=1e-4, atol=1e-6)
+
+
+def _pairs(block: SolveBlock, phases: tuple[Phase, ...]) -> NDArray[np.intp]:
+    """Rows whose next one is of the same solve, phase and start, in one of the phases."""
+    of_solve, phase = _of_solve(block), block.rows[PHASE.name]
+    same = (of_solve[1:] == of_solve[:-1]) & (phase[1:] == phase[:-1]) & _in(block, phases)[1:]
+    if RESTART.name in block.format.layout.names:
+        restart = block.rows[RESTART.name]
+        same &= restart[1:] == restart[:-1]
+    return np.flatnonzero(same)
+
+
+def _check_step(block: SolveBlock, promise: Promise) -> None:
+    """A step taken is as long as the way between two rows."""
+    pairs = _pairs(block, promise.step)
+    assert len(pairs)
+    told = pairs if promise.before else pairs + 1
+    way = np.abs(block.rows[Q.name][pairs + 1] - block.rows[Q.name][pairs]).max(axis=1)
+    size = block.rows[STEP_SIZE.name][told]
+    taken = np.ones(len(pairs), dtype=bool)
+    if ACCEPTED.name in block.format.layout.names:
+        taken = block.rows[ACCEPTED.name][told] > 0
+    assert taken.any()
+    np.testing.assert_allclose(size[taken], way[taken], rtol=1e-4, atol=1e-9)
+
+
+def _check_limits(robot: ik.ArmHand, block: SolveBlock, promise: Promise) -> None:
+    """The bits of the actuators at or beyond a limit, and of no other."""
+    q = block.rows[Q.name]
+    at = (q <= robot.lower + promise.slack) | (q >= robot.upper - promise.slack)
+    assert at.any()
+    np.testing.assert_array_equal(_bits(block.rows[LIMIT_MASK.name], q.shape[1]), at)
+
+
+def _bits(mask: np.ndarray, count: int) -> NDArray[np.bool_]:
+    words = np.atleast_2d(mask.T).T
+    bits = [words[:, i // 32] >> np.uint32(i % 32) & 1 for i in range(count)]
+    return np.stack(bits, axis=1).astype(bool)
+
+
+def _check_phases(block: SolveBlock) -> None:
+    """As many rows of each phase as the solve counts."""
+    codes = {phase.label: int(phase) for phase in Phase}
+    for row, rows in _solves(block):
+        for label, counts in block.batch.phases.items():
+            assert np.sum(rows[PHASE.name] == codes[label]) == counts[row], (row, label)
+
+
+def _check_status(block: SolveBlock) -> None:
+    """The last row says how it ended; no row before says that it was solved."""
+    seen = 0
+    for row, rows in _solves(block):
+        ended = Status(int(block.batch.status[row]))
+        if ended is Status.SOLVED:
+            assert rows[STATUS.name][-1] == Status.SOLVED
+            seen += 1
+        assert not np.any(rows[STATUS.name][:-1] == Status.SOLVED)
+    assert seen
+
+
+def _check_cost(block: SolveBlock, promise: Promise) -> None:
+    """The squares of all contacts, by the errors of the row; while the hand is fitted no less."""
+    position, angle = block.rows[POSITION_ERROR.name], block.rows[ANGLE_ERROR.name]
+    known = ~np.isnan(position).any(axis=1)
+    assert known.any()
+    # Where errors are measured, the cost is, and the other way round.
+    np.testing.assert_array_equal(np.isnan(block.rows[COST.name]), ~known)
+    turned = angle if promise.normals == "angle" else 2 * np.sin(angle / 2)
+    squares = (position / LENGTH) ** 2 + turned**2
+    squares[:, block.fingers.index("thumb")] *= promise.thumb_weight
+    cost, least = block.rows[COST.name], squares.sum(axis=1)
+    whole = known & _in(block, promise.whole)
+    np.testing.assert_allclose(cost[whole], least[whole], rtol=1e-3, atol=1e-12)
+    # The fit of a hand also counts how far the palm is out of the arm's reach.
+    assert (cost[known] >= (1 - 1e-3) * least[known] - 1e-12).all()
+
+
+def _check_restarts(block: SolveBlock) -> None:
+    """Counted on from 0, one by one, as many as the solve counts."""
+    assert block.batch.restarts.any()
+    for row, rows in _solves(block):
+        steps = np.diff(rows[RESTART.name].astype(int), prepend=0)
+        assert np.isin(steps, (0, 1)).all(), row
+        # A solve that ends in vain says so in a row beyond its last start.
+        over = int(rows[STATUS.name][-1] == Status.STALLED)
+        assert (
+            block.batch.restarts[row] <= rows[RESTART.name][-1] <= block.batch.restarts[row] + over
+        )
+
+
+def _check_accepted(block: SolveBlock, promise: Promise) -> None:
+    """A step that is taken moves the robot, lowers the cost and eases the damping."""
+    pairs = _pairs(block, promise.step)
+    told = pairs if promise.before else pairs + 1
+    taken = block.rows[ACCEPTED.name][told] > 0
+    assert taken.any()
+    assert not taken.all()
+    moved = np.any(block.rows[Q.name][pairs + 1] != block.rows[Q.name][pairs], axis=1)
+    np.testing.assert_array_equal(moved, taken)
+    cost = block.rows[COST.name]
+    np.testing.assert_array_equal(cost[pairs + 1] < cost[pairs], taken)
+    damping = block.rows[DAMPING.name]
+    assert (damping[pairs[~taken] + 1] > damping[pairs[~taken]]).all() or not promise.before
+    assert (damping[told] > 0).all()
+
+
+def _check_active(block: SolveBlock) -> None:
+    """What a step brought to its limit it held there."""
+    n = block.rows[Q.name].shape[1]
+    at = _bits(block.rows[LIMIT_MASK.name], n)
+    held = _bits(block.rows[ACTIVE_MASK.name], n)
+    pairs = _pairs(block, PROMISES[block.method].step)
+    come = at[pairs + 1] & ~at[pairs]
+    assert come.any()
+    assert held[pairs + 1][come].all()
+    # And it holds nothing that it leaves.
+    taken = block.rows[ACCEPTED.name][pairs + 1] > 0
+    gone = at[pairs] & ~at[pairs + 1]
+    assert not held[pairs + 1][taken][gone[taken]].any()
