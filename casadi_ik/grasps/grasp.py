@@ -63,7 +63,9 @@ class Contact:
         object.__setattr__(self, "tolerance", tolerance)
         given = {"normal": normal, "tangent": tangent, "line": line, "plane": plane}
         if direction is not None:
-            others = [name for name, value in {"point": point, **given}.items() if value is not None]
+            others = [
+                name for name, value in {"point": point, **given}.items() if value is not None
+            ]
             if others:
                 raise InputError(f"direction: found it beside {others[0]}, expected it alone")
             object.__setattr__(self, "point", _frozen(np.full(3, np.nan)))
@@ -139,7 +141,6 @@ class Grasp:
             points[row] = contact.point if known else np.nan
             normals[row] = contact.normal if known and contact.normal is not None else np.nan
         return points, normals
-
 
     def more(self, fingers: Sequence[str]) -> dict[str, Array]:
         """What the contacts have beside point and normal.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -42,6 +42,39 @@ class Outcome:
     def trace(self) -> tuple[NDArray[Any], ...]:
         """The rows of each solve, views into `rows`; empty if no trace was asked for."""
         return () if self.rows is None else split_rows(self.rows, self.iterations)
+
+    @classmethod
+    def interleaved(
+        cls, places: Sequence[NDArray[np.intp]], outcomes: Sequence[Outcome]
+    ) -> Outcome:
+        """Put the outcomes of some targets each together.
+
+        Args:
+            places: Which rows of the whole the targets of an outcome are; together all of them.
+            outcomes: At least one.
+        """
+        order = np.argsort(np.concatenate(list(places)))
+
+        def whole(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+            return np.concatenate(list(parts))[order]
+
+        names = dict.fromkeys(name for one in outcomes for name in one.phases)
+        rows = None
+        if all(one.rows is not None for one in outcomes):
+            traces = [trace for one in outcomes for trace in one.trace]
+            rows = np.concatenate([traces[i] for i in order])
+        return cls(
+            q=whole([one.q for one in outcomes]),
+            status=whole([one.status for one in outcomes]),
+            iterations=whole([one.iterations for one in outcomes]),
+            restarts=whole([one.restarts for one in outcomes]),
+            time=whole([one.time for one in outcomes]),
+            phases={
+                name: whole([one.phases.get(name, np.zeros_like(one.status)) for one in outcomes])
+                for name in names
+            },
+            rows=rows,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -104,9 +104,9 @@ def deviations(robot: ArmHand, problems: Problems, q: Array) -> tuple[Array, Arr
         q: (k, n) or (n,); NaN gives NaN.
 
     Returns:
-        (k, f) or (f,) distances [m] from the point, line or plane; as many angles [rad] between the
-        normals, or between the whole frames where there is a tangent; NaN where free; (k,) or () by how
-        much the worst actuator or joint is beyond its limits [rad or m].
+        (k, f) or (f,) distances [m] from the point, line or plane; as many angles [rad] between
+        the normals, or between the whole frames where there is a tangent; NaN where free; (k,) or
+        () by how much the worst actuator or joint is beyond its limits [rad or m].
     """
     points, normals = problems.points, problems.normals
     if len(problems) == 1:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,9 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.problem.diagnosis import Reason
+from casadi_ik.problem.contacts.arrays import by_kinds
+from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.diagnosis import Diagnosis, Reason
 from casadi_ik.problem.method import Method, Outcome, QuickMethod
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.recorder import Recorder, SolveBlock
@@ -49,18 +52,40 @@ class Engine:
         robot: The robot.
         method: The method, built for this robot.
         compiled: Whether what a diagnosis needs besides runs in compiled code.
+        kinds: Of the contacts, by finger; None: point and normal.
     """
 
     robot: ArmHand
     method: Method
     compiled: bool = True
+    kinds: Kinds | None = None
+
+    def of_kinds(self, kinds: Kinds) -> Engine:
+        """The engine for targets whose contacts are of these kinds; kept for the next of them."""
+        method = self.method.for_kinds(kinds)
+        if method is self.method:
+            return self
+        with self._lock:
+            if kinds not in self._others:
+                self._others[kinds] = replace(self, method=method, kinds=kinds)
+            return self._others[kinds]
+
+    @cached_property
+    def _others(self) -> dict[Kinds, Engine]:
+        return {}
+
+    @cached_property
+    def _lock(self) -> Lock:
+        return Lock()
 
     @cached_property
     def diagnostician(self) -> Diagnostician:
         """Who says why a target was not solved; asks hand-first, whichever the method is."""
         method = self.method
         if not isinstance(method, HandFirstMethod):
-            method = HandFirstMethod(self.robot.description, HandFirstParameters(), self.compiled)
+            method = HandFirstMethod(
+                self.robot.description, HandFirstParameters(), self.compiled, self.kinds
+            )
         return Diagnostician(self.robot, method)
 
     @property
@@ -76,6 +101,17 @@ class Engine:
     @cached_property
     def _quick(self) -> QuickMethod | None:
         return self.method if isinstance(self.method, QuickMethod) else None
+
+    def kinds_of(self, problems: Problems) -> Engine:
+        """The engine for targets that are all of the same kinds.
+
+        Raises:
+            InputError: They are of several.
+        """
+        engines = {self.of_kinds(kinds) for kinds, _, _ in by_kinds(problems)}
+        if len(engines) > 1:
+            raise InputError("grasps: found contacts of several kinds, expected the same in all")
+        return engines.pop()
 
     @cached_property
     def finder(self) -> AlternativeFinder:
@@ -106,6 +142,11 @@ class Engine:
         Raises:
             InputError: Bad q0 or seed.
         """
+        if problems.more:
+            ((kinds, _, _),) = by_kinds(problems)
+            other = self.of_kinds(kinds)
+            if other is not self:
+                return other.quick(problems, q0, seed)
         method, robot = self._quick, self.robot
         if method is None:
             return None
@@ -163,7 +204,8 @@ class Engine:
         _whole("jobs", jobs, 1)
         _whole("seed", seed, 0)
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
-        self.method.prepare()
+        for kinds, _, _ in by_kinds(problems):
+            self.of_kinds(kinds).method.prepare()
         batches = []
         for part in self._parts(problems, starts, int(seed), int(jobs), recorder, diagnose):
             if recorder is not None and part.outcome.rows is not None:
@@ -195,7 +237,7 @@ class Engine:
 
         def run(rows: slice) -> _Part:
             started, asked = time.time_ns(), problems.rows(rows)
-            outcome = self.method.run(asked, starts[rows], seed, trace)
+            outcome = self._run(asked, starts[rows], seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
             batch = self._judged(asked, outcome)
@@ -204,7 +246,8 @@ class Engine:
             return _Part(asked, starts[rows], started, outcome, batch)
 
         if diagnose:
-            _ = self.diagnostician
+            for kinds, _, _ in by_kinds(problems):
+                _ = self.of_kinds(kinds).diagnostician
         if jobs == 1 and not trace:
             yield run(slice(0, len(problems)))
             return
@@ -220,6 +263,17 @@ class Engine:
                     yield ahead.popleft().result()
             while ahead:
                 yield ahead.popleft().result()
+
+    def _run(self, problems: Problems, starts: Array, seed: int, trace: bool) -> Outcome:
+        """Run the method on targets of any kinds."""
+        groups, outcomes = [], []
+        for kinds, rows, some in by_kinds(problems):
+            method = self.of_kinds(kinds).method
+            if rows is None:
+                return method.run(some, starts, seed, trace)
+            groups.append(rows)
+            outcomes.append(method.run(some, starts[rows], seed, trace))
+        return Outcome.interleaved(groups, outcomes)
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
@@ -253,10 +307,13 @@ class Engine:
         own = isinstance(self.method, HandFirstMethod)
         q, seconds = outcome.q.copy(), outcome.time.copy()
         rows = np.flatnonzero(~batch.success)
-        diagnoses = self.diagnostician.diagnose(
-            problems.rows(rows), starts[rows], q[rows] if own else None
-        )
-        found = dict(zip(rows.tolist(), diagnoses, strict=True))
+        found: dict[int, Diagnosis] = {}
+        for kinds, of_kinds, some in by_kinds(problems.rows(rows)):
+            chosen = rows if of_kinds is None else rows[of_kinds]
+            diagnoses = self.of_kinds(kinds).diagnostician.diagnose(
+                some, starts[chosen], q[chosen] if own else None
+            )
+            found |= zip(chosen.tolist(), diagnoses, strict=True)
         for row, why in found.items():
             if own and why.reason is Reason.REACHABLE:
                 q[row] = why.q

@@ -101,9 +101,7 @@ class WholeNlp:
         residual: ``(q, parameters) -> r`` (rows, 1).
     """
 
-    def __init__(
-        self, robot: RobotDescription, options: IpoptParameters, kinds: Kinds
-    ) -> None:
+    def __init__(self, robot: RobotDescription, options: IpoptParameters, kinds: Kinds) -> None:
         """Build the graphs and both solvers, cold and warm."""
         n = len(robot.actuators)
         self.contacts = NlpContacts(kinds)

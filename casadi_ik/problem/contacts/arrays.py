@@ -101,12 +101,20 @@ def by_kinds(problems: Problems) -> Iterator[tuple[Kinds, NDArray[np.intp] | Non
     names = list(problems.more)
     given = np.stack([~np.isnan(problems.more[name][..., 0]) for name in names], axis=2)
     if "tangents" in names:
-        given[..., names.index("tangents")] = given[..., names.index("tangents")].any(axis=1)[:, None]
+        given[..., names.index("tangents")] = given[..., names.index("tangents")].any(axis=1)[
+            :, None
+        ]
     codes, which = np.unique(given.reshape(len(given), -1), axis=0, return_inverse=True)
     which = which.ravel()
     for i, code in enumerate(codes):
         kinds = tuple(
-            kind_of(["point", "normal", *(name[:-1] for name, has in zip(names, row, strict=True) if has)])
+            kind_of(
+                [
+                    "point",
+                    "normal",
+                    *(name[:-1] for name, has in zip(names, row, strict=True) if has),
+                ]
+            )
             for row in code.reshape(f, -1)
         )
         if len(codes) == 1:
