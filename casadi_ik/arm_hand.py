@@ -52,12 +52,12 @@ class ArmHand:
 
     @property
     def lower(self) -> Array:
-        """(n,) lower limits of the actuators [rad or m]."""
+        """(n,) lower limits of the actuators [rad or m], those of their joints included."""
         return self.description.lower
 
     @property
     def upper(self) -> Array:
-        """(n,) upper limits of the actuators [rad or m]."""
+        """(n,) upper limits of the actuators [rad or m], those of their joints included."""
         return self.description.upper
 
     @property

@@ -103,8 +103,10 @@ class RobotKernels:
     def _excess(self, q: ca.SX) -> ca.SX:
         description = self._robot
         both = ca.vertcat(q, joint_positions(description, q))
-        lower = ca.DM(np.concatenate([description.lower, description.joint_lower]))
-        upper = ca.DM(np.concatenate([description.upper, description.joint_upper]))
+        # As the file has them: bounds that were derived from these are not judged by themselves.
+        strokes = description.strokes
+        lower = ca.DM(np.concatenate([strokes[0], description.joint_lower]))
+        upper = ca.DM(np.concatenate([strokes[1], description.joint_upper]))
         return ca.mmax(ca.fmax(lower - both, both - upper))
 
     @cached_property
