@@ -315,10 +315,10 @@ class Solver:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
             UnsupportedError: The method is not one step run to its end.
         """
-        method = self._engine.method
+        problems = self._questions.of_grasps([grasp], None)
+        method = self._engine.kinds_of(problems).method
         if not isinstance(method, SteppedMethod):
             raise UnsupportedError(f"method {self.method!r} cannot be stepped by hand")
-        problems = self._questions.of_grasps([grasp], None)
         states, parameters = method.start(problems, self._questions.start(q0)[None])
         return Stepper(method.kernel.step, states[0], parameters[0])
 

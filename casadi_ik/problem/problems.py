@@ -88,7 +88,10 @@ class Problems:
             first_row = self.first_row + start
         points, normals = self.points[rows], self.normals[rows]
         more = {name: array[rows] for name, array in self.more.items()} if self.more else self.more
-        return replace(self, points=points, normals=normals, first_row=first_row, more=more)
+        picked = None if self.picked is None else self.picked[rows]
+        return replace(
+            self, points=points, normals=normals, first_row=first_row, more=more, picked=picked
+        )
 
     def number(self, row: int) -> int:
         """Number of a target in the whole batch."""

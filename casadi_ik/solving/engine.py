@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.contacts.arrays import by_kinds
-from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
 from casadi_ik.problem.method import Method, Outcome, QuickMethod
 from casadi_ik.problem.problems import Array, Problems
@@ -29,6 +28,8 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import judge, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.tracking import Tracker
+from casadi_ik.solving.by_kinds import PerKinds
+from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.parts import Parts
 
@@ -61,22 +62,15 @@ class Engine:
     kinds: Kinds | None = None
 
     def of_kinds(self, kinds: Kinds) -> Engine:
-        """The engine for targets whose contacts are of these kinds; kept for the next of them."""
-        method = self.method.for_kinds(kinds)
-        if method is self.method:
-            return self
-        with self._lock:
-            if kinds not in self._others:
-                self._others[kinds] = replace(self, method=method, kinds=kinds)
-            return self._others[kinds]
+        """The engine for targets whose contacts are of these kinds."""
+        own = self.kinds or usual(len(kinds))
+        return self if kinds == own else self._others.of(kinds)
 
     @cached_property
-    def _others(self) -> dict[Kinds, Engine]:
-        return {}
-
-    @cached_property
-    def _lock(self) -> Lock:
-        return Lock()
+    def _others(self) -> PerKinds[Engine]:
+        return PerKinds(
+            lambda kinds: replace(self, method=self.method.for_kinds(kinds), kinds=kinds)
+        )
 
     @cached_property
     def diagnostician(self) -> Diagnostician:
@@ -235,9 +229,12 @@ class Engine:
         """Parts of the batch in order, solved, judged and diagnosed side by side."""
         trace = recorder is not None
 
+        def method(kinds: Kinds) -> Method:
+            return self.of_kinds(kinds).method
+
         def run(rows: slice) -> _Part:
             started, asked = time.time_ns(), problems.rows(rows)
-            outcome = self._run(asked, starts[rows], seed, trace)
+            outcome = run_by_kinds(method, asked, starts[rows], seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
             batch = self._judged(asked, outcome)
@@ -263,17 +260,6 @@ class Engine:
                     yield ahead.popleft().result()
             while ahead:
                 yield ahead.popleft().result()
-
-    def _run(self, problems: Problems, starts: Array, seed: int, trace: bool) -> Outcome:
-        """Run the method on targets of any kinds."""
-        groups, outcomes = [], []
-        for kinds, rows, some in by_kinds(problems):
-            method = self.of_kinds(kinds).method
-            if rows is None:
-                return method.run(some, starts, seed, trace)
-            groups.append(rows)
-            outcomes.append(method.run(some, starts[rows], seed, trace))
-        return Outcome.interleaved(groups, outcomes)
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)

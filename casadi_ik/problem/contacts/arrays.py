@@ -101,23 +101,18 @@ def by_kinds(problems: Problems) -> Iterator[tuple[Kinds, NDArray[np.intp] | Non
     names = list(problems.more)
     given = np.stack([~np.isnan(problems.more[name][..., 0]) for name in names], axis=2)
     if "tangents" in names:
-        given[..., names.index("tangents")] = given[..., names.index("tangents")].any(axis=1)[
-            :, None
-        ]
-    codes, which = np.unique(given.reshape(len(given), -1), axis=0, return_inverse=True)
-    which = which.ravel()
-    for i, code in enumerate(codes):
+        turned = given[..., names.index("tangents")]
+        turned[:] = turned.any(axis=1)[:, None]
+    flat = given.reshape(len(given), -1)
+    _, firsts, which = np.unique(
+        flat @ (1 << np.arange(flat.shape[1])), return_index=True, return_inverse=True
+    )
+    for i, of_fingers in enumerate(given[firsts].tolist()):
         kinds = tuple(
-            kind_of(
-                [
-                    "point",
-                    "normal",
-                    *(name[:-1] for name, has in zip(names, row, strict=True) if has),
-                ]
-            )
-            for row in code.reshape(f, -1)
+            kind_of(name[:-1] for name, has in zip(names, row, strict=True) if has)
+            for row in of_fingers
         )
-        if len(codes) == 1:
+        if len(firsts) == 1:
             yield kinds, None, problems
             return
         rows = np.flatnonzero(which == i)
