@@ -6,7 +6,7 @@ import lzma
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,10 +66,13 @@ class TargetFile:
             InputError: Missing, no npz, damaged, or other arrays than expected; the message names
                 file and key.
         """
-        return sum(len(block["points"]) for block in self.blocks(size))
+        return sum(len(block["points"]) for block in self.blocks(lambda: size))
 
-    def blocks(self, size: int) -> Iterator[dict[str, NDArray[np.float64]]]:
+    def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, NDArray[np.float64]]]:
         """Arrays (up to size, f, 3) by name, one block after the other.
+
+        Args:
+            size: Says before every block how large it may be.
 
         Raises:
             InputError: As `check`.
@@ -87,9 +90,11 @@ class TargetFile:
                         f"{self.path}: points and {key}: found {count} and {member.count} rows, "
                         "expected as many"
                     )
-            for start in range(0, count, size):
-                rows = min(size, count - start)
-                last = start + rows == count
+            start = 0
+            while start < count:
+                rows = min(size(), count - start)
+                start += rows
+                last = start == count
                 yield {key: member.read(rows, last) for key, member in members.items()}
 
     @contextmanager

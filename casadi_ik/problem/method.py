@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.rows import split_rows
+from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.trace import TraceFormat
@@ -106,10 +107,23 @@ class Method(Protocol):
         """Build and compile what `run` needs; afterwards `run` may be called by several threads."""
         ...
 
-    def for_kinds(self, kinds: Kinds) -> Self:
+    def for_kinds(self, kinds: Kinds) -> Method:
         """The same method for contacts of other kinds; itself for its own, and if it has only one.
 
         What it cannot take, it refuses in `run`, target by target.
+        """
+        ...
+
+    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+        """Solve one target by hand, one iteration at a time.
+
+        Args:
+            problems: One target.
+            q0: (n,) configuration to start from.
+
+        Raises:
+            RowError: The method cannot take the target (for example a free finger).
+            UnsupportedError: The method cannot be stepped; the message says why.
         """
         ...
 

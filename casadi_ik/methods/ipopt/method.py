@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.methods.ipopt.contacts import NlpContacts
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.whole_nlp import NlpRun, WholeNlp
@@ -54,9 +56,21 @@ class IpoptMethod:
     name = "ipopt"
 
     def __init__(
-        self, robot: RobotDescription, options: IpoptParameters, kinds: Kinds | None = None
+        self,
+        robot: RobotDescription,
+        options: IpoptParameters,
+        compiled: bool = True,
+        kinds: Kinds | None = None,
     ) -> None:
-        """Remember robot and kinds (point and normal if not given); built when first needed."""
+        """Remember the robot; the program is built when first needed.
+
+        Args:
+            robot: The robot.
+            options: The numbers.
+            compiled: Makes no difference: Ipopt calls its graphs in the virtual machine.
+            kinds: Of the contacts, by finger; None: point and normal.
+        """
+        del compiled
         self._kinds = kinds or usual(len(robot.fingers))
         self.options = options
         self._robot = robot
@@ -68,7 +82,7 @@ class IpoptMethod:
 
     def for_kinds(self, kinds: Kinds) -> IpoptMethod:
         """The same for contacts of other kinds."""
-        return self if kinds == self._kinds else IpoptMethod(self._robot, self.options, kinds)
+        return self if kinds == self._kinds else IpoptMethod(self._robot, self.options, kinds=kinds)
 
     def prepare(self) -> None:
         """Build the program."""
@@ -102,6 +116,18 @@ class IpoptMethod:
     def parameters(self) -> Mapping[str, Any]:
         """The parameter record as a plain mapping."""
         return dataclasses.asdict(self.options)
+
+    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+        """Not to be had.
+
+        Raises:
+            UnsupportedError: Always.
+        """
+        del problems, q0
+        raise UnsupportedError(
+            f"method {self.name!r} cannot be stepped by hand: Ipopt runs its iterations itself and "
+            "only reports them; a log holds them all"
+        )
 
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch; see `Method.run`.
