@@ -165,9 +165,8 @@ class Solver:
             fixed: Positions of actuators that are not to move, by name [rad or m].
             keep: Which solves keep their iterations in the log; None: all.
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
-            more: (k, f, 3) by name, NaN where free: "tangents" (second axes of the contact frames,
-                orthogonal to the normals, see `ArmHand.contact_frames`), "lines", "planes" (a
-                contact may be anywhere on that through its point).
+            more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
+                `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point).
 
         Returns:
             The same fields as a `Solution`, as arrays.
