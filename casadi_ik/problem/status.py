@@ -57,6 +57,7 @@ class Phase(IntEnum):
     ARM_PLACEMENT = 6
     HIERARCHY = 7
     WHOLE_SYSTEM = 8
+    BALANCE = 9
 
     @property
     def label(self) -> str:
