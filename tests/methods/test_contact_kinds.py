@@ -19,6 +19,7 @@ from casadi_ik.problem.contacts.conditions import CONDITIONS
 from casadi_ik.problem.contacts.kinds import ContactKind, usual
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
+from casadi_ik.solving.diagnosis.prover import Prover
 
 METHODS = ("hand-first", "thumb-first", "ipopt")
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
@@ -364,3 +365,17 @@ def test_the_tables_agree():
 
 def _plain() -> Problems:
     return Problems(np.zeros((2, 3, 3)), np.zeros((2, 3, 3)), TIGHT, enforce_limits=True)
+
+
+def test_no_proof_counts_a_contact_that_may_slide(robot):
+    """Its point is far out of reach; the plane through it is not."""
+    at = frames(robot)
+    points, normals = at[None, :, :3, 3].copy(), at[None, :, :3, 0]
+    points[0, 0, :2] += 5.0
+    planes = np.full((1, 3, 3), np.nan)
+    planes[0, 0] = UP
+    prover = Prover(robot.description, compiled=False)
+    asked = Problems(points, normals, TIGHT, enforce_limits=True)
+    assert prover.prove(asked)[0] is not None
+    slides = Problems(points, normals, TIGHT, enforce_limits=True, more={"planes": planes})
+    assert prover.prove(slides)[0] is None
