@@ -164,6 +164,8 @@ class Engine:
         _whole("seed", seed, 0)
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
         self.method.prepare()
+        if recorder is not None and (measures := self.method.trace_format.measures) is not None:
+            measures.prepare()
         batches = []
         for part in self._parts(problems, starts, int(seed), int(jobs), recorder, diagnose):
             if recorder is not None and part.outcome.rows is not None:

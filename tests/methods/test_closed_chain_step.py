@@ -14,9 +14,9 @@ from casadi_ik.methods.thumb_first.closed_chain_step import (
     contact_residuals,
     freezing,
     linearised,
-    motor_scales,
     quadratic_program,
 )
+from casadi_ik.symbolic.actuated import motor_scales
 
 WIDE = 1e3
 

@@ -22,9 +22,10 @@ from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import STAGE_LABELS, HandFirstLayouts
 from casadi_ik.methods.hand_first.step import HandFirstStep
+from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.problems import Array, Problems
-from casadi_ik.problem.status import Status
+from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RESTART, TraceFormat, trace_format
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
@@ -82,10 +83,13 @@ class HandFirstMethod:
         """Build and compile the loop, and fill the table of the first round."""
         _ = self.kernel, self.table, self._beginning
 
-    @property
+    @cached_property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        return trace_format(self.step.layouts.record, self._robot, coupling_jacobian(self._robot))
+        before = (Phase.CANDIDATE, Phase.HAND_FIT)
+        measures = JacobianMeasures(self._robot, without_arm=before, compiled=self._compiled)
+        jacobians = coupling_jacobian(self._robot)
+        return trace_format(self.step.layouts.record, self._robot, jacobians, measures)
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.whole_nlp import NlpRun, WholeNlp, contact_errors
+from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase, Status
@@ -84,10 +85,10 @@ class IpoptMethod:
             STATUS.of(robot),
         )
 
-    @property
+    @cached_property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        return trace_format(self.record, self._robot)
+        return trace_format(self.record, self._robot, measures=JacobianMeasures(self._robot))
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -14,6 +14,7 @@ from casadi_ik.kernels import REPEATED, LoopKernel
 from casadi_ik.methods.qiu.enhanced import EnhancedStep
 from casadi_ik.methods.qiu.original import OriginalStep
 from casadi_ik.methods.qiu.parameters import OriginalParameters, QiuParameters
+from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Status
@@ -49,10 +50,11 @@ class QiuMethod:
         """The compiled loop; the virtual machine if the finger step is Ipopt's."""
         return LoopKernel(self.step.graph(), self._compiled)
 
-    @property
+    @cached_property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        return trace_format(self.step.record, self._robot, self.step.jacobians)
+        measures = JacobianMeasures(self._robot, compiled=self._compiled)
+        return trace_format(self.step.record, self._robot, self.step.jacobians, measures)
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -20,7 +20,7 @@ import casadi as ca
 from casadi_ik.methods.common.contact_fit import LENGTH
 from casadi_ik.methods.thumb_first.proxqp import proxqp
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated
+from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated, motor_scales
 from casadi_ik.symbolic.directions import normal_error, perpendicular
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times, project_to_null_space
 from casadi_ik.symbolic.smooth import Expr
@@ -73,13 +73,6 @@ class Room:
 
 StepSolver = Callable[[Linear, Room], tuple[Expr, Expr]]
 """Gives the step (n, 1) and which motors it holds at their limits (n, 1)."""
-
-
-def motor_scales(robot: RobotDescription) -> ca.DM:
-    """(n, 1) what counts as a unit of each motor: 1 rad, or the range of a slider."""
-    ranges = [actuator.upper - actuator.lower for actuator in robot.actuators]
-    units = [actuator.unit for actuator in robot.actuators]
-    return ca.DM([1.0 if u == "rad" else r for u, r in zip(units, ranges, strict=True)])
 
 
 def contact_residuals(

@@ -17,6 +17,7 @@ from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.methods.thumb_first.state import STAGES
 from casadi_ik.methods.thumb_first.step import ThumbFirstStep
+from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase, Status
@@ -68,10 +69,11 @@ class ThumbFirstMethod:
         """Build and compile the loop, and fill the table."""
         _ = self.kernel, self.table
 
-    @property
+    @cached_property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        return trace_format(self.step.record, self._robot)
+        measures = JacobianMeasures(self._robot, closed_chain=True, compiled=self._compiled)
+        return trace_format(self.step.record, self._robot, measures=measures)
 
     @property
     def parameters(self) -> Mapping[str, Any]:
