@@ -30,6 +30,7 @@ from runner import (
     markdown_table,
     mean_metric,
     median_metric,
+    program,
     provenance,
     rate_metric,
     read_results,
@@ -183,4 +184,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

@@ -131,6 +131,15 @@ def method_summary(name: str) -> str:
     return _entry(name).summary
 
 
+def option_names(name: str) -> tuple[str, ...]:
+    """Names of the parameters that `Solver`'s options can set.
+
+    Raises:
+        UnknownNameError: No such method.
+    """
+    return _entry(name).options
+
+
 def method_options(
     name: str, options: Mapping[str, Any], finger_step: str | None
 ) -> dict[str, Any]:

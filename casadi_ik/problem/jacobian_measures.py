@@ -6,11 +6,11 @@ once, so that a solve that nobody logs costs nothing more. What is measured:
 ============  ==================================================================================
 Jacobian      maps
 ============  ==================================================================================
-arm           arm motors to the palm's twist: velocity by `UNIT_LENGTH`, angular velocity
+arm           arm motors to the palm's twist: velocity by `LENGTH`, angular velocity
 hand          each finger's motors to the velocity of its contact point in the palm frame, by
-              `UNIT_LENGTH`; the smallest value of all fingers and the largest condition number
+              `LENGTH`; the smallest value of all fingers and the largest condition number
 closed_chain  motors of arm and thumb to the five rows of the thumb's contact: velocity of the
-              point by `UNIT_LENGTH`, turning of the normal. Where these rows lose rank the
+              point by `LENGTH`, turning of the normal. Where these rows lose rank the
               closed chain of arm and thumb is singular
 ============  ==================================================================================
 
@@ -32,6 +32,7 @@ from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.layout import Field
 from casadi_ik.kernels.measure_kernel import MeasureKernel
 from casadi_ik.kernels.recipe import recipe
+from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import CONDITION, PHASE, SIGMA, Q, RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
@@ -39,9 +40,6 @@ from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated, motor_scal
 from casadi_ik.symbolic.directions import perpendicular
 from casadi_ik.symbolic.extreme_singular_values import extreme_singular_values
 from casadi_ik.symbolic.smooth import Expr
-
-UNIT_LENGTH = 0.1
-"""What counts as much as a radian [m]: about the size of a hand."""
 
 LARGEST_CONDITION = 1e7
 """Beyond it the smallest singular value is not resolved."""
@@ -174,14 +172,14 @@ class JacobianMeasures:
     def _arm(self, body: ActuatedKinematics) -> tuple[Expr, Expr]:
         columns = self._robot.arm_actuators
         linear, angular = body.palm_jacobian(columns)
-        return _judged(ca.vertcat(linear * (1 / UNIT_LENGTH), angular), self._scales(columns))
+        return _judged(ca.vertcat(linear * (1 / LENGTH), angular), self._scales(columns))
 
     def _hand(self, body: ActuatedKinematics) -> tuple[Expr, Expr]:
         found = []
         for finger in self._robot.finger_names:
             columns = self._robot.finger_actuators(finger)
             linear, _ = body.contact_jacobian(finger, columns)
-            found.append(_judged(linear * (1 / UNIT_LENGTH), self._scales(columns)))
+            found.append(_judged(linear * (1 / LENGTH), self._scales(columns)))
         smallest, condition = (ca.vertcat(*values) for values in zip(*found, strict=True))
         return ca.mmin(smallest), ca.mmax(condition)
 
@@ -192,9 +190,7 @@ class JacobianMeasures:
         _, normal = body.kinematics.contact(thumb)
         first = perpendicular(normal)
         across = ca.horzcat(first, ca.cross(normal, first)).T
-        return _judged(
-            ca.vertcat(linear * (1 / UNIT_LENGTH), across @ angular), self._scales(columns)
-        )
+        return _judged(ca.vertcat(linear * (1 / LENGTH), across @ angular), self._scales(columns))
 
     def _scales(self, columns: Sequence[int]) -> ca.DM:
         return motor_scales(self._robot)[list(columns)]

@@ -77,7 +77,7 @@ class ActuatedKinematics:
 
 def motor_scales(robot: RobotDescription) -> ca.DM:
     """(n, 1) what counts as a unit of each motor: 1 rad, or the range of a slider."""
-    ranges = [actuator.upper - actuator.lower for actuator in robot.actuators]
+    ranges = (robot.upper - robot.lower).tolist()
     units = [actuator.unit for actuator in robot.actuators]
     return ca.DM([1.0 if u == "rad" else r for u, r in zip(units, ranges, strict=True)])
 

@@ -59,13 +59,14 @@ targets for every line, so differences are more certain than the intervals look.
 """
 
 
-def write_report(studies: Sequence[Study], results: Path, folder: Path) -> None:
+def write_report(studies: Sequence[Study], results: Path, folder: Path, command: str) -> None:
     """Write `report.md`, `report.html`, figures and `metrics.json`.
 
     Args:
         studies: The table, its part by the original methods, the ablation and the readings.
         results: Folder with a folder per study.
         folder: Where the report goes.
+        command: What was run.
 
     Raises:
         InputError: There are no results of the table.
@@ -107,8 +108,7 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path) -> None:
         kept(by_object(table)),
         "## Where this comes from",
         provenance({study.name: code_of(results / study.name) for study in studies}),
-        f"Seed {studies[0].seed}. To go on where this stopped: "
-        "`python studies/table_one.py --full --jobs 2`.",
+        f"Seed {studies[0].seed}. Made by, and to go on where it stopped: `{command}`.",
     ]
     write_page(TITLE, parts, folder)
     write_metrics(metrics, folder / "metrics.json")

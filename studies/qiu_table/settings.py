@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from runner import Setting, Study, TargetSet
 from targets import grasp_arms
 
 import casadi_ik as ik
+from casadi_ik.errors import InputError
 from casadi_ik.files.shipped import models_folder
+from casadi_ik.methods.registry import option_names
 
 ROBOT = "kuka_lwr_barrett"
 METHODS = tuple(
@@ -44,19 +47,60 @@ def targets() -> tuple[TargetSet, ...]:
     )
 
 
-def table_study(name: str, methods: Sequence[str], count: int, seed: int, block: int) -> Study:
-    """Table I: methods with limits ignored and enforced."""
+def table_study(
+    name: str,
+    methods: Sequence[str],
+    count: int,
+    seed: int,
+    block: int,
+    changes: Mapping[str, Any] | None = None,
+) -> Study:
+    """Table I: methods with limits ignored and enforced.
+
+    Args:
+        name: Of the study.
+        methods: Their names.
+        count: Targets per grasp.
+        seed: Of the targets.
+        block: Targets per block.
+        changes: Parameters that differ from their defaults, for every method that has them.
+
+    Raises:
+        InputError: No method has such a parameter.
+    """
+    known = {method: _chosen(method, changes or {}) for method in methods}
+    unused = set(changes or {}).difference(*known.values())
+    if methods and unused:
+        raise InputError(
+            f"--set: no method of {', '.join(methods)} has {', '.join(sorted(unused))}"
+        )
     settings = tuple(
         Setting(
             f"{method} {limits}",
             method,
             limits,
-            CLOSED_FORM if method.startswith("enhanced") else {},
+            (CLOSED_FORM if method.startswith("enhanced") else {}) | known[method],
         )
         for method in methods
         for limits in LIMITS
     )
     return Study(name, ROBOT, targets(), settings, count, seed, block)
+
+
+def check_changes(methods: Sequence[str], changes: Mapping[str, Any]) -> None:
+    """Refuse a parameter that none of the methods has.
+
+    Raises:
+        InputError: There is one.
+    """
+    unused = sorted(set(changes).difference(*map(option_names, methods)))
+    if unused:
+        raise InputError(f"--set: none of {', '.join(methods)} has {', '.join(unused)}")
+
+
+def _chosen(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The changes that a method has a parameter for."""
+    return {name: value for name, value in changes.items() if name in option_names(method)}
 
 
 def readings_study(count: int, seed: int, block: int) -> Study:

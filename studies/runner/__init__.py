@@ -6,7 +6,7 @@ Needs the extra `studies`.
 from casadi_ik.errors import MissingExtraError
 
 try:
-    from runner.arguments import add_run_arguments, run_from
+    from runner.arguments import Changes, add_run_arguments, run_from
     from runner.metric import (
         Metric,
         interval_text,
@@ -16,6 +16,7 @@ try:
         write_metrics,
     )
     from runner.page import markdown_table, write_page
+    from runner.program import command, program
     from runner.provenance import provenance
     from runner.results import code_of, read_results
     from runner.run import run
@@ -26,16 +27,19 @@ except ModuleNotFoundError as error:
     ) from error
 
 __all__ = [
+    "Changes",
     "Metric",
     "Setting",
     "Study",
     "TargetSet",
     "add_run_arguments",
     "code_of",
+    "command",
     "interval_text",
     "markdown_table",
     "mean_metric",
     "median_metric",
+    "program",
     "provenance",
     "rate_metric",
     "read_results",

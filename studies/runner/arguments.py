@@ -3,11 +3,35 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from casadi_ik.logs import Keep
 from runner.run import run
 from runner.study import Study
+
+
+class Changes(argparse.Action):
+    """Collects ``NAME=VALUE`` words into a mapping; values as YAML reads them."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        """Add the words of one use of the argument."""
+        found = dict(getattr(namespace, self.dest) or {})
+        for word in values or ():
+            name, sign, text = str(word).partition("=")
+            if not (name and sign and text):
+                parser.error(f"{option_string}: found {word!r}, expected NAME=VALUE")
+            found[name] = yaml.safe_load(text)
+        setattr(namespace, self.dest, found)
 
 
 def add_run_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
@@ -21,8 +45,8 @@ def add_run_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
     parser.add_argument(
         "--dask",
         metavar="ADDRESS",
-        help="scheduler of a Dask cluster that solves instead; its workers need this folder and "
-        "PYTHONPATH=studies",
+        help="scheduler of a Dask cluster that solves instead; scheduler and workers need "
+        "casadi-ik[studies] installed and nothing else",
     )
     parser.add_argument(
         "--out", type=Path, default=Path(folder), help="results; a run goes on where one stopped"

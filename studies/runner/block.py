@@ -1,10 +1,13 @@
-"""One block solved and written: what a worker does."""
+"""One block solved, and what comes of it put where it belongs."""
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import os
+import tempfile
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,36 +22,61 @@ PART = ".part"
 """Ending of a file that is not complete."""
 
 
-def solve_block(study: Study, block: Block, folder: Path, keep: Keep | None = None) -> None:
-    """Solve a block and write its results, with its log if asked for.
+@dataclass(frozen=True)
+class SolvedBlock:
+    """A block, solved; bytes, so that a worker needs no folder in common with who asked.
 
-    Results appear under their name when they are complete, and after the log: a block that is
-    there is there with everything.
+    Attributes:
+        block: The block.
+        results: The rows, as a Parquet file.
+        log: The MCAP log, if one was asked for.
+    """
+
+    block: Block
+    results: bytes
+    log: bytes | None
+
+
+def solve_block(study: Study, block: Block, keep: Keep | None = None) -> SolvedBlock:
+    """Solve a block: what a worker does.
 
     Args:
         study: The study.
         block: The block.
-        folder: The study's folder.
-        keep: What to log, in one file per block; None: no log.
+        keep: What to log; None: no log.
     """
-    solver = study.solver(block.setting)
-    q = study.configurations(block.targets, block.number)
+    solver = study.ready_solver(block.setting)
+    q = study.configurations(block.targets, block.number)[: block.size]
     points, normals = robot_of(study.robot).contacts(q)
-    path = folder / block.path
-    path.parent.mkdir(parents=True, exist_ok=True)
-    logging: dict[str, Any] = {}
-    part = path.with_name(f"{path.stem}-{os.getpid()}{PART}")
-    if keep is not None:
+    asked: dict[str, Any] = {"q0": study.start(block.setting), "seed": study.seed}
+    log = None
+    if keep is None:
+        batch = solver.solve_batch(points, normals, **asked)
+    else:
         # Solves are numbered from 0 in every log; with one seed all would keep the same numbers.
-        own = zlib.crc32(str(block.path).encode())
-        logging = {"log": part, "keep": dataclasses.replace(keep, seed=own)}
-    batch = solver.solve_batch(
-        points, normals, q0=study.start(block.setting), seed=study.seed, **logging
-    )
-    if keep is not None:
-        part.replace(path.with_suffix(".mcap"))
-    _frame(study, block, batch, solver.robot.fingers).write_parquet(part)
-    part.replace(path)
+        own = dataclasses.replace(keep, seed=zlib.crc32(str(block.path).encode()))
+        with tempfile.TemporaryDirectory(prefix="casadi_ik-study-") as place:
+            path = Path(place) / "block.mcap"
+            batch = solver.solve_batch(points, normals, **asked, log=path, keep=own)
+            log = path.read_bytes()
+    table = io.BytesIO()
+    _frame(study, block, batch, solver.robot.fingers).write_parquet(table)
+    return SolvedBlock(block, table.getvalue(), log)
+
+
+def store(solved: SolvedBlock, folder: Path) -> None:
+    """Write what came of a block into the study's folder.
+
+    Results appear under their name when they are complete, and after the log: a block that is
+    there is there with everything.
+    """
+    path = folder / solved.block.path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.stem}-{os.getpid()}{PART}")
+    for content, name in ((solved.log, path.with_suffix(".mcap")), (solved.results, path)):
+        if content is not None:
+            part.write_bytes(content)
+            part.replace(name)
 
 
 def _frame(

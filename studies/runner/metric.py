@@ -60,7 +60,9 @@ def mean_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") 
     value = float(samples.mean())
     spread = float(samples.std(ddof=1)) if len(samples) > 1 else math.nan
     half = Z95 * spread / math.sqrt(len(samples))
-    return Metric(name, value, unit, better, value - half, value + half, len(samples))
+    # Of what cannot be negative the mean is not either, however few samples there are.
+    low = max(value - half, 0.0) if samples.min() >= 0 else value - half
+    return Metric(name, value, unit, better, low, value + half, len(samples))
 
 
 def median_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") -> Metric:

@@ -81,8 +81,14 @@ def claim(study: Study, folder: Path) -> None:
 
 
 def missing(study: Study, folder: Path) -> list[Block]:
-    """The blocks that are not there yet."""
-    return [block for block in study.blocks() if not (folder / block.path).exists()]
+    """The blocks that are not there yet, or with fewer targets than are wanted now."""
+    return [block for block in study.blocks() if _rows(folder / block.path) < block.size]
+
+
+def _rows(path: Path) -> int:
+    if not path.exists():
+        return 0
+    return int(pl.scan_parquet(path).select(pl.len()).collect().item())
 
 
 def read_results(study: Study, folder: Path) -> pl.DataFrame:

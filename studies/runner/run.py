@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import joblib
@@ -13,7 +11,8 @@ from rich.progress import TimeRemainingColumn as TimeRemaining
 from rich.text import Text
 
 from casadi_ik.logs import Keep
-from runner.block import solve_block
+from runner.block import SolvedBlock, solve_block, store
+from runner.cluster import backend
 from runner.results import claim, missing
 from runner.study import Study
 
@@ -28,33 +27,26 @@ def run(
         folder: Where its results are and go: one file per block. A run that is killed loses the
             blocks being solved and nothing else; the next one goes on.
         jobs: Processes on this machine.
-        dask: Address of a Dask scheduler whose workers solve instead; they need this folder and
-            `studies` on their path.
+        dask: Address of a Dask scheduler whose workers solve instead; they need the installed
+            package with its extra `studies`, and neither this folder nor this script.
         keep: What to log, in one file per block; None: no logs.
 
     Raises:
-        InputError: The folder holds results that were made otherwise.
+        InputError: The folder holds results that were made otherwise, or the cluster cannot be
+            used.
     """
     claim(study, folder)
     todo = missing(study, folder)
-    with _backend(jobs, dask), _progress() as progress:
-        task = progress.add_task(study.name, total=len(todo) * study.block)
-        parallel = joblib.Parallel(return_as="generator_unordered")
-        calls = (joblib.delayed(solve_block)(study, block, folder, keep) for block in todo)
-        for _ in parallel(calls):
-            progress.advance(task, study.block)
-
-
-@contextmanager
-def _backend(jobs: int, dask: str | None) -> Iterator[None]:
-    if dask is None:
-        with joblib.parallel_config(backend="loky", n_jobs=jobs):
-            yield
+    if not todo:
         return
-    from dask.distributed import Client
-
-    with Client(dask), joblib.parallel_config(backend="dask"):
-        yield
+    with backend(jobs, dask), _progress() as progress:
+        task = progress.add_task(study.name, total=sum(block.size for block in todo))
+        parallel = joblib.Parallel(return_as="generator_unordered")
+        calls = (joblib.delayed(solve_block)(study, block, keep) for block in todo)
+        for solved in parallel(calls):
+            assert isinstance(solved, SolvedBlock)
+            store(solved, folder)
+            progress.advance(task, solved.block.size)
 
 
 class _Rate(ProgressColumn):

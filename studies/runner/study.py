@@ -16,6 +16,9 @@ import casadi_ik as ik
 
 Array = NDArray[np.float64]
 
+FIRST_USE = 8
+"""Targets that a solver's first use is tried on: so many are also solved side by side."""
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -56,11 +59,19 @@ class TargetSet:
 
 @dataclass(frozen=True)
 class Block:
-    """The unit of work: one block of one set of targets, solved in one way."""
+    """The unit of work: one block of one set of targets, solved in one way.
+
+    Attributes:
+        targets: The set.
+        setting: The way.
+        number: Of the block in its set.
+        size: Targets of it that are wanted; the last block of a set may be cut short.
+    """
 
     targets: TargetSet
     setting: Setting
     number: int
+    size: int
 
     @property
     def path(self) -> Path:
@@ -81,7 +92,7 @@ class Study:
         robot: Name or path of the robot.
         sets: Sets of targets.
         settings: Ways to solve.
-        count: Targets per set; rounded up to whole blocks.
+        count: Targets per set.
         seed: Of targets and methods.
         block: Targets per block.
     """
@@ -97,18 +108,23 @@ class Study:
     def blocks(self) -> Iterator[Block]:
         """All blocks, so that what is done so far is as many of every set and setting."""
         for number in range(-(-self.count // self.block)):
+            size = min(self.block, self.count - number * self.block)
             for setting in self.settings:
                 for targets in self.sets:
-                    yield Block(targets, setting, number)
+                    yield Block(targets, setting, number, size)
 
     def configurations(self, targets: TargetSet, number: int) -> Array:
-        """Configurations (block, n) whose contacts are the targets of a block."""
+        """Configurations (block, n) whose contacts are the targets of a whole block."""
         rng = np.random.default_rng([self.seed, zlib.crc32(targets.key.encode()), number])
         return targets.configurations(robot_of(self.robot), rng, self.block)
 
     def solver(self, setting: Setting) -> ik.Solver:
         """The solver of a setting, built once per process."""
         return _solver(setting.robot or self.robot, setting)
+
+    def ready_solver(self, setting: Setting) -> ik.Solver:
+        """The same, once it has solved a few targets: no result's time holds its first use."""
+        return _used(setting.robot or self.robot, setting)
 
     def start(self, setting: Setting) -> Array:
         """The configuration (n,) a setting starts from."""
@@ -134,3 +150,11 @@ def _solver(robot: str, setting: Setting) -> ik.Solver:
         limits=setting.limits,
         options=setting.options,
     )
+
+
+@lru_cache(maxsize=8)
+def _used(robot: str, setting: Setting) -> ik.Solver:
+    solver = _solver(robot, setting)
+    home = solver.robot.home
+    solver.solve_batch(*solver.robot.contacts(np.tile(home, (FIRST_USE, 1))))
+    return solver

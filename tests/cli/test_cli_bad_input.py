@@ -196,7 +196,10 @@ def test_bad_option(
         ("robots please", "please"),
     ],
 )
-def test_bad_command(words: str, fragment: str, run: Command) -> None:
+def test_bad_command(
+    words: str, fragment: str, run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # "." is an empty folder, whatever was left where the tests run
     assert fragment in run(*words.split()).error
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from runner import Setting, Study, TargetSet, run
+from runner import Setting, Study, TargetSet, program, run
 from targets import any_configuration, near_limits
 
 from casadi_ik.logs import Keep
@@ -20,5 +20,12 @@ STUDY = Study(
     block=4,
 )
 
+
+def main() -> None:
+    """Run it: FOLDER [ADDRESS of a Dask scheduler]."""
+    address = sys.argv[2] if len(sys.argv) > 2 else None
+    run(STUDY, Path(sys.argv[1]), jobs=2, dask=address, keep=Keep())
+
+
 if __name__ == "__main__":
-    run(STUDY, Path(sys.argv[1]), jobs=2, keep=Keep())
+    program(main)

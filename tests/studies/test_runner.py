@@ -10,13 +10,25 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 import small_study
-from runner import interval_text, mean_metric, median_metric, rate_metric, read_results, run
+from runner import (
+    cluster,
+    interval_text,
+    mean_metric,
+    median_metric,
+    rate_metric,
+    read_results,
+    run,
+    study,
+)
+from runner.block import solve_block
 from runner.results import STUDY_FILE, claim, missing
 
 import casadi_ik as ik
@@ -68,14 +80,75 @@ def test_jobs_change_nothing(done, tmp_path):
     assert contents(tmp_path).equals(contents(done))
 
 
-def test_a_dask_cluster_changes_nothing(done, tmp_path):
-    from dask.distributed import LocalCluster
+@contextmanager
+def dask_process(*words: str, says: str) -> Iterator[str]:
+    """A process of Dask's command line, from when it has said something; gives the line.
 
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=40
-    ) as cluster:
-        run(STUDY, tmp_path, dask=cluster.scheduler_address)
+    It runs elsewhere and knows the installed package only: the studies are not on its path.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dask", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=Path(ik.__file__).parents[1] / "casadi_ik",
+        env=os.environ | {"PYTHONPATH": str(Path(ik.__file__).parents[1])},
+    )
+    assert process.stdout is not None
+    try:
+        yield next(line for line in process.stdout if says in line)
+        # What it says meanwhile may be as much as a pipe holds.
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """The address of a scheduler without workers."""
+    words = ("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show")
+    with dask_process(*words, says="Scheduler at:") as line:
+        yield line.split()[-1]
+
+
+def test_a_dask_cluster_without_workers_is_refused(scheduler, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "PATIENCE", 1)
+    with pytest.raises(InputError, match="found no worker within 1 s"):
+        run(STUDY, tmp_path, dask=scheduler)
+
+
+def test_no_dask_scheduler_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "PATIENCE", 1)
+    with pytest.raises(InputError, match="found no scheduler"):
+        run(STUDY, tmp_path, dask="tcp://127.0.0.1:9")
+
+
+def test_a_dask_cluster_needs_the_installed_package_only(done, scheduler, tmp_path):
+    """Scheduler and worker as the documentation starts them; the study as a program."""
+    worker = ("worker", scheduler, "--nthreads", "1", "--no-dashboard", "--no-nanny")
+    with dask_process(*worker, says="Registered to:"):
+        command = [sys.executable, str(Path(small_study.__file__)), str(tmp_path), scheduler]
+        environment = os.environ | {"PYTHONPATH": FOLDERS}
+        ended = subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=120
+        )
+        assert ended.returncode == 0, ended.stderr
     assert contents(tmp_path).equals(contents(done))
+    assert len(list(tmp_path.rglob("*.mcap"))) == len(list(STUDY.blocks()))
+
+
+def test_a_worker_with_another_version_is_named(monkeypatch):
+    class Client:
+        def wait_for_workers(self, n_workers: int, timeout: float) -> None: ...
+
+        def run(self, function):
+            return {"tcp://worker:1": function() | {"casadi-ik": "0.0.1"}}
+
+        def run_on_scheduler(self, function):
+            return function()
+
+    with pytest.raises(InputError, match=r"tcp://worker:1 has .*casadi-ik 0\.0\.1.*expected"):
+        cluster._check(Client(), "tcp://here:1")  # type: ignore[arg-type]
 
 
 def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
@@ -118,6 +191,49 @@ def test_a_study_grows(done, tmp_path):
     assert len(contents(tmp_path, small)) == 2 * STUDY.block
     run(STUDY, tmp_path)
     assert contents(tmp_path).equals(contents(done))
+
+
+def test_as_many_targets_as_are_asked_for(done, tmp_path):
+    """A block cut short holds the first targets of the whole one, and is filled up later."""
+    few = dataclasses.replace(STUDY, count=STUDY.block + 1, settings=STUDY.settings[:1])
+    run(few, tmp_path)
+    table = contents(tmp_path, few)
+    assert len(table) == 2 * few.count
+    first = contents(done, few).filter(pl.col("target") < few.count)
+    assert table.equals(first)
+    run(STUDY, tmp_path)
+    assert contents(tmp_path).equals(contents(done))
+
+
+def test_no_time_holds_a_first_use(monkeypatch):
+    """Before the targets of a block its solver has solved others."""
+    study._used.cache_clear()
+    solved = []
+    whole = ik.Solver.solve_batch
+    monkeypatch.setattr(
+        ik.Solver,
+        "solve_batch",
+        lambda self, points, *rest, **more: (
+            solved.append(len(points)) or whole(self, points, *rest, **more)
+        ),
+    )
+    (block, *_) = STUDY.blocks()
+    solve_block(STUDY, block)
+    solve_block(STUDY, block)
+    assert solved == [study.FIRST_USE, block.size, block.size]
+
+
+def test_a_changed_seed_is_one_line(done):
+    script = f"import runner, small_study as s, dataclasses, pathlib; runner.program(lambda: runner.run(dataclasses.replace(s.STUDY, seed=1), pathlib.Path({str(done)!r})))"  # noqa: E501
+    ended = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | {"PYTHONPATH": FOLDERS},
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1
+    assert "seed: results made with 0 are here, this study has 1" in ended.stderr
 
 
 def test_a_log_per_block_keeps_what_is_asked_for(done, tmp_path):
@@ -176,5 +292,7 @@ def test_means_and_medians(rng):
     assert mean.value == pytest.approx(values.mean())
     assert mean.high - mean.low == pytest.approx(2 * 1.96 * 2 / 20, rel=0.1)
     assert median.low < median.value == np.median(values) < median.high
+    assert mean_metric("x", [0.0, 0.0, 9.0], "ms").low == 0
+    assert mean_metric("x", [-1.0, 0.0, 9.0], "ms").low < -1
     assert interval_text(mean_metric("x", [], "ms")) == "-"
     assert interval_text(mean_metric("x", [2.0], "ms")) == "2.0"
