@@ -37,7 +37,8 @@ def measured_rows(form: TraceFormat, rows: NDArray[Any]) -> NDArray[Any]:
     wide = np.empty(len(rows), dtype)
     # The new fields stand together, behind the others of their width: three pieces of bytes.
     added = dtype.itemsize - rows.dtype.itemsize
-    start = min((dtype.fields[field.name][1] for field in measures.fields), default=0)
+    places: Any = dtype.fields
+    start = min((places[field.name][1] for field in measures.fields), default=0)
     for first in range(0, len(rows), BLOCK):
         block = np.ascontiguousarray(rows[first : first + BLOCK])
         source, target = (
