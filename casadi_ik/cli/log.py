@@ -180,7 +180,7 @@ def _methods(log: logs.Log) -> RenderableType:
 
 
 def _smallest(solves: logs.Table) -> str:
-    """Smallest singular value of every Jacobian over all solves; what was never measured says so."""
+    """Smallest singular value of every Jacobian over all solves, or that it was not measured."""
     field = "lowest_sigma"
     if field not in solves.names:
         return "not measured"
