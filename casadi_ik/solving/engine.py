@@ -63,7 +63,7 @@ class Engine:
         method = self.method
         if not isinstance(method, HandFirstMethod):
             method = HandFirstMethod(self.robot.description, HandFirstParameters(), self.compiled)
-        return Diagnostician(self.robot, method)
+        return Diagnostician(self.robot, method, self.compiled)
 
     @property
     def _hand_first(self) -> HandFirstMethod:
@@ -240,8 +240,9 @@ class Engine:
             None if solved else found[row] for row, solved in enumerate(batch.success)
         )
         status = batch.status.copy()
-        unreachable = [why is not None and why.established for why in diagnoses]
-        status[unreachable] = Status.UNREACHABLE
+        for row, why in enumerate(diagnoses):
+            if why is not None and why.reason is not Reason.REACHABLE:
+                status[row] = Status.UNREACHABLE if why.established else Status.NOT_FOUND
         return replace(batch, status=status, diagnoses=diagnoses)
 
     def _block(self, part: _Part, seed: int, rows: NDArray[Any]) -> SolveBlock:
