@@ -44,6 +44,7 @@ class HandFirstMethod(LoopedMethod):
     """
 
     name = "hand-first"
+    phases_without_arm = (Phase.CANDIDATE, Phase.HAND_FIT)
     takes_free_contacts = True
     takes_fixed_actuators = True
 
