@@ -22,6 +22,7 @@ from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import STAGE_LABELS, HandFirstLayouts
 from casadi_ik.methods.hand_first.step import HandFirstStep
+from casadi_ik.problem.contacts.kinds import usual
 from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Status
@@ -56,7 +57,9 @@ class HandFirstMethod:
         self.options = options
         self._robot = robot
         self._compiled = compiled
-        self.step = HandFirstStep(robot, _closed_form(robot), options.candidates)
+        self.step = HandFirstStep(
+            robot, _closed_form(robot), options.candidates, usual(len(robot.fingers))
+        )
         self._singles: list[FirstRound] = []
 
     @cached_property

@@ -25,6 +25,7 @@ from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts
 from casadi_ik.methods.hand_first.whole_fit import whole_step
+from casadi_ik.problem.contacts.kinds import Kinds, suffix
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose
@@ -40,17 +41,20 @@ class HandFirstStep:
         layouts: State, parameters and record.
     """
 
-    def __init__(self, robot: RobotDescription, arm: SrsArm | None, candidates: int) -> None:
+    def __init__(
+        self, robot: RobotDescription, arm: SrsArm | None, candidates: int, kinds: Kinds
+    ) -> None:
         """Remember what the graph is made of.
 
         Args:
             robot: The description.
             arm: Constants of an S-R-S arm, or None: then refinement does the arm's work.
             candidates: Hand postures a solve may start from.
+            kinds: Of the contacts, by finger.
         """
         self.robot = robot
         self.arm = arm
-        self.layouts = HandFirstLayouts(robot, candidates)
+        self.layouts = HandFirstLayouts(robot, candidates, kinds)
 
     def graph(self) -> StepGraph:
         """The whole iteration."""
@@ -62,12 +66,12 @@ class HandFirstStep:
             layouts.parameters,
             layouts.record,
             stage="phase",
-            recipe=recipe(self._name, self.robot, layouts.candidates),
+            recipe=recipe(self._name, self.robot, layouts.candidates, layouts.kinds),
         )
 
     @property
     def _name(self) -> str:
-        return ca.Function.fix_name(f"hand_first_{self.robot.name}")
+        return ca.Function.fix_name(f"hand_first_{self.robot.name}{suffix(self.layouts.kinds)}")
 
     def _iteration(self) -> ca.Function:
         layouts = self.layouts
@@ -102,7 +106,9 @@ class HandFirstStep:
         )
         exhausted = s["candidate"] >= count
         q = self._with_hand(p["start"], hand)
-        rotation, origin = best_palm(hand_contacts(self.robot, hand, layouts.hand), p)
+        rotation, origin = best_palm(
+            hand_contacts(self.robot, hand, layouts.hand), layouts.contacts, p
+        )
         after = layouts.state.pack(
             self._counted(s, Phase.CANDIDATE)
             | {
@@ -130,7 +136,7 @@ class HandFirstStep:
         columns = list(self.layouts.hand)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
-        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        judged = judge_contacts(s, p, tried, self.layouts.contacts)
         keep, reached = judged.accepted, tried.reached
         # The last candidate goes on to the arm even if it does not fit: its arm and hand are the
         # nearest there is, and refinement starts from them.
@@ -252,8 +258,8 @@ class HandFirstStep:
 
     def _refinement(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
-        tried = whole_step(self.robot, s["q"], s["damping"], p)
-        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        tried = whole_step(self.robot, self.layouts.contacts, s["q"], s["damping"], p)
+        judged = judge_contacts(s, p, tried, self.layouts.contacts)
         q = ca.if_else(judged.accepted, tried.reached, s["q"])
         solved = ca.logic_and(judged.settled, judged.within)
         failed = ca.logic_and(judged.settled, ca.logic_not(judged.within))

@@ -22,8 +22,9 @@ from casadi_ik.methods.qiu.tasks import (
     palm_orientation_task,
     selective,
 )
+from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.target import contact_errors, target_fields, targets, within_tolerance
+from casadi_ik.problem.target import contact_errors, target_fields, targets
 from casadi_ik.problem.trace import (
     ANGLE_ERROR,
     LIMIT_MASK,
@@ -236,7 +237,7 @@ class OriginalStep:
         errors = ca.SX.sym("errors", len(self.robot.fingers), 2)
         step = ca.SX.sym("step", len(self.robot.actuators))
         robot, q, positions, angles = self.robot, s["q"], errors[:, 0], errors[:, 1]
-        solved = within_tolerance(positions, angles, p)
+        solved = within_tolerance(positions, angles, p["position_tolerance"], p["angle_tolerance"])
         q_next = kept_within(robot, q + step, p["enforce_limits"])
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
         after = self.state.pack({"q": ca.if_else(solved, q, q_next)})

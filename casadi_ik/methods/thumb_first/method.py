@@ -17,6 +17,7 @@ from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.methods.thumb_first.state import STAGES
 from casadi_ik.methods.thumb_first.step import ThumbFirstStep
+from casadi_ik.problem.contacts.kinds import usual
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase, Status
@@ -47,7 +48,7 @@ class ThumbFirstMethod:
     ) -> None:
         """Recognise the arm and lay out the step."""
         self.options = options
-        self.step = ThumbFirstStep(robot, options, _closed_form(robot))
+        self.step = ThumbFirstStep(robot, options, usual(len(robot.fingers)), _closed_form(robot))
         self._robot = robot
         self._compiled = compiled
 
