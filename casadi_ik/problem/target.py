@@ -11,6 +11,7 @@ from casadi_ik.kernels.layout import Field
 from casadi_ik.problem.contacts.conditions import Vectors
 from casadi_ik.problem.contacts.kinds import USUAL
 from casadi_ik.problem.contacts.rows import tip_vectors
+from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Kinematics
 from casadi_ik.symbolic.smooth import Expr
@@ -25,6 +26,16 @@ def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
         Field("position_tolerance", (f,), unit="m"),
         Field("angle_tolerance", (f,), unit="rad"),
     )
+
+
+def target_values(problems: Problems) -> dict[str, Array]:
+    """Values of `target_fields` for a batch: targets (k, f, 3), tolerances (f,)."""
+    return {
+        "points": problems.points,
+        "normals": problems.normals,
+        "position_tolerance": problems.position_tolerance,
+        "angle_tolerance": problems.angle_tolerance,
+    }
 
 
 @dataclass(frozen=True, eq=False)
