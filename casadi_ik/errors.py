@@ -7,6 +7,33 @@ what was expected.
 
 from __future__ import annotations
 
+import unicodedata
+
+
+def printable(text: str, most: int = 0) -> str:
+    r"""A text that may come from anybody, made fit for a terminal.
+
+    Args:
+        text: The text.
+        most: Characters of it that are kept, at the most; 0: all.
+
+    Returns:
+        The text with what would move the cursor, change colours or turn the direction of writing
+        as visible escapes (``\x1b``); line breaks stay.
+    """
+    if most and len(text) > most:
+        text = f"{text[:most]}... ({len(text)} characters)"
+    if text.isprintable():
+        return text
+    return "".join(_escaped(character) for character in text)
+
+
+def _escaped(character: str) -> str:
+    # Cc: control characters; Cf: marks without a shape, among them those of direction; Cs: halves.
+    if character == "\n" or unicodedata.category(character) not in ("Cc", "Cf", "Cs"):
+        return character
+    return character.encode("unicode_escape", "surrogatepass").decode("ascii")
+
 
 class CasadiIKError(Exception):
     """Base of every error that casadi_ik raises on purpose."""

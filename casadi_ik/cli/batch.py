@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -21,7 +22,38 @@ from casadi_ik.cli.solution_file import columns, growing_npz
 from casadi_ik.cli.target_file import TargetFile
 
 BLOCK = 4096
-"""Targets in memory at once."""
+"""Targets in memory at once, at most."""
+
+FIRST_BLOCK = 64
+
+BRIEF, LONG = 1.0, 4.0
+"""Seconds from which on the next block is not larger, or smaller: what Ctrl-C may cost."""
+
+
+class Pace:
+    """How large blocks are: a few seconds each, whatever a target takes.
+
+    Attributes:
+        size: Of the next block.
+    """
+
+    def __init__(self, jobs: int) -> None:
+        self._least = min(jobs, BLOCK)
+        self.size = min(max(FIRST_BLOCK, jobs), BLOCK)
+        self._began = time.monotonic()
+
+    def begin(self) -> int:
+        """A block is begun."""
+        self._began = time.monotonic()
+        return self.size
+
+    def end(self) -> None:
+        """It has been solved."""
+        seconds = time.monotonic() - self._began
+        if seconds < BRIEF:
+            self.size = min(4 * self.size, BLOCK)
+        elif seconds > LONG:
+            self.size = max(self.size // 2, self._least)
 
 
 def batch(arguments: argparse.Namespace) -> Answer:
@@ -29,6 +61,7 @@ def batch(arguments: argparse.Namespace) -> Answer:
 
     Raises:
         CasadiIKError: Bad input, or an output that cannot be written.
+        KeyboardInterrupt: Ctrl-C; what was finished by then is written.
     """
     path = Path(arguments.targets)
     robot = the_robot(arguments.robot)
@@ -39,8 +72,9 @@ def batch(arguments: argparse.Namespace) -> Answer:
     outputs = {"--log": arguments.log, "--out": arguments.out}
     check_outputs(outputs.items(), inputs=[path])
     solver = the_solver(arguments, robot)
+    pace = Pace(arguments.jobs)
     blocks = solver.solve_blocks(
-        targets.blocks(BLOCK),
+        targets.blocks(pace.begin),
         q0,
         arguments.seed,
         arguments.jobs,
@@ -49,12 +83,17 @@ def batch(arguments: argparse.Namespace) -> Answer:
         fixed,
     )
     totals = BatchTotals()
-    npz = growing_npz(arguments.out, "--out", count)
-    with npz as append, closing(blocks), _progress(count) as advance:
-        for block in blocks:
-            append(columns(block.solution))
-            totals.add(block)
-            advance(len(block.solution))
+    with growing_npz(arguments.out, "--out") as npz, closing(blocks), _progress(count) as show:
+        try:
+            for block in blocks:
+                npz.append(columns(block.solution))
+                totals.add(block)
+                show(len(block.solution))
+                pace.end()
+        except KeyboardInterrupt:
+            if npz.count:
+                say("interrupted", f"{arguments.out} keeps the first {npz.count} of {count} rows")
+            raise
     _say_faults(str(path), totals)
     written = [(option.lstrip("-"), file) for option, file in outputs.items() if file is not None]
     report = batch_report(path.name, solver, totals, written)

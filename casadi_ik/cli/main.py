@@ -6,14 +6,14 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from casadi_ik.cli.answer import Exit
 from casadi_ik.cli.outputs import OutputError
 from casadi_ik.cli.parser import build_parser
 from casadi_ik.cli.say import say
-from casadi_ik.errors import CasadiIKError
+from casadi_ik.errors import CasadiIKError, printable
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -66,11 +66,19 @@ def _show(report: RenderableType) -> None:
     """Print a report; plain and 80 columns wide where stdout is no terminal."""
     if sys.stdout is None:  # closed by the shell: >&-
         return
-    from rich.console import Console
+    from rich.console import Console, ConsoleOptions
+    from rich.segment import Segment
 
     class Terminal(Console):
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
+
+        def render(
+            self, renderable: RenderableType, options: ConsoleOptions | None = None
+        ) -> Iterable[Segment]:
+            """Names may come from any file: none of them writes to the terminal what it likes."""
+            for segment in super().render(renderable, options):
+                yield segment if segment.control else segment._replace(text=printable(segment.text))
 
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 from casadi_ik.cli.parser import PROGRAM
+from casadi_ik.errors import printable
 
 
 def say(kind: str, text: str) -> None:
@@ -14,4 +15,4 @@ def say(kind: str, text: str) -> None:
         kind: What it is about: "error", "warning".
         text: The rest; line breaks in it become spaces.
     """
-    print(f"{PROGRAM}: {kind}: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
+    print(f"{PROGRAM}: {kind}: {printable(' '.join(text.split()))}", file=sys.stderr)  # noqa: T201

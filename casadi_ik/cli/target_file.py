@@ -6,7 +6,7 @@ import lzma
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,10 +62,15 @@ class TargetFile:
             InputError: Missing, no npz, damaged, or other arrays than expected; the message names
                 file and key.
         """
-        return sum(len(points) for points, _ in self.blocks(size))
+        return sum(len(points) for points, _ in self.blocks(lambda: size))
 
-    def blocks(self, size: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    def blocks(
+        self, size: Callable[[], int]
+    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
         """Points and normals (up to size, f, 3), one block after the other.
+
+        Args:
+            size: Says before every block how large it may be.
 
         Raises:
             InputError: As `check`.
@@ -80,9 +85,11 @@ class TargetFile:
                     f"{self.path}: points and normals: found {points.count} and "
                     f"{normals.count} rows, expected as many"
                 )
-            for start in range(0, points.count, size):
-                rows = min(size, points.count - start)
-                last = start + rows == points.count
+            start = 0
+            while start < points.count:
+                rows = min(size(), points.count - start)
+                start += rows
+                last = start == points.count
                 yield points.read(rows, last), normals.read(rows, last)
 
     @contextmanager

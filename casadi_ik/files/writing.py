@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
+
+from casadi_ik.files.leftovers import tidy
 
 
 def target_of(path: Path) -> Path:
@@ -28,6 +31,7 @@ def written_whole(path: Path) -> Iterator[Path]:
     """
     target = target_of(path)
     part = part_of(target)
+    tidy(target.parent, f".{glob.escape(target.stem)}.*.part{glob.escape(target.suffix)}")
     try:
         yield part
         part.replace(target)

@@ -1,7 +1,7 @@
 """Kernels: a CasADi Function becomes a fast callable."""
 
-from casadi_ik.kernels.cache import cache_directory
 from casadi_ik.kernels.compiler import NoCompilerWarning
+from casadi_ik.kernels.folders import CacheWarning, cache_directory
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.layout import Field, Layout
@@ -15,6 +15,7 @@ __all__ = [
     "NON_FINITE",
     "REPEATED",
     "RUNNING",
+    "CacheWarning",
     "Field",
     "FunctionGraph",
     "FunctionKernel",

@@ -4,7 +4,7 @@ A library's file name holds two hashes: of everything it was built from (the key
 bytes. The second lets a torn file be known before it is loaded (loading one can kill the
 process), and being in the name it needs no second file that could disagree. Files appear by
 `os.replace` only: two processes building at once both win, and one killed in the middle leaves
-nothing that looks like a library.
+nothing that looks like a library. Whose files are loaded is said in `folders`.
 """
 
 from __future__ import annotations
@@ -14,42 +14,37 @@ import hashlib
 import os
 import platform
 import re
-import sys
-import tempfile
-import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import casadi as ca
 
-from casadi_ik.errors import KernelError
+from casadi_ik.files.leftovers import tidy
 from casadi_ik.kernels.codegen import library_source
-from casadi_ik.kernels.compiler import Compiler, find_compiler, warn_no_compiler
+from casadi_ik.kernels.compiler import (
+    Compiler,
+    UnloadableError,
+    find_compiler,
+    warn_no_compiler,
+)
+from casadi_ik.kernels.folders import (
+    own_file,
+    private_directory,
+    reason,
+    trusted_cache,
+    warn_once,
+    workshop,
+)
+from casadi_ik.kernels.forks import ForkSafeLock
+from casadi_ik.kernels.progress import announce
 
 KEY = re.compile("[0-9a-f]{32}")
 
-_lock = threading.Lock()
+NAME = 100
+"""Characters of a kernel's name that its file's name has at most; the key tells the rest."""
+
+_lock = ForkSafeLock()
 _loaded: dict[str, ctypes.CDLL] = {}
-_private: list[tempfile.TemporaryDirectory[str]] = []
-
-
-def cache_directory() -> Path:
-    """Where libraries are kept.
-
-    `CASADI_IK_CACHE`, else `casadi_ik` in `XDG_CACHE_HOME`, else in the platform's directory for
-    caches (`~/.cache`, `~/Library/Caches`, `%LOCALAPPDATA%`).
-    """
-    if own := os.environ.get("CASADI_IK_CACHE"):
-        return Path(own).absolute()
-    if xdg := os.environ.get("XDG_CACHE_HOME"):
-        return Path(xdg) / "casadi_ik"
-    if sys.platform == "win32" and (local := os.environ.get("LOCALAPPDATA")):
-        return Path(local) / "casadi_ik"
-    try:
-        home = Path.home()
-    except RuntimeError:
-        return _private_directory()
-    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "casadi_ik"
 
 
 def load_library(
@@ -72,41 +67,47 @@ def load_library(
         write: Gives the library's text from the function and the driver.
 
     Returns:
-        The library, or None where there is no compiler (a `NoCompilerWarning` says so once).
+        The library, or None where there is no compiler, or no room for what it makes (a warning
+        says so once).
 
     Raises:
-        KernelError: The function has no C code, or the compiler refused it.
+        KernelError: The function has no C code, or the compiler refused it or made no library.
     """
     compiler = find_compiler()
     if compiler is None:
         warn_no_compiler()
         return None
-    directory = cache_directory()
+    short = name[:NAME]
     with _lock:
+        directory = trusted_cache()
         brief = (
             library_key(f"{ca.CasadiMeta.version()} {recipe} {driver}", compiler) if recipe else ""
         )
-        library = _recognised(directory, name, brief, symbol) if brief else None
+        note = f"{short}-{brief}.key"
+        library = _recognised(directory, short, note, symbol) if directory and brief else None
         if library is not None:
             return library
         source = write(build(), driver)
         key = library_key(source, compiler)
         library = _loaded.get(key)
         if library is None:
-            stem = f"{name}-{key}"
-            library = _find(directory, stem, symbol)
+            stem = f"{short}-{key}"
+            library = _find(directory, stem, symbol) if directory else None
             if library is None:
-                library = _build(directory, stem, source, compiler)
+                library = _built(directory, stem, source, compiler, symbol)
+            if library is None:
+                return None
             _loaded[key] = library
-        if brief:
-            _note(directory / f"{name}-{brief}.key", key)
+        if directory and brief:
+            _note(directory / note, key)
         return library
 
 
-def _recognised(directory: Path, name: str, brief: str, symbol: str) -> ctypes.CDLL | None:
+def _recognised(directory: Path, name: str, note: str, symbol: str) -> ctypes.CDLL | None:
     """The library that a recipe led to before, or None."""
+    path = directory / note
     try:
-        key = (directory / f"{name}-{brief}.key").read_text(encoding="ascii")
+        key = path.read_text(encoding="ascii") if own_file(path) else ""
     except (OSError, ValueError):
         return None
     if not KEY.fullmatch(key):
@@ -122,9 +123,13 @@ def _note(path: Path, key: str) -> None:
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         part.write_text(key, encoding="ascii")
+        part.chmod(0o600)
         part.replace(path)
     except OSError:
-        part.unlink(missing_ok=True)
+        try:
+            part.unlink(missing_ok=True)
+        except OSError:
+            return
 
 
 def library_key(source: str, compiler: Compiler) -> str:
@@ -145,6 +150,8 @@ def _find(directory: Path, stem: str, symbol: str) -> ctypes.CDLL | None:
     """A whole, loadable library of that key that has the symbol, or None; torn ones are removed."""
     for path in directory.glob(f"{stem}-*.so"):
         try:
+            if not own_file(path):
+                continue
             if path.name != f"{stem}-{_content_hash(path)}.so":
                 path.unlink(missing_ok=True)
                 continue
@@ -160,32 +167,54 @@ def _content_hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
-def _build(directory: Path, stem: str, source: str, compiler: Compiler) -> ctypes.CDLL:
-    """Compile into the directory, or into a private temporary one if it cannot be written."""
-    try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        workshop = tempfile.TemporaryDirectory(prefix="build-", dir=directory)
-    except OSError:
-        directory = _private_directory()
-        workshop = tempfile.TemporaryDirectory(prefix="build-", dir=directory)
-    with workshop as place:
-        text, file = Path(place) / "kernel.c", Path(place) / "kernel.so"
-        text.write_text(source, encoding="utf-8")
-        compiler.build(text, file)
+def _built(
+    directory: Path | None, stem: str, source: str, compiler: Compiler, symbol: str
+) -> ctypes.CDLL | None:
+    """Compile into the cache, else into a directory of this process; None if neither has room."""
+    problems: dict[Path, OSError | UnloadableError] = {}
+    library = None
+    announce(stem.rpartition("-")[0], len(source))
+    for place in _places(directory):
         try:
-            # Loaded before it is shown to others, who might tidy the directory up.
-            library = ctypes.CDLL(str(file))
-        except OSError as error:
-            raise KernelError(
-                f"a library built in {directory} cannot be loaded: {error}; "
-                "CASADI_IK_CACHE can name another directory"
-            ) from error
-        file.replace(directory / f"{stem}-{_content_hash(file)}.so")
+            tidy(place, "build-*", 1)
+            tidy(place, ".*.part", -2)
+            library = _compiled(place, stem, source, compiler, symbol)
+            break
+        except (OSError, UnloadableError) as error:
+            problems[place] = error
+    for place, error in problems.items():
+        if library is None and isinstance(error, UnloadableError):
+            raise error
+        warn_once(str(place), f"cannot be used: {reason(error)}")
+    if library is None:
+        warn_no_compiler("there is no room for what it makes")
     return library
 
 
-def _private_directory() -> Path:
-    """A directory of this process alone: one of a known name in /tmp could be somebody else's."""
-    if not _private:
-        _private.append(tempfile.TemporaryDirectory(prefix="casadi_ik-"))
-    return Path(_private[0].name)
+def _places(directory: Path | None) -> Iterator[Path]:
+    if directory is not None:
+        yield directory
+    try:
+        yield private_directory()
+    except OSError as error:
+        warn_once("a temporary folder", f"cannot be used: {reason(error)}")
+
+
+def _compiled(
+    directory: Path, stem: str, source: str, compiler: Compiler, symbol: str
+) -> ctypes.CDLL:
+    """Compile into a directory.
+
+    Raises:
+        OSError: It cannot be written, or is full.
+        KernelError: The compiler refused, or made something else than the library.
+    """
+    with workshop(directory) as place:
+        text, file = place / "kernel.c", place / "kernel.so"
+        text.write_text(source, encoding="utf-8")
+        compiler.build(text, file, symbol)
+        # Loaded before it is shown to others, who might tidy the directory up.
+        library = ctypes.CDLL(str(file))
+        file.chmod(0o700)
+        file.replace(directory / f"{stem}-{_content_hash(file)}.so")
+    return library

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import shlex
 import shutil
+import signal
+import struct
 import subprocess
+import sys
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 from casadi_ik.errors import KernelError
+from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.kernels.folders import NO_ROOM
+from casadi_ik.kernels.outcome import SLICE
 
 # No contraction: with fused multiply-adds the iterates would differ from the VM's. Errno of sqrt
 # and friends is never read, and without it they are single instructions of the same value. All
@@ -20,11 +29,22 @@ FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fv
 
 CANDIDATES = ("cc", "gcc", "clang")
 
-SHOWN_ERROR_LINES = 5
+SHOWN_ERROR_LINES, SHOWN_CHARACTERS = 3, 200
+"""How much of a compiler's complaint is shown."""
+
+SMALL = 2**20
+"""A disk with less room [bytes] counts as full if a compiler failed on it."""
+
+LOAD = "import ctypes, sys; getattr(ctypes.CDLL(sys.argv[1]), sys.argv[2])"
+"""Program that loads a library: a broken one can kill the process that does."""
 
 
 class NoCompilerWarning(RuntimeWarning):
     """There is no C compiler: kernels run in CasADi's virtual machine, about ten times slower."""
+
+
+class UnloadableError(KernelError):
+    """What a compiler made cannot be loaded."""
 
 
 @dataclass(frozen=True)
@@ -46,27 +66,122 @@ class Compiler:
         """What decides the produced code, apart from the source."""
         return "\n".join((*self.command, self.version, *self.flags))
 
-    def build(self, source: Path, library: Path) -> None:
-        """Compile one C file to a shared library.
+    def build(self, source: Path, library: Path, symbol: str) -> None:
+        """Compile one C file to a shared library, and see that it can be loaded.
+
+        Args:
+            source: The file.
+            library: Where the library shall stand; the compiler's own files are put beside it.
+            symbol: A function it has to export.
 
         Raises:
             KernelError: The compiler refused; the message has the first lines of its complaint.
+            UnloadableError: It did not, but what it made is no library or lacks the symbol.
+            OSError: The disk is full.
+            KeyboardInterrupt: Ctrl-C reached the compiler.
+            CancelledError: This thread has been told to stop.
         """
         command = [*self.command, *self.flags, "-o", str(library), str(source), "-lm"]
+        place = {"TMPDIR": str(library.parent), "LC_ALL": "C"}
         try:
-            done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+            done = _run(command, os.environ | place)
         except OSError as error:
             raise KernelError(f"compiler {self.command[0]} cannot be run: {error}") from error
         if done.returncode == 0 and library.is_file():
+            self._check(library, symbol)
             return
+        if done.returncode == -signal.SIGINT:
+            raise KeyboardInterrupt
+        if _full(library.parent, done.stderr):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(library.parent))
         lines = done.stderr.splitlines()
-        errors = [line for line in lines if "error" in line.lower()] or lines
-        complaint = "\n  ".join(errors[:SHOWN_ERROR_LINES])
+        errors = [line for line in lines if "error" in line.lower()] or lines or ["no complaint"]
+        complaint = "; ".join(line[:SHOWN_CHARACTERS] for line in errors[:SHOWN_ERROR_LINES])
+        ended = f"failed with {_ending(done.returncode)}" if done.returncode else "made no library"
         raise KernelError(
-            f"compiler {shlex.join(self.command)} failed with exit code {done.returncode} "
-            "(CC=... names another compiler, CC=none does without):\n"
-            f"  {complaint}"
+            f"compiler {self} {ended} "
+            f"(CC=... names another compiler, CC=none does without): {complaint}"
         )
+
+    def __str__(self) -> str:
+        return shlex.join(self.command)[:SHOWN_CHARACTERS]
+
+    def _check(self, library: Path, symbol: str) -> None:
+        """See that nothing of it is cut off, and have another process load it."""
+        if _cut(library):
+            raise UnloadableError(
+                f"compiler {self} ended well, but what it made is cut off "
+                "(CC=... names another compiler, CC=none does without)"
+            )
+        if not Path(sys.executable or "").name.startswith("python"):
+            return  # part of a program that could not be asked to
+        command = [sys.executable, "-I", "-S", "-c", LOAD, str(library), symbol]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        except OSError:
+            return  # this user may not start it
+        if done.returncode == 0:
+            return
+        if _full(library.parent, ""):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(library.parent))
+        complaint = (done.stderr.splitlines() or [_ending(done.returncode)])[-1]
+        raise UnloadableError(
+            f"compiler {self} ended well, but what it made cannot be loaded "
+            f"(CC=... names another compiler, CC=none does without): "
+            f"{complaint[:SHOWN_CHARACTERS]}"
+        )
+
+
+def _run(
+    command: Sequence[str], environment: Mapping[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end, or until this thread has been told to stop."""
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        env=environment,
+    )
+    with process:
+        try:
+            while True:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    out, complaint = process.communicate(timeout=SLICE)
+                    break
+                stop_if_cancelled()
+        except BaseException:
+            process.kill()
+            raise
+    return subprocess.CompletedProcess(command, process.returncode, out, complaint)
+
+
+def _cut(library: Path) -> bool:
+    """Whether a 64-bit ELF file ends before its table of sections does, the last thing in it."""
+    with library.open("rb") as stream:
+        head = stream.read(64)
+        size = stream.seek(0, os.SEEK_END)
+    if len(head) < 64 or head[:5] != b"\x7fELF\x02":
+        return False
+    (table,) = struct.unpack_from("@Q", head, 0x28)
+    width, count = struct.unpack_from("@HH", head, 0x3A)
+    return table + width * count > size
+
+
+def _ending(code: int) -> str:
+    """How a process ended, in words."""
+    try:
+        return signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    except ValueError:
+        return f"exit code {code}"
+
+
+def _full(directory: Path, complaint: str) -> bool:
+    """Whether it was for want of room that a compiler failed."""
+    if any(os.strerror(code) in complaint for code in NO_ROOM):
+        return True
+    return shutil.disk_usage(directory).free < SMALL
 
 
 def find_compiler() -> Compiler | None:
@@ -86,13 +201,21 @@ def find_compiler() -> Compiler | None:
 @lru_cache(maxsize=16)
 def _find(cc: str, path: str, flags: str) -> Compiler | None:
     """`find_compiler` for one environment, remembered because it starts processes."""
-    for words in [shlex.split(cc)] if cc.strip() else [[name] for name in CANDIDATES]:
+    try:
+        further = shlex.split(flags)
+    except ValueError as error:
+        raise KernelError(f"CASADI_IK_CFLAGS={flags[:SHOWN_CHARACTERS]!r}: {error}") from error
+    try:
+        wanted = [shlex.split(cc)] if cc.strip() else [[name] for name in CANDIDATES]
+    except ValueError:  # a quotation without an end
+        return None
+    for words in wanted:
         program = shutil.which(words[0], path=path)
         if program is None:
             continue
         version = _version((program, *words[1:]))
         if version is not None:
-            return Compiler((program, *words[1:]), version, flags=(*FLAGS, *shlex.split(flags)))
+            return Compiler((program, *words[1:]), version, flags=(*FLAGS, *further))
     return None
 
 
@@ -112,14 +235,18 @@ def _version(command: tuple[str, ...]) -> str | None:
 _warned = False
 
 
-def warn_no_compiler() -> None:
-    """Say once per process that kernels run in the virtual machine."""
+def warn_no_compiler(problem: str = "") -> None:
+    """Say once per process that kernels run in the virtual machine.
+
+    Args:
+        problem: Why; "": there is no compiler.
+    """
     global _warned
     if _warned:
         return
     _warned = True
-    found = (
-        f"CC={os.environ['CC']!r} does not run"
+    found = problem or (
+        f"CC={os.environ['CC'][:SHOWN_CHARACTERS]!r} does not run"
         if os.environ.get("CC", "").strip()
         else (f"none of {', '.join(CANDIDATES)} is on the path")
     )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.buffered import BufferedFunction, doubles, memory
 from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, row_major
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.outcome import SLICE, Outcome, check
@@ -253,6 +254,7 @@ class FunctionKernel:
         sources = [array.reshape(-1) for array in arrays]
         targets = [output.reshape(-1) for output in outputs]
         for sample in range(count):
+            stop_if_cancelled()
             for buffer, source, step in zip(call.inputs, sources, steps, strict=True):
                 buffer[:] = source[sample * step : sample * step + buffer.size]
             if not call():

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, row_major
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
@@ -187,6 +188,7 @@ class LookupKernel:
         (keys,) = self.key(*arrays)
         keys = keys.reshape(len(found), self._keys.shape[1])  # also a single entry
         for start in range(0, len(keys), CHUNK):
+            stop_if_cancelled()
             part = keys[start : start + CHUNK]
             known = ~np.isnan(part)
             wanted = 2 * _rounded(np.where(known, part, 0.0))

@@ -14,6 +14,7 @@ import numpy as np
 from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.buffered import doubles
 from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, row_major
 from casadi_ik.kernels.lanes import LANES, lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
@@ -130,6 +131,7 @@ class LoopKernel:
         Raises:
             InputError: A shape or `max_iterations` is wrong.
         """
+        stop_if_cancelled()
         first = doubles(states)
         given = doubles(parameters)
         n_state, n_parameters = self.step.state.size, self.step.parameters.size

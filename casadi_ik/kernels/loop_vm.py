@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.buffered import BufferedFunction
+from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.loop_result import (
     CODE_LIMIT,
     FAILED,
@@ -48,6 +49,7 @@ def run_vm(
         constants[:] = row
         status, iteration, mark = RUNNING, 0, b""
         while status == RUNNING and iteration < max_iterations:
+            stop_if_cancelled()
             if not call():
                 status = FAILED
                 break

@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from casadi_ik.errors import KernelError
+from casadi_ik.kernels.cancellation import stop_if_cancelled
 
 SLICE = 0.2
 """Seconds after which a driver returns to Python, so that Ctrl-C works; then it is called again."""
@@ -27,7 +28,9 @@ def check(name: str, code: int) -> None:
     Raises:
         MemoryError: No work memory.
         KernelError: The function failed, or too many threads use one that needs memory objects.
+        CancelledError: This thread has been told to stop.
     """
+    stop_if_cancelled()
     if code == Outcome.NO_MEMORY:
         raise MemoryError(f"{name}: no work memory")
     if code == Outcome.NO_CHECKOUT:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -28,6 +28,7 @@ from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.tracking import Tracker
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.parts import Parts
+from casadi_ik.solving.workers import workers
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,10 +213,10 @@ class Engine:
         if jobs == 1:
             yield from map(run, parts)
             return
-        with ThreadPoolExecutor(jobs) as pool:
+        with workers(jobs) as threads:
             ahead: deque[Future[_Part]] = deque()
             for part in parts:
-                ahead.append(pool.submit(run, part))
+                ahead.append(threads.submit(run, part))
                 if len(ahead) > jobs:
                     yield ahead.popleft().result()
             while ahead:

@@ -63,35 +63,90 @@ def test_poor_terminal(run_process: Command) -> None:
     assert done.out.isascii()
 
 
-def test_interrupted(tmp_path: Path) -> None:
-    """In the middle of a long batch: one line, the exit code of an interrupt, no half file."""
+@pytest.mark.parametrize(("jobs", "finished"), [(1, False), (1, True), (2, False), (2, True)])
+def test_interrupted(tmp_path: Path, jobs: int, finished: bool) -> None:
+    """In the middle of a long batch: the exit code of an interrupt, and what is finished stays."""
     robot = ik.load_robot("kuka_lwr_barrett")
     points, normals = robot.contacts(robot.random(np.random.default_rng(0), 3000))
     targets, out = tmp_path / "targets.npz", tmp_path / "out.npz"
     np.savez(targets, points=points, normals=normals)
-    process = subprocess.Popen(
-        [*PROGRAM, "batch", targets, "--robot", robot.name, "--method", "ipopt", "--out", out],
+    process = start_batch(targets, out, "--method", "ipopt", "--jobs", str(jobs))
+    assert wait_for(tmp_path, finished)
+    pressed = time.monotonic()
+    # One that arrives before the handler stands may be lost: press again.
+    while process.poll() is None and time.monotonic() < pressed + 60:
+        process.send_signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(10)
+    took = time.monotonic() - pressed
+    process.kill()
+    said, error = process.communicate()
+    assert process.returncode == 130
+    # The batch would take minutes; the rest is patience with a busy machine.
+    assert took < 20
+    lines = error.splitlines()
+    assert (said, lines[-1]) == ("", "casadi-ik: error: interrupted")
+    if not finished:
+        assert list(tmp_path.iterdir()) == [targets]
+        return
+    with np.load(out) as kept:
+        count = len(kept["q"])
+        assert 0 < count < 3000
+        assert {len(kept[name]) for name in kept.files} == {count}
+        assert kept["success"].all()
+        reached, _ = robot.contacts(kept["q"])
+    np.testing.assert_allclose(reached, points[:count], atol=5e-3)
+    assert lines[-2] == f"casadi-ik: interrupted: {out} keeps the first {count} of 3000 rows"
+    assert sorted(tmp_path.iterdir()) == [out, targets]
+
+
+def start_batch(targets: Path, out: Path, *more: str) -> subprocess.Popen[str]:
+    """A batch that takes minutes."""
+    return subprocess.Popen(
+        [*PROGRAM, "batch", targets, "--robot", "kuka_lwr_barrett", "--out", out, *more],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
+
+
+def wait_for(folder: Path, finished: bool) -> bool:
+    """Whether a batch has begun its output, or even finished a block, within five minutes."""
     # On a busy machine the first use may compile for minutes.
-    started = time.monotonic()
-    while not list(tmp_path.glob(".batch-*")) and time.monotonic() < started + 300:
+    deadline = time.monotonic() + 300
+    while time.monotonic() < deadline:
+        if list(folder.glob(".batch-*/q" if finished else ".batch-*")):
+            if not finished:
+                time.sleep(0.5)
+            return True
         time.sleep(0.05)
-    time.sleep(0.5)
-    deadline = time.monotonic() + 60
-    # One that arrives before the handler stands may be lost: press again.
-    while process.poll() is None and time.monotonic() < deadline:
-        process.send_signal(signal.SIGINT)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(5)
+    return False
+
+
+def test_a_killed_batch(tmp_path: Path) -> None:
+    """It leaves no result; what it leaves is removed by a later one that finds it old."""
+    robot = ik.load_robot("kuka_lwr_barrett")
+    points, normals = robot.contacts(robot.random(np.random.default_rng(0), 300))
+    targets, out = tmp_path / "targets.npz", tmp_path / "out.npz"
+    np.savez(targets, points=points, normals=normals)
+    process = start_batch(targets, out, "--method", "ipopt")
+    assert wait_for(tmp_path, finished=False)
     process.kill()
-    said, error = process.communicate()
-    assert process.returncode == 130
-    assert (said, error.splitlines()[-1]) == ("", "casadi-ik: error: interrupted")
-    assert list(tmp_path.iterdir()) == [targets]
+    process.communicate()
+    assert not out.exists()
+    (left,) = tmp_path.glob(".batch-*")
+    young = tmp_path / f".batch-{os.getpid()}-running"
+    young.mkdir()
+    np.savez(targets, points=points[:2], normals=normals[:2])
+    again = ["batch", str(targets), "--robot", robot.name, "--out", str(out)]
+    assert entry.main(again) == 0
+    assert left.exists()  # a process elsewhere could be at it
+    then = time.time() - 3700
+    for path in (*left.iterdir(), left, young):
+        os.utime(path, (then, then))
+    assert entry.main(again) == 0
+    assert sorted(tmp_path.iterdir()) == sorted([young, out, targets])
 
 
 def test_bugs_are_not_hidden(run: Command, monkeypatch: pytest.MonkeyPatch) -> None:

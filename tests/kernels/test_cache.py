@@ -145,17 +145,6 @@ def test_processes_may_build_at_once(directory: Path) -> None:
     assert sorted(directory.iterdir()) == libraries(directory)
 
 
-@needs_compiler
-def test_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way")
-    monkeypatch.setenv("CASADI_IK_CACHE", str(blocked / "cache"))
-    forget(monkeypatch)
-    kernel = FunctionKernel(function())
-    assert kernel.compiled
-    assert kernel(3)[0] == 6
-
-
 def test_cache_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path / "own"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))

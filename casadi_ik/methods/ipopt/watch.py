@@ -8,6 +8,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.kernels.cancellation import is_cancelled
+
 Array = NDArray[np.float64]
 
 EXACT = 1e-8
@@ -18,7 +20,7 @@ JOINT_SLACK = 1e-9
 
 
 class Watch(ca.Callback):
-    """Keeps every iterate, and stops Ipopt once the contacts are met exactly.
+    """Keeps every iterate, and stops Ipopt once the contacts are met exactly or nobody waits.
 
     For a program over x = (motors, slacks s) whose constraints are (r - s, joints). One solve at
     a time: `begin`, then Ipopt, then `end`.
@@ -68,7 +70,8 @@ class Watch(ca.Callback):
         self._path.append(x)
         self._rows.append(rows)
         r, joints = rows[: self._contacts], rows[self._contacts :]
-        np.frombuffer(res[0], dtype=float)[0] = r @ r < EXACT**2 and within(joints, self._joints)
+        met = r @ r < EXACT**2 and within(joints, self._joints)
+        np.frombuffer(res[0], dtype=float)[0] = met or is_cancelled()
         return 0
 
 

@@ -24,7 +24,6 @@ definition that all other methods share (`problem.contacts`) shows up as a diffe
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +31,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.kernels.forks import ForkSafeLock
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.ipopt.interrupts import interrupt_afterwards
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
@@ -143,7 +144,7 @@ class WholeNlp:
         self._watch = Watch(n + self._rows, rows.numel(), self.program["p"].numel())
         self._solvers = {mu: self._solver(mu, options) for mu in (COLD, WARM)}
         # Ipopt's callback hands its rows to this object, so one solve at a time.
-        self._lock = threading.Lock()
+        self._lock = ForkSafeLock()
 
     def _solver(self, barrier: float, options: IpoptParameters) -> ca.Function:
         settings: dict[str, Any] = {
@@ -178,7 +179,9 @@ class WholeNlp:
 
         Raises:
             KeyboardInterrupt: Ctrl-C while Ipopt was at work.
+            CancelledError: This thread has been told to stop.
         """
+        stop_if_cancelled()
         enforced = bool(np.all(lower >= self._lower))
         joints = (self._joint_lower, self._joint_upper)
         if not enforced:

@@ -1,0 +1,109 @@
+"""Ctrl-C in the middle of batches: threads stop, and what a stream has finished was handed over."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.kernels.cancellation import CancelledError, stop_if_cancelled
+from casadi_ik.solving.workers import workers
+
+SCRIPT = """
+    import os, signal, sys, threading, time
+    import numpy as np
+    import casadi_ik as ik
+    robot = ik.load_robot("kuka_lwr_barrett")
+    points, normals = robot.contacts(robot.random(np.random.default_rng(0), {count}))
+    normals += {noise} * np.random.default_rng(1).normal(size=normals.shape)
+    solver = ik.Solver(robot, "{method}", compiled={compiled})
+    solver.solve_batch(points[:8], normals[:8], jobs=2, diagnose={diagnose})
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's "&" ignores it
+    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    begin = time.monotonic()
+    try:
+        solver.solve_batch(points, normals, jobs=2, diagnose={diagnose})
+    except KeyboardInterrupt:
+        print("interrupted", time.monotonic() - begin, threading.active_count())
+"""
+
+
+@pytest.mark.parametrize(
+    ("method", "count", "diagnose", "compiled"),
+    [
+        ("ipopt", 600, False, True),
+        ("hand-first", 1_000_000, False, True),
+        ("hand-first", 6000, True, True),
+        ("hand-first", 3000, False, False),
+        ("original-dls", 4000, False, True),
+    ],
+)
+def test_threads_stop(method: str, count: int, diagnose: bool, compiled: bool) -> None:
+    """The whole batches take from twenty seconds to minutes; a busy machine gets some patience."""
+    script = SCRIPT.format(
+        method=method, count=count, diagnose=diagnose, compiled=compiled, noise=int(diagnose)
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=600
+    )
+    word, seconds, threads = done.stdout.split()
+    assert word == "interrupted", done.stderr
+    assert float(seconds) < 10
+    assert threads == "1"
+
+
+def test_a_stream_has_handed_over_what_is_finished() -> None:
+    robot = ik.load_robot("kuka_lwr_barrett")
+    points, normals = robot.contacts(robot.random(np.random.default_rng(0), 30))
+    solver = ik.Solver(robot)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def blocks():
+        for start in range(0, 30, 10):
+            if start == 20:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(5)
+            yield points[start : start + 10], normals[start : start + 10]
+
+    kept = []
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            kept.extend(solver.solve_blocks(blocks(), jobs=2))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert [block.first_row for block in kept] == [0, 10]
+    assert all(block.solution.success.all() for block in kept)
+
+
+def test_an_error_stops_the_others() -> None:
+    stopped = threading.Event()
+
+    def until_told() -> None:
+        try:
+            while True:
+                stop_if_cancelled()
+                time.sleep(0.01)
+        except CancelledError:
+            stopped.set()
+            raise
+
+    def fail() -> None:
+        raise ValueError("of one")
+
+    def work() -> None:
+        with workers(2) as threads:
+            threads.submit(until_told)
+            threads.submit(fail).result()
+
+    with pytest.raises(ValueError, match="of one"):
+        work()
+    assert stopped.is_set()
+    stop_if_cancelled()  # this thread was never told
