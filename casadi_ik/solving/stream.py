@@ -11,12 +11,15 @@ from numpy.typing import ArrayLike
 from casadi_ik.errors import InputError, RowError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.recorder import Recorder
 from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
 
-Block = tuple[ArrayLike, ArrayLike]
-"""Points and normals (k, f, 3) of some targets."""
+REQUIRED = ("points", "normals")
+"""What every target is told by."""
+
+Block = tuple[ArrayLike, ArrayLike] | Mapping[str, ArrayLike]
+"""Points and normals (k, f, 3) of some targets; or these and more by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,64 +43,61 @@ class Stream:
 
     Attributes:
         engine: Who solves.
-        ask: Points, normals and the number of the first target as a checked question.
+        ask: Arrays by name and the number of the first target as a checked question.
         tolerances: When a contact counts as reached, by finger.
-        q0: (n,) start; None is the robot's home.
-        seed: Of all random numbers.
-        jobs: Threads.
-        recorder: Who keeps the iterations, if anyone.
-        diagnose: Whether to find out why what is not solved is not.
+        run: How targets are solved; one start (n,) for all of them.
     """
 
     engine: Engine
-    ask: Callable[[np.ndarray, np.ndarray, int], Problems]
+    ask: Callable[[Mapping[str, np.ndarray], int], Problems]
     tolerances: tuple[Tolerance, ...]
-    q0: ArrayLike | None
-    seed: int
-    jobs: int
-    recorder: Recorder | None
-    diagnose: bool
+    run: Run
 
     def solve(self, blocks: Iterable[Block]) -> Iterator[SolvedBlock]:
         """Solve one block after the other; a target's numbers do not depend on the blocks.
 
         Raises:
-            InputError: Bad q0, seed or jobs, or a block of the wrong shape.
+            InputError: Bad q0, or a block of the wrong shape.
         """
-        if self.engine.robot.configuration(self.q0, "q0").ndim != 1:
+        if self.run.start(self.engine.robot).ndim != 1:
             raise InputError("q0: found several, expected one start for all targets")
         first_row = 0
-        for points, normals in blocks:
-            block = self._block(np.asarray(points), np.asarray(normals), first_row)
+        for given in blocks:
+            named = given if isinstance(given, Mapping) else dict(zip(REQUIRED, given, strict=True))
+            arrays = {name: np.asarray(array) for name, array in named.items()}
+            block = self._block(arrays, first_row)
             yield block
             first_row += len(block.solution)
 
-    def _block(self, points: np.ndarray, normals: np.ndarray, first_row: int) -> SolvedBlock:
+    def _block(self, arrays: Mapping[str, np.ndarray], first_row: int) -> SolvedBlock:
         """Solve what can be asked: a row with a fault parts those before it from those after it."""
-        if len(points) != len(normals):
-            raise InputError(
-                f"points and normals: found {len(points)} and {len(normals)} rows, expected as many"
-            )
+        count = len(arrays[REQUIRED[0]])
+        for name, array in arrays.items():
+            if len(array) != count:
+                raise InputError(
+                    f"{REQUIRED[0]} and {name}: found {count} and {len(array)} rows, expected as "
+                    "many"
+                )
         engine = self.engine
-        n = len(engine.robot.actuators)
         parts: dict[int, BatchSolution] = {}
         faults: dict[int, str] = {}
-        waiting = [(0, len(points))]
+        waiting = [(0, count)]
         while waiting:
             start, stop = waiting.pop()
             rows = slice(start, stop)
             try:
-                parts[start] = self._solved(points[rows], normals[rows], first_row + start)
+                parts[start] = self._solved(
+                    {name: array[rows] for name, array in arrays.items()}, first_row + start
+                )
             except RowError as error:
                 row = error.row - first_row
                 faults[error.row] = str(error)
-                parts[row] = BatchSolution.invalid(1, n, self.tolerances, self.diagnose)
+                parts[row] = BatchSolution.invalid(
+                    1, engine.method.name, engine.robot, self.tolerances, self.run.diagnose
+                )
                 waiting += [part for part in ((row + 1, stop), (start, row)) if part[0] < part[1]]
         solution = BatchSolution.joined([parts[start] for start in sorted(parts)])
         return SolvedBlock(first_row, solution, dict(sorted(faults.items())))
 
-    def _solved(self, points: np.ndarray, normals: np.ndarray, first_row: int) -> BatchSolution:
-        problems = self.ask(points, normals, first_row)
-        return self.engine.solve(
-            problems, self.q0, self.seed, self.jobs, self.recorder, self.diagnose
-        )
+    def _solved(self, arrays: Mapping[str, np.ndarray], first_row: int) -> BatchSolution:
+        return self.engine.solve(self.ask(arrays, first_row), self.run)
