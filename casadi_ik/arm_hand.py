@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
+from casadi_ik.grasps.arrays import real_array
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
 
@@ -78,9 +79,9 @@ class ArmHand:
         if q is None:
             return self.home.copy()
         try:
-            array = np.array(q, dtype=float)
+            array = real_array(q)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{name}: found {q!r}, expected numbers") from error
+            raise InputError(f"{name}: found {q!r}, expected numbers: {error}") from error
         n = len(self.actuators)
         if array.ndim not in (1, 2) or array.shape[-1] != n:
             raise InputError(f"{name}: found shape {array.shape}, expected ({n},) or (k, {n})")

@@ -7,9 +7,32 @@ what was expected.
 
 from __future__ import annotations
 
+LONGEST = 600
+"""Characters of a message; of a longer one the beginning and the end are kept."""
+
+
+def printable(text: str) -> str:
+    """Text without what a terminal would take for a command; line breaks stay."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else f"\\x{ord(c):02x}" for c in text)
+
+
+def shortened(text: str) -> str:
+    """A text of any length as one of a few hundred printable characters."""
+    if len(text) > LONGEST:
+        text = f"{text[: LONGEST - 200]} [...] {text[-180:]}"
+    return printable(text)
+
 
 class CasadiIKError(Exception):
-    """Base of every error that casadi_ik raises on purpose."""
+    """Base of every error that casadi_ik raises on purpose.
+
+    Its text is printable and short, whatever the file holds that it speaks of.
+    """
+
+    def __str__(self) -> str:
+        return shortened(super().__str__())
 
 
 class DescriptionError(CasadiIKError):

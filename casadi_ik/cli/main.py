@@ -6,17 +6,17 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from casadi_ik.cli.answer import Exit
 from casadi_ik.cli.outputs import OutputError
 from casadi_ik.cli.parser import build_parser
 from casadi_ik.cli.say import say
-from casadi_ik.errors import CasadiIKError
+from casadi_ik.errors import CasadiIKError, printable
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import ConsoleOptions, RenderableType
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,8 +67,17 @@ def _show(report: RenderableType) -> None:
     if sys.stdout is None:  # closed by the shell: >&-
         return
     from rich.console import Console
+    from rich.segment import Segment
 
     class Terminal(Console):
+        def render(
+            self, renderable: RenderableType, options: ConsoleOptions | None = None
+        ) -> Iterable[Segment]:
+            """What a name in a file tells a terminal to do is shown, not done."""
+            for segment in super().render(renderable, options):
+                plain = segment.control or segment.text.isprintable()
+                yield segment if plain else Segment(printable(segment.text), segment.style)
+
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
 

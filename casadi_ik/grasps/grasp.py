@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
+from casadi_ik.grasps.arrays import real_array, unit_vectors
 from casadi_ik.grasps.tolerance import Tolerance
 
 Array = NDArray[np.float64]
@@ -48,10 +49,9 @@ class Contact:
         if normal is None:
             return
         vector = _vector(normal, "normal")
-        length = float(np.linalg.norm(vector))
-        if length < 1e-9:
-            raise InputError(f"normal: found {vector.tolist()}, expected a direction, not zero")
-        vector = vector / length
+        vector, zero = unit_vectors(vector)
+        if zero:
+            raise InputError("normal: found [0, 0, 0], expected a direction, not zero")
         vector.flags.writeable = False
         object.__setattr__(self, "normal", vector)
 
@@ -117,7 +117,7 @@ class Grasp:
 
 def _vector(value: Any, name: str) -> Array:
     try:
-        array = np.array(value, dtype=float)
+        array = real_array(value)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: found {value!r}, expected three numbers") from error
     if array.shape != (3,):

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import msgspec
 
+from casadi_ik.files.units import AnyValue, Length, Pure, Turn
+
 
 class Linear(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="linear", tag_field="kind"
@@ -20,8 +22,8 @@ class Linear(
     """
 
     of: str
-    ratio: float = 1.0
-    offset: float = 0.0
+    ratio: Pure = 1.0
+    offset: AnyValue = 0.0
 
 
 class LeadScrew(
@@ -39,9 +41,9 @@ class LeadScrew(
     """
 
     of: str
-    b: float
-    c: float
-    theta_0: float = 0.0
+    b: Length
+    c: Length
+    theta_0: Turn = 0.0
 
 
 class FourBar(
@@ -64,12 +66,12 @@ class FourBar(
     """
 
     of: str
-    p: float
-    q: float
-    g: float
-    h: float
-    phi_0: float
-    theta_3_0: float
+    p: Length
+    q: Length
+    g: Length
+    h: Length
+    phi_0: Turn
+    theta_3_0: Turn
 
 
 Coupling = Linear | LeadScrew | FourBar

@@ -68,7 +68,7 @@ class Stream:
             raise InputError("q0: found several, expected one start for all targets")
         first_row = 0
         for points, normals in blocks:
-            block = self._block(np.asarray(points), np.asarray(normals), first_row)
+            block = self._block(np.asanyarray(points), np.asanyarray(normals), first_row)
             yield block
             first_row += len(block.solution)
 
