@@ -28,6 +28,10 @@ class ArmHand:
         """Wrap a description; kernels are compiled when first used and cached on the machine."""
         self.description = description
 
+    def __reduce__(self) -> tuple[type[ArmHand], tuple[RobotDescription]]:
+        """Its data; a copy finds the compiled kernels on the machine it comes to."""
+        return type(self), (self.description,)
+
     def __repr__(self) -> str:
         return f"<ArmHand {self.name}: {len(self.actuators)} actuators, fingers {self.fingers}>"
 

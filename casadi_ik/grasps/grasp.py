@@ -89,6 +89,11 @@ class Grasp:
                 )
         object.__setattr__(self, "contacts", MappingProxyType(dict(self.contacts)))
 
+    def __reduce__(self) -> tuple[type[Grasp], tuple[Any, ...]]:
+        """Its fields; the mapping that cannot be changed is made anew."""
+        held = self.robot, self.name, self.object, self.object_pose, dict(self.posture)
+        return type(self), (dict(self.contacts), *held)
+
     def arrays(self, fingers: Sequence[str]) -> tuple[Array, Array]:
         """Points and normals in the order of the given fingers.
 

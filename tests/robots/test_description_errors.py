@@ -103,7 +103,7 @@ SHIPPED = {
         "hand",
         COUPLED,
         "coupling: {kind: wire, of: bh_spread}",
-        "joints[2].coupling.kind",
+        "joints[bh_finger_2_spread].coupling.kind",
         "'wire'",
     ),
     "coupling ratio": (
@@ -245,10 +245,22 @@ SHIPPED = {
         "home.bh_spread",
         "wide",
     ),
-    "unknown unit": ("arm", "110 mm", "110 inch", "joints[lwr_joint_1].origin.xyz[2]", "unknown unit 'inch'"),
+    "unknown unit": (
+        "arm",
+        "110 mm",
+        "110 inch",
+        "joints[lwr_joint_1].origin.xyz[2]",
+        "unknown unit 'inch'",
+    ),
     "not finite": ("arm", "110 mm", ".nan", "joints[lwr_joint_1].origin.xyz[2]", "finite"),
     "wrong type": ("hand", "joints:\n", "joints: 3\nspare:\n", "joints", "expected `array`"),
-    "wrong length": ("arm", "limits: [-170 deg, 170 deg]", "limits: [1]", "joints[lwr_joint_1].limits", "2"),
+    "wrong length": (
+        "arm",
+        "limits: [-170 deg, 170 deg]",
+        "limits: [1]",
+        "joints[lwr_joint_1].limits",
+        "2",
+    ),
     "wrong type in contact": (
         "hand",
         "normal: [0, 1, 0]",
