@@ -25,6 +25,7 @@ from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
 from casadi_ik.solving.stream import SolvedBlock, Stream
 
 Array = NDArray[np.float64]
@@ -132,13 +133,11 @@ class Solver:
             LogError: The log cannot be written.
         """
         problems = self._questions.of_grasps([grasp], fixed)
-        if log is None and (quick := self._engine.quick(problems, q0, seed)) is not None:
+        if log is None and (quick := self._engine.quick(problems, Run(q0, seed))) is not None:
             return quick
         with self._recorder(log, seed) as recorder:
-            batch = self._engine.solve(problems, q0, seed, 1, recorder, diagnose)
-        return batch.solution(
-            0, self.method, self.robot.name, self.robot.actuators, self.robot.fingers
-        )
+            run = Run(q0, seed, recorder=recorder, diagnose=diagnose)
+            return self._engine.solve(problems, run).solution(0)
 
     def solve_batch(
         self,
@@ -181,7 +180,7 @@ class Solver:
         """
         problems = self._questions.of_arrays(points, normals, self._questions.held(fixed))
         with self._recorder(log, seed, keep, compression) as recorder:
-            return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
+            return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 
     def solve_blocks(
         self,
@@ -224,8 +223,8 @@ class Solver:
 
         with self._recorder(log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
-            stream = Stream(self._engine, ask, tolerances, q0, seed, jobs, recorder, diagnose)
-            yield from stream.solve(blocks)
+            run = Run(q0, seed, jobs, recorder, diagnose)
+            yield from Stream(self._engine, ask, tolerances, run).solve(blocks)
 
     def solve_all(
         self,

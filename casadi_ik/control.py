@@ -246,6 +246,10 @@ class ScrewControl:
             limits_ok=np.ones(1, dtype=bool),
             phases={"screw-control": count},
             tolerances=(Tolerance(),) * n,
+            fingers=self.robot.fingers,
+            method="screw-control",
+            robot=self.robot.name,
+            actuators=self.robot.actuators,
         )
         labels = {
             "q": self.robot.actuators,
@@ -253,9 +257,6 @@ class ScrewControl:
             "status": Status.labels(),
         }
         block = SolveBlock(
-            method="screw-control",
-            robot=self.robot.name,
-            fingers=self.robot.fingers,
             format=TraceFormat(
                 self._step.record, labels, coupling_jacobian(self.robot.description)
             ),

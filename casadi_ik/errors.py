@@ -7,22 +7,42 @@ what was expected.
 
 from __future__ import annotations
 
+import unicodedata
+
+
+def printable(text: str, most: int = 0) -> str:
+    r"""A text that may come from anybody, made fit for a terminal.
+
+    Args:
+        text: The text.
+        most: Characters of it that are kept, at the most; 0: all.
+
+    Returns:
+        The text with what would move the cursor, change colours or turn the direction of writing
+        as visible escapes (``\x1b``); line breaks stay.
+    """
+    if most and len(text) > most:
+        text = f"{text[:most]}... ({len(text)} characters)"
+    if text.isprintable():
+        return text
+    return "".join(_escaped(character) for character in text)
+
+
+def _escaped(character: str) -> str:
+    # Cc: control characters; Cf: marks without a shape, among them those of direction; Cs: halves.
+    if character == "\n" or unicodedata.category(character) not in ("Cc", "Cf", "Cs"):
+        return character
+    return character.encode("unicode_escape", "surrogatepass").decode("ascii")
+
+
 LONGEST = 600
 """Characters of a message; of a longer one the beginning and the end are kept."""
 
 
-def printable(text: str) -> str:
-    """Text without what a terminal would take for a command; line breaks stay."""
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() or c == "\n" else f"\\x{ord(c):02x}" for c in text)
-
-
 def shortened(text: str) -> str:
-    """A text of any length as one of a few hundred printable characters."""
-    if len(text) > LONGEST:
-        text = f"{text[: LONGEST - 200]} [...] {text[-180:]}"
-    return printable(text)
+    """A text of any length as one of a few hundred characters, fit for a terminal."""
+    text = printable(text)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 200]} [...] {text[-180:]}"
 
 
 class CasadiIKError(Exception):

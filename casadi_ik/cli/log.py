@@ -7,7 +7,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import islice
+from itertools import groupby, islice
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from rich.text import Text
 from casadi_ik import logs
 from casadi_ik.cli.answer import Answer
 from casadi_ik.cli.report import duration, fields, table
+from casadi_ik.errors import printable
 from casadi_ik.logs.explain.phrases import SERIOUS, plain_name, told
 from casadi_ik.logs.read.one_solve import happening
 
@@ -30,7 +31,7 @@ def info(arguments: argparse.Namespace) -> Answer:
     """
     parts: list[RenderableType] = []
     for name in arguments.files:
-        parts += _report(logs.open(name))
+        parts += _report(logs.open(name), name)
     return Answer(Group(*parts))
 
 
@@ -47,7 +48,10 @@ def solves(arguments: argparse.Namespace) -> Answer:
     for part in found.parts:
         shown = islice(logs.Table("solve", (part,)).records(), left)
         if len(part) and left:
-            parts += [Text(f"  {part.method}", "bold"), _solve_rows(part, shown)]
+            parts.append(Text(f"  {part.method}", "bold"))
+            for shard, records in groupby(shown, lambda record: record.get("shard")):
+                of_shard = [] if shard is None else [Text(f"  from {shard}", "dim")]
+                parts += [*of_shard, _solve_rows(part, records)]
             left -= min(left, len(part))
     return Answer(Group(*parts, _count(len(found), arguments.most, "solves")))
 
@@ -99,6 +103,12 @@ def _solve_rows(part: logs.Part, records: Iterable[Mapping[str, Any]]) -> Table:
     return _kept_whole(rows)
 
 
+SHOWN = 4
+"""How many files, or values in which shards differ, are named."""
+
+SHORT, LONG = 60, 2000
+"""Characters of a name and of a text of the metadata that are shown."""
+
 _NUMBERS = ("solve", "iteration", "iterations", "restarts", "mm off", "deg off", "time")
 
 
@@ -130,7 +140,7 @@ def _tally(kinds: Sequence[str], record: Mapping[str, Any]) -> str:
     return ", ".join(found)
 
 
-def _report(log: logs.Log) -> list[RenderableType]:
+def _report(log: logs.Log, name: str) -> list[RenderableType]:
     about = log.info()
     iterations = sum(counts["iteration"] for counts in about.counts.values())
     each = f", {about.size / iterations:.0f} bytes/iteration" if iterations else ""
@@ -138,11 +148,14 @@ def _report(log: logs.Log) -> list[RenderableType]:
     if about.compressed:
         packed += f" ({about.uncompressed / about.compressed:.1f} times smaller)"
     attached = (f"{name} ({size(length)})" for name, length in about.attachments.items())
+    sources = log.sources.names
+    shards = {"shards": named(sources, "")} if len(sources) > 1 else {}
     return [
-        Text(", ".join(map(str, about.paths)), "bold", no_wrap=True, overflow="ignore"),
+        Text(name, "bold", no_wrap=True, overflow="ignore"),
         fields(
             {
                 "robot": about.robot,
+                **shards,
                 "size": f"{size(about.size)}{each}",
                 "chunks": packed,
                 "attached": ", ".join(attached) or "nothing",
@@ -150,16 +163,27 @@ def _report(log: logs.Log) -> list[RenderableType]:
             }
         ),
         _methods(log),
-        fields(_origin(about.metadata)),
+        fields(_origin(about)),
     ]
 
 
 def _unfinished(about: logs.LogInfo) -> dict[str, str]:
-    """Files without an end, if there are any."""
-    if not about.unfinished:
-        return {}
-    files = ", ".join(map(str, about.unfinished))
-    return {"unfinished": f"{files}: killed while writing, or still at it (casadi-ik log finish)"}
+    """Files without an end and files without anything, if there are any."""
+    found = {}
+    if about.unfinished:
+        why = "killed while writing, or still at it (casadi-ik log finish)"
+        found["unfinished"] = named(about.unfinished, why)
+    if about.left_out:
+        found["left out"] = named(about.left_out, "nothing in it is whole")
+    return found
+
+
+def named(items: Sequence[Any], why: str) -> str:
+    """How many there are, the first few, and why they are named."""
+    first = ", ".join(map(str, items[:SHOWN]))
+    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
+    count = f"{len(items)}: " if len(items) > 1 else ""
+    return f"{count}{first}{more}" + (f": {why}" if why else "")
 
 
 def _methods(log: logs.Log) -> RenderableType:
@@ -186,8 +210,9 @@ def _counted(counter: Counter[str]) -> str:
     return "\n".join(f"{count} {name}" for name, count in counter.most_common()) or "none"
 
 
-def _origin(metadata: Mapping[str, Any]) -> dict[str, str]:
+def _origin(about: logs.LogInfo) -> dict[str, str]:
     """The metadata that says where a log is from, as text by name."""
+    metadata = about.metadata
     packages = {"casadi_ik": metadata.get("code_version"), "python": metadata.get("python")}
     packages |= metadata.get("packages", {})
     pairs = {
@@ -198,7 +223,21 @@ def _origin(metadata: Mapping[str, Any]) -> dict[str, str]:
     }
     for name, value in metadata.get("parameters", {}).items():
         pairs[name.replace("_", " ")] = _flat(value)
-    return pairs
+    for key, values in about.differs.items():
+        if key == "parameters":
+            for name in dict.fromkeys(name for each in values for name in each):
+                own = list(dict.fromkeys(_flat(each.get(name)) for each in values))
+                if len(own) > 1:
+                    pairs[name.replace("_", " ")] = _several(own)
+        elif key in pairs and key != "created":
+            pairs[key] = _several([_flat(value) for value in values])
+    return {printable(name, SHORT): printable(text, LONG) for name, text in pairs.items()}
+
+
+def _several(texts: Sequence[str]) -> str:
+    """What shards differ in."""
+    more = f" | {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
+    return " | ".join(texts[:SHOWN]) + more + " (by shard)"
 
 
 def _flat(value: Any) -> str:

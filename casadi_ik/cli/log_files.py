@@ -11,12 +11,14 @@ from rich.text import Text
 from casadi_ik import logs
 from casadi_ik.arm_hand import load_robot
 from casadi_ik.cli.answer import Answer
-from casadi_ik.cli.log import filters, size
+from casadi_ik.cli.log import filters, named, size
 from casadi_ik.cli.log_solve import the_solve
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import located
 from casadi_ik.cli.report import fields, files
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
+from casadi_ik.logs.mcap.data_section import NothingWrittenError
+from casadi_ik.logs.read.files import log_files
 from casadi_ik.logs.repair.finish import finish_log
 from casadi_ik.logs.repair.merge import merge_logs
 
@@ -65,17 +67,24 @@ def _table(arguments: argparse.Namespace, out: Path, kind: str) -> Answer:
 
 
 def finish(arguments: argparse.Namespace) -> Answer:
-    """Repair logs in place.
+    """Repair logs in place; in a folder those in which nothing is whole are named and left.
 
     Raises:
         LogError: A file is missing, no MCAP file, or damaged elsewhere than at its end.
     """
     parts: list[RenderableType] = []
-    for name in arguments.files:
-        done = finish_log(name)
+    for path, _ in (found := log_files(arguments.files)):
+        name = str(path)
+        try:
+            done = finish_log(path)
+        except NothingWrittenError:
+            if len(found) == 1:
+                raise
+            parts += [_heading(name), fields({"done": "left as it is: nothing in it is whole"})]
+            continue
         text = f"finished, {size(done.cut)} of a torn tail cut" if done.changed else "whole already"
         about = {"done": text, "holds": f"{done.chunks} chunks, {done.messages} messages"}
-        parts += [Text(name, "bold", no_wrap=True, overflow="ignore"), fields(about)]
+        parts += [_heading(name), fields(about)]
     return Answer(Group(*parts))
 
 
@@ -87,9 +96,8 @@ def merge(arguments: argparse.Namespace) -> Answer:
             new log cannot be written.
     """
     out: Path = arguments.out
-    shards = [Path(name) for name in arguments.files]
-    check_outputs([("--out", out)], inputs=shards)
-    done = merge_logs(shards, out)
+    check_outputs([("--out", out)], inputs=[path for path, _ in log_files(arguments.files)])
+    done = merge_logs(arguments.files, out)
     solves = ", ".join(f"{count} of {method}" for method, count in done.solves.items()) or "none"
     about = {
         "shards": str(done.shards),
@@ -97,4 +105,10 @@ def merge(arguments: argparse.Namespace) -> Answer:
         "messages": str(done.messages),
         "size": size(done.size),
     }
+    if done.left_out:
+        about["left out"] = named(done.left_out, "nothing in it is whole")
     return Answer(Group(fields(about), *files([("log", out)])))
+
+
+def _heading(name: str) -> Text:
+    return Text(name, "bold", no_wrap=True, overflow="ignore")

@@ -29,6 +29,8 @@ def why(arguments: argparse.Namespace) -> Answer:
     solve = the_solve(arguments, logs.open(arguments.file))
     found = explain(solve)
     parts: list[RenderableType] = [headline(solve.success, solve.status, found.headline)]
+    if solve.shard:
+        parts.append(Text(f"  solve {solve.number} of {solve.shard}"))
     for title, lines in (
         ("phases", found.phases),
         ("fingers", found.fingers),

@@ -16,7 +16,7 @@ from casadi_ik.cli.say import say
 from casadi_ik.errors import CasadiIKError, printable
 
 if TYPE_CHECKING:
-    from rich.console import ConsoleOptions, RenderableType
+    from rich.console import RenderableType
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -66,20 +66,19 @@ def _show(report: RenderableType) -> None:
     """Print a report; plain and 80 columns wide where stdout is no terminal."""
     if sys.stdout is None:  # closed by the shell: >&-
         return
-    from rich.console import Console
+    from rich.console import Console, ConsoleOptions
     from rich.segment import Segment
 
     class Terminal(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
         def render(
             self, renderable: RenderableType, options: ConsoleOptions | None = None
         ) -> Iterable[Segment]:
-            """What a name in a file tells a terminal to do is shown, not done."""
+            """Names may come from any file: none of them writes to the terminal what it likes."""
             for segment in super().render(renderable, options):
-                plain = segment.control or segment.text.isprintable()
-                yield segment if plain else Segment(printable(segment.text), segment.style)
-
-        def on_broken_pipe(self) -> None:
-            raise BrokenPipeError
+                yield segment if segment.control else segment._replace(text=printable(segment.text))
 
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from casadi_ik.cli.calibrate_parser import add_calibrate
 from casadi_ik.cli.log_parser import add_log
+from casadi_ik.cli.say import PROGRAM
 from casadi_ik.cli.values import assignment, file_name, numbers, one_of, positive, whole
 from casadi_ik.errors import InputError
 
 if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
 
-PROGRAM = "casadi-ik"
 
 _DESCRIPTION = """\
 Where must every motor of an arm and its hand stand, so that each fingertip touches a given point

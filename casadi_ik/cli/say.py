@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sys
 
-from casadi_ik.cli.parser import PROGRAM
 from casadi_ik.errors import shortened
+
+PROGRAM = "casadi-ik"
+"""What the command is called."""
 
 
 def say(kind: str, text: str) -> None:

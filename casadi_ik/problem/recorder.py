@@ -22,23 +22,17 @@ class SolveBlock:
     """k solves of one method, numbered one after the other, with everything that is kept of them.
 
     Attributes:
-        method: Name of the method.
-        robot: Name of the robot.
-        fingers: Finger names, the order of every (k, f) array.
         format: How the rows are to be read.
         first: Number of the first solve; solves are unique per method in one log.
         problems: The targets.
         starts: Where each solve began, (k, n).
         seed: Of the random numbers.
-        batch: What became of them.
+        batch: The answers; it names method, robot and fingers.
         rows: The iterations of all solves, one solve after the other, (sum of
             `BatchSolution.iterations`,) of the format's layout.
         started: When each solve began, (k,) [ns since the Unix epoch].
     """
 
-    method: str
-    robot: str
-    fingers: tuple[str, ...]
     format: TraceFormat
     first: int
     problems: Problems
@@ -50,6 +44,21 @@ class SolveBlock:
 
     def __len__(self) -> int:
         return len(self.batch)
+
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+        return self.batch.method
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+        return self.batch.robot
+
+    @property
+    def fingers(self) -> tuple[str, ...]:
+        """Names of the fingers."""
+        return self.batch.fingers
 
 
 class Recorder(Protocol):

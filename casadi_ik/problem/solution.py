@@ -9,6 +9,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.diagnosis import Diagnosis
@@ -18,7 +19,7 @@ from casadi_ik.problem.status import Status
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What became of one grasp.
+    """The answer to one grasp.
 
     Attributes:
         success: Every contact within tolerance, and every actuator and joint within its limits
@@ -54,7 +55,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class BatchSolution:
-    """What became of a batch of k targets; the fields of `Solution` as arrays.
+    """The answers to a batch of k targets; the fields of `Solution` as arrays.
 
     Attributes:
         success: (k,) bool.
@@ -69,6 +70,10 @@ class BatchSolution:
         limits_ok: (k,) bool.
         phases: (k,) iterations by phase name.
         tolerances: When a contact counted as reached, by finger.
+        fingers: Names of the fingers, the order of every (k, f) array.
+        method: Name of the method.
+        robot: Name of the robot.
+        actuators: Names of the columns of q.
         diagnoses: Why each target is not solved (None if it is); empty if not asked for.
     """
 
@@ -84,14 +89,23 @@ class BatchSolution:
     limits_ok: NDArray[np.bool_]
     phases: Mapping[str, NDArray[np.int64]]
     tolerances: tuple[Tolerance, ...]
+    fingers: tuple[str, ...]
+    method: str
+    robot: str
+    actuators: tuple[str, ...]
     diagnoses: tuple[Diagnosis | None, ...] = ()
 
     @classmethod
     def invalid(
-        cls, count: int, n: int, tolerances: tuple[Tolerance, ...], diagnosed: bool
+        cls,
+        count: int,
+        method: str,
+        robot: ArmHand,
+        tolerances: tuple[Tolerance, ...],
+        diagnosed: bool,
     ) -> BatchSolution:
-        """Rows for targets that could not be asked: status INVALID, NaN for every number."""
-        f = len(tolerances)
+        """Rows for targets that are malformed: status INVALID, NaN for every number."""
+        n, f = len(robot.actuators), len(robot.fingers)
         none = np.zeros(count, dtype=np.int64)
         return cls(
             success=np.zeros(count, dtype=bool),
@@ -106,6 +120,10 @@ class BatchSolution:
             limits_ok=np.zeros(count, dtype=bool),
             phases={},
             tolerances=tolerances,
+            fingers=robot.fingers,
+            method=method,
+            robot=robot.name,
+            actuators=robot.actuators,
             diagnoses=(None,) * count if diagnosed else (),
         )
 
@@ -142,14 +160,7 @@ class BatchSolution:
         """(k,) names of the statuses."""
         return np.array([status.name for status in sorted(Status)])[self.status - min(Status)]
 
-    def solution(
-        self,
-        row: int,
-        method: str,
-        robot: str,
-        actuators: tuple[str, ...],
-        fingers: tuple[str, ...],
-    ) -> Solution:
+    def solution(self, row: int) -> Solution:
         """One row as a `Solution`."""
         verdicts = zip(
             self.position_error[row].tolist(),
@@ -159,7 +170,8 @@ class BatchSolution:
             strict=True,
         )
         contacts = {
-            name: ContactVerdict(*verdict) for name, verdict in zip(fingers, verdicts, strict=True)
+            name: ContactVerdict(*verdict)
+            for name, verdict in zip(self.fingers, verdicts, strict=True)
         }
         return Solution(
             success=bool(self.success[row]),
@@ -171,8 +183,8 @@ class BatchSolution:
             contacts=contacts,
             phases={name: int(counts[row]) for name, counts in self.phases.items()},
             limits_ok=bool(self.limits_ok[row]),
-            method=method,
-            robot=robot,
-            actuators=actuators,
+            method=self.method,
+            robot=self.robot,
+            actuators=self.actuators,
             diagnosis=self.diagnoses[row] if self.diagnoses else None,
         )

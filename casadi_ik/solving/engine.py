@@ -11,16 +11,16 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.errors import UnsupportedError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.diagnosis import Reason
 from casadi_ik.problem.method import Method, Outcome, QuickMethod
 from casadi_ik.problem.problems import Array, Problems
-from casadi_ik.problem.recorder import Recorder, SolveBlock
+from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import judge, judge_one
@@ -28,6 +28,7 @@ from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.tracking import Tracker
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.parts import Parts
+from casadi_ik.solving.run import Run
 from casadi_ik.solving.workers import workers
 
 
@@ -62,7 +63,7 @@ class Engine:
         method = self.method
         if not isinstance(method, HandFirstMethod):
             method = HandFirstMethod(self.robot.description, HandFirstParameters(), self.compiled)
-        return Diagnostician(self.robot, method)
+        return Diagnostician(self.robot, method, self.compiled)
 
     @property
     def _hand_first(self) -> HandFirstMethod:
@@ -96,22 +97,20 @@ class Engine:
         """
         return Tracker(self.robot, self._hand_first, self.finder)
 
-    def quick(self, problems: Problems, q0: ArrayLike | None, seed: int) -> Solution | None:
+    def quick(self, problems: Problems, run: Run) -> Solution | None:
         """The answer to one target if it is solved at once, by the shortest way; None: `solve` it.
 
         Args:
             problems: One target.
-            q0: (n,) start; None is the robot's home.
-            seed: As for `solve`, which draws numbers for hard targets only.
+            run: As for `solve`; its random numbers are for hard targets only.
 
         Raises:
-            InputError: Bad q0 or seed.
+            InputError: Bad q0.
         """
         method, robot = self._quick, self.robot
         if method is None:
             return None
-        start = robot.configuration(q0, "q0")
-        _whole("seed", seed, 0)
+        start = run.start(robot)
         if start.ndim != 1:
             return None
         self.method.prepare()
@@ -138,65 +137,33 @@ class Engine:
             actuators=robot.actuators,
         )
 
-    def solve(
-        self,
-        problems: Problems,
-        q0: ArrayLike | None,
-        seed: int,
-        jobs: int = 1,
-        recorder: Recorder | None = None,
-        diagnose: bool = False,
-    ) -> BatchSolution:
+    def solve(self, problems: Problems, run: Run) -> BatchSolution:
         """Solve a batch of k targets.
 
         Args:
             problems: The targets.
-            q0: (n,) or (k, n) start; None is the robot's home.
-            seed: Of all random numbers.
-            jobs: Threads; compiled loops run side by side.
-            recorder: Who keeps the iterations, if anyone.
-            diagnose: Whether to find out why what is not solved is not.
+            run: How to solve them.
 
         Raises:
-            InputError: Bad q0, seed or jobs, or targets the method cannot take.
+            InputError: Bad q0, or targets the method cannot take.
         """
-        starts = self._starts(q0, len(problems))
-        _whole("jobs", jobs, 1)
-        _whole("seed", seed, 0)
+        starts, recorder = run.starts(self.robot, len(problems)), run.recorder
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
         self.method.prepare()
         batches = []
-        for part in self._parts(problems, starts, int(seed), int(jobs), recorder, diagnose):
+        for part in self._parts(problems, starts, run):
             if recorder is not None and part.outcome.rows is not None:
-                recorder.record(self._block(part, int(seed), part.outcome.rows))
+                recorder.record(self._block(part, run.seed, part.outcome.rows))
             batches.append(part.batch)
         return BatchSolution.joined(batches)
 
-    def _starts(self, q0: ArrayLike | None, count: int) -> Array:
-        start = self.robot.configuration(q0, "q0")
-        if start.ndim == 1:
-            return np.repeat(start[None], count, axis=0)
-        if len(start) != count:
-            raise InputError(
-                f"q0: found {len(start)} rows for {count} targets, expected as many, or one (n,)"
-            )
-        return start
-
-    def _parts(
-        self,
-        problems: Problems,
-        starts: Array,
-        seed: int,
-        jobs: int,
-        recorder: Recorder | None,
-        diagnose: bool,
-    ) -> Iterator[_Part]:
+    def _parts(self, problems: Problems, starts: Array, run: Run) -> Iterator[_Part]:
         """Parts of the batch in order, solved, judged and diagnosed side by side."""
-        trace = recorder is not None
+        trace, jobs, diagnose = run.recorder is not None, run.jobs, run.diagnose
 
-        def run(rows: slice) -> _Part:
+        def solve(rows: slice) -> _Part:
             started, asked = time.time_ns(), problems.rows(rows)
-            outcome = self.method.run(asked, starts[rows], seed, trace)
+            outcome = self.method.run(asked, starts[rows], run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
             batch = self._judged(asked, outcome)
@@ -207,16 +174,16 @@ class Engine:
         if diagnose:
             _ = self.diagnostician
         if jobs == 1 and not trace:
-            yield run(slice(0, len(problems)))
+            yield solve(slice(0, len(problems)))
             return
         parts = Parts(len(problems), jobs, trace)
         if jobs == 1:
-            yield from map(run, parts)
+            yield from map(solve, parts)
             return
         with workers(jobs) as threads:
             ahead: deque[Future[_Part]] = deque()
             for part in parts:
-                ahead.append(threads.submit(run, part))
+                ahead.append(threads.submit(solve, part))
                 if len(ahead) > jobs:
                     yield ahead.popleft().result()
             while ahead:
@@ -243,6 +210,10 @@ class Engine:
             limits_ok=verdict.limits_ok,
             phases=outcome.phases,
             tolerances=problems.tolerances,
+            fingers=self.robot.fingers,
+            method=self.method.name,
+            robot=self.robot.name,
+            actuators=self.robot.actuators,
         )
 
     def _diagnosed(
@@ -267,17 +238,15 @@ class Engine:
             None if solved else found[row] for row, solved in enumerate(batch.success)
         )
         status = batch.status.copy()
-        unreachable = [why is not None and why.established for why in diagnoses]
-        status[unreachable] = Status.UNREACHABLE
+        for row, why in enumerate(diagnoses):
+            if why is not None and why.reason is not Reason.REACHABLE:
+                status[row] = Status.UNREACHABLE if why.established else Status.NOT_FOUND
         return replace(batch, status=status, diagnoses=diagnoses)
 
     def _block(self, part: _Part, seed: int, rows: NDArray[Any]) -> SolveBlock:
         batch = part.batch
         before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
         return SolveBlock(
-            method=self.method.name,
-            robot=self.robot.name,
-            fingers=self.robot.fingers,
             format=self.method.trace_format,
             first=part.problems.first_row,
             problems=part.problems,
@@ -287,8 +256,3 @@ class Engine:
             rows=rows,
             started=part.started + (before * 1e9).astype(np.int64),
         )
-
-
-def _whole(name: str, value: object, least: int) -> None:
-    if not isinstance(value, (int, np.integer)) or value < least:
-        raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from casadi_ik.errors import InputError, RowError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.recorder import Recorder
 from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
 
 Block = tuple[ArrayLike, ArrayLike]
 """Points and normals (k, f, 3) of some targets."""
@@ -42,29 +42,21 @@ class Stream:
         engine: Who solves.
         ask: Points, normals and the number of the first target as a checked question.
         tolerances: When a contact counts as reached, by finger.
-        q0: (n,) start; None is the robot's home.
-        seed: Of all random numbers.
-        jobs: Threads.
-        recorder: Who keeps the iterations, if anyone.
-        diagnose: Whether to find out why what is not solved is not.
+        run: How targets are solved; one start (n,) for all of them.
     """
 
     engine: Engine
     ask: Callable[[np.ndarray, np.ndarray, int], Problems]
     tolerances: tuple[Tolerance, ...]
-    q0: ArrayLike | None
-    seed: int
-    jobs: int
-    recorder: Recorder | None
-    diagnose: bool
+    run: Run
 
     def solve(self, blocks: Iterable[Block]) -> Iterator[SolvedBlock]:
         """Solve one block after the other; a target's numbers do not depend on the blocks.
 
         Raises:
-            InputError: Bad q0, seed or jobs, or a block of the wrong shape.
+            InputError: Bad q0, or a block of the wrong shape.
         """
-        if self.engine.robot.configuration(self.q0, "q0").ndim != 1:
+        if self.run.start(self.engine.robot).ndim != 1:
             raise InputError("q0: found several, expected one start for all targets")
         first_row = 0
         for points, normals in blocks:
@@ -79,7 +71,6 @@ class Stream:
                 f"points and normals: found {len(points)} and {len(normals)} rows, expected as many"
             )
         engine = self.engine
-        n = len(engine.robot.actuators)
         parts: dict[int, BatchSolution] = {}
         faults: dict[int, str] = {}
         waiting = [(0, len(points))]
@@ -91,13 +82,13 @@ class Stream:
             except RowError as error:
                 row = error.row - first_row
                 faults[error.row] = str(error)
-                parts[row] = BatchSolution.invalid(1, n, self.tolerances, self.diagnose)
+                parts[row] = BatchSolution.invalid(
+                    1, engine.method.name, engine.robot, self.tolerances, self.run.diagnose
+                )
                 waiting += [part for part in ((row + 1, stop), (start, row)) if part[0] < part[1]]
         solution = BatchSolution.joined([parts[start] for start in sorted(parts)])
         return SolvedBlock(first_row, solution, dict(sorted(faults.items())))
 
     def _solved(self, points: np.ndarray, normals: np.ndarray, first_row: int) -> BatchSolution:
         problems = self.ask(points, normals, first_row)
-        return self.engine.solve(
-            problems, self.q0, self.seed, self.jobs, self.recorder, self.diagnose
-        )
+        return self.engine.solve(problems, self.run)

@@ -77,6 +77,10 @@ def make_block(
         ok=np.tile([True, False, True], (k, 1)),
         limits_ok=np.ones(k, dtype=bool),
         tolerances=(Tolerance(),) * 3,
+        fingers=FINGERS,
+        method=method,
+        robot="made_up",
+        actuators=tuple(f"motor_{i}" for i in range(14)),
         phases={
             # As in `make_rows`: a third each, rounded up.
             phase: -(-iterations * (i + 1) // 3) - -(-iterations * i // 3)
@@ -87,9 +91,6 @@ def make_block(
         make_rows(number, count, form.layout) for number, count in zip(numbers, counts, strict=True)
     ]
     return SolveBlock(
-        method=method,
-        robot="made_up",
-        fingers=FINGERS,
         format=form,
         first=first,
         problems=Problems(rng.normal(size=(k, 3, 3)), normals, Tolerance(), True),

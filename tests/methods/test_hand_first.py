@@ -17,6 +17,7 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.problems import Problems, fixed_array, target_arrays
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
 
 EXACT = ik.Tolerance(1e-6, 1e-6)
 TOLERANCES = {"usual": ik.Tolerance(), "exact": EXACT}
@@ -34,7 +35,7 @@ def problems(robot, q, tolerance=EXACT, enforce=True, fixed=None):
 
 
 def solve(robot, method, asked):
-    return Engine(robot, method).solve(asked, None, 0)
+    return Engine(robot, method).solve(asked, Run())
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)

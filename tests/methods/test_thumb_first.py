@@ -16,6 +16,7 @@ from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.problem.problems import Problems, Tolerance, fixed_array, target_arrays
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
 
 PAPER = Tolerance()
 EXACT = Tolerance(1e-6, 1e-6)
@@ -37,7 +38,7 @@ def problems(robot, q, tolerance=PAPER, enforce=True, fixed=None) -> Problems:
 
 
 def solve(robot, method, asked) -> ik.BatchSolution:
-    return Engine(robot, method).solve(asked, None, 0)
+    return Engine(robot, method).solve(asked, Run())
 
 
 def bent(robot, rng, count):
@@ -151,7 +152,7 @@ def test_the_start_chooses_between_hands(robot, once, rng):
     """Of several hands for the same contacts, the one near q0 is begun with."""
     q = robot.random(rng, 200)
     asked = problems(robot, q)
-    batches = [Engine(robot, once).solve(asked, q0, 0) for q0 in (robot.home, q)]
+    batches = [Engine(robot, once).solve(asked, Run(q0)) for q0 in (robot.home, q)]
     hand = list(once.step.hand)
     from_home, from_truth = (np.abs(batch.q - q)[:, hand].max(axis=1) for batch in batches)
     assert np.median(from_truth) < np.median(from_home)

@@ -12,6 +12,7 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.parts import FIRST_PART, PART_BYTES, Parts
+from casadi_ik.solving.run import Run
 
 LAYOUT = Layout.record(Field("row", (), "f8"))
 
@@ -73,7 +74,7 @@ def test_limits_are_part_of_success_where_enforced(robot, enforce):
     """The method is sure of itself, the contacts are met, but a motor is beyond its limit."""
     q = np.tile(robot.home, (2, 1))
     q[1, 6] = robot.upper[6] + 0.01
-    batch = Engine(robot, Answering()).solve(targets(robot, q, enforce), q, 0)
+    batch = Engine(robot, Answering()).solve(targets(robot, q, enforce), Run(q))
     np.testing.assert_array_equal(batch.limits_ok, [True, False])
     np.testing.assert_array_equal(batch.success, [True, not enforce])
     assert list(batch.status_names) == ["SOLVED", "STALLED" if enforce else "SOLVED"]
@@ -85,7 +86,7 @@ def test_the_verdict_outvotes_the_method(robot, status):
     q = np.tile(robot.home, (2, 1))
     goals = q.copy()
     goals[1, 0] += 0.5
-    batch = Engine(robot, Answering(status)).solve(targets(robot, goals), q, 0)
+    batch = Engine(robot, Answering(status)).solve(targets(robot, goals), Run(q))
     assert list(batch.status_names) == ["SOLVED", status.name]
     np.testing.assert_array_equal(batch.success, [True, False])
 
@@ -93,7 +94,7 @@ def test_the_verdict_outvotes_the_method(robot, status):
 def test_threads_share_a_batch_in_order(robot, rng):
     q = robot.random(rng, 11)
     method = Answering()
-    batch = Engine(robot, method).solve(targets(robot, q), q, 5, jobs=3)
+    batch = Engine(robot, method).solve(targets(robot, q), Run(q, 5, jobs=3))
     assert method.prepared == 1
     assert sorted(count for count, _, _ in method.calls) == [3, 4, 4]
     assert {seed for _, seed, _ in method.calls} == {5}
@@ -109,7 +110,7 @@ def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
     keeping = Keeping()
     problems = targets(robot, q)
     method = Answering()
-    batch = Engine(robot, method).solve(problems, q, 9, jobs=jobs, recorder=keeping)
+    batch = Engine(robot, method).solve(problems, Run(q, 9, jobs=jobs, recorder=keeping))
     assert method.prepared == 1
     assert len(keeping.blocks) > 1
     assert keeping.blocks[0].first == 0

@@ -236,6 +236,20 @@ def test_a_changed_seed_is_one_line(done):
     assert "seed: results made with 0 are here, this study has 1" in ended.stderr
 
 
+def test_the_logs_of_a_study_are_one_log(tmp_path):
+    """Of two settings, each block counting from 0 and with a sample of its own."""
+    study = dataclasses.replace(STUDY, sets=STUDY.sets[:1], count=8)
+    run(study, tmp_path / "study", keep=Keep())
+    merged = ik.logs.merge_logs(tmp_path / "study", tmp_path / "all.mcap")
+    assert merged.shards == 4
+    for log in map(ik.logs.open, (tmp_path / "study", merged.path)):
+        assert log.solves().solve_id.tolist() == list(range(16))
+        solve = ik.logs.one_solve(log, 9)
+        assert (solve.shard, solve.number) == ("loose/random hands/00000.mcap", 1)
+        assert solve.tolerances[0].position == study.settings[0].tolerance[0]
+        assert ik.logs.one_solve(log, 0).tolerances[0].position == study.settings[1].tolerance[0]
+
+
 def test_a_log_per_block_keeps_what_is_asked_for(done, tmp_path):
     study = dataclasses.replace(STUDY, settings=STUDY.settings[:1])
     run(study, tmp_path, keep=Keep(failed=True, singular=False, sample=0.25))

@@ -62,7 +62,11 @@ class Run:
 
 
 def chunk_bytes(
-    data: memoryview, runs: Sequence[Run], compression: str, position: int
+    data: memoryview,
+    runs: Sequence[Run],
+    compression: str,
+    position: int,
+    packed: bytes | memoryview | None = None,
 ) -> tuple[list[bytes | memoryview], ChunkIndex]:
     """A Chunk record and its MessageIndex records.
 
@@ -71,12 +75,13 @@ def chunk_bytes(
         runs: Where in it which messages are; none of them empty, at least one.
         compression: A key of `COMPRESSORS`.
         position: Where in the file the chunk will stand.
+        packed: The data compressed, where they are already.
 
     Returns:
         The bytes in pieces, and the ChunkIndex record for the summary.
     """
     name, compress = COMPRESSORS[compression]
-    packed = compress(data)
+    packed = compress(data) if packed is None else packed
     start = min(int(run.log_time.min()) for run in runs)
     end = max(int(run.log_time.max()) for run in runs)
     head = RecordBuilder()

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.errors import LogError
 from casadi_ik.logs.events.traces import bits_of
 from casadi_ik.logs.read.table import Part, element_name
 from casadi_ik.problem.problems import Tolerance
+
+
+class _Parameters(msgspec.Struct):
+    """What logs of earlier versions say of the solver."""
+
+    tolerance: dict[str, dict[Literal["position", "angle"], float]] = {}
+    limits: Literal["enforce", "ignore"] = "enforce"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +51,13 @@ def asked_of(part: Part, metadata: Mapping[str, Any]) -> Asked:
     """
     row, fingers = part.rows[0], part.labels["position_error"]
     if "start" not in (part.rows.dtype.names or ()):
-        parameters = metadata.get("parameters", {})
-        known = parameters.get("tolerance", {})
-        tolerances = tuple(Tolerance(**known.get(finger, {})) for finger in fingers)
-        limits = parameters.get("limits", "enforce")
-        return Asked(tolerances, limits, int(metadata["seed"]))
+        try:
+            known = msgspec.convert(metadata.get("parameters", {}), _Parameters)
+            seed = int(metadata["seed"][:20])
+        except ValueError as error:  # msgspec's too
+            raise LogError(f"metadata: {error}") from error
+        tolerances = tuple(Tolerance(**known.tolerance.get(finger, {})) for finger in fingers)
+        return Asked(tolerances, known.limits, seed)
     names = part.labels["q"]
     (held,) = bits_of(np.atleast_1d(row["fixed_mask"])[None])
     pairs = zip(row["position_tolerance"].tolist(), row["angle_tolerance"].tolist(), strict=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +39,11 @@ def chosen(part: Part, keep: NDArray[np.bool_]) -> Part:
     """Some of the rows (k,) of a part."""
     if keep.all():
         return part
-    return Part(
-        part.method,
-        part.rows[keep],
-        part.solve_id[keep],
-        part.iteration[keep],
-        part.labels,
-        part.units,
+    shard = None if part.shard is None else part.shard[keep]
+    return replace(
+        part,
+        rows=part.rows[keep],
+        solve_id=part.solve_id[keep],
+        iteration=part.iteration[keep],
+        shard=shard,
     )

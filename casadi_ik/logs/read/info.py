@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ class LogInfo:
         attachments: Attached files and their sizes [bytes], of the first file.
         unfinished: Files without a footer: their writer was killed or is still at it. What is
             after their last complete chunk is lost.
+        left_out: Files in which nothing is whole: their writer was killed before its first chunk.
+        differs: Entries of the metadata in which the shards differ, and what they say.
     """
 
     paths: tuple[Path, ...]
@@ -38,3 +40,5 @@ class LogInfo:
     metadata: Mapping[str, Any]
     attachments: Mapping[str, int]
     unfinished: tuple[Path, ...]
+    left_out: tuple[Path, ...] = ()
+    differs: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)

@@ -3,45 +3,39 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.errors import LogError, UnknownNameError
+from casadi_ik.errors import LogError, UnknownNameError, printable
 from casadi_ik.logs.read import filters
+from casadi_ik.logs.read.files import Paths, open_shards
 from casadi_ik.logs.read.filters import Names, Solves
 from casadi_ik.logs.read.info import LogInfo
+from casadi_ik.logs.read.joining import joined, raised
 from casadi_ik.logs.read.shard import Shard
+from casadi_ik.logs.read.sources import Sources, offsets_of, overlapping, sources_of
 from casadi_ik.logs.read.table import Part, Table
 
 logger = logging.getLogger(__name__)
 
 
-def open_log(path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> Log:
+def open_log(path: Paths) -> Log:
     """Open a log.
 
     Args:
-        path: A file, a folder (all .mcap files in it), or several of these: the shards of one
-            study, read as one log.
+        path: A file, a folder (all .mcap files in it and below), or several of these: the shards
+            of one study, read as one log. How its solves are numbered: see `read.sources`.
 
     Raises:
         LogError: A file is missing, is no MCAP file, is damaged, or is not a log of casadi_ik; or
             the files are not of one robot, or a method is not of one kind in all of them.
     """
-    given = [path] if isinstance(path, str | os.PathLike) else list(path)
-    files: list[Path] = []
-    for item in map(Path, given):
-        found = sorted(item.rglob("*.mcap")) if item.is_dir() else [item]
-        if not found:
-            raise LogError(f"{item}: no log in this folder")
-        files += found
-    if not files:
-        raise LogError("no log was named")
-    return Log([Shard(file) for file in files])
+    return Log(*open_shards(path))
 
 
 class Log:
@@ -61,9 +55,10 @@ class Log:
         shards: The files.
         methods: What methods there are.
         metadata: Where the log comes from, of the first file.
+        left_out: Files in which nothing is whole.
     """
 
-    def __init__(self, shards: Sequence[Shard]) -> None:
+    def __init__(self, shards: Sequence[Shard], left_out: Sequence[Path] = ()) -> None:
         """Put shards together; use `open_log`."""
         first = shards[0]
         for shard in shards[1:]:
@@ -74,10 +69,13 @@ class Log:
         self.shards = tuple(shards)
         self.methods = tuple(dict.fromkeys(m for shard in shards for m in shard.methods))
         self.metadata = first.metadata
+        self.left_out = tuple(left_out)
+        self._own: dict[tuple[int, str], Part] = {}
         for shard in shards:
             if not shard.contents.complete:
                 lost = shard.contents.size - shard.contents.readable
-                logger.warning("%s: not finished; %d bytes at its end are lost", shard.path, lost)
+                where = printable(str(shard.path))
+                logger.warning("%s: not finished; %d bytes at its end are lost", where, lost)
 
     def __repr__(self) -> str:
         return f"<Log of {len(self.shards)} file(s), methods {', '.join(self.methods) or 'none'}>"
@@ -105,6 +103,8 @@ class Log:
             metadata=self.metadata,
             attachments={item.name: item.data_size for item in contents[0].attachments},
             unfinished=tuple(each.path for each in contents if not each.complete),
+            left_out=self.left_out,
+            differs=self._differs(),
         )
 
     def attachment(self, name: str) -> bytes:
@@ -241,37 +241,55 @@ class Log:
         fields: Sequence[str] | None,
     ) -> Part:
         """The rows of all shards as one."""
-        parts = [
-            shard.read(method, kind, wanted, fields)
-            for shard in self.shards
-            if method in shard.methods
-        ]
-        first = parts[0]
-        for part, shard in zip(parts, self.shards, strict=False):
+        holders = [i for i, shard in enumerate(self.shards) if method in shard.methods]
+        sources, parts, origin = self.sources, [], []
+        for i in holders:
+            offset = sources.offsets[i]
+            own = None if wanted is None else wanted[wanted >= offset] - offset
+            part = self._own.pop((i, method), None) if kind == "solve" and own is None else None
+            part = part or self.shards[i].read(method, kind, own, fields)
+            first = parts[0] if parts else part
             if part.rows.dtype != first.rows.dtype or part.labels != first.labels:
                 raise LogError(
-                    f"{shard.path}: method {method!r} has other fields or names than in "
-                    f"{self.shards[0].path}"
+                    f"{self.shards[i].path}: method {method!r} has other fields or names than in "
+                    f"{self.shards[holders[0]].path}"
                 )
-        solve_id, iteration, rows = (
-            np.concatenate([getattr(part, name) for part in parts])
-            if len(parts) > 1
-            else getattr(first, name)
-            for name in ("solve_id", "iteration", "rows")
-        )
-        later = solve_id[1:] * 2**24 + iteration[1:] - solve_id[:-1] * 2**24 - iteration[:-1]
-        if np.any(later < 0):
-            order = np.lexsort((iteration, solve_id))
-            solve_id, iteration, rows = solve_id[order], iteration[order], rows[order]
-            later = np.diff(solve_id * 2**24 + iteration)
-        if kind != "event":
-            twice = np.flatnonzero(later == 0 if kind == "iteration" else np.diff(solve_id) == 0)
-            if len(twice):
-                paths = ", ".join(str(shard.path) for shard in self.shards)
-                raise LogError(
-                    f"{paths}: solve {solve_id[twice[0]]} of method {method!r} is there twice"
-                )
-        return Part(method, rows, solve_id, iteration, first.labels, first.units)
+            if offset:
+                part = raised(part, offset)
+            parts.append(part)
+            origin.append(sources.of(i, method, part.solve_id))
+        where = str(self.shards[holders[0]].path)
+        return joined(where, kind, parts, np.concatenate(origin), sources.names)
+
+    @cached_property
+    def sources(self) -> Sources:
+        """Where the solves come from, and how they are numbered.
+
+        Raises:
+            LogError: A solve is in two files, or what a merged log says of its shards is wrong.
+        """
+        offsets = [0] * len(self.shards)
+        if overlapping(self.shards):
+            self._own = {
+                (i, method): shard.read(method, "solve")
+                for i, shard in enumerate(self.shards)
+                for method in shard.methods
+            }
+            offsets = offsets_of(self.shards, self._own)
+        return sources_of(self.shards, offsets)
+
+    def _differs(self) -> dict[str, tuple[Any, ...]]:
+        """Entries of the metadata in which sources differ."""
+        all_of = [source.metadata for source in self.sources.sources]
+        found: dict[str, tuple[Any, ...]] = {}
+        for key in dict.fromkeys(key for each in all_of for key in each):
+            values: list[Any] = []
+            for each in all_of:
+                if each.get(key) not in values:
+                    values.append(each.get(key))
+            if len(values) > 1:
+                found[key] = tuple(values)
+        return found
 
     def _methods(self, method: Names) -> tuple[str, ...]:
         if method is None:

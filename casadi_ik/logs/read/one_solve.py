@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.errors import UnknownNameError
+from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.events.kinds import SINGULAR
 from casadi_ik.logs.events.traces import bits_of
@@ -96,6 +96,8 @@ class OneSolve:
         events: What happened, by iteration.
         parameters: What the solver was set to.
         asked: What it was asked besides its targets.
+        shard: Name of the shard it comes from, if the log has several.
+        number: Its number there; random numbers follow from it and the seed.
     """
 
     method: str
@@ -119,6 +121,8 @@ class OneSolve:
     events: tuple[Happening, ...]
     parameters: Mapping[str, Any]
     asked: Asked
+    shard: str = ""
+    number: int = 0
 
     @property
     def tolerances(self) -> tuple[Tolerance, ...]:
@@ -187,9 +191,13 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
         raise UnknownNameError(f"{problem}; the log holds: {held or 'nothing'}")
     (part,) = found
     row, number = part.rows[0], int(part.solve_id[0])
+    if not np.isfinite([row["started"], row["time"]]).all():
+        raise LogError(f"solve {number} of {part.method}: its times are no numbers")
     record = next(Table("solve", (part,)).records())
     iterations = log.iterations(method=part.method, solve=number).part
     events = log.events(method=part.method, solve=number)
+    sources = log.sources.sources
+    source = sources[0 if part.shard is None else int(part.shard[0])]
     return OneSolve(
         method=part.method,
         robot=log.metadata["robot"],
@@ -210,8 +218,10 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
         labels=iterations.labels,
         rows=iterations.rows,
         events=tuple(map(happening, events.records())) if len(events) else (),
-        parameters=log.metadata.get("parameters", {}),
-        asked=asked_of(part, log.metadata),
+        parameters=source.metadata["parameters"],
+        asked=asked_of(part, source.metadata),
+        shard=source.name if len(sources) > 1 else "",
+        number=number - source.first,
     )
 
 

@@ -43,6 +43,7 @@ class Shard:
 
     Attributes:
         path: The file.
+        name: What it is called among the files of its log.
         contents: Where in it what is.
         record: Where it comes from, as it stands in the file.
         metadata: The same, structured values as what they say.
@@ -51,7 +52,7 @@ class Shard:
         clock: Rule of its log times.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, name: str = "") -> None:
         """Look into the file.
 
         Raises:
@@ -59,6 +60,7 @@ class Shard:
             LogError: It is missing, no MCAP file, damaged, or no log of casadi_ik.
         """
         self.path = path
+        self.name = name or path.name
         self.contents: Contents = read_contents(path)
         with naming(path):
             contents = self.contents

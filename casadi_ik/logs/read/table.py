@@ -35,6 +35,8 @@ class Part:
         iteration: (k,) its number within the solve from 0; of a solve the last.
         labels: Names that make a field readable, as in `TraceFormat.labels`.
         units: Unit by field, "" if dimensionless.
+        shard: (k,) which of `shards` each row comes from; None where that is not told.
+        shards: Names of the shards of the log.
     """
 
     method: str
@@ -43,6 +45,15 @@ class Part:
     iteration: NDArray[np.int64]
     labels: Labels
     units: Mapping[str, str]
+    shard: NDArray[np.int64] | None = None
+    shards: tuple[str, ...] = ()
+
+    @property
+    def origins(self) -> list[str] | None:
+        """(k,) name of the shard of each row, if the log has several."""
+        if self.shard is None or len(self.shards) < 2:
+            return None
+        return [self.shards[i] for i in self.shard.tolist()]
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -122,7 +133,8 @@ class Table:
         """The rows as a polars DataFrame: a column per number, codes as their names.
 
         A field with several numbers becomes several columns ("q.lwr_joint_1", "target_points.
-        thumb.x"). Methods stand one below the other; what a method does not record is null.
+        thumb.x"). Of a log of several shards "shard" names that of each row. Methods stand one
+        below the other; what a method does not record is null.
 
         Raises:
             MissingExtraError: polars is not installed.
@@ -149,10 +161,13 @@ class Table:
         for part in self.parts:
             subjects = _subjects(part) if self.kind == "event" else None
             fields = {name: _readable(part, name) for name in part.rows.dtype.names or ()}
+            origins = part.origins
             for i in range(len(part)):
                 record: dict[str, Any] = {"method": part.method}
                 record |= {name: int(getattr(part, name)[i]) for name in self._keys}
                 record |= {name: values[i] for name, values in fields.items()}
+                if origins is not None:
+                    record["shard"] = origins[i]
                 if subjects is not None:
                     record["subject"] = subjects[i]
                 yield record
@@ -168,9 +183,7 @@ def _series(pl: Any, part: Part, keys: Sequence[str]) -> dict[str, Any]:
     columns |= {name: getattr(part, name).astype(np.uint32) for name in keys}
     for name in part.rows.dtype.names or ():
         values, labels = part.rows[name], part.labels.get(name, ())
-        if values.dtype.kind == "O":
-            columns[name] = pl.Series(values.tolist())
-        elif values.ndim > 1:
+        if values.ndim > 1:
             matrix = np.ascontiguousarray(as_matrix(values).T)
             for column, label in zip(matrix, _element_names(values.shape[1:], labels), strict=True):
                 columns[f"{name}.{label}"] = column
@@ -179,6 +192,8 @@ def _series(pl: Any, part: Part, keys: Sequence[str]) -> dict[str, Any]:
             columns[name] = known.gather(values.astype(np.uint32))
         else:
             columns[name] = np.ascontiguousarray(values)
+    if (origins := part.origins) is not None:
+        columns["shard"] = origins
     if "joint_mask" in columns or "joint_mask.0" in columns:
         columns["joints"] = [", ".join(names) for names in _readable(part, "joint_mask")]
         columns["subject"] = _subjects(part)
@@ -217,6 +232,11 @@ def label_of(labels: Sequence[str], code: int) -> str:
     return (labels[code] if 0 <= code < len(labels) else "") or str(code)
 
 
+def _code_of(labels: Sequence[str], value: float) -> str:
+    """The name of a code that is kept as a float, or the number."""
+    return label_of(labels, int(value)) if np.isfinite(value) else str(value)
+
+
 def _subjects(part: Part) -> list[str]:
     """What each event is about: the Jacobian, the joints, the phases."""
     kinds = _readable(part, "kind")
@@ -227,7 +247,7 @@ def _subjects(part: Part) -> list[str]:
     for i, kind in enumerate(kinds):
         before, after = part.rows["threshold"][i], part.rows["value"][i]
         if kind == EventKind.PHASE_CHANGE.name:
-            subject = f"{label_of(phases, int(before))} -> {label_of(phases, int(after))}"
+            subject = f"{_code_of(phases, before)} -> {_code_of(phases, after)}"
         elif kind == EventKind.RESTART.name:
             subject = f"{before:.0f} -> {after:.0f}"
         elif kind in (EventKind.NEAR_SINGULAR.name, EventKind.ILL_CONDITIONED.name):

@@ -1,38 +1,36 @@
-"""Joins the shards of a study: compressed chunks are copied as they are, only offsets change.
+"""Joins the shards of a study to one log.
 
-Log times are arithmetic in the number of the solve, so shards can only be joined if they count
-time alike and no solve of a method is in two of them.
+What the reader would refuse is not joined: every chunk is unpacked and verified on its way. A chunk
+goes into the new log as it is, compressed, unless its solves get other numbers or its channels
+others ids (see `read.sources`): then its messages are changed accordingly and compressed anew.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any
 
-import numpy as np
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
+from mcap.records import Attachment, Metadata
 
 from casadi_ik.errors import LogError
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs.mcap.chunk import definitions
-from casadi_ik.logs.mcap.clock import LogClock
 from casadi_ik.logs.mcap.contents import read_attachment, reading
-from casadi_ik.logs.mcap.metadata import CHECKSUM, METADATA_NAME, checksum
-from casadi_ik.logs.mcap.records import HEAD
+from casadi_ik.logs.mcap.metadata import CHECKSUM, METADATA_NAME, SHARDS, checksum
 from casadi_ik.logs.mcap.summary import Summary
-from casadi_ik.logs.mcap.unpacking import read_chunk
-from casadi_ik.logs.read.shard import Shard, naming
+from casadi_ik.logs.read.files import open_shards
+from casadi_ik.logs.read.log import Log
+from casadi_ik.logs.read.shard import Shard
+from casadi_ik.logs.read.sources import ranges_of
+from casadi_ik.logs.repair.joint import JointChannels, copied
 
-VARYING = ("created", "machine", "python", "packages", "code_version", "compression")
-"""What may differ between shards; what does is kept in the metadata, shard by shard."""
-
-Declared = TypeVar("Declared", Schema, Channel)
+ALIKE = ("robot", "seed", "t0_ns", "slot_ns")
+"""What must be the same in all shards; in what else they differ is kept, shard by shard."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +43,7 @@ class Merged:
         solves: Solves in it, by method.
         messages: Messages in it.
         size: Its size [bytes].
+        left_out: Files in which nothing is whole.
     """
 
     path: Path
@@ -52,23 +51,18 @@ class Merged:
     solves: Mapping[str, int]
     messages: int
     size: int
+    left_out: tuple[Path, ...] = ()
 
 
-@dataclass(frozen=True)
-class _Shard:
-    path: Path
-    stream: IO[bytes]
-    summary: Summary
-    metadata: Mapping[str, str]
-    attachments: tuple[Attachment, ...]
-
-
-def merge_logs(shards: Sequence[str | os.PathLike[str]], target: str | os.PathLike[str]) -> Merged:
+def merge_logs(
+    shards: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    target: str | os.PathLike[str],
+) -> Merged:
     """Join shards to one log.
 
     Args:
-        shards: Complete logs (see `finish_log`) of one study: same robot, parameters, seed and
-            clock, same schemas and channels under the same numbers.
+        shards: Complete logs (see `finish_log`) or folders of them: same robot, seed and clock,
+            and the methods of one kind in all.
         target: The log to write; it is there when it is complete.
 
     Returns:
@@ -78,139 +72,85 @@ def merge_logs(shards: Sequence[str | os.PathLike[str]], target: str | os.PathLi
         LogError: A shard is missing, damaged or incomplete, contradicts the first, or holds a
             solve that another holds too; or the target cannot be written.
     """
-    if not shards:
+    if not isinstance(shards, str | os.PathLike) and not shards:
         raise LogError("merge: found no shards, expected at least one")
     path = Path(target)
-    with ExitStack() as stack:
-        opened = [stack.enter_context(_opened(Path(shard))) for shard in shards]
-        metadata = _joint_metadata(opened)
-        solves = _joint_solves(opened, LogClock(int(metadata["t0_ns"]), int(metadata["slot_ns"])))
-        summary = _joint_summary(opened)
-        attachments = _joint_attachments(opened)
-        try:
-            with written_whole(path) as part, part.open("xb") as stream:
-                _write(stream, opened, summary, metadata, attachments)
-                size = stream.tell()
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise LogError(f"{path}: cannot write the merged log: {reason}") from error
-    return Merged(path, len(opened), solves, sum(summary.counts.values()), size)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[_Shard]:
-    shard = Shard(path)
-    if not shard.contents.complete:
-        raise LogError(f"{path}: not finished (`casadi-ik log finish` repairs what was torn)")
-    with reading(path) as stream:
-        attachments = tuple(read_attachment(stream, item) for item in shard.contents.attachments)
-    with path.open("rb") as stream:
-        yield _Shard(path, stream, shard.contents.summary, shard.record, attachments)
-
-
-def _joint_metadata(shards: Sequence[_Shard]) -> dict[str, str]:
-    first = shards[0]
-    for shard in shards[1:]:
-        for key in sorted({*first.metadata, *shard.metadata} - {*VARYING, CHECKSUM}):
-            place, found, expected = _difference(key, shard.metadata, first.metadata)
-            if found != expected:
-                raise LogError(
-                    f"{shard.path}: {place}: found {found}, expected {expected} as in {first.path}"
-                )
-    origins = [
-        {"file": shard.path.name}
-        | {key: shard.metadata[key] for key in VARYING if key in shard.metadata}
-        for shard in shards
-    ]
-    record = {**first.metadata, "shards": json.dumps(origins)}
-    return {**record, CHECKSUM: checksum(record)}
-
-
-def _difference(
-    key: str, found: Mapping[str, Any], expected: Mapping[str, Any]
-) -> tuple[str, Any, Any]:
-    """The first place under a key where two records differ, and what is there."""
-    first, second = _parsed(found.get(key)), _parsed(expected.get(key))
-    if isinstance(first, dict) and isinstance(second, dict):
-        for name in sorted({*first, *second}):
-            if first.get(name) != second.get(name):
-                place, *rest = _difference(name, first, second)
-                return f"{key}.{place}", rest[0], rest[1]
-    return key, first, second
-
-
-def _parsed(value: Any) -> Any:
-    """JSON as what it says; anything else as it is."""
-    if isinstance(value, str):
-        with suppress(ValueError):
-            return json.loads(value)
-    return value
-
-
-def _joint_solves(shards: Sequence[_Shard], clock: LogClock) -> dict[str, int]:
-    """How many solves there are by method; each must be in one shard only."""
-    holders: dict[str, dict[int, _Shard]] = {}
-    for shard in shards:
-        for method, numbers in _solves_of(shard, clock).items():
-            holder = holders.setdefault(method, {})
-            doubled = sorted(numbers & holder.keys())
-            if doubled:
-                raise LogError(
-                    f"{shard.path}: solve {doubled[0]} of {method} is in"
-                    f" {holder[doubled[0]].path} too ({len(doubled)} such solves)"
-                )
-            holder.update(dict.fromkeys(numbers, shard))
-    return {method: len(holder) for method, holder in holders.items()}
-
-
-def _solves_of(shard: _Shard, clock: LogClock) -> dict[str, set[int]]:
-    """Numbers of the solves by method."""
-    found: dict[str, set[int]] = {}
-    methods = {
-        channel.id: channel.metadata["method"]
-        for channel in shard.summary.channels.values()
-        if "method" in channel.metadata
-    }
-    for index in shard.summary.chunks:
-        with naming(shard.path):
-            chunk = read_chunk(shard.stream, index)
-        for run in chunk.runs:
-            numbers = found.setdefault(methods[run.channel], set())
-            numbers.update(np.unique(clock.locate(run.log_time)[0]).tolist())
-    return found
-
-
-def _joint_summary(shards: Sequence[_Shard]) -> Summary:
-    """Schemas, channels and counts of all; one number stands for one thing."""
-    joint = Summary()
-    for shard in shards:
-        _unite(shard, shards[0], joint.channels, shard.summary.channels)
-        _unite(shard, shards[0], joint.schemas, shard.summary.schemas)
-        for channel, count in shard.summary.counts.items():
-            joint.counts[channel] = joint.counts.get(channel, 0) + count
-    return joint
-
-
-def _unite(
-    shard: _Shard, first: _Shard, joint: dict[int, Declared], found: Mapping[int, Declared]
-) -> None:
-    for number, record in found.items():
-        known = joint.setdefault(number, record)
-        if known != record:
+    opened, left_out = open_shards(shards)
+    for shard in opened:
+        if not shard.contents.complete:
             raise LogError(
-                f"{shard.path}: {type(record).__name__.lower()} {number}, {_name(record)}, is not"
-                f" as in {first.path} ({_name(known)})"
+                f"{shard.path}: the log is truncated or damaged at its end (`casadi-ik log finish`"
+                " repairs what was torn)"
+            )
+        _check_alike(shard, opened[0])
+    log = Log(opened, left_out)
+    numbers = {part.method: part for part in log.solves().parts}
+    channels = JointChannels(opened)
+    attachments = _joint_attachments(opened)
+    record = Metadata(METADATA_NAME, _joint_record(log))
+    summary = Summary()
+    try:
+        with written_whole(path) as part, part.open("xb") as stream:
+            _write(stream, log, channels, summary, record, attachments)
+            size = stream.tell()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LogError(f"{path}: cannot write the merged log: {reason}") from error
+    solves = {method: len(part) for method, part in numbers.items()}
+    return Merged(path, len(opened), solves, sum(summary.counts.values()), size, tuple(left_out))
+
+
+def _check_alike(shard: Shard, first: Shard) -> None:
+    for key in ALIKE:
+        found, expected = shard.record.get(key), first.record.get(key)
+        if found != expected:
+            raise LogError(
+                f"{shard.path}: {key}: found {found}, expected {expected} as in {first.path}"
             )
 
 
-def _name(record: Schema | Channel) -> str:
-    return record.topic if isinstance(record, Channel) else record.name
+def _joint_record(log: Log) -> dict[str, str]:
+    """The metadata: of the first shard, and in what each of them differs from it."""
+    base = {key: text for key, text in log.shards[0].record.items() if key != SHARDS}
+    parts, origins = log.solves().parts, []
+    for i, source in enumerate(log.sources.sources):
+        own = {key: _text(value) for key, value in source.metadata.items()}
+        differs = {
+            key: text
+            for key, text in own.items()
+            if key not in (CHECKSUM, SHARDS) and text != _text(_value(base.get(key)))
+        }
+        solves = {
+            part.method: ranges_of(part.solve_id[part.shard == i])
+            for part in parts
+            if part.shard is not None and (part.shard == i).any()
+        }
+        origins.append(
+            {"file": source.name, "first": source.first, "solves": solves, "differs": differs}
+        )
+    record = {**base, SHARDS: json.dumps(origins)}
+    return {**record, CHECKSUM: checksum(record)}
 
 
-def _joint_attachments(shards: Sequence[_Shard]) -> list[Attachment]:
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _value(text: str | None) -> Any:
+    """Structured values as what they say, so that they compare."""
+    with suppress(ValueError):
+        found = json.loads(text or "")
+        if isinstance(found, dict):
+            return found
+    return text or ""
+
+
+def _joint_attachments(shards: Sequence[Shard]) -> list[Attachment]:
     joint: dict[str, Attachment] = {}
     for shard in shards:
-        for attachment in shard.attachments:
+        with reading(shard.path) as stream:
+            found = [read_attachment(stream, item) for item in shard.contents.attachments]
+        for attachment in found:
             known = joint.setdefault(attachment.name, attachment)
             if known.data != attachment.data:
                 raise LogError(
@@ -222,32 +162,42 @@ def _joint_attachments(shards: Sequence[_Shard]) -> list[Attachment]:
 
 def _write(
     stream: IO[bytes],
-    shards: Sequence[_Shard],
+    log: Log,
+    channels: JointChannels,
     summary: Summary,
-    metadata: dict[str, str],
+    record: Metadata,
     attachments: Sequence[Attachment],
 ) -> None:
-    record, library = Metadata(METADATA_NAME, metadata), f"casadi_ik {metadata['code_version']}"
+    library = f"casadi_ik {record.metadata['code_version']}"
     stream.write(summary.beginning("ros2", library, record, attachments))
-    stream.write(definitions([*summary.schemas.values()], [*summary.channels.values()]))
-    pairs = [(index, shard) for shard in shards for index in shard.summary.chunks]
-    for index, shard in sorted(pairs, key=lambda pair: pair[0].message_start_time):
-        summary.chunks.append(_copy(stream, shard, index))
+    for channel in channels.channels:
+        summary.channels[channel.id] = channel
+    for schema in channels.schemas:
+        summary.schemas[schema.id] = schema
+    stream.write(definitions(channels.schemas, channels.channels))
+    offsets = log.sources.offsets
+    pairs = [
+        (index.message_start_time + offset * shard.clock.slot, i, index)
+        for i, (shard, offset) in enumerate(zip(log.shards, offsets, strict=True))
+        for index in shard.contents.chunks
+    ]
+    counts = [dict[int, int]() for _ in log.shards]
+    for _, i, index in sorted(pairs, key=lambda pair: pair[:2]):
+        shard = log.shards[i]
+        with reading(shard.path) as source:
+            ids = None if channels.same(i) else channels.of(i)
+            pieces, moved, runs = copied(source, shard, index, ids, offsets[i], stream.tell())
+        for piece in pieces:
+            stream.write(piece)
+        if not runs:
+            continue
+        summary.chunks.append(moved)
+        for run in runs:
+            summary.counts[run.channel] = summary.counts.get(run.channel, 0) + len(run.log_time)
+            counts[i][run.channel] = counts[i].get(run.channel, 0) + len(run.log_time)
+    for shard, found, i in zip(log.shards, counts, range(len(log.shards)), strict=True):
+        said = shard.contents.summary.counts
+        expected = {channels.of(i).get(channel): count for channel, count in said.items() if count}
+        if found != expected:
+            raise LogError(f"{shard.path}: the log is damaged: its summary counts other messages")
     stream.write(summary.ending(stream.tell()))
-
-
-def _copy(stream: IO[bytes], shard: _Shard, index: ChunkIndex) -> ChunkIndex:
-    """Copy a chunk with its message indexes as it is; gives where it is now."""
-    shard.stream.seek(index.chunk_start_offset)
-    data = shard.stream.read(index.chunk_length + index.message_index_length)
-    if HEAD.unpack_from(data) != (Opcode.CHUNK, index.chunk_length - HEAD.size):
-        raise LogError(f"{shard.path}: no chunk at byte {index.chunk_start_offset}")
-    moved = stream.tell() - index.chunk_start_offset
-    stream.write(data)
-    return replace(
-        index,
-        chunk_start_offset=index.chunk_start_offset + moved,
-        message_index_offsets={
-            channel: offset + moved for channel, offset in index.message_index_offsets.items()
-        },
-    )

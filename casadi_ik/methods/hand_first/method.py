@@ -32,6 +32,10 @@ UNBOUNDED = 1e3
 AT_LIMITS = 0.5
 """Part of the range that the wide table moves to the limits."""
 
+CARRIED = ("passed", "near", "balanced", "best_cost", "best_q", "counts")
+"""What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
+were balanced in vain, and what was found."""
+
 
 class HandFirstMethod(LoopedMethod):
     """`hand-first`: contacts fix palm and hand, the arm follows in closed form.
@@ -92,8 +96,7 @@ class HandFirstMethod(LoopedMethod):
         states, parameters = self.rows(problems, q0, self.postures(problems, number))
         if last is not None:
             layout = self.step.layouts.state
-            # `passed`: it goes on where it stopped in the numeric arm's list of starts.
-            for name in ("passed", "best_cost", "best_q", "counts"):
+            for name in CARRIED:
                 states[:, layout.slice(name)] = last[:, layout.slice(name)]
             states[:, layout.slice("earlier")] = number * self.options.candidates
         return states, parameters

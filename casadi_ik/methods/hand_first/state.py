@@ -9,7 +9,7 @@ import casadi as ca
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.bounded_step import Bounded
-from casadi_ik.methods.common.contact_fit import Judged, Tried
+from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.methods.common.coupling_record import coupling_fields, coupling_values
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.problem.contacts.kinds import Kinds
@@ -31,7 +31,7 @@ from casadi_ik.problem.trace import (
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
 
-STAGES = (Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT)
+STAGES = (Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT, Phase.BALANCE)
 """The stages in the order of their codes."""
 
 STAGE_LABELS = tuple(stage.label for stage in STAGES)
@@ -83,6 +83,9 @@ class HandFirstLayouts:
                 Field("fits", doc="1 if palm and hand meet the contacts"),
                 Field("waited", doc="evaluations in a row that gained little"),
                 Field("spent", doc="evaluations in this phase"),
+                Field("power", doc="powers done while the contacts are balanced"),
+                Field("near", doc="cost of the near fit that last went on to the arm, 0: none"),
+                Field("balanced", doc="cost of the refinement last balanced, 0: none"),
                 Field("margin", doc="best margin of the arm so far, negative: a violation"),
                 Field("arm", (len(self.robot.arm_actuators),), doc="arm with the best margin"),
                 Field("starts", doc="starts of the numeric arm stage so far"),
@@ -136,6 +139,11 @@ class HandFirstLayouts:
         rows = list(self.hand)
         return Bounded(q[rows], p["lower"][rows], p["upper"][rows], first)
 
+    def counted(self, s: dict[str, Expr], stage: Phase) -> dict[str, Expr]:
+        """The state with one more iteration spent in a stage."""
+        one = ca.DM([float(stage == other) for other in STAGES])
+        return s | {"counts": s["counts"] + one}
+
     def row(
         self,
         s: dict[str, Expr],
@@ -144,7 +152,7 @@ class HandFirstLayouts:
         phase: Phase,
         status: Expr,
         tried: Tried | None = None,
-        judged: Judged | None = None,
+        accepted: Expr = 0.0,
         margin: Expr = NOTHING,
     ) -> Expr:
         """What is logged at q (n, 1).
@@ -156,7 +164,7 @@ class HandFirstLayouts:
             phase: The stage.
             status: Whether the solve goes on.
             tried: The damped step, if the stage makes one.
-            judged: What was made of it.
+            accepted: Whether it was taken.
             margin: Of the arm, if the stage places it.
         """
         f = len(self.robot.fingers)
@@ -179,7 +187,7 @@ class HandFirstLayouts:
                 **coupling_values(self.robot, q),
                 "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
                 "restart": s["earlier"] + s["candidate"],
-                "accepted": judged.accepted if judged else 0.0,
+                "accepted": accepted,
                 "phase": float(phase),
                 "status": status,
             }

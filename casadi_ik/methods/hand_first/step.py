@@ -7,7 +7,9 @@ candidate   take the next hand posture of the list and the palm pose that suits 
 hand fit    one damped step of palm pose and hand posture;
 placement   try some swivels of the arm for that palm pose;
 refinement  one damped step of all motors, from the least violating arm, where the arm cannot
-            follow exactly or has no closed form.
+            follow exactly or has no closed form;
+balance     one step of all motors towards the smallest largest error, where least squares misses
+            the tolerances by little.
 """
 
 from __future__ import annotations
@@ -19,9 +21,18 @@ import casadi as ca
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, place_arm
-from casadi_ik.methods.common.contact_fit import EXACT, fresh_fit, judge, judge_contacts
+from casadi_ik.methods.common.balance import differs, worth_balancing
+from casadi_ik.methods.common.contact_fit import (
+    EXACT,
+    Judged,
+    Tried,
+    fresh_fit,
+    judge,
+    judge_contacts,
+)
 from casadi_ik.methods.common.numeric_arm import STARTS, nearest_start, pose_step
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
+from casadi_ik.methods.hand_first.balance_stage import balance_stage
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts
 from casadi_ik.methods.hand_first.whole_fit import whole_step
@@ -77,13 +88,22 @@ class HandFirstStep:
         layouts = self.layouts
         state = ca.MX.sym("state", layouts.state.size)
         parameters = ca.MX.sym("parameters", layouts.parameters.size)
-        cases = [self._refinement(), self._candidate()]  # in the order of STAGES
+        stages = {
+            Phase.REFINEMENT: self._refinement(),
+            Phase.CANDIDATE: self._candidate(),
+            Phase.BALANCE: balance_stage(layouts),
+        }
         if self.robot.arm_actuators:
-            placement = self._placement() if self.arm else self._numeric_placement()
-            cases += [self._hand_fit(), placement]
+            stages[Phase.HAND_FIT] = self._hand_fit()
+            stages[Phase.ARM_PLACEMENT] = (
+                self._placement() if self.arm else self._numeric_placement()
+            )
+        phases = [phase for phase in STAGES if phase in stages]
+        cases = [stages[phase] for phase in phases]
         choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
         phase = state[layouts.state.slice("phase")]
-        outputs = choose(phase - float(STAGES[0]), state, parameters)
+        number = sum((i * (phase == float(stage)) for i, stage in enumerate(phases)), ca.MX(0))
+        outputs = choose(number, state, parameters)
         return ca.Function(self._name, [state, parameters], list(outputs))
 
     def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
@@ -110,7 +130,7 @@ class HandFirstStep:
             hand_contacts(self.robot, hand, layouts.hand), layouts.contacts, p
         )
         after = layouts.state.pack(
-            self._counted(s, Phase.CANDIDATE)
+            self.layouts.counted(s, Phase.CANDIDATE)
             | {
                 "q": ca.if_else(exhausted, s["best_q"], q),
                 "palm_rotation": rotation,
@@ -142,9 +162,16 @@ class HandFirstStep:
         # nearest there is, and refinement starts from them.
         last = s["candidate"] + 1 >= self.layouts.candidates
         onwards = ca.logic_or(judged.within, last)
+        # Nor does one that fits nearly have to fit: it is balanced with the arm.
+        near = ca.logic_and(
+            worth_balancing(self._left(judged, tried), self.layouts.contacts, p),
+            ca.logic_and(differs(judged.cost, s["near"]), ca.logic_not(p["alone"])),
+        )
+        near = ca.logic_and(near, judged.settled)
         ended = ca.logic_and(judged.settled, ca.logic_and(onwards, p["alone"] > 0))
+        onwards = ca.logic_or(onwards, near)
         after = self.layouts.state.pack(
-            self._counted(s, Phase.HAND_FIT)
+            self.layouts.counted(s, Phase.HAND_FIT)
             | {
                 "q": self._with_hand(s["q"], ca.if_else(keep, reached.hand, x.hand)),
                 "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
@@ -157,12 +184,13 @@ class HandFirstStep:
                 "candidate": s["candidate"]
                 + ca.if_else(ca.logic_and(judged.settled, ca.logic_not(onwards)), 1.0, 0.0),
                 "fits": judged.within,
+                "near": ca.if_else(near, judged.cost, s["near"]),
             }
             | judged.fit
         )
         fitted = ca.if_else(judged.within, float(Status.SOLVED), float(Status.STALLED))
         status = ca.if_else(ended, fitted, float(Status.RUNNING))
-        record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged)
+        record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged.accepted)
         return ca.Function("hand_fit", [state, parameters], shared(after, record, status))
 
     def _placement(self) -> ca.Function:
@@ -209,7 +237,7 @@ class HandFirstStep:
         leave = ca.logic_or(exact, starts >= STARTS)
         q = self._with_arm(s["q"], ca.if_else(leave, best, now))
         after = self.layouts.state.pack(
-            self._counted(s, Phase.ARM_PLACEMENT)
+            self.layouts.counted(s, Phase.ARM_PLACEMENT)
             | judged.fit
             | {
                 "q": q,
@@ -243,7 +271,7 @@ class HandFirstStep:
         solved = ca.logic_and(allowed, s["fits"] > 0)
         leave = ca.logic_or(allowed, over)
         after = self.layouts.state.pack(
-            self._counted(s, Phase.ARM_PLACEMENT)
+            self.layouts.counted(s, Phase.ARM_PLACEMENT)
             | {
                 "q": ca.if_else(leave, q, s["q"]),
                 "phase": ca.if_else(leave, float(Phase.REFINEMENT), float(Phase.ARM_PLACEMENT)),
@@ -262,27 +290,36 @@ class HandFirstStep:
         judged = judge_contacts(s, p, tried, self.layouts.contacts)
         q = ca.if_else(judged.accepted, tried.reached, s["q"])
         solved = ca.logic_and(judged.settled, judged.within)
-        failed = ca.logic_and(judged.settled, ca.logic_not(judged.within))
+        unsolved = ca.logic_and(judged.settled, ca.logic_not(judged.within))
+        near = worth_balancing(self._left(judged, tried), self.layouts.contacts, p)
+        near = ca.logic_and(near, differs(judged.cost, s["balanced"]))
+        near = ca.logic_and(near, unsolved)
+        failed = ca.logic_and(unsolved, ca.logic_not(near))
         better = judged.cost < s["best_cost"]
         after = self.layouts.state.pack(
-            self._counted(s, Phase.REFINEMENT)
+            self.layouts.counted(s, Phase.REFINEMENT)
             | {
                 "q": q,
-                "phase": ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.REFINEMENT)),
+                "phase": ca.if_else(
+                    near,
+                    float(Phase.BALANCE),
+                    ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.REFINEMENT)),
+                ),
                 "candidate": s["candidate"] + ca.if_else(failed, 1.0, 0.0),
+                "balanced": ca.if_else(near, judged.cost, s["balanced"]),
                 "best_cost": ca.if_else(better, judged.cost, s["best_cost"]),
                 "best_q": ca.if_else(better, q, s["best_q"]),
             }
             | judged.fit
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged)
+        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged.accepted)
         return ca.Function("refinement", [state, parameters], shared(after, record, status))
 
-    def _counted(self, s: dict[str, Expr], stage: Phase) -> dict[str, Expr]:
-        """The state with one more iteration spent in a stage."""
-        one = ca.DM([float(stage == other) for other in STAGES])
-        return s | {"counts": s["counts"] + one}
+    def _left(self, judged: Judged, tried: Tried) -> Expr:
+        """Residual of the contacts after a step was judged."""
+        left = ca.if_else(judged.accepted, tried.there, tried.before)
+        return left[: self.layouts.contacts.size]
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
         return _with(q, self.layouts.hand, hand)

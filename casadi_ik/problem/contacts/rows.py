@@ -60,6 +60,17 @@ class ContactRows:
         """Number of rows of the residual."""
         return sum(condition.rows for kind in self.kinds for condition in kind.conditions)
 
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        """Rows of the places of all fingers, then of their facings, (2 f,)."""
+        found, first = [], 0
+        for aspect in range(2):
+            for kind in self.kinds:
+                after = first + kind.conditions[aspect].rows
+                found.append(slice(first, after))
+                first = after
+        return tuple(found)
+
     def goals(self, p: dict[str, Expr]) -> list[Vectors]:
         """The targets by finger, base frame.
 
@@ -101,15 +112,9 @@ class ContactRows:
 
     def errors(self, residual: Expr) -> tuple[Expr, Expr]:
         """Distances [m] and chords of a residual, each (f, 1); zero where free."""
-        lengths: list[list[Expr]] = [[], []]
-        first = 0
-        for aspect in range(2):
-            for kind in self.kinds:
-                after = first + kind.conditions[aspect].rows
-                lengths[aspect].append(ca.norm_2(residual[first:after]))
-                first = after
-        distances = [length * LENGTH for length in lengths[0]]
-        return ca.vertcat(*distances), ca.vertcat(*lengths[1])
+        lengths = [ca.norm_2(residual[own]) for own in self.slices]
+        f = len(self.kinds)
+        return ca.vertcat(*(length * LENGTH for length in lengths[:f])), ca.vertcat(*lengths[f:])
 
 
 def _weighted(rows: Sequence[Sequence[Expr]], weights: Expr) -> Expr:

@@ -1,0 +1,55 @@
+"""Balance stage: contacts that least squares misses by little are brought within tolerance."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from casadi_ik.methods.common.balance import Balanced, balance_step
+from casadi_ik.methods.common.bounded_step import Bounded
+from casadi_ik.methods.common.contact_fit import fresh_fit
+from casadi_ik.methods.hand_first.state import HandFirstLayouts
+from casadi_ik.methods.hand_first.whole_fit import whole_jacobian, whole_residual
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.subexpressions import shared
+
+
+def balance_stage(layouts: HandFirstLayouts) -> ca.Function:
+    """The stage: all motors at once, from where refinement ended.
+
+    It ends with a solution or with the next candidate.
+    """
+    state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
+    s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
+    balanced = _step(layouts, s, p)
+    failed = ca.logic_and(balanced.over, ca.logic_not(balanced.within))
+    fit = {
+        name: ca.if_else(failed, fresh_fit().get(name, 0.0), balanced.fit[name])
+        for name in balanced.fit
+    }
+    after = layouts.state.pack(
+        layouts.counted(s, Phase.BALANCE)
+        | {
+            "q": balanced.q,
+            "phase": ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.BALANCE)),
+            "candidate": s["candidate"] + failed,
+        }
+        | fit
+    )
+    status = ca.if_else(balanced.within, float(Status.SOLVED), float(Status.RUNNING))
+    record = layouts.row(
+        s, p, s["q"], Phase.BALANCE, status, balanced.tried, accepted=balanced.accepted
+    )
+    return ca.Function("balance", [state, parameters], shared(after, record, status))
+
+
+def _step(layouts: HandFirstLayouts, s: dict[str, Expr], p: dict[str, Expr]) -> Balanced:
+    robot = layouts.robot
+    return balance_step(
+        lambda q: whole_residual(robot, layouts.contacts, q, p),
+        whole_jacobian(robot, layouts.contacts, s["q"], p),
+        Bounded(s["q"], p["lower"], p["upper"], first=0),
+        layouts.contacts,
+        s,
+        p,
+    )

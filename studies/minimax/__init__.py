@@ -1,0 +1,1 @@
+"""How nearly contacts can be met at all: by Ipopt, sharing nothing but the kinematics."""

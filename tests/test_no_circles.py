@@ -1,0 +1,43 @@
+"""No module of the package needs, over whatever way, one that needs it."""
+
+from __future__ import annotations
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1] / "casadi_ik"
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def needs(path: Path, modules: set[str]) -> set[str]:
+    """Modules of the package that one imports anywhere, inside its functions too."""
+
+    def imports(node: ast.AST) -> set[str]:
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            return set()
+        found: set[str] = set()
+        if isinstance(node, ast.Import):
+            found = {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inside = {f"{node.module}.{alias.name}" for alias in node.names} & modules
+            found = inside or {node.module}
+        return found.union(*map(imports, ast.iter_child_nodes(node)))
+
+    return imports(ast.parse(path.read_text(encoding="utf-8"))) & modules - {module_name(path)}
+
+
+def test_no_circles():
+    paths = {module_name(path): path for path in ROOT.rglob("*.py")}
+    graph = {name: needs(path, set(paths)) for name, path in paths.items()}
+    assert "casadi_ik.cli.say" in graph["casadi_ik.cli.batch"]
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
