@@ -26,7 +26,7 @@ from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
-from casadi_ik.solving.stream import SolvedBlock, Stream
+from casadi_ik.solving.stream import REQUIRED, SolvedBlock, Stream
 
 Array = NDArray[np.float64]
 
@@ -151,6 +151,7 @@ class Solver:
         fixed: Mapping[str, float] | None = None,
         keep: Keep | None = None,
         compression: Compression = "zstd",
+        **more: ArrayLike | None,
     ) -> BatchSolution:
         """Solve k targets.
 
@@ -168,6 +169,8 @@ class Solver:
             fixed: Positions of actuators that are not to move, by name [rad or m].
             keep: Which solves keep their iterations in the log; None: all.
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
+            more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
+                `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point).
 
         Returns:
             The same fields as a `Solution`, as arrays.
@@ -178,13 +181,14 @@ class Solver:
             UnsupportedError: The method cannot keep actuators fixed.
             LogError: The log cannot be written.
         """
-        problems = self._questions.of_arrays(points, normals, self._questions.held(fixed))
+        held = self._questions.held(fixed)
+        problems = self._questions.of_arrays(points, normals, held, more=more)
         with self._recorder(log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 
     def solve_blocks(
         self,
-        blocks: Iterable[tuple[ArrayLike, ArrayLike]],
+        blocks: Iterable[tuple[ArrayLike, ArrayLike] | Mapping[str, ArrayLike]],
         q0: ArrayLike | None = None,
         seed: int = 0,
         jobs: int = 1,
@@ -198,7 +202,8 @@ class Solver:
         target does not stop the others: it is among the faults of its block.
 
         Args:
-            blocks: Points and normals of some targets each, as for `solve_batch`.
+            blocks: Points and normals of some targets each, as for `solve_batch`; or all of its
+                arrays by name.
             q0: (n,) start of all; None is `robot.home`.
             seed: Of all random numbers, an integer >= 0.
             jobs: Threads, at least 1; a few thousand targets a block keep them busy.
@@ -218,8 +223,10 @@ class Solver:
         """
         held = self._questions.held(fixed)
 
-        def ask(points: ArrayLike, normals: ArrayLike, first_row: int) -> Problems:
-            return self._questions.of_arrays(points, normals, held, first_row)
+        def ask(block: Mapping[str, ArrayLike], first_row: int) -> Problems:
+            more = {name: array for name, array in block.items() if name not in REQUIRED}
+            points, normals = (block[name] for name in REQUIRED)
+            return self._questions.of_arrays(points, normals, held, first_row, more)
 
         with self._recorder(log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
@@ -257,8 +264,8 @@ class Solver:
             InputError: Bad limit, preference or q0, or a grasp the robot cannot take.
             UnsupportedError: The method is not hand-first.
         """
-        finder = self._engine.finder
         problems = self._questions.of_grasps([grasp], fixed)
+        finder = self._engine.kinds_of(problems).finder
         return finder.find(problems, self._questions.start(q0), seed, limit, prefer)
 
     def track(
@@ -289,10 +296,10 @@ class Solver:
             InputError: No grasp, bad q0, period or velocity, or a grasp the robot cannot take.
             UnsupportedError: The method is not hand-first.
         """
-        tracker = self._engine.tracker
         if not grasps:
             raise InputError("grasps: found none, expected at least one")
         problems = self._questions.of_grasps(grasps, fixed)
+        tracker = self._engine.kinds_of(problems).tracker
         travel = travel_limits(self.robot, period, velocity)
         prefer = "limits" if q0 is None else "q0"
         return tracker.track(problems, self._questions.start(q0), prefer, travel, seed)
@@ -309,7 +316,7 @@ class Solver:
             UnsupportedError: The method cannot be stepped; the message says why.
         """
         problems = self._questions.of_grasps([grasp], None)
-        return self._engine.method.stepper(problems, self._questions.start(q0))
+        return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
 
     def _recorder(
         self,

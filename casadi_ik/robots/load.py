@@ -20,7 +20,6 @@ from casadi_ik.files.reading import (
 from casadi_ik.files.shipped import resolve
 from casadi_ik.robots.checks import (
     check_couplings,
-    check_numbers,
     known_link,
     known_source,
     positive,
@@ -142,7 +141,8 @@ def _joints(
         if entry.velocity is not None:
             positive(entry.velocity, f"{where}: velocity")
         known_source(entry.source, sources, f"{where}: source")
-        check_numbers(entry.coupling, f"{where}: coupling")
+        if entry.coupling is not None:
+            entry.coupling.check(f"{where}: coupling")
     by_parent: dict[str, list[JointEntry]] = {}
     for entry in entries:
         by_parent.setdefault(entry.parent, []).append(entry)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from casadi_ik.errors import DescriptionError
-from casadi_ik.robots.coupling_values import Array, followed
+from casadi_ik.robots.couplings import Array
 
 if TYPE_CHECKING:
     from casadi_ik.robots.description import Actuator, Joint
@@ -91,7 +91,7 @@ def _after(joint: Joint, found: dict[str, Callable[[Array], Array]]) -> Callable
     if coupling is None:
         return found[joint.name]
     source = found[coupling.of]
-    return lambda q: followed(coupling, source(q))
+    return lambda q: coupling.followed(source(q))
 
 
 def _narrowed(moved: list[Follower], actuator: Actuator, near: float) -> tuple[float, float] | None:

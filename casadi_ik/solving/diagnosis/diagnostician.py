@@ -22,7 +22,7 @@ from casadi_ik.problem.diagnosis import (
 )
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.proof import Proof, ProofKind
-from casadi_ik.problem.verdict import Verdict, judge
+from casadi_ik.problem.verdict import Verdict, deviations, judge
 from casadi_ik.solving.diagnosis.minimax import Closest, closest
 from casadi_ik.solving.diagnosis.palm_free import HandFits, PalmFree
 from casadi_ik.solving.diagnosis.prover import Prover
@@ -227,7 +227,7 @@ class Diagnostician:
     def _nearest(self, problems: Problems, q: Array) -> list[dict[str, NearContact]]:
         """The contacts of configurations (k, n), beside those asked for."""
         points, normals = self.robot.contacts(q)
-        position_error, angle_error = self.robot.errors(q, problems.points, problems.normals)
+        position_error, angle_error, _ = deviations(self.robot, problems, q)
         columns = points, normals, position_error, angle_error
         rows = zip(*(column.tolist() for column in columns), strict=True)
         return [

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.problem.arm_span import arm_span
+from casadi_ik.problem.contacts.conditions import CONDITIONS, PLACE
 from casadi_ik.problem.hand_motors import endless_fingers, joint_limits, motor_box
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.proof import Proof, ProofKind
@@ -25,6 +26,15 @@ MOST = 6000
 TOGETHER = 256
 """Targets whose boxes are divided side by side."""
 
+
+SLIDING = {
+    f"{name}s"
+    for condition in CONDITIONS.values()
+    if condition.aspect == PLACE
+    for name in condition.data
+    if name != "point"
+}
+"""Arrays that let a contact be elsewhere than at its point: no proof counts such a finger."""
 
 TINY = 1e-9
 """A box whose contacts move by less than this is not divided any more [0.1 m, rad]."""
@@ -62,6 +72,9 @@ class Prover:
     def _together(self, problems: Problems) -> list[Proof | None]:
         proofs: list[Proof | None] = [None] * len(problems)
         known = ~np.isnan(problems.points[:, :, 0])
+        for name in SLIDING & problems.more.keys():
+            # Anywhere on a line or a plane: the point itself need not be reached.
+            known &= np.isnan(problems.more[name][..., 0])
         known &= ~np.array(endless_fingers(self._robot, motor_box(self._robot, problems)))
         for group in self._groups():
             chosen = np.zeros(known.shape[1], dtype=bool)
