@@ -127,8 +127,8 @@ def _narrowed(moved: list[Follower], actuator: Actuator, near: float) -> tuple[f
     first, last = max(
         runs, key=lambda run: (q[run[0]] <= inside <= q[run[1]], q[run[1]] - q[run[0]])
     )
-    low = q[0] if first == 0 else _edge(excess, q[first - 1], q[first])
-    high = q[-1] if last == len(q) - 1 else _edge(excess, q[last + 1], q[last])
+    low = q[0] if first == 0 else _edge(excess, float(q[first - 1]), float(q[first]))
+    high = q[-1] if last == len(q) - 1 else _edge(excess, float(q[last + 1]), float(q[last]))
     return (float(low), float(high)) if low < high else None
 
 
