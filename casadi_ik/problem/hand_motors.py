@@ -6,7 +6,6 @@ import numpy as np
 
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.verdict import LIMIT_SLACK
-from casadi_ik.robots.couplings import Linear
 from casadi_ik.robots.description import Joint, RobotDescription
 
 OUTWARDS = 2 * LIMIT_SLACK
@@ -113,5 +112,6 @@ def _rate(by_name: dict[str, Joint], name: str, motor: str) -> float | None:
         if joint is None or joint.coupling is None:
             return None
         coupling = joint.coupling
-        ratio = ratio * coupling.ratio if isinstance(coupling, Linear) else 1.0
+        slope = coupling.slope
+        ratio = 1.0 if slope is None else ratio * slope[0]
         name = coupling.of

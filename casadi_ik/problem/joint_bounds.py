@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
+from casadi_ik.errors import UnsupportedError
 from casadi_ik.problem.hand_motors import finger_joints
 from casadi_ik.problem.problems import Array
-from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew
+from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear
 from casadi_ik.robots.description import RobotDescription
 
 ROUNDING = 1e-11
@@ -47,14 +49,21 @@ def joint_bounds(
 
 
 def _followed(coupling: Coupling, lower: Array, upper: Array) -> Bounds:
-    if isinstance(coupling, FourBar):
-        return _four_bar(coupling, lower, upper)
-    if isinstance(coupling, LeadScrew):
-        least = np.where((lower < 0) & (upper > 0), 0.0, np.minimum(abs(lower), abs(upper)))
-        low = _triangle(coupling, least)
-        return low, _triangle(coupling, np.maximum(abs(lower), abs(upper)))
+    try:
+        return BOUNDS[type(coupling)](coupling, lower, upper)
+    except KeyError:
+        kind = type(coupling).__name__
+        raise UnsupportedError(f"coupling: no guaranteed range for the kind {kind}") from None
+
+
+def _linear(coupling: Linear, lower: Array, upper: Array) -> Bounds:
     ends = coupling.ratio * lower + coupling.offset, coupling.ratio * upper + coupling.offset
     return np.minimum(*ends), np.maximum(*ends)
+
+
+def _lead_screw(screw: LeadScrew, lower: Array, upper: Array) -> Bounds:
+    least = np.where((lower < 0) & (upper > 0), 0.0, np.minimum(abs(lower), abs(upper)))
+    return _triangle(screw, least), _triangle(screw, np.maximum(abs(lower), abs(upper)))
 
 
 def _triangle(screw: LeadScrew, s: Array) -> Array:
@@ -101,3 +110,11 @@ def _coupler(bar: FourBar, phi: Array) -> Array:
 
     sides = [abs(angle(np.array([bar.phi_0]), side)[0]) for side in (1, -1)]
     return angle(phi, 1 if sides[0] < sides[1] else -1)
+
+
+BOUNDS: dict[type[Any], Callable[[Any, Array, Array], Bounds]] = {
+    Linear: _linear,
+    LeadScrew: _lead_screw,
+    FourBar: _four_bar,
+}
+"""The kinds of couplings whose range over an interval is guaranteed."""

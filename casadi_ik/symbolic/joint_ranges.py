@@ -7,12 +7,15 @@ known in closed form; where an interval may hold a toggle the joint may be anywh
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from casadi_ik.robots.couplings import FourBar, LeadScrew
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.robots.couplings import FourBar, LeadScrew, Linear
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic.couplings import follow
 from casadi_ik.symbolic.smooth import Expr
@@ -68,17 +71,35 @@ def joint_ranges(robot: RobotDescription, given: dict[str, Range]) -> dict[str, 
     return {name: range_ for name in joints if (range_ := known(name)) is not None}
 
 
+def are_bounded(robot: RobotDescription) -> bool:
+    """Whether every kind of coupling of the robot has a guaranteed range here.
+
+    Of a robot with another kind nothing can be proved.
+    """
+    return all(joint.coupling is None or type(joint.coupling) in RANGES for joint in robot.movable)
+
+
 def _followed(joint: Joint, source: Range) -> Range:
-    coupling = joint.coupling
-    if isinstance(coupling, FourBar):
-        return _bent(joint, coupling, source)
-    if isinstance(coupling, LeadScrew):
-        # The triangle knows the length of the slider only, not its sign.
-        a, b = ca.fabs(source.lower), ca.fabs(source.upper)
-        around = ca.logic_and(source.lower < 0, source.upper > 0)
-        source = Range(ca.if_else(around, 0.0, ca.fmin(a, b)), ca.fmax(a, b))
+    try:
+        ranged = RANGES[type(joint.coupling)]
+    except KeyError:
+        kind = type(joint.coupling).__name__
+        raise UnsupportedError(f"coupling: no guaranteed range for the kind {kind}") from None
+    return ranged(joint, joint.coupling, source)
+
+
+def _between_ends(joint: Joint, _: Any, source: Range) -> Range:
+    """The joint of a coupling that is monotone: between its ends."""
     ends = follow(joint, source.lower), follow(joint, source.upper)
     return Range(ca.fmin(*ends) - ROUNDING, ca.fmax(*ends) + ROUNDING)
+
+
+def _opposite(joint: Joint, screw: LeadScrew, source: Range) -> Range:
+    """The joint of a triangle, which knows the length of the slider only, not its sign."""
+    a, b = ca.fabs(source.lower), ca.fabs(source.upper)
+    around = ca.logic_and(source.lower < 0, source.upper > 0)
+    lengths = Range(ca.if_else(around, 0.0, ca.fmin(a, b)), ca.fmax(a, b))
+    return _between_ends(joint, screw, lengths)
 
 
 def _bent(joint: Joint, bar: FourBar, source: Range) -> Range:
@@ -141,3 +162,11 @@ def _holds(range_: Range, angle: float) -> Expr:
     """Whether an interval may hold an angle, by whole turns."""
     turns = (range_.upper + NEAR - angle) / (2 * np.pi), (range_.lower - NEAR - angle) / (2 * np.pi)
     return ca.floor(turns[0]) >= ca.ceil(turns[1])
+
+
+RANGES: dict[type[Any], Callable[[Joint, Any, Range], Range]] = {
+    Linear: _between_ends,
+    LeadScrew: _opposite,
+    FourBar: _bent,
+}
+"""The kinds of couplings whose range over an interval is guaranteed."""

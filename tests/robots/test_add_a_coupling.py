@@ -62,8 +62,14 @@ assert {"left_4.rise", "left_4.curve"} <= set(names)
 points, normals = robot.contacts(robot.home + 0.1 * (q - robot.home))
 contacts = zip(robot.fingers, points, normals)
 grasp = ik.Grasp({name: ik.Contact(point, normal) for name, point, normal in contacts})
-solution = ik.Solver(robot, compiled=False).solve(grasp, diagnose=False)
+solver = ik.Solver(robot, compiled=False)
+solution = solver.solve(grasp, diagnose=False)
 assert solution.success, solution
+
+far = {name: ik.Contact(c.point + [9.0, 0, 0], c.normal) for name, c in grasp.contacts.items()}
+missed = solver.solve(ik.Grasp(far))
+# Nothing bounds the new kind, so nothing is proved with it.
+assert missed.status is ik.Status.NOT_FOUND, missed.status
 """
 
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from casadi_ik.problem.hand_motors import OUTWARDS, finger_joints, hand_motors, motor_box
 from casadi_ik.problem.problems import Array, Problems
-from casadi_ik.robots.couplings import Linear
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.joint_ranges import Range, joint_ranges
 
@@ -60,10 +59,8 @@ class HandSpace:
             coupling = by_name[joint].coupling
             if coupling is None:
                 raise AssertionError(f"joint {joint!r} follows no motor of the hand")
-            if isinstance(coupling, Linear) and rate is not None:
-                rate *= coupling.ratio
-            else:
-                rate = None
+            slope = coupling.slope
+            rate = None if slope is None or rate is None else rate * slope[0]
             joint = coupling.of
         return self.coordinates.index(joint), rate
 

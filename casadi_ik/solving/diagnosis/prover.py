@@ -19,6 +19,7 @@ from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solving.diagnosis.box_test import BoxTest
 from casadi_ik.solving.diagnosis.hand_space import HandSpace
 from casadi_ik.solving.diagnosis.wrist_bound import Wrist
+from casadi_ik.symbolic.joint_ranges import are_bounded
 
 MOST = 6000
 """Boxes of a target after which the search for a proof is given up."""
@@ -64,6 +65,8 @@ class Prover:
 
         No proof says nothing: neither that a target can be reached nor that it cannot.
         """
+        if not are_bounded(self._robot):
+            return [None] * len(problems)
         found: list[Proof | None] = []
         for start in range(0, len(problems), TOGETHER):
             found += self._together(problems.rows(slice(start, start + TOGETHER)))
