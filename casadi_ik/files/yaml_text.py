@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml.composer import ComposerError
 
 from casadi_ik.errors import DescriptionError
 
@@ -110,7 +111,7 @@ def _check_events(text: str) -> None:
         elif isinstance(event, yaml.ScalarEvent) and not _readable(event.value):
             problem = "a text with control characters"
         if problem:
-            raise yaml.composer.ComposerError(None, None, problem, event.start_mark)
+            raise ComposerError(None, None, problem, event.start_mark)
 
 
 def _readable(text: str) -> bool:

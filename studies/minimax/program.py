@@ -67,7 +67,7 @@ class MinimaxProgram:
         # Sliders of millimetres and joints of radians move the contacts alike once scaled.
         x, w = ca.SX.sym("x", n), ca.SX.sym("w")
         points, normals = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3)
-        q = robot.lower + x * ranges
+        q = ca.SX(robot.lower) + x * ca.SX(ranges)
         kinematics = actuated(description, q).kinematics
         chord = 2 * np.sin(tolerance.angle / 2)
         squares = []

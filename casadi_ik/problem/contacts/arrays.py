@@ -102,7 +102,7 @@ def by_kinds(problems: Problems) -> Iterator[tuple[Kinds, NDArray[np.intp] | Non
     given = np.stack([~np.isnan(problems.more[name][..., 0]) for name in names], axis=2)
     if "tangents" in names:
         turned = given[..., names.index("tangents")]
-        turned[:] = turned.any(axis=1)[:, None]
+        turned[:] = turned.any(axis=1, keepdims=True)
     flat = given.reshape(len(given), -1)
     _, firsts, which = np.unique(
         flat @ (1 << np.arange(flat.shape[1])), return_index=True, return_inverse=True
