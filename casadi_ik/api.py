@@ -16,6 +16,8 @@ from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.logs import Compression, Keep, McapRecorder
 from casadi_ik.methods.registry import METHODS, build_method, method_options
+from casadi_ik.problem.method import PreferringMethod
+from casadi_ik.problem.preference import preference
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
@@ -104,6 +106,7 @@ class Solver:
         log: str | PathLike[str] | None = None,
         diagnose: bool = True,
         fixed: Mapping[str, float] | None = None,
+        prefer: str | None = None,
     ) -> Solution:
         """Solve one grasp.
 
@@ -114,6 +117,9 @@ class Solver:
             log: Path of an MCAP file to write every iteration to.
             diagnose: Whether to find out why, if it is not solved (`Solution.diagnosis`).
             fixed: Positions of actuators that are not to move, by name [rad or m].
+            prefer: Which of several solutions: "q0" (near the start, every motion as a part of its
+                motor's range; what already solves is not moved), "limits" (far from its limits),
+                or "manipulability" (of the arm). None: "q0" if q0 is given, else "limits".
 
         Returns:
             The solution; not converging is its status, never an exception.
@@ -121,10 +127,10 @@ class Solver:
         Raises:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
             UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed.
+            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
-        problems = self._questions.of_grasps([grasp], fixed)
+        problems = self._questions.of_grasps([grasp], fixed, self._preference(prefer, q0))
         if log is None and (quick := self._engine.quick(problems, q0, seed)) is not None:
             return quick
         with self._recorder(log, seed) as recorder:
@@ -145,6 +151,7 @@ class Solver:
         fixed: Mapping[str, float] | None = None,
         keep: Keep | None = None,
         compression: Compression = "zstd",
+        prefer: str | None = None,
     ) -> BatchSolution:
         """Solve k targets.
 
@@ -162,6 +169,7 @@ class Solver:
             fixed: Positions of actuators that are not to move, by name [rad or m].
             keep: Which solves keep their iterations in the log; None: all.
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
+            prefer: As for `solve`.
 
         Returns:
             The same fields as a `Solution`, as arrays.
@@ -169,10 +177,11 @@ class Solver:
         Raises:
             InputError: Bad shapes or values; the message names row and finger.
             UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed.
+            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
-        problems = self._questions.of_arrays(points, normals, self._questions.held(fixed))
+        held, preferred = self._questions.held(fixed), self._preference(prefer, q0)
+        problems = self._questions.of_arrays(points, normals, held, prefer=preferred)
         with self._recorder(log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, q0, seed, jobs, recorder, diagnose)
 
@@ -185,6 +194,7 @@ class Solver:
         log: str | PathLike[str] | None = None,
         diagnose: bool = False,
         fixed: Mapping[str, float] | None = None,
+        prefer: str | None = None,
     ) -> Generator[SolvedBlock, None, None]:
         """Solve targets that come block by block, in the memory that one block takes.
 
@@ -200,6 +210,7 @@ class Solver:
                 and given up if the iterator is closed before.
             diagnose: Whether to find out why, for every target that is not solved.
             fixed: Positions of actuators that are not to move, by name [rad or m].
+            prefer: As for `solve`.
 
         Yields:
             The blocks, solved.
@@ -207,13 +218,13 @@ class Solver:
         Raises:
             InputError: Bad q0, seed or jobs, or a block of the wrong shape.
             UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed.
+            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
-        held = self._questions.held(fixed)
+        held, preferred = self._questions.held(fixed), self._preference(prefer, q0)
 
         def ask(points: ArrayLike, normals: ArrayLike, first_row: int) -> Problems:
-            return self._questions.of_arrays(points, normals, held, first_row)
+            return self._questions.of_arrays(points, normals, held, first_row, preferred)
 
         with self._recorder(log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
@@ -308,6 +319,22 @@ class Solver:
         problems = self._questions.of_grasps([grasp], None)
         states, parameters = method.start(problems, self._questions.start(q0)[None])
         return Stepper(method.kernel.step, states[0], parameters[0])
+
+    def _preference(self, prefer: str | None, q0: ArrayLike | None) -> str:
+        asked, method = preference(prefer, q0 is not None), self._engine.method
+        if isinstance(method, PreferringMethod):
+            if asked in method.preferences:
+                return asked
+            raise UnsupportedError(
+                f"prefer: method {self.method!r} knows {', '.join(method.preferences)} only, "
+                f"found {asked!r}"
+            )
+        if prefer is None:
+            return "limits"
+        raise UnsupportedError(
+            f"prefer: method {self.method!r} cannot choose, it takes the solution it comes to from "
+            f"q0; found {prefer!r}"
+        )
 
     def _recorder(
         self,

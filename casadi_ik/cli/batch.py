@@ -47,6 +47,7 @@ def batch(arguments: argparse.Namespace) -> Answer:
         arguments.log,
         arguments.diagnose,
         fixed,
+        arguments.prefer,
     )
     totals = BatchTotals()
     npz = growing_npz(arguments.out, "--out", count)

@@ -29,6 +29,9 @@ from casadi_ik.solving.alternatives.tracking import Tracker
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.parts import Parts
 
+MANIPULABILITY = "manipulability"
+"""The preference that is seen to after the solve."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Part:
@@ -107,7 +110,7 @@ class Engine:
             InputError: Bad q0 or seed.
         """
         method, robot = self._quick, self.robot
-        if method is None:
+        if method is None or problems.prefer == MANIPULABILITY:
             return None
         start = robot.configuration(q0, "q0")
         _whole("seed", seed, 0)
@@ -198,6 +201,8 @@ class Engine:
             outcome = self.method.run(asked, starts[rows], seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
+            if problems.prefer == MANIPULABILITY:
+                outcome = self._most_manipulable(asked, starts[rows], seed, outcome)
             batch = self._judged(asked, outcome)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
@@ -205,6 +210,8 @@ class Engine:
 
         if diagnose:
             _ = self.diagnostician
+        if problems.prefer == MANIPULABILITY:
+            _ = self.finder
         if jobs == 1 and not trace:
             yield run(slice(0, len(problems)))
             return
@@ -220,6 +227,19 @@ class Engine:
                     yield ahead.popleft().result()
             while ahead:
                 yield ahead.popleft().result()
+
+    def _most_manipulable(
+        self, problems: Problems, starts: Array, seed: int, outcome: Outcome
+    ) -> Outcome:
+        """Every hand where it is, held by the arm of the best measure."""
+        begin, q = time.perf_counter(), outcome.q.copy()
+        rows = np.flatnonzero(outcome.status == Status.SOLVED)
+        for row in rows:
+            one = problems.rows(slice(row, row + 1))
+            q[row] = self.finder.best_arm(one, q[row], starts[row], seed, MANIPULABILITY)
+        seconds = outcome.time.copy()
+        seconds[rows] += (time.perf_counter() - begin) / max(len(rows), 1)
+        return replace(outcome, q=q, time=seconds)
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
@@ -253,9 +273,8 @@ class Engine:
         own = isinstance(self.method, HandFirstMethod)
         q, seconds = outcome.q.copy(), outcome.time.copy()
         rows = np.flatnonzero(~batch.success)
-        diagnoses = self.diagnostician.diagnose(
-            problems.rows(rows), starts[rows], q[rows] if own else None
-        )
+        unbiased = replace(problems.rows(rows), prefer="limits")
+        diagnoses = self.diagnostician.diagnose(unbiased, starts[rows], q[rows] if own else None)
         found = dict(zip(rows.tolist(), diagnoses, strict=True))
         for row, why in found.items():
             if own and why.reason is Reason.REACHABLE:

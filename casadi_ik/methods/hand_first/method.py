@@ -23,8 +23,9 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import STAGE_LABELS, HandFirstLayouts
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.method import Outcome, Quick
+from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Array, Problems
-from casadi_ik.problem.status import Status
+from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RESTART, TraceFormat, trace_format
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
@@ -34,6 +35,12 @@ UNBOUNDED = 1e3
 
 AT_LIMITS = 0.5
 """Part of the range that the wide table moves to the limits."""
+
+NEAREST = "q0"
+"""The preference for what is near the start."""
+
+TINY = 1e-9
+"""Smallest range [rad or m] a motion is measured by."""
 
 CARRIED = ("passed", "near", "balanced")
 """What a round leaves to the next: how far the numeric arm's list of starts is through, and which
@@ -49,9 +56,11 @@ class HandFirstMethod:
     Attributes:
         name: Name of the method.
         options: Its numbers.
+        preferences: What it can prefer.
     """
 
     name = "hand-first"
+    preferences = PREFERENCES
 
     def __init__(
         self, robot: RobotDescription, options: HandFirstParameters, compiled: bool = True
@@ -99,15 +108,20 @@ class HandFirstMethod:
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch; see `Method.run`. No random numbers are drawn."""
         del seed
+        again = [self.step.layouts.state.slice(name).start for name in ("phase", "candidate")]
         carried = [self.step.layouts.state.slice(name).start for name in CARRIED]
         collected = _Collected(self.step.layouts)
         left, waiting, here = problems, np.arange(len(problems)), q0
         done: Array | None = None
         for number in range(self.options.rounds):
             begin = time.perf_counter()
-            states, parameters = self.rows(left, here, self.postures(left, number))
+            postures = self.postures(left, number)
+            if left.prefer == NEAREST:
+                postures = self.order(postures, here, own=number == 0)
+            states, parameters = self.rows(left, here, postures)
             if done is not None:
                 states[:, carried] = done
+                states[:, again] = Phase.CANDIDATE, 0.0
             result = self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
             besides = time.perf_counter() - begin - result.time.sum()
             collected.take(waiting, result, besides / max(len(left), 1))
@@ -125,7 +139,9 @@ class HandFirstMethod:
         try:
             first = self._singles.pop()
         except IndexError:
-            first = FirstRound(self.table, self._beginning, self.kernel, self.step.layouts)
+            first = FirstRound(
+                self.table, self._beginning, self.kernel, self.step.layouts, self.order
+            )
         found = first(problems, q0, self._terms(problems), MAX_ITERATIONS)
         self._singles.append(first)
         return found
@@ -163,10 +179,32 @@ class HandFirstMethod:
         table, wanted = (self.wide_table, number * count) if number else (self.table, count)
         return table.nearest(problems.points, problems.normals, wanted)[:, -count:]
 
+    def order(self, postures: Array, q0: Array, own: bool) -> Array:
+        """Hand postures (k, c, hand), those nearest to q0 (k, n) first.
+
+        Args:
+            postures: The postures.
+            q0: Where the robot is.
+            own: Whether its own posture comes first, instead of the last of them.
+        """
+        hand = list(self.step.layouts.hand)
+        here = q0[:, None, hand]
+        if own:
+            postures = postures[:, : max(postures.shape[1] - 1, 1)]
+        ranges = np.maximum((self._robot.upper - self._robot.lower)[hand], TINY)
+        distance = (((postures - here) / ranges) ** 2).sum(axis=2)
+        rows = np.argsort(distance, axis=1, kind="stable")[:, :, None]
+        ordered = np.take_along_axis(postures, rows, axis=1)
+        if not own or self.options.candidates == 1:
+            return ordered
+        return np.concatenate([here, ordered], axis=1)
+
     def _terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms."""
         bounds = problems.bounds(self._robot, UNBOUNDED)
-        return np.concatenate([problems.position_tolerance, problems.angle_tolerance, *bounds])
+        nearest = [float(problems.prefer == NEAREST)]
+        tolerances = problems.position_tolerance, problems.angle_tolerance
+        return np.concatenate([*tolerances, *bounds, nearest])
 
     @cached_property
     def _beginning(self) -> FunctionKernel:
