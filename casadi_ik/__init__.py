@@ -7,7 +7,7 @@ from casadi_ik.control import ScrewControl
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
-from casadi_ik.methods.registry import METHODS
+from casadi_ik.methods.registry import METHODS, register_method
 from casadi_ik.methods.screw_control.objectives import ScrewTask
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
@@ -43,6 +43,7 @@ __all__ = [
     "load_grasp",
     "load_robot",
     "logs",
+    "register_method",
     "shipped_grasps",
     "shipped_names",
 ]

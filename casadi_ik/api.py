@@ -14,8 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
+from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import Compression, Keep, McapRecorder
-from casadi_ik.methods.registry import METHODS, build_method, method_options
+from casadi_ik.methods.qiu.parameters import FINGER_STEPS
+from casadi_ik.methods.registry import METHODS, build_method, option_names
 from casadi_ik.problem.method import PreferringMethod
 from casadi_ik.problem.preference import preference
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
@@ -25,7 +27,6 @@ from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.stepper import SteppedMethod, Stepper
 from casadi_ik.solving.stream import SolvedBlock, Stream
 
 Array = NDArray[np.float64]
@@ -56,14 +57,15 @@ class Solver:
 
         Args:
             robot: From `load_robot`.
-            method: One of `METHODS`.
+            method: One of `METHODS`, or of those registered with `register_method`.
             tolerance: 5 mm and 3 deg unless said; one for all fingers, or by finger name (a
                 finger left out keeps the default). A contact's own tolerance goes before.
             limits: "enforce": being solved includes that every actuator and joint is within its
                 limits. "ignore": only the contacts decide (the paper's reading).
-            finger_step: "ipopt" (the default of the paper's methods) or "closed-form", the same
-                answer, much faster. Methods without a finger step take no notice.
-            options: Other fields of the method's parameter record (`QiuParameters`).
+            finger_step: The option of this name: "ipopt" (the default of the paper's methods) or
+                "closed-form", the same answer, much faster. Methods without a finger step take no
+                notice.
+            options: Fields of the method's parameter record (`QiuParameters`), by name.
             compiled: False keeps to CasADi's virtual machine: the same iterates, slower.
 
         Raises:
@@ -79,7 +81,7 @@ class Solver:
         self.method = method
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
         self.limits = limits
-        self.options = method_options(method, options or {}, finger_step)
+        self.options = _with_finger_step(method, options or {}, finger_step)
         self._questions = Questions(robot, self.tolerances, limits == "enforce")
         self._engine = Engine(
             robot, build_method(method, robot.description, self.options, compiled), compiled
@@ -311,14 +313,10 @@ class Solver:
 
         Raises:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
-            UnsupportedError: The method is not one step run to its end.
+            UnsupportedError: The method cannot be stepped; the message says why.
         """
-        method = self._engine.method
-        if not isinstance(method, SteppedMethod):
-            raise UnsupportedError(f"method {self.method!r} cannot be stepped by hand")
-        problems = self._questions.of_grasps([grasp], None)
-        states, parameters = method.start(problems, self._questions.start(q0)[None])
-        return Stepper(method.kernel.step, states[0], parameters[0])
+        problems = self._questions.of_grasps([grasp], None, self._preference(None, q0))
+        return self._engine.method.stepper(problems, self._questions.start(q0))
 
     def _preference(self, prefer: str | None, q0: ArrayLike | None) -> str:
         asked, method = preference(prefer, q0 is not None), self._engine.method
@@ -354,3 +352,19 @@ class Solver:
             keep=keep,
             compression=compression,
         )
+
+
+def _with_finger_step(
+    method: str, options: Mapping[str, Any], finger_step: str | None
+) -> dict[str, Any]:
+    """Options with the finger step, if it is given and the method has one."""
+    if finger_step is None:
+        return dict(options)
+    if finger_step not in FINGER_STEPS:
+        raise InputError(
+            f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
+        )
+    if "finger_step" in options:
+        raise InputError("finger_step: found twice, expected it as argument or among the options")
+    has_one = "finger_step" in option_names(method)
+    return {**options, "finger_step": finger_step} if has_one else dict(options)

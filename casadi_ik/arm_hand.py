@@ -52,12 +52,12 @@ class ArmHand:
 
     @property
     def lower(self) -> Array:
-        """(n,) lower limits of the actuators [rad or m]."""
+        """(n,) lower limits of the actuators [rad or m], those of their joints included."""
         return self.description.lower
 
     @property
     def upper(self) -> Array:
-        """(n,) upper limits of the actuators [rad or m]."""
+        """(n,) upper limits of the actuators [rad or m], those of their joints included."""
         return self.description.upper
 
     @property
@@ -139,6 +139,25 @@ class ArmHand:
         """
         points, normals = self._kernels.contacts(self.configuration(q))
         return points, normals
+
+    def contact_frames(self, q: ArrayLike) -> Array:
+        """Contact frames of all fingers, in the base frame.
+
+        The origin is the contact point. The first axis is the outward pad normal, the second the
+        pad's tangent: the one the description names (``tangent``), else the x axis of its contact
+        frame made orthogonal to the normal. The third is normal x tangent.
+
+        Args:
+            q: (n,) or (k, n) actuator positions.
+
+        Returns:
+            (f, 4, 4), or (k, f, 4, 4) for a batch.
+
+        Raises:
+            InputError: See `configuration`.
+        """
+        (frames,) = self._kernels.contact_frames(self.configuration(q))
+        return frames.reshape(*frames.shape[:-2], len(self.fingers), 4, 4)
 
     def errors(self, q: ArrayLike, points: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
         """How far the fingertips are from contacts.

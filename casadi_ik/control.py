@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError
-from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
+from casadi_ik.kernels import FunctionKernel, LoopKernel
+from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import McapRecorder
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.methods.screw_control.objectives import ScrewTask
@@ -27,7 +28,6 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.problem.trajectory import Trajectory
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solving.stepper import Stepper
 from casadi_ik.symbolic import dual_quaternion as dq
 
 Array = NDArray[np.float64]
@@ -168,9 +168,7 @@ class ScrewControl:
             start[None], self._step.parameter_vector(asked, numbers), int(steps) + 1, trace=True
         )
         rows = result.trace[0]
-        code = int(result.status[0])
-        ended = {RUNNING: Status.ITERATION_LIMIT, REPEATED: Status.STALLED}
-        status = ended.get(code) or (Status.INVALID if code < 0 else Status(code))
+        status = Status(int(Status.from_loop(result.status)[0]))
         trajectory = Trajectory(
             times=self.period * np.arange(len(rows), dtype=np.float64),
             q=rows["q"],

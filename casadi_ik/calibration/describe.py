@@ -104,7 +104,7 @@ def _widen(joints: dict[str, dict[str, Any]], names: set[str], path: Path) -> No
     q = ca.SX.sym("q", len(robot.actuators))
     positions = ca.Function("joints", [q], [joint_positions(robot, q)])
     # A triangle or a four-bar hangs on one actuator, so all strokes can be gone through at once.
-    strokes = np.linspace(robot.lower, robot.upper, GRID)
+    strokes = np.linspace(*robot.strokes, GRID)
     ranges = np.array(positions(strokes.T))
     for joint, values in zip(robot.movable, ranges, strict=True):
         if joint.name in names and isinstance(joint.coupling, LeadScrew | FourBar):

@@ -194,8 +194,8 @@ def _actuators(solver: Solver, solution: Solution) -> Table:
         rows.add_row(
             actuator.name,
             f"{solution.q[i] * scale:.3f} {unit}",
-            f"{actuator.lower * scale:.4g}",
-            f"{actuator.upper * scale:.4g}",
+            f"{robot.lower[i] * scale:.4g}",
+            f"{robot.upper[i] * scale:.4g}",
             flag,
         )
     return rows
@@ -203,14 +203,16 @@ def _actuators(solver: Solver, solution: Solution) -> Table:
 
 def _flags(solver: Solver, solution: Solution) -> list[str]:
     """Per actuator "" or "lower" or "upper" (at that limit) or by how much it is beyond."""
+    robot = solver.robot
     found = []
-    for actuator, value in zip(solver.robot.description.actuators, solution.q, strict=True):
-        excess = _excess(float(value), actuator.lower, actuator.upper, actuator.unit)
+    rows = zip(robot.description.actuators, robot.lower, robot.upper, solution.q, strict=True)
+    for actuator, lower, upper, value in rows:
+        excess = _excess(float(value), lower, upper, actuator.unit)
         if excess:
             found.append(excess)
-        elif value - actuator.lower <= AT_LIMIT:
+        elif value - lower <= AT_LIMIT:
             found.append("lower")
-        elif actuator.upper - value <= AT_LIMIT:
+        elif upper - value <= AT_LIMIT:
             found.append("upper")
         else:
             found.append("")

@@ -15,6 +15,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError
 
@@ -121,10 +122,7 @@ class Layout:
         Raises:
             InputError: A field is missing, unknown or of the wrong size.
         """
-        extra = set(values) - set(self.names)
-        missing = set(self.names) - set(values)
-        if extra or missing:
-            raise InputError(f"layout: missing {sorted(missing)}, unknown {sorted(extra)}")
+        self._check_names(values)
         symbolic = any(isinstance(value, (ca.SX, ca.MX)) for value in values.values())
         parts: list[Any] = []
         for item in self.fields:
@@ -142,6 +140,44 @@ class Layout:
                 )
             parts.append(part)
         return ca.vertcat(*parts) if symbolic else np.concatenate(parts) if parts else np.zeros(0)
+
+    def pack_rows(self, values: Mapping[str, Any], count: int) -> NDArray[np.float64]:
+        """Lay numbers out as the vectors of several solves.
+
+        Args:
+            values: One value per field, no more and no fewer: of the field's shape (or a number)
+                for all solves, or with a leading dimension of `count` for one each.
+            count: How many solves.
+
+        Returns:
+            (count, size).
+
+        Raises:
+            InputError: A field is missing, unknown or of the wrong shape.
+        """
+        self._check_names(values)
+        vectors = np.empty((count, self.size))
+        for item in self.fields:
+            value = np.asarray(values[item.name], dtype=float)
+            expected = () if value.ndim == 0 else item.shape
+            if value.ndim == len(item.shape) + 1:
+                expected = (count, *item.shape)
+            if value.shape != expected:
+                raise InputError(
+                    f"layout: field {item.name!r} has shape {value.shape}, expected {item.shape} "
+                    f"or {(count, *item.shape)}"
+                )
+            target = vectors[:, self._slices[item.name]]
+            target[...] = (
+                value.reshape(count, -1) if len(expected) > len(item.shape) else (value.reshape(-1))
+            )
+        return vectors
+
+    def _check_names(self, values: Mapping[str, Any]) -> None:
+        extra = set(values) - set(self.names)
+        missing = set(self.names) - set(values)
+        if extra or missing:
+            raise InputError(f"layout: missing {sorted(missing)}, unknown {sorted(extra)}")
 
     def unpack(self, vector: Any) -> dict[str, Any]:
         """The fields of a vector by name: the inverse of `pack`.

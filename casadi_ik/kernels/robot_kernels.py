@@ -57,8 +57,27 @@ class RobotKernels:
         return self._kernel("contacts", build, {}, [(f, 3), (f, 3)])
 
     @cached_property
+    def contact_frames(self) -> FunctionKernel:
+        """Contact frames (4, 4), one below the other: axes normal, tangent, normal x tangent."""
+
+        def build(q: ca.SX) -> list[ca.SX]:
+            kinematics = actuated(self._robot, q).kinematics
+            frames = []
+            for name in self._robot.finger_names:
+                point, normal = kinematics.contact(name)
+                tangent = kinematics.tangent(name)
+                axes = ca.horzcat(normal, tangent, ca.cross(normal, tangent))
+                frames.append(_matrix(Pose(axes, point)))
+            return [ca.vertcat(*frames)]
+
+        return self._kernel("contact_frames", build, {}, [(4 * len(self._robot.finger_names), 4)])
+
+    @cached_property
     def deviations(self) -> FunctionKernel:
-        """Distances and angles (f,) from points and normals (f, 3), and `beyond`."""
+        """Distances and angles (f,) from points and normals (f, 3), and `beyond`.
+
+        What the verdict judges by: written without what the methods minimise, on purpose.
+        """
 
         def build(q: ca.SX, points: ca.SX, normals: ca.SX) -> list[ca.SX]:
             kinematics = actuated(self._robot, q).kinematics
@@ -84,8 +103,10 @@ class RobotKernels:
     def _excess(self, q: ca.SX) -> ca.SX:
         description = self._robot
         both = ca.vertcat(q, joint_positions(description, q))
-        lower = ca.DM(np.concatenate([description.lower, description.joint_lower]))
-        upper = ca.DM(np.concatenate([description.upper, description.joint_upper]))
+        # As the file has them: bounds that were derived from these are not judged by themselves.
+        strokes = description.strokes
+        lower = ca.DM(np.concatenate([strokes[0], description.joint_lower]))
+        upper = ca.DM(np.concatenate([strokes[1], description.joint_upper]))
         return ca.mmax(ca.fmax(lower - both, both - upper))
 
     @cached_property

@@ -1,11 +1,11 @@
 """MCAP logs: every iteration into a file, and back."""
 
-from casadi_ik.logs.clock import LogClock
 from casadi_ik.logs.events.detect import detect_events
 from casadi_ik.logs.events.kinds import EventKind
 from casadi_ik.logs.events.rules import EventRules
 from casadi_ik.logs.explain.compare import matched, side_by_side
 from casadi_ik.logs.explain.why import Explanation, explain
+from casadi_ik.logs.mcap.clock import LogClock
 from casadi_ik.logs.read.asked import Asked
 from casadi_ik.logs.read.info import LogInfo
 from casadi_ik.logs.read.log import Log

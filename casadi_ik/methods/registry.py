@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 from casadi_ik.errors import InputError, UnknownNameError
@@ -11,14 +11,15 @@ from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.ipopt.method import IpoptMethod
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
-from casadi_ik.methods.qiu.enhanced import EnhancedStep
-from casadi_ik.methods.qiu.method import QiuMethod
-from casadi_ik.methods.qiu.original import OriginalStep
-from casadi_ik.methods.qiu.parameters import FINGER_STEPS, OriginalParameters, QiuParameters
+from casadi_ik.methods.qiu.method import EnhancedMethod, OriginalMethod
+from casadi_ik.methods.qiu.parameters import OriginalParameters, QiuParameters
 from casadi_ik.methods.thumb_first.method import ThumbFirstMethod
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.problem.method import Method
 from casadi_ik.robots.description import RobotDescription
+
+Build = Callable[[RobotDescription, Any, bool], Method]
+"""Makes a method from robot, parameter record and whether to compile; often a class."""
 
 
 @dataclass(frozen=True)
@@ -27,15 +28,15 @@ class _Entry:
 
     Attributes:
         summary: What it does, in one line.
-        record: Its parameter record.
+        record: Its parameter record, a dataclass.
+        build: Makes it.
         fixed: Fields of the record that make the method what its name says.
-        build: Makes it from robot, record and whether to compile.
     """
 
     summary: str
     record: type[Any]
-    fixed: Mapping[str, Any]
-    build: Callable[[str, RobotDescription, Any, bool], Method]
+    build: Build
+    fixed: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def options(self) -> tuple[str, ...]:
@@ -43,83 +44,90 @@ class _Entry:
         return tuple(entry.name for entry in fields(self.record) if entry.name not in self.fixed)
 
 
-def _hand_first(
-    name: str, robot: RobotDescription, record: HandFirstParameters, compiled: bool
-) -> Method:
-    del name
-    return HandFirstMethod(robot, record, compiled)
-
-
-def _thumb_first(
-    name: str, robot: RobotDescription, record: ThumbFirstParameters, compiled: bool
-) -> Method:
-    del name
-    return ThumbFirstMethod(robot, record, compiled)
-
-
-def _enhanced(name: str, robot: RobotDescription, record: QiuParameters, compiled: bool) -> Method:
-    return QiuMethod(name, EnhancedStep(robot, record), compiled)
-
-
-def _original(
-    name: str, robot: RobotDescription, record: OriginalParameters, compiled: bool
-) -> Method:
-    return QiuMethod(name, OriginalStep(robot, record), compiled)
-
-
-def _ipopt(name: str, robot: RobotDescription, record: IpoptParameters, compiled: bool) -> Method:
-    del name, compiled  # Ipopt calls its graphs in the virtual machine
-    return IpoptMethod(robot, record)
-
-
 _PAPER = "(Qiu & Kermani 2021)"
 _ENTRIES: dict[str, _Entry] = {
     "hand-first": _Entry(
         "palm and hand are fitted to the contacts, the arm follows in closed form (ours)",
         HandFirstParameters,
-        {},
-        _hand_first,
+        HandFirstMethod,
     ),
     "thumb-first": _Entry(
         "the arm starts at the estimated palm, then moves along the arm-thumb closed chain (ours)",
         ThumbFirstParameters,
-        {},
-        _thumb_first,
+        ThumbFirstMethod,
     ),
     "enhanced-dls": _Entry(
         f"thumb first, then the arm-thumb closed chain; damped least squares {_PAPER}",
         QiuParameters,
+        EnhancedMethod,
         {"steps": "dls"},
-        _enhanced,
     ),
     "enhanced-sdls": _Entry(
         f"the same with selectively damped least squares {_PAPER}",
         QiuParameters,
+        EnhancedMethod,
         {"steps": "sdls"},
-        _enhanced,
     ),
     "original-dls": _Entry(
         f"all contacts in one hierarchy, what the paper compares with; DLS {_PAPER}",
         OriginalParameters,
+        OriginalMethod,
         {"steps": "dls"},
-        _original,
     ),
     "original-sdls": _Entry(
         f"the same with selectively damped least squares {_PAPER}",
         OriginalParameters,
+        OriginalMethod,
         {"steps": "sdls"},
-        _original,
     ),
     "ipopt": _Entry(
         "the whole arm-hand as one nonlinear program, with restarts: slow, to compare with",
         IpoptParameters,
-        {},
-        _ipopt,
+        IpoptMethod,
     ),
 }
 
 METHODS: tuple[str, ...] = tuple(_ENTRIES)
-"""Names of the methods, the default first."""
+"""Names of the methods that come with the package, the default first."""
+
+
+def register_method(
+    name: str,
+    summary: str,
+    parameters: type[Any],
+    build: Build,
+    fixed: Mapping[str, Any] | None = None,
+    replace: bool = False,
+) -> None:
+    """Make a method known to `Solver` by its name, in this process.
+
+    Args:
+        name: What it is called; also `Method.name` of what `build` makes.
+        summary: What it does, in one line.
+        parameters: Its parameter record, a dataclass whose fields have defaults; `Solver(options=)`
+            sets them.
+        build: Makes it from robot, parameter record and whether to compile; a subclass of
+            `LoopedMethod` does.
+        fixed: Fields of the record that cannot be chosen.
+        replace: Whether it may take the place of a method registered before.
+
+    Raises:
+        InputError: The name is taken, or an argument is not what it has to be.
+    """
+    if not (isinstance(name, str) and name):
+        raise InputError(f"name: found {name!r}, expected the name of a method")
+    if name in METHODS or (name in _ENTRIES and not replace):
+        raise InputError(f"name: there is a method {name!r} already, expected another name")
+    if not (isinstance(parameters, type) and is_dataclass(parameters)):
+        raise InputError(f"parameters: found {parameters!r}, expected a dataclass")
+    if not callable(build):
+        raise InputError(f"build: found {build!r}, expected what makes a method")
+    _ENTRIES[name] = _Entry(summary, parameters, build, dict(fixed or {}))
+
+
+def method_names() -> tuple[str, ...]:
+    """Names of all methods there are: `METHODS`, then those registered."""
+    return tuple(_ENTRIES)
 
 
 def method_summary(name: str) -> str:
@@ -140,37 +148,13 @@ def option_names(name: str) -> tuple[str, ...]:
     return _entry(name).options
 
 
-def method_options(
-    name: str, options: Mapping[str, Any], finger_step: str | None
-) -> dict[str, Any]:
-    """Options of a method, with the finger step if the method has one.
-
-    Args:
-        name: One of `METHODS`.
-        options: What was set besides.
-        finger_step: One of `FINGER_STEPS`; None leaves the method's own.
-
-    Raises:
-        UnknownNameError: No such method.
-        InputError: No such finger step.
-    """
-    if finger_step is None:
-        return dict(options)
-    if finger_step not in FINGER_STEPS:
-        raise InputError(
-            f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
-        )
-    has_one = "finger_step" in _entry(name).options
-    return {**options, "finger_step": finger_step} if has_one else dict(options)
-
-
 def build_method(
     name: str, robot: RobotDescription, options: dict[str, Any], compiled: bool = True
 ) -> Method:
     """Build a method for a robot.
 
     Args:
-        name: One of `METHODS`.
+        name: One of `method_names`.
         robot: The description.
         options: Fields of the method's parameter record that differ from their defaults.
         compiled: False keeps to CasADi's virtual machine.
@@ -191,7 +175,10 @@ def build_method(
         record = entry.record(**options, **entry.fixed)
     except TypeError as error:
         raise InputError(f"options: {error}") from error
-    return entry.build(name, robot, record, compiled)
+    method = entry.build(robot, record, compiled)
+    if method.name != name:
+        raise InputError(f"method {name!r} calls itself {method.name!r}, expected one name")
+    return method
 
 
 def _entry(name: str) -> _Entry:
@@ -199,5 +186,5 @@ def _entry(name: str) -> _Entry:
         return _ENTRIES[name]
     except (KeyError, TypeError):
         raise UnknownNameError(
-            f"method {name!r} does not exist; methods: {', '.join(METHODS)}"
+            f"method {name!r} does not exist; methods: {', '.join(_ENTRIES)}"
         ) from None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.rows import split_rows
+from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.trace import TraceFormat
 
@@ -70,6 +71,19 @@ class Method(Protocol):
 
     def prepare(self) -> None:
         """Build and compile what `run` needs; afterwards `run` may be called by several threads."""
+        ...
+
+    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+        """Solve one target by hand, one iteration at a time.
+
+        Args:
+            problems: One target.
+            q0: (n,) configuration to start from.
+
+        Raises:
+            RowError: The method cannot take the target (for example a free finger).
+            UnsupportedError: The method cannot be stepped; the message says why.
+        """
         ...
 
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:

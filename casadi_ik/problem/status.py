@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.kernels import REPEATED, RUNNING
+
 
 class Status(IntEnum):
     """How a solve ended. Not converging is a status, never an exception."""
@@ -20,6 +25,20 @@ class Status(IntEnum):
     """The budget of iterations is used up."""
     UNREACHABLE = 4
     """The contacts cannot be reached; the verdict says why."""
+
+    @classmethod
+    def from_loop(cls, codes: NDArray[np.int32]) -> NDArray[np.int64]:
+        """How solves ended, from the codes (k,) of `LoopResult.status`.
+
+        A step ends with a status of its own; what the loop itself ends is out of iterations, back
+        at an earlier state (and would be there again and again), or no longer finite.
+        """
+        found = codes.astype(np.int64)
+        return np.select(
+            [found == RUNNING, found == REPEATED, found < 0],
+            [int(cls.ITERATION_LIMIT), int(cls.STALLED), int(cls.INVALID)],
+            found,
+        )
 
     @classmethod
     def labels(cls) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What every method is told of a problem, and how far a configuration is from it."""
+"""Targets of methods that need a point and a normal for every finger."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.kernels.layout import Field
+from casadi_ik.problem.contacts.conditions import Vectors
+from casadi_ik.problem.contacts.kinds import USUAL
+from casadi_ik.problem.contacts.rows import tip_vectors
+from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.directions import angle_between
 from casadi_ik.symbolic.kinematics import Kinematics
-from casadi_ik.symbolic.smooth import Expr, safe_norm
+from casadi_ik.symbolic.smooth import Expr
 
 
 def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
@@ -25,12 +28,27 @@ def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
     )
 
 
+def target_values(problems: Problems) -> dict[str, Array]:
+    """Values of `target_fields` for a batch: targets (k, f, 3), tolerances (f,)."""
+    return {
+        "points": problems.points,
+        "normals": problems.normals,
+        "position_tolerance": problems.position_tolerance,
+        "angle_tolerance": problems.angle_tolerance,
+    }
+
+
 @dataclass(frozen=True, eq=False)
 class Target:
     """One finger's contact: point (3, 1) [m] and unit normal (3, 1), in one common frame."""
 
     point: Expr
     normal: Expr
+
+    @property
+    def vectors(self) -> Vectors:
+        """As the conditions of a contact take them."""
+        return {"point": self.point, "normal": self.normal}
 
 
 def targets(robot: RobotDescription, parameters: dict[str, ca.SX]) -> dict[str, Target]:
@@ -51,21 +69,8 @@ def contact_errors(
     """
     positions, angles = [], []
     for name in fingers:
-        point, normal = kinematics.contact(name)
-        positions.append(safe_norm(goal[name].point - point))
-        angles.append(angle_between(normal, goal[name].normal))
+        tip, target = tip_vectors(kinematics, name), goal[name].vectors
+        place, facing = USUAL.conditions
+        positions.append(place.measure(tip, target))
+        angles.append(facing.measure(tip, target))
     return ca.vertcat(*positions), ca.vertcat(*angles)
-
-
-def within_tolerance(positions: Expr, angles: Expr, p: dict[str, ca.SX]) -> Expr:
-    """Whether every contact is met; boolean.
-
-    Args:
-        positions: (f, 1) distances [m].
-        angles: (f, 1) angles [rad].
-        p: Parameters of `target_fields`.
-    """
-    return ca.logic_and(
-        ca.mmax(positions - p["position_tolerance"]) <= 0,
-        ca.mmax(angles - p["angle_tolerance"]) <= 0,
-    )

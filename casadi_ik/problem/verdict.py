@@ -1,4 +1,8 @@
-"""The verdict: is it solved? Recomputed from q alone, whatever a method believes."""
+"""The verdict: is it solved? Recomputed from q alone, whatever a method believes.
+
+Its errors are formulas of their own on purpose, not those of `problem.contacts` that the methods
+minimise: a fault there must not be judged by itself.
+"""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.robots.couplings import Coupling, LeadScrew
+from casadi_ik.robots.motor_ranges import motor_ranges
 
 Array = NDArray[np.float64]
 
@@ -53,8 +54,8 @@ class Actuator:
     Attributes:
         name: Unique name.
         unit: "rad" or "m".
-        lower: Lower limit.
-        upper: Upper limit.
+        lower: Lower limit of its own; `RobotDescription.lower` minds its joints' limits as well.
+        upper: Upper limit, likewise.
         velocity: Velocity limit [unit/s], inf if unknown.
         part: "arm" or "hand".
     """
@@ -77,6 +78,9 @@ class Finger:
         placement: (4, 4) pose of the contact frame in that link.
         normal: (3,) outward pad normal, unit, in the contact frame.
         joints: Names of the movable joints from the palm to the contact, in order.
+        tangent: (3,) second axis of the pad, unit, in the contact frame and orthogonal to the
+            normal: what a contact's tangent turns about the normal. If the description names
+            none, the contact frame's x axis made orthogonal to the normal.
     """
 
     name: str
@@ -84,6 +88,7 @@ class Finger:
     placement: Array
     normal: Array
     joints: tuple[str, ...]
+    tangent: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,13 +141,24 @@ class RobotDescription:
 
     @cached_property
     def lower(self) -> Array:
-        """(n,) lower limits of the actuators."""
-        return _frozen([actuator.lower for actuator in self.actuators])
+        """(n,) lower limits of the actuators, which keep all joints within theirs as well."""
+        return self._ranges[0]
 
     @cached_property
     def upper(self) -> Array:
-        """(n,) upper limits of the actuators."""
-        return _frozen([actuator.upper for actuator in self.actuators])
+        """(n,) upper limits of the actuators, which keep all joints within theirs as well."""
+        return self._ranges[1]
+
+    @cached_property
+    def _ranges(self) -> tuple[Array, Array]:
+        found = motor_ranges(self.movable, self.actuators, self.home, f"robot {self.name!r}")
+        return _frozen(found[0]), _frozen(found[1])
+
+    @cached_property
+    def strokes(self) -> tuple[Array, Array]:
+        """(n,) what the actuators could do by themselves, whatever their joints' limits say."""
+        lower = [actuator.lower for actuator in self.actuators]
+        return _frozen(lower), _frozen([actuator.upper for actuator in self.actuators])
 
     @cached_property
     def mechanical(self) -> tuple[Array, Array]:
@@ -239,7 +255,7 @@ class RobotDescription:
         return tuple(sorted(found))
 
 
-def _frozen(values: Sequence[float]) -> Array:
+def _frozen(values: Sequence[float] | Array) -> Array:
     array = np.asarray(values, dtype=float)
     array.flags.writeable = False
     return array

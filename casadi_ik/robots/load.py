@@ -11,6 +11,7 @@ from casadi_ik.errors import DescriptionError, UnknownNameError
 from casadi_ik.files.reading import (
     Frame,
     T,
+    Vector,
     convert,
     frame_matrix,
     read_yaml,
@@ -26,6 +27,7 @@ from casadi_ik.robots.checks import (
     unique,
 )
 from casadi_ik.robots.description import Actuator, Array, Finger, Joint, RobotDescription
+from casadi_ik.robots.motor_ranges import motor_ranges
 from casadi_ik.robots.schema import (
     ActuatorEntry,
     ArmFile,
@@ -35,6 +37,9 @@ from casadi_ik.robots.schema import (
     JointEntry,
     LinkFrame,
 )
+
+ALONG = 0.995
+"""Cosine with the normal above which the contact frame's x axis is no tangent."""
 
 JOINT_TYPES = ("revolute", "prismatic", "fixed")
 
@@ -88,7 +93,7 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
         thumb=top.thumb,
         palm_link=palm_link,
         palm_placement=_freeze(_pose(hand.palm)),
-        home=_home(top.home, actuators, path),
+        home=_home(top.home, actuators, joints, path),
         sources=sources,
     )
 
@@ -260,28 +265,54 @@ def _fingers(
             link = by_child[link].parent
         normal = np.asarray(entry.normal, dtype=float) / length
         fingers.append(
-            Finger(name, entry.link, _freeze(_pose(entry)), _freeze(normal), tuple(chain[::-1]))
+            Finger(
+                name,
+                entry.link,
+                _freeze(_pose(entry)),
+                _freeze(normal),
+                tuple(chain[::-1]),
+                _freeze(_tangent(entry.tangent, normal, where)),
+            )
         )
     return tuple(fingers)
 
 
-def _home(home: dict[str, float], actuators: list[Actuator], path: Path) -> Array:
+def _tangent(given: Vector | None, normal: Array, where: str) -> Array:
+    """The pad's second axis (3,): what is given, else x (y if the normal is along x)."""
+    along = given
+    if given is None:
+        along = (1.0, 0.0, 0.0) if abs(normal[0]) < ALONG else (0.0, 1.0, 0.0)
+    across = np.asarray(along, dtype=float)
+    across = across - normal * (normal @ across)
+    length = float(np.linalg.norm(across))
+    if not length > 1e-3 * float(np.linalg.norm(np.asarray(along))):
+        raise DescriptionError(
+            f"{where}.tangent: found {list(along or ())}, expected a direction across the normal"
+        )
+    return across / length
+
+
+def _home(
+    home: dict[str, float], actuators: list[Actuator], joints: list[Joint], path: Path
+) -> Array:
+    """The home position; where the file gives none, the position nearest to zero."""
     names = [actuator.name for actuator in actuators]
     for name in home:
         if name not in names:
             raise DescriptionError(
                 f"{path}: home.{name}: no such actuator; known: {', '.join(names)}"
             )
-    values = []
-    for actuator in actuators:
-        value = home.get(actuator.name, min(max(0.0, actuator.lower), actuator.upper))
-        if not actuator.lower <= value <= actuator.upper:
+    asked = np.array([home.get(name, 0.0) for name in names])
+    movable = [joint for joint in joints if joint.type != "fixed"]
+    lower, upper = motor_ranges(movable, actuators, asked, str(path))
+    values = np.clip(asked, lower, upper)
+    for name, value, low, high in zip(names, asked, lower, upper, strict=True):
+        if name in home and not low <= value <= high:
             raise DescriptionError(
-                f"{path}: home.{actuator.name}: {value:.6g} is outside the limits "
-                f"[{actuator.lower:.6g}, {actuator.upper:.6g}]"
+                f"{path}: home.{name}: {value:.6g} is outside the limits [{low:.6g}, {high:.6g}] "
+                "of the actuator and its joints"
             )
-        values.append(value)
-    return _freeze(np.array(values))
+    return _freeze(values)
 
 
 def _pose(entry: LinkFrame | ContactEntry) -> Array:

@@ -42,13 +42,18 @@ class LinkFrame(Struct, frozen=True):
 
 
 class ContactEntry(Struct, frozen=True):
-    """The contact frame of a finger; ``normal`` is the outward pad normal in that frame."""
+    """The contact frame of a finger; ``normal`` is the outward pad normal in that frame.
+
+    ``tangent`` is the pad's second axis; left out, it is the frame's x axis. Either is made
+    orthogonal to the normal.
+    """
 
     link: str
     normal: Vector
     source: str
     xyz: Vector = (0.0, 0.0, 0.0)
     rpy: Vector = (0.0, 0.0, 0.0)
+    tangent: Vector | None = None
 
 
 class ArmFile(Struct, frozen=True):

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.kernels.layout import Layout
-from casadi_ik.methods.common.contact_fit import LENGTH, fresh_fit
+from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.method import UNBOUNDED, HandFirstMethod
+from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.verdict import judge

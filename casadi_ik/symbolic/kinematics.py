@@ -67,6 +67,10 @@ class Kinematics:
         frame = self.contact_frame(finger)
         return frame.origin, frame.rotate(self.robot.finger(finger).normal)
 
+    def tangent(self, finger: str) -> ca.SX:
+        """The second axis (3, 1) of a finger's pad, unit, orthogonal to the normal, base frame."""
+        return self.contact_frame(finger).rotate(self.robot.finger(finger).tangent)
+
     def twist_columns(self, joints: Sequence[str], link: str, point: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Geometric Jacobian of a point fixed to a link with respect to some joints.
 

@@ -10,15 +10,13 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from made_up_solves import FORMAT, JOINTS, LAYOUT, T0, changed, make_block
+from made_up_solves import FORMAT, JOINTS, LAYOUT, changed, make_block
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
-from mcap_ros2._dynamic import serialize_dynamic
 
 import casadi_ik as ik
 from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError
-from casadi_ik.logs import EventKind, Keep, Log, LogClock
-from casadi_ik.logs.provenance import METADATA_NAME, log_metadata
+from casadi_ik.logs import EventKind, Keep, Log
 
 Write = Callable[..., Path]
 
@@ -70,11 +68,11 @@ def test_only_the_chunks_asked_for_are_read(write: Write, monkeypatch: pytest.Mo
     log = ik.logs.open(write(make_block(*[10] * 20)))
     assert log.info().chunks == 20
     read: list[int] = []
-    from casadi_ik.logs.mcap import bulk
+    from casadi_ik.logs.mcap import unpacking
 
-    whole = bulk.chunk_data
+    whole = unpacking.read_chunk
     monkeypatch.setattr(
-        bulk, "chunk_data", lambda stream, chunk: (read.append(1), whole(stream, chunk))[1]
+        unpacking, "read_chunk", lambda stream, chunk: (read.append(1), whole(stream, chunk))[1]
     )
     assert len(log.iterations(solve=[3, 11])) == 20
     assert len(read) == 2
@@ -265,49 +263,3 @@ def test_messages_outside_chunks_are_refused(write: Write) -> None:
     path = rewritten(write(make_block(5)), use_chunking=False)
     with pytest.raises(LogError, match=r"copy\.mcap: the messages are not in chunks"):
         ik.logs.open(path)
-
-
-SCHEMA = "string name\nuint8 phase\nfloat64[] residual\nbool[2] flags\nfloat64 cost\n"
-
-
-def foreign(path: Path, damage: bool = False) -> Path:
-    """A log whose iterations have another layout: text, padding, and lists of any length."""
-    clock, encode = LogClock(T0), serialize_dynamic("a/msg/B", SCHEMA)["a/msg/B"]
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2")
-        writer.add_metadata(METADATA_NAME, log_metadata("r", 0, {}, {}, "zstd", clock))
-        number = writer.register_schema("a/msg/B", "ros2msg", SCHEMA.encode())
-        labels = '{"phase": ["reach", "refine"]}'
-        channel = writer.register_channel(
-            "/ik/foreign/iteration", "cdr", number, {"method": "foreign", "labels": labels}
-        )
-        for i in range(6):
-            values = {"name": f"step {i}", "phase": i % 2, "residual": [0.5] * i}
-            data = encode(values | {"flags": [True, i > 2], "cost": float(i)})
-            time = int(clock.times(np.array([i // 3]), np.array([i % 3]))[0])
-            writer.add_message(channel, time, data[:-5] if damage and i == 3 else data, time)
-        writer.finish()
-    return path
-
-
-def test_a_foreign_layout_is_decoded_message_by_message(tmp_path: Path) -> None:
-    log = ik.logs.open(foreign(tmp_path / "foreign.mcap"))
-    found = log.iterations()
-    assert found.solve_id.tolist() == [0, 0, 0, 1, 1, 1]
-    assert found.rows["name"].tolist() == [f"step {i}" for i in range(6)]
-    assert [len(residual) for residual in found.rows["residual"]] == list(range(6))
-    np.testing.assert_array_equal(found.rows["cost"], np.arange(6))
-    one = log.iterations(solve=1, fields=["cost", "flags"])
-    assert one.rows["cost"].tolist() == [3.0, 4.0, 5.0]
-    assert one.rows["flags"].all()
-    frame = found.frame()
-    assert frame["phase"].to_list() == ["reach", "refine"] * 3
-    assert frame["residual"].list.len().to_list() == list(range(6))
-    assert [record["name"] for record in found.records()] == frame["name"].to_list()
-
-
-def test_a_foreign_message_that_is_cut(tmp_path: Path) -> None:
-    log = ik.logs.open(foreign(tmp_path / "foreign.mcap", damage=True))
-    with pytest.raises(LogError, match=r"foreign\.mcap: message of \d+ bytes is cut or damaged"):
-        log.iterations()

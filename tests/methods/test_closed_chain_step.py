@@ -7,18 +7,21 @@ import numpy as np
 import pytest
 
 from casadi_ik.methods.thumb_first.closed_chain_step import (
-    LENGTH,
     THUMB_DAMPING,
     Linear,
     Room,
-    contact_residuals,
+    contact_errors,
     freezing,
     linearised,
     motor_scales,
     quadratic_program,
 )
+from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.contacts.rows import ContactRows
 
 WIDE = 1e3
+ROWS = ContactRows(usual(3))
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +30,9 @@ def problem(robot):
     q, points = ca.SX.sym("q", 14), ca.SX.sym("points", 3, 3)
     normals, weights = ca.SX.sym("normals", 3, 3), ca.SX.sym("weights", 3, 2)
     p = {"points": points, "normals": normals, "weights": weights}
-    linear = linearised(robot.description, q, p)
+    linear = linearised(robot.description, ROWS, q, p)
     outputs = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
-    residuals = ca.vertcat(*map(ca.vertcat, *contact_residuals(robot.description, q, p)))
+    residuals = ca.vertcat(*map(ca.vertcat, *contact_errors(robot.description, ROWS, q, p)))
     return ca.Function("problem", [q, points, normals, weights], [*outputs, residuals])
 
 

@@ -9,6 +9,7 @@ import pytest
 from casadi_ik.methods.qiu.enhanced import EnhancedStep
 from casadi_ik.methods.qiu.finger_step import finger_step_function
 from casadi_ik.methods.qiu.parameters import QiuParameters
+from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Phase, Status
 
 
@@ -27,10 +28,9 @@ class Stepper:
         )
 
     def parameters(self, points, normals, enforce_limits=False):
-        values = self.step.parameter_values(
-            np.full(3, 5e-3), np.full(3, np.radians(3)), enforce_limits
-        )
-        return self.step.parameters.pack({"points": points, "normals": normals, **values})
+        problems = Problems(points[None], normals[None], Tolerance(), enforce_limits)
+        values = self.step.parameter_values(problems)
+        return self.step.parameters.pack_rows(values, 1)[0]
 
     def __call__(self, state, parameters):
         after, record, status = self.graph.function(state, parameters)

@@ -7,8 +7,7 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.methods.qiu.enhanced import EnhancedStep
-from casadi_ik.methods.qiu.method import QiuMethod
+from casadi_ik.methods.qiu.method import EnhancedMethod
 from casadi_ik.methods.qiu.parameters import QiuParameters
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Phase, Status
@@ -34,8 +33,7 @@ def pinch_targets(robot, count, seed=0):
 
 def method(robot, compiled=True, **options):
     options = {"finger_step": "closed-form"} | options
-    step = EnhancedStep(robot.description, QiuParameters(**options))
-    return QiuMethod("enhanced-dls", step, compiled)
+    return EnhancedMethod(robot.description, QiuParameters(**options), compiled)
 
 
 def run(built, robot, points, normals, enforce=False, q0=None):

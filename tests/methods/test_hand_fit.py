@@ -6,7 +6,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.methods.common.contact_fit import LENGTH, errors, within_tolerance
 from casadi_ik.methods.common.numeric_arm import (
     STARTS,
     TABLE,
@@ -24,11 +23,15 @@ from casadi_ik.methods.hand_first.hand_fit import (
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.methods.hand_first.whole_fit import whole_jacobian, whole_residual
+from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.contacts.rows import ContactRows, chord, within_tolerance
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import compose, exp_se3
 from casadi_ik.symbolic.srs_arm import srs_arm
 
 ARM, HAND = 7, 7
+ROWS = ContactRows(usual(3))
 
 
 def parameters(robot, points, normals, weights=None):
@@ -45,7 +48,7 @@ def parameters(robot, points, normals, weights=None):
 
 @pytest.fixture(scope="module")
 def layouts(robot):
-    return HandFirstLayouts(robot.description, 1)
+    return HandFirstLayouts(robot.description, 1, ROWS.kinds)
 
 
 def differences(function, x, step=1e-6):
@@ -82,12 +85,12 @@ def test_hand_jacobian(robot, layouts, problem):
     def residual(x):
         at = moved(x)
         contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.hand)
-        return number(fit_residual(contacts, at, p)).ravel()
+        return number(fit_residual(contacts, ROWS, at, p)).ravel()
 
     at = moved(np.zeros(6 + HAND))
     contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.hand)
     expected = differences(residual, np.zeros(6 + HAND))
-    np.testing.assert_allclose(number(fit_jacobian(contacts, at, p)), expected, atol=1e-7)
+    np.testing.assert_allclose(number(fit_jacobian(contacts, ROWS, at, p)), expected, atol=1e-7)
     assert np.linalg.matrix_rank(expected) > 8
 
 
@@ -95,9 +98,9 @@ def test_whole_jacobian(robot, problem):
     q, p = problem
 
     def residual(x):
-        return number(whole_residual(robot.description, ca.SX(x), p)).ravel()
+        return number(whole_residual(robot.description, ROWS, ca.SX(x), p)).ravel()
 
-    found = number(whole_jacobian(robot.description, ca.SX(q), p))
+    found = number(whole_jacobian(robot.description, ROWS, ca.SX(q), p))
     np.testing.assert_allclose(found, differences(residual, q), atol=1e-7)
 
 
@@ -117,14 +120,14 @@ def test_residual_vanishes_at_the_generating_configuration(robot, layouts, probl
     p, palm = parameters(robot, *robot.contacts(q)), robot.palm(q)
     at = PalmAndHand(ca.DM(palm[:3, :3]), ca.DM(palm[:3, 3]), ca.DM(q[ARM:]))
     contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.hand)
-    assert np.abs(number(fit_residual(contacts, at, p))).max() < 1e-13
-    assert np.abs(number(whole_residual(robot.description, ca.SX(q), p))).max() < 1e-13
+    assert np.abs(number(fit_residual(contacts, ROWS, at, p))).max() < 1e-13
+    assert np.abs(number(whole_residual(robot.description, ROWS, ca.SX(q), p))).max() < 1e-13
 
 
 def test_best_palm_finds_the_palm_of_the_right_posture(robot, layouts, rng):
     for q in robot.random(rng, 10):
         contacts = hand_contacts(robot.description, ca.SX(q[ARM:]), layouts.hand)
-        rotation, origin = best_palm(contacts, parameters(robot, *robot.contacts(q)))
+        rotation, origin = best_palm(contacts, ROWS, parameters(robot, *robot.contacts(q)))
         palm = robot.palm(q)
         np.testing.assert_allclose(number(rotation), palm[:3, :3], atol=1e-3)
         np.testing.assert_allclose(number(origin).ravel(), palm[:3, 3], atol=1e-3)
@@ -187,12 +190,12 @@ def test_a_step_of_the_numeric_arm_lowers_what_it_promises(robot, rng):
     assert before - there == pytest.approx(float(number(tried.promised)[0, 0]), rel=0.05)
 
 
-def test_within_tolerance_compares_the_angle(robot):
-    p = {"position_tolerance": ca.DM([5e-3] * 3), "angle_tolerance": ca.DM([0.1] * 3)}
+def test_within_tolerance_compares_the_angle():
+    tolerances = ca.DM([5e-3] * 3), chord(ca.DM([0.1] * 3))
     for angle, expected in ((0.0999, 1), (0.1001, 0)):
         residual = np.zeros(18)
         residual[3] = 4.9e-3 / LENGTH
         residual[9:12] = [np.cos(angle) - 1, np.sin(angle), 0]
-        positions, chords = errors(ca.DM(residual), 3)
+        positions, chords = ROWS.errors(ca.DM(residual))
         assert float(positions[1]) == pytest.approx(4.9e-3)
-        assert int(within_tolerance(positions, chords, p)) == expected
+        assert int(within_tolerance(positions, chords, *tolerances)) == expected

@@ -13,6 +13,8 @@ from casadi_ik.methods.hand_first.whole_fit import whole_residual
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.watch import EXACT
 from casadi_ik.methods.ipopt.whole_nlp import LENGTH, WholeNlp, contact_errors, limited_joints
+from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.status import Status
 
 
@@ -55,7 +57,9 @@ def test_residual_is_that_of_the_other_methods(robot, program, rng):
         program.targets(robot.random(rng, 1)[0], [[1, 1], [1, 0], [0, 0]]),
     )
     symbols = ca.SX.sym("q", len(q))
-    other = whole_residual(robot.description, symbols, program.nlp.parameters.unpack(ca.SX(p)))
+    other = whole_residual(
+        robot.description, ContactRows(usual(3)), symbols, program.nlp.parameters.unpack(ca.SX(p))
+    )
     other = ca.Function("other", [symbols], [other])
     np.testing.assert_allclose(program.nlp.residual(q, p), other(q), atol=1e-14)
 

@@ -33,17 +33,32 @@ COMPRESSORS: Mapping[str, tuple[str, Callable[[memoryview], bytes | memoryview]]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Messages of one channel that stand one after the other in a chunk.
+    """Messages of one channel and size that stand one after the other in a chunk.
 
     Attributes:
         channel: Channel id.
+        start: Where in the chunk the first begins.
+        size: Of one message, its head included [bytes].
         log_time: (k,) uint64 [ns].
-        offsets: (k,) uint64, where each begins in the chunk.
     """
 
     channel: int
+    start: int
+    size: int
     log_time: np.ndarray
-    offsets: np.ndarray
+
+    @property
+    def stop(self) -> int:
+        """Where in the chunk the last ends."""
+        return self.start + self.size * len(self.log_time)
+
+    @property
+    def entries(self) -> np.ndarray:
+        """Log time and offset of each message, (k, 2) uint64, as a message index has them."""
+        found = np.empty((len(self.log_time), 2), "<u8")
+        found[:, 0] = self.log_time
+        found[:, 1] = np.arange(self.start, self.stop, self.size, dtype=np.uint64)
+        return found
 
 
 def chunk_bytes(
@@ -53,7 +68,7 @@ def chunk_bytes(
 
     Args:
         data: Schemas, channels and messages, uncompressed.
-        runs: Where in it which messages are; none of them empty, at least one, a channel once.
+        runs: Where in it which messages are; none of them empty, at least one.
         compression: A key of `COMPRESSORS`.
         position: Where in the file the chunk will stand.
 
@@ -75,14 +90,15 @@ def chunk_bytes(
     head.write8(len(packed))
     length = head.count + len(packed)
     tail, places = RecordBuilder(), {}
-    for run in runs:
-        places[run.channel] = position + length + tail.count
-        entries = np.stack([run.log_time, run.offsets], axis=1, dtype="<u8", casting="unsafe")
+    for channel in dict.fromkeys(run.channel for run in runs):
+        places[channel] = position + length + tail.count
+        parts = [run.entries.tobytes() for run in runs if run.channel == channel]
         # Not `mcap.records.MessageIndex.write`: it takes the pairs one by one.
         tail.start_record(Opcode.MESSAGE_INDEX)
-        tail.write2(run.channel)
-        tail.write4(entries.nbytes)
-        tail.write(entries.tobytes())
+        tail.write2(channel)
+        tail.write4(sum(map(len, parts)))
+        for part in parts:
+            tail.write(part)
         tail.finish_record()
     index = ChunkIndex(
         chunk_length=length,

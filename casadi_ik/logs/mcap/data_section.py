@@ -1,55 +1,35 @@
-"""What the data section of an MCAP file really holds, record by record, checksums verified."""
+"""What the data section of an MCAP file really holds, record by record, every checksum verified."""
 
 from __future__ import annotations
 
-import io
 import os
 import struct
 from dataclasses import dataclass, field
-from typing import IO, TypeVar
+from typing import IO
 
 import numpy as np
-from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.exceptions import McapError
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    MessageIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-)
-from mcap.stream_reader import get_chunk_data_stream
-from mcap.writer import MCAP0_MAGIC
+from mcap.records import Attachment, Channel, Header, MessageIndex, Metadata, MetadataIndex, Schema
 from numpy.typing import NDArray
-from zstandard import ZstdError
 
 from casadi_ik.errors import LogError
-from casadi_ik.logs.mcap.file import Summary
-
-HEAD = struct.Struct("<BQ")
-"""Opcode and length in front of every record."""
-
-_SAME = HEAD.size + 2
-"""Bytes at the beginning of a message that are the same in those of its channel and size."""
-
-_LOG_TIME = slice(HEAD.size + 6, HEAD.size + 14)
-"""Where in a message its log time is, behind channel and sequence."""
+from casadi_ik.logs.mcap.records import HEAD, MAGIC, Record, parsed, records
+from casadi_ik.logs.mcap.summary import Summary, attachment_index
+from casadi_ik.logs.mcap.unpacking import unpacked
 
 _INDEX_HEAD = struct.Struct("<HI")
 """Channel and size of the entries: how the content of a MessageIndex begins."""
 
-_DAMAGED = (McapError, struct.error, ValueError, RuntimeError, MemoryError, ZstdError)
-"""What a record with wrong bytes was seen to raise (RuntimeError is lz4's)."""
-
-Kind = TypeVar("Kind", Attachment, Channel, Chunk, Metadata, Schema)
+_ENTRY = 16
+"""Bytes of a log time and an offset."""
 
 Entries = dict[int, NDArray[np.uint64]]
 """Log time and offset of every message in a chunk, (k, 2), by channel."""
+
+
+class NothingWrittenError(LogError):
+    """A log whose writer ended before anything was whole: nothing can be lost with it."""
 
 
 @dataclass
@@ -58,6 +38,7 @@ class DataSection:
 
     Attributes:
         summary: What is in it.
+        records: Its metadata records.
         end: Where it ends: behind the last whole record [bytes].
         closed: Whether a DataEnd record stands there.
         owed: Entries of the last chunk whose MessageIndex records are not all there.
@@ -65,7 +46,8 @@ class DataSection:
     """
 
     summary: Summary
-    end: int = len(MCAP0_MAGIC)
+    records: list[Metadata] = field(default_factory=list)
+    end: int = len(MAGIC)
     closed: bool = False
     owed: Entries = field(default_factory=dict)
     size: int = 0
@@ -83,6 +65,26 @@ class DataSection:
         return builder.end()
 
 
+def check_magic(stream: IO[bytes]) -> tuple[int, bool]:
+    """See to it that a file begins as MCAP files do.
+
+    Returns:
+        Its size [bytes], and whether it ends as a complete one does.
+
+    Raises:
+        NothingWrittenError: It is empty, or less than those bytes.
+        LogError: It is no MCAP file.
+    """
+    stream.seek(0)
+    found = stream.read(len(MAGIC))
+    if found != MAGIC:
+        kind = NothingWrittenError if MAGIC.startswith(found) else LogError
+        raise kind(f"not an MCAP file: {f'it begins with {found!r}' if found else 'it is empty'}")
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(size - len(MAGIC))
+    return size, size > len(MAGIC) and stream.read() == MAGIC
+
+
 def scan(stream: IO[bytes]) -> DataSection:
     """Read the data section from its beginning to its end or to where it is torn.
 
@@ -90,57 +92,42 @@ def scan(stream: IO[bytes]) -> DataSection:
         stream: An MCAP file.
 
     Raises:
-        LogError: Not an MCAP file, torn before its first record was whole, or damaged where it
-            cannot be torn: in a file that was closed, or in front of a chunk that is whole.
+        NothingWrittenError: Torn before its first record was whole.
+        LogError: Not an MCAP file, or damaged where it cannot be torn: in a file that was closed,
+            or in front of a chunk that is whole.
     """
-    magic = stream.read(len(MCAP0_MAGIC))
-    if magic != MCAP0_MAGIC:
-        found = f"it begins with {magic!r}" if magic else "it is empty"
-        raise LogError(f"not an MCAP file: {found}")
-    size = stream.seek(-len(MCAP0_MAGIC), os.SEEK_END) + len(MCAP0_MAGIC)
-    was_closed = size > len(MCAP0_MAGIC) and stream.read() == MCAP0_MAGIC
-    stream.seek(len(MCAP0_MAGIC))
+    size, was_closed = check_magic(stream)
     found, wrong = _Scan(), "it is cut off"
-    found.section.size = size
-    while (record := _record(stream, size)) is not None:
-        opcode, body = record
-        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-            found.section.closed = True
-            return found.section
+    section = found.section
+    section.size = size
+    for record in records(stream, section.end, size):
+        if record.opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            section.closed = True
+            return section
         try:
-            found.take(opcode, body)
-        except _DAMAGED as error:
-            wrong = str(error) or type(error).__name__
+            found.take(record)
+        except LogError as error:
+            wrong = str(error)
             break
-    place = found.section.end
-    if was_closed or _chunk_follows(stream, size):
+    if was_closed or _chunk_follows(stream, section.end, size):
         raise LogError(
-            f"the log is damaged in its middle: the record at byte {place} is not as it was"
+            f"the log is damaged in its middle: the record at byte {section.end} is not as it was"
             f" written: {wrong}"
         )
-    if place == len(MCAP0_MAGIC):
-        raise LogError(f"the log is truncated: none of its {size} bytes is a whole record")
-    return found.section
+    if section.end == len(MAGIC):
+        raise NothingWrittenError(
+            f"the log is truncated: none of its {size} bytes is a whole record"
+        )
+    return section
 
 
-def _record(stream: IO[bytes], size: int) -> tuple[int, bytes] | None:
-    """Opcode and content of the next record; None if it is not all there."""
-    head = stream.read(HEAD.size)
-    if len(head) < HEAD.size:
-        return None
-    opcode, length = HEAD.unpack(head)
-    if opcode == 0 or stream.tell() + length > size:
-        return None
-    return opcode, stream.read(length)
-
-
-def _chunk_follows(stream: IO[bytes], size: int) -> bool:
-    while (record := _record(stream, size)) is not None:
-        opcode, body = record
-        if opcode == Opcode.CHUNK:
+def _chunk_follows(stream: IO[bytes], start: int, size: int) -> bool:
+    """Whether a whole chunk stands behind the record at `start`."""
+    for record in records(stream, start, size):
+        if record.opcode == Opcode.CHUNK and record.offset > start:
             try:
-                _Scan().chunk(body)
-            except _DAMAGED:
+                unpacked(record)
+            except LogError:
                 continue
             return True
     return False
@@ -152,124 +139,61 @@ class _Scan:
     def __init__(self) -> None:
         self.section = DataSection(Summary())
 
-    def take(self, opcode: int, body: bytes) -> None:
-        """Account for one record; if it raises, nothing has changed."""
-        if opcode == Opcode.CHUNK:
-            self.chunk(body)
-        elif opcode == Opcode.MESSAGE_INDEX:
-            self._message_index(body)
-        elif opcode == Opcode.MESSAGE:
-            raise ValueError("a message outside of the chunks, which casadi_ik does not write")
-        elif opcode == Opcode.ATTACHMENT:
-            self._attachment(body)
-        elif opcode == Opcode.METADATA:
-            name = _read(Metadata, body).name
-            index = MetadataIndex(self.section.end, HEAD.size + len(body), name)
-            self.section.summary.metadata.append(index)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self._declare(opcode, body)
-        self.section.end += HEAD.size + len(body)
+    def take(self, record: Record) -> None:
+        """Account for one record.
 
-    def chunk(self, body: bytes) -> None:
-        """A chunk, unpacked and its checksum verified."""
-        chunk = _read(Chunk, body)
-        unpacked, length = get_chunk_data_stream(chunk, validate_crc=True)
-        data = unpacked.read(length)
-        if len(data) != chunk.uncompressed_size:
-            raise ValueError(f"{len(data)} bytes for {chunk.uncompressed_size}")
-        entries, declared = _walked(data)
-        for opcode, content in declared:
-            self._declare(opcode, content)
-        counts = self.section.summary.counts
+        Raises:
+            LogError: It is damaged or does not belong there; then nothing has changed.
+        """
+        section = self.section
+        if record.opcode == Opcode.CHUNK:
+            self._chunk(record)
+        elif record.opcode == Opcode.MESSAGE_INDEX:
+            self._message_index(record)
+        elif record.opcode == Opcode.ATTACHMENT:
+            attachment, length = parsed(Attachment, record), record.end - record.offset
+            index = attachment_index(attachment, record.offset, length)
+            section.summary.attachments.append(index)
+        elif record.opcode == Opcode.METADATA:
+            metadata = parsed(Metadata, record)
+            length = record.end - record.offset
+            section.summary.metadata.append(MetadataIndex(record.offset, length, metadata.name))
+            section.records.append(metadata)
+        elif record.opcode == Opcode.HEADER and record.offset == len(MAGIC):
+            parsed(Header, record)
+        elif record.opcode == Opcode.MESSAGE:
+            raise LogError("the messages are not in chunks, which casadi_ik does not read")
+        else:
+            self._declare(record)
+        section.end = record.end
+
+    def _chunk(self, record: Record) -> None:
+        chunk = unpacked(record)
+        for definition in chunk.definitions:
+            self._declare(definition)
+        entries, counts = chunk.entries(), self.section.summary.counts
         for channel, found in entries.items():
             counts[channel] = counts.get(channel, 0) + len(found)
         self.section.owed = entries
-        self.section.summary.chunks.append(
-            ChunkIndex(
-                chunk_length=HEAD.size + len(body),
-                chunk_start_offset=self.section.end,
-                compression=chunk.compression,
-                compressed_size=len(chunk.data),
-                message_end_time=chunk.message_end_time,
-                message_index_length=0,
-                message_index_offsets={},
-                message_start_time=chunk.message_start_time,
-                uncompressed_size=chunk.uncompressed_size,
-            )
-        )
+        self.section.summary.chunks.append(chunk.index)
 
-    def _message_index(self, body: bytes) -> None:
+    def _message_index(self, record: Record) -> None:
         """An index must say what the chunk before it holds."""
-        channel, size = _INDEX_HEAD.unpack_from(body)
-        found = np.frombuffer(body, "<u8", offset=_INDEX_HEAD.size).reshape(-1, 2)
+        if len(record.body) < _INDEX_HEAD.size or len(record.body) % _ENTRY != _INDEX_HEAD.size:
+            raise LogError(f"no message index at byte {record.offset}")
+        channel, size = _INDEX_HEAD.unpack_from(record.body)
+        found = np.frombuffer(record.body, "<u8", offset=_INDEX_HEAD.size).reshape(-1, 2)
         expected = self.section.owed.get(channel)
         in_order = found[np.argsort(found[:, 1], kind="stable")]
         if expected is None or size != found.nbytes or not np.array_equal(in_order, expected):
-            raise ValueError(f"the message index of channel {channel} is wrong")
+            raise LogError(f"the message index of channel {channel} is wrong")
         del self.section.owed[channel]
         chunk = self.section.summary.chunks[-1]
-        chunk.message_index_offsets[channel] = self.section.end
-        chunk.message_index_length += HEAD.size + len(body)
+        chunk.message_index_offsets[channel] = record.offset
+        chunk.message_index_length += HEAD.size + len(record.body)
 
-    def _attachment(self, body: bytes) -> None:
-        attachment = _read(Attachment, body)
-        self.section.summary.attachments.append(
-            AttachmentIndex(
-                offset=self.section.end,
-                length=HEAD.size + len(body),
-                log_time=attachment.log_time,
-                create_time=attachment.create_time,
-                data_size=len(attachment.data),
-                name=attachment.name,
-                media_type=attachment.media_type,
-            )
-        )
-
-    def _declare(self, opcode: int, body: bytes) -> None:
-        summary = self.section.summary
-        if opcode == Opcode.SCHEMA:
-            schema = _read(Schema, body)
-            summary.schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = _read(Channel, body)
-            summary.channels[channel.id] = channel
-
-
-def _walked(data: bytes) -> tuple[Entries, list[tuple[int, bytes]]]:
-    """Where the messages of a chunk are, and its other records."""
-    octets = np.frombuffer(data, np.uint8)
-    parts: dict[int, list[NDArray[np.uint64]]] = {}
-    declared: list[tuple[int, bytes]] = []
-    offset, most = 0, 1
-    while offset < len(data):
-        opcode, length = HEAD.unpack_from(data, offset)
-        size = HEAD.size + length
-        if offset + size > len(data):
-            raise ValueError("a record reaches beyond its chunk")
-        if opcode != Opcode.MESSAGE:
-            declared.append((opcode, data[offset + HEAD.size : offset + size]))
-            offset += size
-            continue
-        # Messages of one channel and size that follow each other are taken at once.
-        most = min(2 * most, (len(data) - offset) // size)
-        block = octets[offset : offset + most * size].reshape(most, size)
-        other = np.flatnonzero((block[:, :_SAME] != block[0, :_SAME]).any(axis=1))
-        count = int(other[0]) if len(other) else most
-        entries = np.empty((count, 2), np.uint64)
-        entries[:, 0] = np.ascontiguousarray(block[:count, _LOG_TIME]).view("<u8")[:, 0]
-        entries[:, 1] = offset + size * np.arange(count)
-        channel = int.from_bytes(data[offset + HEAD.size : offset + _SAME], "little")
-        parts.setdefault(channel, []).append(entries)
-        offset += count * size
-        most = max(count, 1)
-    return {channel: np.concatenate(found) for channel, found in parts.items()}, declared
-
-
-def _read(kind: type[Kind], body: bytes) -> Kind:
-    """A record that, written again, is the very same: lengths and checksums in it are right."""
-    record = kind.read(ReadDataStream(io.BytesIO(body)))
-    builder = RecordBuilder()
-    record.write(builder)
-    if builder.end()[HEAD.size :] != body:
-        raise ValueError(f"{kind.__name__} contradicts its own length or checksum")
-    return record
+    def _declare(self, record: Record) -> None:
+        if record.opcode == Opcode.SCHEMA:
+            self.section.summary.declare(parsed(Schema, record))
+        else:
+            self.section.summary.declare(parsed(Channel, record))

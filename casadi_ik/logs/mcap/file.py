@@ -5,28 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
-
-from mcap.data_stream import RecordBuilder
-from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
-from mcap.writer import MCAP0_MAGIC
 
 from casadi_ik.errors import LogError
 
@@ -119,98 +99,3 @@ class McapFile:
 
     def _failure(self, error: OSError) -> LogError:
         return LogError(f"{self.path}: cannot write the log: {error.strerror or error}")
-
-
-class Summary:
-    """What stands at the end of an MCAP file, collected while it grows.
-
-    Attributes:
-        schemas: By id.
-        channels: By id.
-        counts: Messages by channel id.
-        chunks: Index records.
-        attachments: Index records.
-        metadata: Index records.
-    """
-
-    def __init__(self) -> None:
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.counts: dict[int, int] = {}
-        self.chunks: list[ChunkIndex] = []
-        self.attachments: list[AttachmentIndex] = []
-        self.metadata: list[MetadataIndex] = []
-
-    def beginning(
-        self, profile: str, library: str, metadata: Metadata, attachments: Sequence[Attachment]
-    ) -> bytes:
-        """The first bytes of a file, up to the first chunk."""
-        builder = RecordBuilder()
-        builder.write(MCAP0_MAGIC)
-        Header(profile, library).write(builder)
-        offset = builder.count
-        metadata.write(builder)
-        self.metadata.append(MetadataIndex(offset, builder.count - offset, metadata.name))
-        for item in attachments:
-            offset = builder.count
-            item.write(builder)
-            self.attachments.append(
-                AttachmentIndex(
-                    offset=offset,
-                    length=builder.count - offset,
-                    log_time=item.log_time,
-                    create_time=item.create_time,
-                    data_size=len(item.data),
-                    name=item.name,
-                    media_type=item.media_type,
-                )
-            )
-        return builder.end()
-
-    def ending(self, position: int) -> bytes:
-        """The last bytes of a file, from the end of the data on.
-
-        Args:
-            position: Where in the file they will stand.
-        """
-        builder = RecordBuilder()
-        DataEnd(0).write(builder)
-        data_end = builder.end()
-        start = position + len(data_end)
-        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
-            (Opcode.SCHEMA, list(self.schemas.values())),
-            (Opcode.CHANNEL, list(self.channels.values())),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self.chunks),
-            (Opcode.ATTACHMENT_INDEX, self.attachments),
-            (Opcode.METADATA_INDEX, self.metadata),
-        ]
-        offsets = []
-        for opcode, records in groups:
-            offset = builder.count
-            for record in records:
-                record.write(builder)
-            if records:
-                offsets.append(SummaryOffset(opcode, start + offset, builder.count - offset))
-        offset_start = start + builder.count
-        for item in offsets:
-            item.write(builder)
-        summary = builder.end()
-        # The checksum covers the footer up to itself.
-        Footer(start, offset_start, 0).write(builder)
-        footer = builder.end()
-        Footer(start, offset_start, zlib.crc32(summary + footer[:-4])).write(builder)
-        return data_end + summary + builder.end() + MCAP0_MAGIC
-
-    def _statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=len(self.attachments),
-            channel_count=len(self.channels),
-            channel_message_counts=dict(self.counts),
-            chunk_count=len(self.chunks),
-            message_count=sum(self.counts.values()),
-            message_end_time=max((chunk.message_end_time for chunk in self.chunks), default=0),
-            message_start_time=min((chunk.message_start_time for chunk in self.chunks), default=0),
-            metadata_count=len(self.metadata),
-            schema_count=len(self.schemas),
-        )

@@ -13,7 +13,7 @@ import numpy as np
 
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs.mcap.cdr import Member, parse_members
+from casadi_ik.logs.mcap.records import check_size
 
 PACKAGE = "casadi_ik/msg"
 KINDS = ("iteration", "solve", "event")
@@ -22,8 +22,16 @@ KINDS = ("iteration", "solve", "event")
 ROS_TYPES = {"f8": "float64", "f4": "float32", "u4": "uint32", "i4": "int32", "u1": "uint8"}
 """How a layout's storage is called in ros2msg."""
 
+_STORAGE = {ros: dtype for dtype, ros in ROS_TYPES.items()}
+_AXES = 8
+"""A field has no more axes."""
+
 _ROS_NAME = re.compile(r"(?!.*__)(?!.*_\Z)[a-z][a-z0-9_]*\Z")
-_COMMENT = re.compile(r"(?:\((?P<shape>\d+(?:, \d+)*)\) )?\[(?P<unit>[^\]]*)\](?: (?P<doc>.*))?\Z")
+_CONSTANT = re.compile(r"[a-z]+[0-9]*\s+[A-Z][A-Z0-9_]*\s*=")
+_LINE = re.compile(r"(?P<type>[a-z]+[0-9]*)(?P<array>\[\d{1,9}\])?\s+(?P<name>[a-z]\w*)\Z")
+_COMMENT = re.compile(
+    r"(?:\((?P<shape>\d{1,9}(?:, \d{1,9})*)\) )?\[(?P<unit>[^\]]*)\](?: (?P<doc>.*))?\Z"
+)
 
 
 def topic(method: str, kind: str) -> str:
@@ -85,29 +93,39 @@ def schema_text(layout: Layout, labels: Mapping[str, tuple[str, ...]] | None = N
     return "\n".join(lines) + "\n"
 
 
-def parse_layout(schema: str) -> Layout:
+def parse_layout(text: str) -> Layout:
     """The layout that `schema_text` was given.
 
     Raises:
         LogError: Not such a text.
     """
-    storage = {ros: dtype for dtype, ros in ROS_TYPES.items()}
+    lines = (line.partition("#") for line in text.splitlines())
+    coded = ((code.strip(), comment.strip()) for code, _, comment in lines)
+    wanted = [each for each in coded if each[0] and not _CONSTANT.match(each[0])]
     try:
-        return Layout(tuple(_field(member, storage) for member in parse_members(schema)))
+        layout = Layout(tuple(_field(*each) for each in wanted))
+        widths = [np.dtype(item.dtype).itemsize for item in layout]
+        if not widths or widths != sorted(widths, reverse=True):
+            raise LogError("schema: its fields are not sorted by falling width, or there are none")
+        size = sum(item.size * width for item, width in zip(layout, widths, strict=True))
+        check_size("schema: a message", size)
     except InputError as error:
         raise LogError(f"schema: {error}") from error
+    return layout
 
 
-def _field(member: Member, storage: Mapping[str, str]) -> Field:
-    comment = _COMMENT.match(member.comment)
-    if member.type not in storage or member.length == -1 or comment is None:
-        raise LogError(f"field {member.name!r} is no part of a record layout")
-    shape = () if member.length is None else (member.length,)
-    if comment["shape"]:
-        shape = tuple(int(number) for number in comment["shape"].split(", "))
-    found = Field(member.name, shape, storage[member.type], comment["unit"], comment["doc"] or "")
-    if found.size != (1 if member.length is None else member.length):
-        raise LogError(f"field {member.name!r}: shape {shape} has not {member.length} elements")
+def _field(code: str, comment: str) -> Field:
+    """The field that a line of a schema describes."""
+    line, about = _LINE.match(code), _COMMENT.match(comment)
+    if line is None or line["type"] not in _STORAGE or about is None:
+        raise LogError(f"schema: the line {code[:60]!r} is no part of a record layout")
+    length = int(line["array"][1:-1]) if line["array"] else None
+    shape = () if length is None else (length,)
+    if about["shape"]:
+        shape = tuple(int(number) for number in about["shape"].split(", "))
+    found = Field(line["name"], shape, _STORAGE[line["type"]], about["unit"], about["doc"] or "")
+    if found.size != (1 if length is None else length) or len(shape) > _AXES:
+        raise LogError(f"schema: field {found.name!r}: its shape has not {length} elements")
     return found
 
 

@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.kernels.rows import opaque
-from casadi_ik.logs.clock import LogClock
-from casadi_ik.logs.mcap import bulk
-from casadi_ik.logs.mcap.cdr import NUMPY_TYPES, Codec
-from casadi_ik.logs.mcap.contents import read_attachment, read_contents, reading
-from casadi_ik.logs.mcap.schema import parse_layout, topic
-from casadi_ik.logs.provenance import CHECKSUM, METADATA_NAME, checksum
+from casadi_ik.logs.mcap import rows as messages
+from casadi_ik.logs.mcap.contents import Contents, read_attachment, read_contents, reading
+from casadi_ik.logs.mcap.data_section import NothingWrittenError
+from casadi_ik.logs.mcap.metadata import clock_of, own_record, values_of
+from casadi_ik.logs.mcap.schema import KINDS, topic
+from casadi_ik.logs.read.fields import NAME_LIMIT, Labels, described
 from casadi_ik.logs.read.table import Part
 
-_PARSED = ("packages", "machine", "parameters", "keep")
+
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """Messages of one kind of one method.
+
+    Attributes:
+        channel: Channel id.
+        layout: Fields of a row.
+        labels: Names that make a field readable.
+    """
+
+    channel: int
+    layout: Layout
+    labels: Labels
 
 
 class Shard:
@@ -31,7 +44,8 @@ class Shard:
     Attributes:
         path: The file.
         contents: Where in it what is.
-        metadata: Where it comes from.
+        record: Where it comes from, as it stands in the file.
+        metadata: The same, structured values as what they say.
         robot: Name of the robot.
         methods: What methods it holds.
         clock: Rule of its log times.
@@ -41,40 +55,32 @@ class Shard:
         """Look into the file.
 
         Raises:
+            NothingWrittenError: Its writer was killed before anything was whole.
             LogError: It is missing, no MCAP file, damaged, or no log of casadi_ik.
         """
         self.path = path
-        self.contents = read_contents(path)
-        records = self.contents.metadata
-        with reading(path):
-            if METADATA_NAME not in records:
-                raise LogError(
-                    f"not a log of casadi_ik: no metadata {METADATA_NAME!r} (found: "
-                    f"{', '.join(sorted(records)) or 'none'})"
-                )
-            record = records[METADATA_NAME]
-            if record.get(CHECKSUM) != checksum(record):
-                raise LogError("the log is damaged: its metadata fail their checksum")
-            if not self.contents.chunks and any(self.contents.counts.values()):
-                raise LogError("the messages are not in chunks, which casadi_ik does not read")
-            self.metadata: Mapping[str, Any] = {
-                key: json.loads(text) if key in _PARSED else text for key, text in record.items()
-            }
+        self.contents: Contents = read_contents(path)
+        with naming(path):
+            contents = self.contents
+            if not (contents.complete or contents.chunks or contents.records):
+                raise NothingWrittenError("the log is truncated before its metadata")
+            self.record: Mapping[str, str] = own_record(contents.records)
+            self.metadata: Mapping[str, Any] = values_of(self.record)
             self.robot: str = self.metadata["robot"]
-            self.clock = LogClock(int(self.metadata["t0_ns"]), int(self.metadata["slot_ns"]))
-            self._channels: dict[str, Channel] = {
-                channel.topic: channel for channel in self.contents.channels.values()
-            }
-            self.methods: tuple[str, ...] = tuple(
-                channel.metadata["method"]
-                for name, channel in self._channels.items()
-                if name.endswith("/iteration") and "method" in channel.metadata
-            )
+            self.clock = clock_of(self.metadata)
+            if not contents.chunks and any(contents.summary.counts.values()):
+                raise LogError("the messages are not in chunks, which casadi_ik does not read")
+            self._topics = self._described()
+            self.methods: tuple[str, ...] = tuple(dict.fromkeys(name for name, _ in self._topics))
+
+    def topic(self, method: str, kind: str) -> Topic:
+        """The messages of a kind of one of the `methods`."""
+        return self._topics[method, kind]
 
     def count(self, method: str, kind: str) -> int:
         """How many messages of a kind a method has; 0 if it is not in this file."""
-        channel = self._channels.get(topic(method, kind))
-        return 0 if channel is None else self.contents.counts.get(channel.id, 0)
+        found = self._topics.get((method, kind))
+        return 0 if found is None else self.contents.summary.counts.get(found.channel, 0)
 
     def attachment(self, name: str) -> bytes:
         """An attached file.
@@ -86,7 +92,7 @@ class Shard:
         for item in self.contents.attachments:
             if item.name == name:
                 with reading(self.path) as stream:
-                    return read_attachment(stream, item)
+                    return read_attachment(stream, item).data
         names = ", ".join(item.name for item in self.contents.attachments) or "none"
         raise UnknownNameError(f"{self.path}: no attachment {name!r}; attached: {names}")
 
@@ -109,48 +115,60 @@ class Shard:
             UnknownNameError: No such field.
             LogError: The file is damaged.
         """
+        found = self._topics[method, kind]
         with reading(self.path) as stream:
-            name = topic(method, kind)
-            if name not in self._channels:
-                raise LogError(f"no topic {name}")
-            channel = self._channels[name]
-            schema = self.contents.schemas[channel.schema_id]
-            labels = json.loads(channel.metadata.get("labels", "{}"))
-            layout = fixed_layout(schema)
-            wanted = self._wanted(channel.id, solves)
-            if layout is None:
-                times, rows = self._decoded(stream, wanted, schema)
-                if fields is not None:
-                    rows = rows[_known(fields, rows.dtype.names or ())]
-            else:
-                times, rows = self._fixed(stream, wanted, layout, fields)
-            if solves is None and len(times) != self.contents.counts.get(channel.id, 0):
-                raise LogError(f"{len(times)} messages on {name}, but the summary counts others")
-        return Part(
-            method,
-            rows,
-            *self.clock.locate(times),
-            {key: tuple(names) for key, names in labels.items()},
-            {} if layout is None else {item.name: item.unit for item in layout},
-        )
+            times, rows = self._rows(stream, found, solves, fields)
+            if solves is None and len(times) != self.count(method, kind):
+                raise LogError(
+                    f"{len(times)} messages on {topic(method, kind)!r}, but the summary counts"
+                    f" {self.count(method, kind)}"
+                )
+            solve_id, iteration = self.clock.locate(times)
+            if len(solve_id) and (solve_id.min() < 0 or solve_id.max() >= 2**32):
+                raise LogError(f"{topic(method, kind)!r}: a message before the log began, or late")
+            if "solve_id" in (rows.dtype.names or ()) and np.any(rows["solve_id"] != solve_id):
+                raise LogError(f"{topic(method, kind)!r}: a solve's number is not that of its time")
+        units = {item.name: item.unit for item in found.layout}
+        return Part(method, rows, solve_id, iteration, found.labels, units)
 
-    def _fixed(
+    def _described(self) -> dict[tuple[str, str], Topic]:
+        """The topics by method and kind.
+
+        Raises:
+            LogError: One is missing, or is not such as a log of ours has.
+        """
+        summary = self.contents.summary
+        by_name = {channel.topic: channel for channel in summary.channels.values()}
+        found: dict[tuple[str, str], Topic] = {}
+        for channel in summary.channels.values():
+            method = channel.metadata.get("method")
+            if method is None or channel.topic != topic(method, KINDS[0]):
+                continue
+            if not (0 < len(method) <= NAME_LIMIT):
+                raise LogError(f"a method's name has {len(method)} characters")
+            for kind in KINDS:
+                own = by_name.get(topic(method, kind))
+                if own is None or own.schema_id not in summary.schemas:
+                    raise LogError(f"no topic {topic(method, kind)!r}, or no schema of it")
+                layout, labels = described(kind, own, summary.schemas[own.schema_id])
+                found[method, kind] = Topic(own.id, layout, labels)
+        return found
+
+    def _rows(
         self,
         stream: IO[bytes],
-        wanted: bulk.Wanted,
-        layout: Layout,
+        found: Topic,
+        solves: NDArray[np.int64] | None,
         fields: Sequence[str] | None,
     ) -> tuple[NDArray[np.uint64], NDArray[Any]]:
-        """Log times and rows of a channel whose messages are of fixed size."""
-        dtype = layout.dtype
-        chosen = dtype
+        """Log times and rows."""
+        dtype = chosen = found.layout.dtype
         if fields is not None:
-            known = _known(fields, layout.names)
-            chosen = np.dtype(
-                [(item.name, "<" + item.dtype, item.shape) for item in layout if item.name in known]
-            )
+            known = _known(fields, found.layout.names)
+            chosen = np.dtype(_columns(found.layout, known))
         times, parts = [np.zeros(0, np.uint64)], [np.zeros(0, chosen)]
-        for log_times, rows in bulk.rows(stream, self.contents, wanted, dtype):
+        wanted = self._wanted(found.channel, solves)
+        for log_times, rows in messages.rows(stream, self.contents.chunks, wanted, dtype):
             times.append(log_times)
             if fields is None:
                 parts.append(rows)
@@ -161,29 +179,26 @@ class Shard:
             parts.append(part)
         return np.concatenate(times), np.concatenate(list(map(opaque, parts))).view(chosen)
 
-    def _decoded(
-        self, stream: IO[bytes], wanted: bulk.Wanted, schema: Schema
-    ) -> tuple[NDArray[np.uint64], NDArray[Any]]:
-        """The same of a channel with another layout, message by message."""
-        codec = Codec(schema.data.decode())
-        found = list(bulk.decoded(stream, self.contents, wanted, codec))
-        rows = np.empty(len(found), [_column(member) for member in codec.members])
-        for i, (_, values) in enumerate(found):
-            for name, value in values.items():
-                rows[name][i] = value
-        return np.array([time for time, _ in found], np.uint64), rows
-
-    def _wanted(self, channel: int, solves: NDArray[np.int64] | None) -> bulk.Wanted:
+    def _wanted(self, channel: int, solves: NDArray[np.int64] | None) -> messages.Wanted:
         if solves is None:
-            return bulk.Wanted(channel)
+            return messages.Wanted(channel)
 
         def chunk(first: int, last: int) -> bool:
             low, high = self.clock.locate(np.array([first, last], np.uint64))[0]
             return bool(np.searchsorted(solves, low) < np.searchsorted(solves, high, "right"))
 
-        return bulk.Wanted(
+        return messages.Wanted(
             channel, chunk, lambda times: in_solves(self.clock.locate(times)[0], solves)
         )
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Put the file's name before what is wrong with it."""
+    try:
+        yield
+    except LogError as error:
+        raise type(error)(f"{path}: {error}") from error
 
 
 def in_solves(numbers: NDArray[np.int64], solves: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -194,16 +209,6 @@ def in_solves(numbers: NDArray[np.int64], solves: NDArray[np.int64]) -> NDArray[
     return solves[place] == numbers
 
 
-def fixed_layout(schema: Schema) -> Layout | None:
-    """The layout of messages of fixed size without padding; None if the schema has another."""
-    try:
-        layout = parse_layout(schema.data.decode())
-    except LogError:
-        return None
-    widths = [np.dtype(item.dtype).itemsize for item in layout]
-    return layout if widths == sorted(widths, reverse=True) else None
-
-
 def _known(fields: Sequence[str], names: Sequence[str]) -> list[str]:
     for name in fields:
         if name not in names:
@@ -211,9 +216,6 @@ def _known(fields: Sequence[str], names: Sequence[str]) -> list[str]:
     return list(fields)
 
 
-def _column(member: Any) -> tuple[Any, ...]:
-    """How a message member is kept: as numbers if their count is fixed, else as objects."""
-    if member.type == "string" or member.length == -1:
-        return member.name, object
-    shape = () if member.length is None else (member.length,)
-    return member.name, NUMPY_TYPES[member.type], shape
+def _columns(layout: Layout, names: Sequence[str]) -> list[tuple[str, str, tuple[int, ...]]]:
+    """The chosen fields as numpy describes them, in the order of the log."""
+    return [(item.name, "<" + item.dtype, item.shape) for item in layout if item.name in names]

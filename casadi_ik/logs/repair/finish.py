@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 import os
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from mcap.exceptions import McapError
-from mcap.records import Footer
-from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC
-
 from casadi_ik.errors import LogError
-from casadi_ik.logs.mcap.data_section import HEAD, DataSection, scan
+from casadi_ik.logs.mcap.data_section import DataSection, check_magic, scan
+from casadi_ik.logs.mcap.summary import read_summary
 
 try:
     import fcntl
 except ImportError:  # Windows: no lock
     fcntl = None
-
-_FOOTER_SIZE = HEAD.size + 20
-
-_UNCHECKED = 4
-"""Bytes at the footer's end that its checksum does not cover: the checksum."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +59,7 @@ def finish_log(path: str | os.PathLike[str]) -> Finished:
         reason = error.strerror or str(error)
         raise LogError(f"{path}: cannot finish the log: {reason}") from error
     except LogError as error:
-        raise LogError(f"{path}: {error}") from error
+        raise type(error)(f"{path}: {error}") from error
     summary = section.summary
     return Finished(path, not whole, len(summary.chunks), sum(summary.counts.values()), cut)
 
@@ -102,18 +92,11 @@ def _locked(stream: IO[bytes]) -> bool:
 
 
 def _ends_well(stream: IO[bytes], section: DataSection) -> bool:
-    """Whether summary, footer and magic stand behind the data section and match their checksum."""
-    stream.seek(section.end)
-    tail = stream.read()
-    magic = len(MCAP0_MAGIC)
-    if len(tail) < _FOOTER_SIZE + magic or tail[-magic:] != MCAP0_MAGIC:
+    """Whether a summary that matches its checksum stands behind the data, and says what they do."""
+    if not check_magic(stream)[1]:
         return False
-    stream.seek(-(_FOOTER_SIZE + magic), os.SEEK_END)
     try:
-        footer = next(StreamReader(stream, skip_magic=True).records)
-    except (McapError, ValueError):
+        summary, start = read_summary(stream)
+    except LogError:
         return False
-    if not isinstance(footer, Footer) or footer.summary_start < section.end:
-        return False
-    checked = tail[footer.summary_start - section.end : -magic - _UNCHECKED]
-    return not footer.summary_crc or zlib.crc32(checked) == footer.summary_crc
+    return start >= section.end and summary.chunks == section.summary.chunks

@@ -15,34 +15,24 @@ from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import (
-    Attachment,
-    Channel,
-    ChunkIndex,
-    Header,
-    Metadata,
-    Schema,
-)
-from mcap.summary import Summary as Found
-from mcap.writer import MCAP0_MAGIC
+from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
 
 from casadi_ik.errors import LogError
 from casadi_ik.files.writing import written_whole
-from casadi_ik.logs.clock import LogClock
 from casadi_ik.logs.mcap.chunk import definitions
-from casadi_ik.logs.mcap.data_section import HEAD
-from casadi_ik.logs.mcap.file import Summary
-from casadi_ik.logs.provenance import CHECKSUM, METADATA_NAME, checksum
+from casadi_ik.logs.mcap.clock import LogClock
+from casadi_ik.logs.mcap.contents import read_attachment, reading
+from casadi_ik.logs.mcap.metadata import CHECKSUM, METADATA_NAME, checksum
+from casadi_ik.logs.mcap.records import HEAD
+from casadi_ik.logs.mcap.summary import Summary
+from casadi_ik.logs.mcap.unpacking import read_chunk
+from casadi_ik.logs.read.shard import Shard, naming
 
 VARYING = ("created", "machine", "python", "packages", "code_version", "compression")
 """What may differ between shards; what does is kept in the metadata, shard by shard."""
 
 Declared = TypeVar("Declared", Schema, Channel)
-
-_UNREADABLE = (McapError, ValueError, OverflowError, LookupError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -68,8 +58,7 @@ class Merged:
 class _Shard:
     path: Path
     stream: IO[bytes]
-    header: Header
-    summary: Found
+    summary: Summary
     metadata: Mapping[str, str]
     attachments: tuple[Attachment, ...]
 
@@ -110,31 +99,13 @@ def merge_logs(shards: Sequence[str | os.PathLike[str]], target: str | os.PathLi
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Shard]:
-    try:
-        stream = path.open("rb")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise LogError(f"{path}: cannot read the log: {reason}") from error
-    with stream:
-        try:
-            if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                raise LogError(f"{path}: not an MCAP file")
-            stream.seek(0)
-            reader = SeekingReader(stream, validate_crcs=True)
-            header, summary = reader.get_header(), reader.get_summary()
-            records = {record.name: record.metadata for record in reader.iter_metadata()}
-            attachments = tuple(reader.iter_attachments())
-        except OSError as error:
-            raise LogError(f"{path}: cannot read the log: {error.strerror}") from error
-        except _UNREADABLE as error:
-            raise LogError(
-                f"{path}: the log is truncated or damaged (`casadi-ik log finish` repairs what"
-                " was torn)"
-            ) from error
-        if summary is None or METADATA_NAME not in records:
-            raise LogError(f"{path}: not a log of casadi_ik: no metadata {METADATA_NAME!r}")
-        metadata = records[METADATA_NAME]
-        yield _Shard(path, stream, header, summary, metadata, attachments)
+    shard = Shard(path)
+    if not shard.contents.complete:
+        raise LogError(f"{path}: not finished (`casadi-ik log finish` repairs what was torn)")
+    with reading(path) as stream:
+        attachments = tuple(read_attachment(stream, item) for item in shard.contents.attachments)
+    with path.open("rb") as stream:
+        yield _Shard(path, stream, shard.contents.summary, shard.record, attachments)
 
 
 def _joint_metadata(shards: Sequence[_Shard]) -> dict[str, str]:
@@ -193,26 +164,20 @@ def _joint_solves(shards: Sequence[_Shard], clock: LogClock) -> dict[str, int]:
 
 
 def _solves_of(shard: _Shard, clock: LogClock) -> dict[str, set[int]]:
-    """Numbers of the solves by method, from the message index."""
+    """Numbers of the solves by method."""
     found: dict[str, set[int]] = {}
-    for channel in shard.summary.channels.values():
-        if "method" not in channel.metadata:
-            continue
-        numbers = found.setdefault(channel.metadata["method"], set())
-        for chunk in shard.summary.chunk_indexes:
-            if channel.id in chunk.message_index_offsets:
-                times = _index_times(shard, chunk.message_index_offsets[channel.id])
-                numbers.update(np.unique(clock.locate(times)[0]).tolist())
+    methods = {
+        channel.id: channel.metadata["method"]
+        for channel in shard.summary.channels.values()
+        if "method" in channel.metadata
+    }
+    for index in shard.summary.chunks:
+        with naming(shard.path):
+            chunk = read_chunk(shard.stream, index)
+        for run in chunk.runs:
+            numbers = found.setdefault(methods[run.channel], set())
+            numbers.update(np.unique(clock.locate(run.log_time)[0]).tolist())
     return found
-
-
-def _index_times(shard: _Shard, position: int) -> np.ndarray:
-    """Log times of a MessageIndex record, (k,) uint64 [ns]."""
-    shard.stream.seek(position)
-    opcode, length = HEAD.unpack(shard.stream.read(HEAD.size))
-    if opcode != Opcode.MESSAGE_INDEX or length % 16 != 6:
-        raise LogError(f"{shard.path}: no message index at byte {position}")
-    return np.frombuffer(shard.stream.read(length)[6:], "<u8").reshape(-1, 2)[:, 0]
 
 
 def _joint_summary(shards: Sequence[_Shard]) -> Summary:
@@ -221,9 +186,8 @@ def _joint_summary(shards: Sequence[_Shard]) -> Summary:
     for shard in shards:
         _unite(shard, shards[0], joint.channels, shard.summary.channels)
         _unite(shard, shards[0], joint.schemas, shard.summary.schemas)
-        if shard.summary.statistics is not None:
-            for channel, count in shard.summary.statistics.channel_message_counts.items():
-                joint.counts[channel] = joint.counts.get(channel, 0) + count
+        for channel, count in shard.summary.counts.items():
+            joint.counts[channel] = joint.counts.get(channel, 0) + count
     return joint
 
 
@@ -263,11 +227,10 @@ def _write(
     metadata: dict[str, str],
     attachments: Sequence[Attachment],
 ) -> None:
-    header = shards[0].header
-    record = Metadata(METADATA_NAME, metadata)
-    stream.write(summary.beginning(header.profile, header.library, record, attachments))
+    record, library = Metadata(METADATA_NAME, metadata), f"casadi_ik {metadata['code_version']}"
+    stream.write(summary.beginning("ros2", library, record, attachments))
     stream.write(definitions([*summary.schemas.values()], [*summary.channels.values()]))
-    pairs = [(index, shard) for shard in shards for index in shard.summary.chunk_indexes]
+    pairs = [(index, shard) for shard in shards for index in shard.summary.chunks]
     for index, shard in sorted(pairs, key=lambda pair: pair[0].message_start_time):
         summary.chunks.append(_copy(stream, shard, index))
     stream.write(summary.ending(stream.tell()))

@@ -10,8 +10,9 @@ from mcap.records import Channel, Schema
 
 from casadi_ik.errors import LogError
 from casadi_ik.logs.mcap.chunk import Run, chunk_bytes, definitions
-from casadi_ik.logs.mcap.file import McapFile, Summary
+from casadi_ik.logs.mcap.file import McapFile
 from casadi_ik.logs.mcap.message import fill
+from casadi_ik.logs.mcap.summary import Summary
 from casadi_ik.logs.write.messages import Messages
 
 CHUNK_SIZE = 2**21
@@ -108,9 +109,8 @@ class ChunkStream:
                 fill(data[start:stop], channel, part.rows, part.sequence, *times)
                 start = stop
             if start > first:
-                offsets = np.arange(first, start, parts[0].size, dtype=np.uint64)
                 log_time = np.concatenate([part.log_time for part in parts])
-                runs.append(Run(channel, log_time, offsets))
+                runs.append(Run(channel, first, parts[0].size, log_time))
         self._waiting, self._size, self._new = [], 0, ([], [])
         return data, runs
 

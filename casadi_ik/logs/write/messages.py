@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.logs.clock import LogClock
+from casadi_ik.logs.mcap.clock import LogClock
 from casadi_ik.logs.mcap.message import HEAD
 from casadi_ik.problem.recorder import SolveBlock
 

@@ -21,17 +21,19 @@ import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from casadi_ik.errors import LogError
-from casadi_ik.logs.clock import LogClock
 from casadi_ik.logs.events.detect import detect_events
 from casadi_ik.logs.events.kinds import SINGULAR, EventKind, event_format
 from casadi_ik.logs.events.rules import EventRules
 from casadi_ik.logs.mcap import schema
 from casadi_ik.logs.mcap.chunk import COMPRESSORS
-from casadi_ik.logs.mcap.file import McapFile, Summary
-from casadi_ik.logs.provenance import METADATA_NAME, log_metadata
+from casadi_ik.logs.mcap.clock import LogClock
+from casadi_ik.logs.mcap.file import McapFile
+from casadi_ik.logs.mcap.metadata import METADATA_NAME
+from casadi_ik.logs.mcap.summary import Summary
 from casadi_ik.logs.write.chunk_stream import ChunkStream
 from casadi_ik.logs.write.keep import Keep
 from casadi_ik.logs.write.messages import block_messages
+from casadi_ik.logs.write.provenance import log_metadata
 from casadi_ik.logs.write.solve_rows import solve_format, solve_rows
 from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.trace import TraceFormat

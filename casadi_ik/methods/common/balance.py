@@ -17,7 +17,9 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
-from casadi_ik.methods.common.contact_fit import LENGTH, Tried
+from casadi_ik.methods.common.contact_fit import Tried
+from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts.rows import ContactRows, chord
 from casadi_ik.symbolic.smooth import Expr
 
 POWERS = (4.0, 10.0, 24.0, 60.0, 150.0, 400.0)
@@ -58,7 +60,7 @@ class Balanced:
     """A step that was tried and what comes of it.
 
     Attributes:
-        tried: The step, with the residuals of `weighted_residual`.
+        tried: The step, with the residuals of the contacts.
         q: (n, 1) where it leads, or where it began if it gained nothing.
         accepted: Whether it gained.
         within: Whether every contact is met at q.
@@ -74,9 +76,9 @@ class Balanced:
     fit: dict[str, Expr]
 
 
-def worth_balancing(residual: Expr, f: int, p: dict[str, Expr]) -> Expr:
-    """Whether the contacts of a `weighted_residual` are missed, but by little."""
-    largest = ca.mmax(_lengths(_scaled(residual, p), f))
+def worth_balancing(residual: Expr, rows: ContactRows, p: dict[str, Expr]) -> Expr:
+    """Whether the contacts of a residual are missed, but by little."""
+    largest = ca.mmax(_lengths(_scaled(residual, rows, p), rows))
     return ca.logic_and(largest > 1, largest < NEAR)
 
 
@@ -89,46 +91,45 @@ def balance_step(
     residual: Callable[[Expr], Expr],
     jacobian: Expr,
     bounds: Bounded,
-    f: int,
+    contacts: ContactRows,
     s: dict[str, Expr],
     p: dict[str, Expr],
 ) -> Balanced:
     """One step.
 
     Args:
-        residual: Coordinates (n, 1) -> `weighted_residual` (6 f, 1).
-        jacobian: (6 f, n) its Jacobian at the bounds' value.
+        residual: Coordinates (n, 1) -> residual (size, 1) of the contacts.
+        jacobian: (size, n) its Jacobian at the bounds' value.
         bounds: Of all coordinates, and where the step begins.
-        f: Number of fingers.
+        contacts: Their rows.
         s: State with damping, power (how many of `POWERS` are done) and spent.
         p: Parameters.
     """
     before = residual(bounds.value)
-    scaled = _scaled(before, p)
-    parts = _lengths(scaled, f)
+    scaled = _scaled(before, contacts, p)
+    parts = _lengths(scaled, contacts)
     largest = ca.fmax(ca.mmax(parts), TINY)
     power = sum(
         (ca.if_else(s["power"] == i, value, 0.0) for i, value in enumerate(POWERS)), ca.SX(0)
     )
     weights = (parts / largest) ** (power - 2)
-    rows = ca.sqrt(_each(weights))
-    slopes = _scaled(jacobian, p)
-    along = [
-        ca.sqrt(weights[i] * (power - 2)) / ca.fmax(parts[i], TINY) * _three(scaled, i).T
-        for i in range(2 * f)
+    rows = ca.sqrt(_each(weights, contacts))
+    slopes = _scaled(jacobian, contacts, p)
+    stretched = [
+        ca.sqrt(weights[i] * (power - 2)) / ca.fmax(parts[i], TINY) * scaled[own].T @ slopes[own, :]
+        for i, own in enumerate(contacts.slices)
     ]
-    stretched = ca.vertcat(*(along[i] @ _three(slopes, i) for i in range(2 * f)))
     damping = DAMPING * s["damping"]
     damped = damped_step(
-        ca.vertcat(rows * slopes, stretched),
-        ca.vertcat(rows * scaled, ca.SX.zeros(2 * f, 1)),
+        ca.vertcat(rows * slopes, *stretched),
+        ca.vertcat(rows * scaled, ca.SX.zeros(len(stretched), 1)),
         damping,
         bounds,
         PASSES,
     )
     reached = clip(bounds.value + damped.step, bounds)
     there = residual(reached)
-    parts_there = _lengths(_scaled(there, p), f)
+    parts_there = _lengths(_scaled(there, contacts, p), contacts)
     # Bounded, since a large number to a high power is none.
     grown = ca.fmin(parts_there / largest, FARTHEST)
     total, total_there = ca.dot(weights, parts**2), ca.dot(grown ** (power - 2), parts_there**2)
@@ -155,22 +156,17 @@ def balance_step(
     )
 
 
-def _scaled(rows: Expr, p: dict[str, Expr]) -> Expr:
-    """Rows (6 f, k) of `weighted_residual` as parts of the tolerances."""
-    chord = 2 * ca.sin(p["angle_tolerance"] / 2)
-    allowed = ca.vertcat(p["position_tolerance"] / LENGTH, chord)
-    return rows / _each(ca.fmax(allowed, TINY))
+def _scaled(values: Expr, contacts: ContactRows, p: dict[str, Expr]) -> Expr:
+    """Rows (size, k) of the contacts as parts of the tolerances."""
+    allowed = ca.vertcat(p["position_tolerance"] / LENGTH, chord(p["angle_tolerance"]))
+    return values / _each(ca.fmax(allowed, TINY), contacts)
 
 
-def _each(values: Expr) -> Expr:
-    """Every value three times: (2 f, 1) -> (6 f, 1)."""
-    return ca.vertcat(*(ca.repmat(values[i], 3, 1) for i in range(values.numel())))
+def _each(values: Expr, contacts: ContactRows) -> Expr:
+    """A value for each place and facing (2 f, 1) as one for each of its rows (size, 1)."""
+    sizes = [own.stop - own.start for own in contacts.slices]
+    return ca.vertcat(*(ca.repmat(values[i], size, 1) for i, size in enumerate(sizes)))
 
 
-def _three(rows: Expr, i: int) -> Expr:
-    """The rows of one point or normal."""
-    return rows[3 * i : 3 * i + 3, :]
-
-
-def _lengths(scaled: Expr, f: int) -> Expr:
-    return ca.vertcat(*(ca.norm_2(_three(scaled, i)) for i in range(2 * f)))
+def _lengths(scaled: Expr, contacts: ContactRows) -> Expr:
+    return ca.vertcat(*(ca.norm_2(scaled[own]) for own in contacts.slices))

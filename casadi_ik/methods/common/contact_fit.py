@@ -6,16 +6,13 @@ what the linear model promised (Nielsen 1999: Damping parameter in Marquardt's m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 
+from casadi_ik.problem.contacts.rows import ContactRows, chord, within_tolerance
 from casadi_ik.symbolic.smooth import Expr
-
-LENGTH = 0.1
-"""Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
 
 DAMPING_START = 1e-3
 DAMPING_FLOOR = 1e-12
@@ -81,12 +78,15 @@ class Judged:
     fit: dict[str, Expr]
 
 
-def judge_contacts(s: dict[str, Expr], p: dict[str, Expr], tried: Tried, f: int) -> Judged:
-    """Judge a step by the contacts of f fingers; see `judge`."""
+def judge_contacts(
+    s: dict[str, Expr], p: dict[str, Expr], tried: Tried, rows: ContactRows
+) -> Judged:
+    """Judge a step by the contacts, its residuals those of `rows`; see `judge`."""
     residual = ca.if_else(gains(tried), tried.there, tried.before)
-    positions, chords = errors(residual, f)
-    exact = within_tolerance(positions / FINE, chords / FINE, p)
-    return judge(s, tried, within_tolerance(positions, chords, p), exact)
+    positions, chords = rows.errors(residual)
+    tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
+    exact = within_tolerance(positions / FINE, chords / FINE, *tolerances)
+    return judge(s, tried, within_tolerance(positions, chords, *tolerances), exact)
 
 
 def gains(tried: Tried) -> Expr:
@@ -132,40 +132,3 @@ def judge(s: dict[str, Expr], tried: Tried, within: Expr, exact: Expr) -> Judged
 def fresh_fit() -> dict[str, float]:
     """Counters and damping of a fit that begins."""
     return {"damping": DAMPING_START, "growth": GROWTH_START, "waited": 0.0, "spent": 0.0}
-
-
-def weighted_residual(position: Sequence[Expr], normal: Sequence[Expr], weights: Expr) -> Expr:
-    """Residual (6 f, 1) of all contacts: positions by `LENGTH`, then normals.
-
-    Args:
-        position: Per finger (3, k) rows in metres (an error, or its Jacobian).
-        normal: Per finger (3, k) rows.
-        weights: (f, 2) 1 where the contact (its normal) counts, 0 where it is free.
-    """
-    rows = [position[i] / LENGTH * weights[i, 0] for i in range(len(position))]
-    rows += [normal[i] * weights[i, 1] for i in range(len(normal))]
-    return ca.vertcat(*rows)
-
-
-def errors(residual: Expr, f: int) -> tuple[Expr, Expr]:
-    """Distances [m] and chords of a residual of `weighted_residual`, each (f, 1)."""
-    positions = [ca.norm_2(residual[3 * i : 3 * i + 3]) * LENGTH for i in range(f)]
-    chords = [ca.norm_2(residual[3 * (f + i) : 3 * (f + i) + 3]) for i in range(f)]
-    return ca.vertcat(*positions), ca.vertcat(*chords)
-
-
-def within_tolerance(positions: Expr, normals: Expr, p: dict[str, Expr]) -> Expr:
-    """Whether every contact is met.
-
-    Args:
-        positions: (f, 1) distances [m], zero where free.
-        normals: (f, 1) lengths of the difference of the unit normals, zero where free.
-        p: Parameters.
-
-    Returns:
-        Boolean; an angle is compared through the chord 2 sin(angle / 2).
-    """
-    chord = 2 * ca.sin(p["angle_tolerance"] / 2)
-    return ca.logic_and(
-        ca.mmax(positions - p["position_tolerance"]) <= 0, ca.mmax(normals - chord) <= 0
-    )

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.recipe import recipe
-
-LENGTH = 0.1
-"""Distances are divided by this [m], so that they weigh like the cosines."""
+from casadi_ik.problem.contacts.conditions import LENGTH
 
 
 def contact_shape(f: int, scales: Sequence[float] | NDArray = ()) -> FunctionGraph:
@@ -49,8 +47,9 @@ def _build(name: str, f: int, factors: tuple[float, ...]) -> ca.Function:
     for i, j in permutations(range(f), 2):
         values.append(ca.dot(points[j, :] - points[i, :], normals[i, :]) / LENGTH)
     for i, j, m in combinations(range(f), 3):
-        across = ca.cross(points[j, :] - points[i, :], points[m, :] - points[i, :])
-        values += [ca.dot(across, normals[k, :]) / LENGTH**2 for k in (i, j, m)]
+        one, other = points[j, :] - points[i, :], points[m, :] - points[i, :]
+        across = ca.cross(one, other) / ca.fmax(ca.norm_2(one) * ca.norm_2(other), 1e-12)
+        values += [ca.dot(across, normals[k, :]) for k in (i, j, m)]
     invariants = ca.vertcat(*values) if values else ca.SX(float("nan"))
     if not factors:
         return ca.Function(name, [points, normals], [invariants])

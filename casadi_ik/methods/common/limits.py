@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import casadi as ca
+import numpy as np
 
+from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.trace import WORD
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
@@ -13,6 +15,11 @@ def kept_within(robot: RobotDescription, q: Expr, enforce: Expr) -> Expr:
     """Move q (n, 1) into the limits where `enforce` is 1; leave it as it is where it is 0."""
     lower, upper = ca.DM(robot.lower.tolist()), ca.DM(robot.upper.tolist())
     return ca.if_else(enforce > 0, ca.fmin(ca.fmax(q, lower), upper), q)
+
+
+def starts_within(robot: RobotDescription, problems: Problems, q0: Array) -> Array:
+    """Starts (k, n), moved into the limits where the targets enforce them."""
+    return np.clip(q0, robot.lower, robot.upper) if problems.enforce_limits else q0
 
 
 def limit_mask(robot: RobotDescription, q: Expr) -> Expr:

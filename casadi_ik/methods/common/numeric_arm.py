@@ -10,8 +10,9 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
-from casadi_ik.methods.common.contact_fit import LENGTH, Tried
+from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.methods.common.even_spread import evenly
+from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.kinematics import Pose

@@ -6,26 +6,29 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from casadi_ik.methods.common.contact_fit import LENGTH
+from casadi_ik.problem.contacts.conditions import LENGTH, Rates, Vectors
+from casadi_ik.problem.contacts.rows import ContactRows, tip_rates, tip_vectors
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.alignment import align
 from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.so3 import skew
 
 
 @dataclass(frozen=True, eq=False)
 class HandContacts:
-    """Contacts of a hand posture in the palm frame: per finger point (3, 1) [m], normal (3, 1)."""
+    """Fingertips of a hand posture in the palm frame, and what moves them.
 
-    points: list[Expr]
-    normals: list[Expr]
-    point_jacobians: list[Expr]
-    normal_jacobians: list[Expr]
+    Attributes:
+        tips: Per finger.
+        rates: Jacobians over the hand's actuators.
+    """
+
+    tips: list[Vectors]
+    rates: list[Rates]
 
 
 def hand_contacts(robot: RobotDescription, hand: Expr, columns: tuple[int, ...]) -> HandContacts:
-    """Contacts and their Jacobians (3, k) over the hand's actuators, in the palm frame.
+    """Fingertips and their Jacobians (3, k) over the hand's actuators, in the palm frame.
 
     Args:
         robot: The description.
@@ -38,37 +41,43 @@ def hand_contacts(robot: RobotDescription, hand: Expr, columns: tuple[int, ...])
         q[column] = hand[i]
     body = actuated(robot, q)
     palm = body.kinematics.palm
-    points, normals, point_jacobians, normal_jacobians = [], [], [], []
+    tips, rates = [], []
     for name in robot.finger_names:
-        point, normal = body.kinematics.contact(name)
-        linear, angular = body.contact_jacobian(name, columns)
-        points.append(palm.inverse_apply(point))
-        normals.append(palm.rotation.T @ normal)
-        point_jacobians.append(ca.sparsify(palm.rotation.T @ linear))
-        normal_jacobians.append(ca.sparsify(palm.rotation.T @ (-skew(normal) @ angular)))
-    return HandContacts(points, normals, point_jacobians, normal_jacobians)
+        tip = tip_vectors(body.kinematics, name)
+        turned = {key: palm.rotation.T @ axis for key, axis in tip.items() if key != "point"}
+        tips.append({"point": palm.inverse_apply(tip["point"]), **turned})
+        rates.append(
+            {
+                key: ca.sparsify(palm.rotation.T @ rate)
+                for key, rate in tip_rates(body, name, columns).items()
+            }
+        )
+    return HandContacts(tips, rates)
 
 
-def best_palm(contacts: HandContacts, p: dict[str, Expr]) -> tuple[Expr, Expr]:
+def best_palm(contacts: HandContacts, rows: ContactRows, p: dict[str, Expr]) -> tuple[Expr, Expr]:
     """The palm pose that brings a given posture closest to the contacts.
+
+    A line or a plane is taken for the point it goes through.
 
     Returns:
         rotation (3, 3) and origin (3, 1) [m], base frame.
     """
-    f = len(contacts.points)
-    total = ca.fmax(ca.sum1(p["weights"][:, 0]), 1e-12)
-    target_centre = sum(
-        (p["weights"][i, 0] * p["points"][i, :].T for i in range(f)), ca.SX.zeros(3, 1)
-    )
+    goals, weights = rows.goals(p), p["weights"]
+    f = len(goals)
+    total = ca.fmax(ca.sum1(weights[:, 0]), 1e-12)
+    target_centre = sum((weights[i, 0] * goals[i]["point"] for i in range(f)), ca.SX.zeros(3, 1))
     hand_centre = sum(
-        (p["weights"][i, 0] * contacts.points[i] for i in range(f)), ca.SX.zeros(3, 1)
+        (weights[i, 0] * contacts.tips[i]["point"] for i in range(f)), ca.SX.zeros(3, 1)
     )
     target_centre, hand_centre = target_centre / total, hand_centre / total
     B = ca.SX.zeros(3, 3)
-    for i in range(f):
-        b = (p["points"][i, :].T - target_centre) / LENGTH
-        a = (contacts.points[i] - hand_centre) / LENGTH
-        B = B + p["weights"][i, 0] * b @ a.T
-        B = B + p["weights"][i, 1] * p["normals"][i, :].T @ contacts.normals[i].T
+    for i, (tip, goal) in enumerate(zip(contacts.tips, goals, strict=True)):
+        b = (goal["point"] - target_centre) / LENGTH
+        a = (tip["point"] - hand_centre) / LENGTH
+        B = B + weights[i, 0] * b @ a.T
+        for axis in ("normal", "tangent"):
+            if axis in goal:
+                B = B + weights[i, 1] * goal[axis] @ tip[axis].T
     rotation = align(B)
     return rotation, target_centre - rotation @ hand_centre

@@ -46,10 +46,10 @@ def balance_stage(layouts: HandFirstLayouts) -> ca.Function:
 def _step(layouts: HandFirstLayouts, s: dict[str, Expr], p: dict[str, Expr]) -> Balanced:
     robot = layouts.robot
     return balance_step(
-        lambda q: whole_residual(robot, q, p),
-        whole_jacobian(robot, s["q"], p),
+        lambda q: whole_residual(robot, layouts.contacts, q, p),
+        whole_jacobian(robot, layouts.contacts, s["q"], p),
         Bounded(s["q"], p["lower"], p["upper"], first=0),
-        len(robot.fingers),
+        layouts.contacts,
         s,
         p,
     )

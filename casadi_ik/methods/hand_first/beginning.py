@@ -11,6 +11,7 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
+from casadi_ik.problem.contacts.kinds import suffix
 from casadi_ik.problem.status import Phase
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
@@ -38,37 +39,39 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
     bounds.
 
     Returns:
-        points (f, 3) [m] and normals (f, 3), NaN where free, where the robot is (n, 1), the
-        `terms`, hand postures to try (candidates, hand) -> state, parameters.
+        points (f, 3) [m], normals (f, 3) and the contacts' other vectors, NaN where free, where
+        the robot is (n, 1), the `terms`, hand postures to try (candidates, hand) -> state,
+        parameters.
     """
     robot = layouts.robot
     f, n = len(robot.fingers), len(robot.actuators)
-    name = ca.Function.fix_name(f"hand_first_beginning_{robot.name}")
+    name = ca.Function.fix_name(f"hand_first_beginning_{robot.name}{suffix(layouts.kinds)}")
     return FunctionGraph(
         name,
         lambda: _build(name, layouts),
         {
-            "points": (f, 3),
-            "normals": (f, 3),
+            **{f"{vector}s": (f, 3) for vector in layouts.contacts.data},
             "here": (n, 1),
             "terms": (terms(robot).size, 1),
             "postures": (layouts.candidates, len(layouts.hand)),
         },
         ((layouts.state.size, 1), (layouts.parameters.size, 1)),
-        recipe(name, robot, layouts.candidates),
+        recipe(name, robot, layouts.candidates, layouts.kinds),
     )
 
 
 def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
     robot, hand = layouts.robot, list(layouts.hand)
     f, n = len(robot.fingers), len(robot.actuators)
-    points, normals, here = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3), ca.SX.sym("q", n)
+    vectors = {f"{vector}s": ca.SX.sym(f"{vector}s", f, 3) for vector in layouts.contacts.data}
+    here = ca.SX.sym("q", n)
     common = terms(robot)
     given = common.symbols("terms")
     t = common.unpack(given)
     postures = ca.SX.sym("postures", layouts.candidates, len(hand))
 
-    known = ca.horzcat(*(_is_number(array[:, 0]) for array in (points, normals)))
+    numbers = {key: _is_number(array[:, 0]) for key, array in vectors.items()}
+    known = ca.horzcat(numbers["points"], numbers["normals"])
     needed = ca.vertcat(*(_mover(robot, actuator, known[:, 0]) for actuator in hand))
     held = _bounded(here[hand], t, hand)
     tried = [
@@ -78,8 +81,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
     start = _bounded(here, t, list(range(n)))
     parameters = layouts.parameters.pack(
         {
-            "points": _or_zero(points, known[:, 0]),
-            "normals": _or_zero(normals, known[:, 1]),
+            **{key: _or_zero(array, numbers[key]) for key, array in vectors.items()},
             "weights": known,
             "reach": 1.0,
             "alone": 0.0,
@@ -100,7 +102,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
         }
         | fresh_fit()
     )
-    inputs = [points, normals, here, given, postures]
+    inputs = [*vectors.values(), here, given, postures]
     return ca.Function(name, inputs, shared(state, parameters))
 
 

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.methods.common.bounded_step import clip, damped_step
-from casadi_ik.methods.common.contact_fit import LENGTH, Tried, weighted_residual
+from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.methods.common.palm_fit import HandContacts, hand_contacts
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
+from casadi_ik.problem.contacts.conditions import LENGTH, Vectors
+from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.symbolic.se3 import compose, exp_se3
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 from casadi_ik.symbolic.so3 import skew
@@ -33,25 +35,47 @@ class PalmAndHand:
     hand: Expr
 
 
-def fit_residual(contacts: HandContacts, x: PalmAndHand, p: dict[str, Expr]) -> Expr:
-    """Residual (6 f, 1) of `weighted_residual`, in the palm frame."""
-    f = len(contacts.points)
-    positions = [
-        contacts.points[i] - x.rotation.T @ (p["points"][i, :].T - x.origin) for i in range(f)
+def fit_residual(
+    contacts: HandContacts, rows: ContactRows, x: PalmAndHand, p: dict[str, Expr]
+) -> Expr:
+    """Residual of `ContactRows`, in the palm frame."""
+    return rows.residual(contacts.tips, _seen(rows.goals(p), x), p["weights"])
+
+
+def fit_jacobian(
+    contacts: HandContacts, rows: ContactRows, x: PalmAndHand, p: dict[str, Expr]
+) -> Expr:
+    """Jacobian (size, 6 + k) over palm shift [m], palm turn [rad] (palm frame) and hand.
+
+    Seen from the palm, it is the targets that move when the palm does.
+    """
+    goals = _seen(rows.goals(p), x)
+    k = contacts.rates[0]["point"].shape[1]
+    tip_rates = [
+        {name: ca.horzcat(ca.SX(3, 6), rate) for name, rate in rates.items()}
+        for rates in contacts.rates
     ]
-    normals = [contacts.normals[i] - x.rotation.T @ p["normals"][i, :].T for i in range(f)]
-    return weighted_residual(positions, normals, p["weights"])
+    goal_rates = [
+        {
+            name: ca.horzcat(
+                -ca.DM.eye(3) if name == "point" else ca.DM(3, 3), skew(seen), ca.DM(3, k)
+            )
+            for name, seen in goal.items()
+        }
+        for goal in goals
+    ]
+    return rows.jacobian(contacts.tips, tip_rates, goals, goal_rates, p["weights"])
 
 
-def fit_jacobian(contacts: HandContacts, x: PalmAndHand, p: dict[str, Expr]) -> Expr:
-    """Jacobian (6 f, 6 + k) over palm shift [m], palm turn [rad] (palm frame) and hand."""
-    positions, normals = [], []
-    for i in range(len(contacts.points)):
-        seen = x.rotation.T @ (p["points"][i, :].T - x.origin)
-        facing = x.rotation.T @ p["normals"][i, :].T
-        positions.append(ca.horzcat(ca.DM.eye(3), -skew(seen), contacts.point_jacobians[i]))
-        normals.append(ca.horzcat(ca.DM(3, 3), -skew(facing), contacts.normal_jacobians[i]))
-    return weighted_residual(positions, normals, p["weights"])
+def _seen(goals: list[Vectors], x: PalmAndHand) -> list[Vectors]:
+    """Targets of the base frame in the palm frame."""
+    return [
+        {
+            name: x.rotation.T @ (vector - x.origin if name == "point" else vector)
+            for name, vector in goal.items()
+        }
+        for goal in goals
+    ]
 
 
 def reach_row(
@@ -109,7 +133,8 @@ def _rows(
 ) -> tuple[Expr, Expr]:
     """Residual and Jacobian of contacts and reach."""
     contacts = hand_contacts(layouts.robot, x.hand, layouts.hand)
-    residual, jacobian = fit_residual(contacts, x, p), fit_jacobian(contacts, x, p)
+    asked = contacts, layouts.contacts, x, p
+    residual, jacobian = fit_residual(*asked), fit_jacobian(*asked)
     if arm is None:
         return residual, jacobian
     beyond, slope = reach_row(arm, layouts.robot.arm_actuators, x, p)

@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import dataclasses
-import time
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.kernels import FunctionKernel, LoopKernel, LoopResult
-from casadi_ik.kernels.rows import opaque
+from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
+from casadi_ik.methods.common.looped_method import Counts, LoopedMethod, Start
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.state import STAGE_LABELS, HandFirstLayouts
+from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
-from casadi_ik.problem.method import Outcome, Quick
+from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.method import Quick
 from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Array, Problems
-from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.trace import RESTART, TraceFormat, trace_format
+from casadi_ik.problem.status import Phase
+from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
@@ -42,40 +39,41 @@ NEAREST = "q0"
 TINY = 1e-9
 """Smallest range [rad or m] a motion is measured by."""
 
-CARRIED = ("passed", "near", "balanced")
-"""What a round leaves to the next: how far the numeric arm's list of starts is through, and which
-fits were balanced in vain."""
-
-MAX_ITERATIONS = 100_000
-"""Far above what the stages' own budgets allow: the loop always ends by a status."""
+CARRIED = ("passed", "near", "balanced", "best_cost", "best_q", "counts")
+"""What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
+were balanced in vain, and what was found."""
 
 
-class HandFirstMethod:
+class HandFirstMethod(LoopedMethod):
     """`hand-first`: contacts fix palm and hand, the arm follows in closed form.
 
+    A round takes the next best hand postures of a table; nearly all targets need one round only.
+
     Attributes:
-        name: Name of the method.
-        options: Its numbers.
+        step: Its step for this robot.
         preferences: What it can prefer.
     """
 
     name = "hand-first"
     preferences = PREFERENCES
+    takes_free_contacts = True
+    takes_fixed_actuators = True
 
     def __init__(
         self, robot: RobotDescription, options: HandFirstParameters, compiled: bool = True
     ) -> None:
         """Recognise the arm and lay out the step."""
-        self.options = options
-        self._robot = robot
-        self._compiled = compiled
-        self.step = HandFirstStep(robot, _closed_form(robot), options.candidates)
+        super().__init__(robot, options, compiled)
+        self.options: HandFirstParameters = options
+        self.rounds = options.rounds
+        self.step = HandFirstStep(
+            robot, _closed_form(robot), options.candidates, usual(len(robot.fingers))
+        )
         self._singles: list[FirstRound] = []
 
-    @cached_property
-    def kernel(self) -> LoopKernel:
-        """The compiled loop."""
-        return LoopKernel(self.step.graph(), self._compiled)
+    def step_graph(self) -> StepGraph:
+        """The whole iteration."""
+        return self.step.graph()
 
     @cached_property
     def table(self) -> PostureTable:
@@ -89,48 +87,50 @@ class HandFirstMethod:
 
     def _table(self, size: int, at_limits: float = 0.0) -> PostureTable:
         hand = self.step.layouts.hand
-        return PostureTable(ArmHand(self._robot), hand, size, at_limits, compiled=self._compiled)
+        return PostureTable(ArmHand(self.robot), hand, size, at_limits, compiled=self._compiled)
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
         _ = self.kernel, self.table, self._beginning
 
     @property
-    def trace_format(self) -> TraceFormat:
-        """How its traces are to be read."""
-        return trace_format(self.step.layouts.record, self._robot, coupling_jacobian(self._robot))
+    def jacobians(self) -> Mapping[str, RecordedJacobian]:
+        """Those of the couplings."""
+        return coupling_jacobian(self.robot)
 
-    @property
-    def parameters(self) -> Mapping[str, Any]:
-        """The parameter record as a plain mapping."""
-        return dataclasses.asdict(self.options)
+    def begin(
+        self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
+    ) -> Start:
+        """Start with the hand postures of the round; what was found before is kept."""
+        postures = self.postures(problems, number)
+        if problems.prefer == NEAREST:
+            postures = self.order(postures, q0, own=number == 0)
+        states, parameters = self.rows(problems, q0, postures)
+        if last is not None:
+            layout = self.step.layouts.state
+            states[:, layout.slice("phase")], states[:, layout.slice("candidate")] = (
+                Phase.CANDIDATE,
+                0.0,
+            )
+            for name in CARRIED:
+                states[:, layout.slice(name)] = last[:, layout.slice(name)]
+            states[:, layout.slice("earlier")] = number * self.options.candidates
+        return states, parameters
 
-    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
-        """Solve a batch; see `Method.run`. No random numbers are drawn."""
-        del seed
-        again = [self.step.layouts.state.slice(name).start for name in ("phase", "candidate")]
-        carried = [self.step.layouts.state.slice(name).start for name in CARRIED]
-        collected = _Collected(self.step.layouts)
-        left, waiting, here = problems, np.arange(len(problems)), q0
-        done: Array | None = None
-        for number in range(self.options.rounds):
-            begin = time.perf_counter()
-            postures = self.postures(left, number)
-            if left.prefer == NEAREST:
-                postures = self.order(postures, here, own=number == 0)
-            states, parameters = self.rows(left, here, postures)
-            if done is not None:
-                states[:, carried] = done
-                states[:, again] = Phase.CANDIDATE, 0.0
-            result = self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
-            besides = time.perf_counter() - begin - result.time.sum()
-            collected.take(waiting, result, besides / max(len(left), 1))
-            missed = np.flatnonzero(result.status != Status.SOLVED)
-            if not len(missed):
-                break
-            left, waiting, here = left.rows(missed), waiting[missed], here[missed]
-            done = result.states[np.ix_(missed, carried)]
-        return collected.outcome(trace)
+    def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
+        """The step counts them."""
+        del iterations
+        counts = states[:, self.step.layouts.state.slice("counts")].astype(np.int64)
+        return {stage: counts[:, i] for i, stage in enumerate(STAGES)}
+
+    def restarts(self, states: Array) -> Counts:
+        """Hand postures tried but the first."""
+        layout = self.step.layouts.state
+        earlier, candidate = (
+            states[:, layout.slice(name).start].astype(np.int64)
+            for name in ("earlier", "candidate")
+        )
+        return earlier + np.clip(candidate, 0, self.options.candidates - 1)
 
     def quick(self, problems: Problems, q0: Array) -> Quick | None:
         """The first round of one target; see `QuickMethod.quick`."""
@@ -142,7 +142,7 @@ class HandFirstMethod:
             first = FirstRound(
                 self.table, self._beginning, self.kernel, self.step.layouts, self.order
             )
-        found = first(problems, q0, self._terms(problems), MAX_ITERATIONS)
+        found = first(problems, q0, self._terms(problems), self.max_iterations)
         self._singles.append(first)
         return found
 
@@ -166,7 +166,7 @@ class HandFirstMethod:
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
-        return self.kernel.run(states, parameters, MAX_ITERATIONS, trace)
+        return self.kernel.run(states, parameters, self.max_iterations, trace)
 
     def postures(self, problems: Problems, number: int) -> Array:
         """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
@@ -191,7 +191,7 @@ class HandFirstMethod:
         here = q0[:, None, hand]
         if own:
             postures = postures[:, : max(postures.shape[1] - 1, 1)]
-        ranges = np.maximum((self._robot.upper - self._robot.lower)[hand], TINY)
+        ranges = np.maximum((self.robot.upper - self.robot.lower)[hand], TINY)
         distance = (((postures - here) / ranges) ** 2).sum(axis=2)
         rows = np.argsort(distance, axis=1, kind="stable")[:, :, None]
         ordered = np.take_along_axis(postures, rows, axis=1)
@@ -201,7 +201,7 @@ class HandFirstMethod:
 
     def _terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms."""
-        bounds = problems.bounds(self._robot, UNBOUNDED)
+        bounds = problems.bounds(self.robot, UNBOUNDED)
         nearest = [float(problems.prefer == NEAREST)]
         tolerances = problems.position_tolerance, problems.angle_tolerance
         return np.concatenate([*tolerances, *bounds, nearest])
@@ -209,61 +209,6 @@ class HandFirstMethod:
     @cached_property
     def _beginning(self) -> FunctionKernel:
         return FunctionKernel(beginning(self.step.layouts), self._compiled)
-
-
-class _Collected:
-    """Results of a batch whose targets may take several rounds; the best of a target is kept."""
-
-    def __init__(self, layouts: HandFirstLayouts) -> None:
-        self._layouts = layouts
-        self._rounds: list[NDArray[Any]] = []
-        self._targets: list[NDArray[np.intp]] = []
-
-    def take(self, targets: NDArray[np.intp], result: LoopResult, share: float) -> None:
-        """Take a round of some targets, the first time of all; `share` of them is time besides."""
-        state, before = self._layouts.state, self._layouts.candidates * len(self._rounds)
-        states = result.states
-        q, cost = states[:, state.slice("q")], states[:, state.slice("best_cost").start]
-        counts = states[:, state.slice("counts")].astype(np.int64)
-        candidate = states[:, state.slice("candidate").start].astype(np.int64)
-        restarts = before + np.minimum(candidate, self._layouts.candidates - 1)
-        status = result.status.astype(np.int64)
-        status[status < 0] = Status.INVALID
-        if result.rows is not None:
-            result.rows[RESTART.name] += before
-        if not self._rounds:
-            # A copy: the states are much larger and need not stay.
-            self._q, self._cost, self._counts = q.copy(), cost.copy(), counts
-            self._restarts, self._status, self._time = restarts, status, result.time + share
-        else:
-            better = (status == Status.SOLVED) | (cost < self._cost[targets])
-            self._q[targets[better]], self._cost[targets[better]] = q[better], cost[better]
-            self._counts[targets] += counts
-            self._restarts[targets], self._status[targets] = restarts, status
-            self._time[targets] += result.time + share
-        self._rounds.append(result.rows if result.rows is not None else np.zeros(0))
-        self._targets.append(np.repeat(targets, result.iterations))
-
-    def outcome(self, trace: bool) -> Outcome:
-        """What became of the batch."""
-        return Outcome(
-            q=self._q,
-            status=self._status,
-            iterations=self._counts.sum(axis=1),
-            restarts=self._restarts,
-            time=self._time,
-            phases={label: self._counts[:, i] for i, label in enumerate(STAGE_LABELS)},
-            rows=self._rows if trace else None,
-        )
-
-    @property
-    def _rows(self) -> NDArray[Any]:
-        """The records of all rounds, target by target."""
-        if len(self._rounds) == 1:
-            return self._rounds[0]
-        order = np.argsort(np.concatenate(self._targets), kind="stable")
-        rows = np.concatenate(list(map(opaque, self._rounds)))
-        return np.take(rows, order).view(self._rounds[0].dtype)
 
 
 def _closed_form(robot: RobotDescription) -> SrsArm | None:

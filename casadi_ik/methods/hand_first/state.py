@@ -10,9 +10,11 @@ import casadi as ca
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.bounded_step import Bounded
-from casadi_ik.methods.common.contact_fit import Tried, errors
+from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.methods.common.coupling_record import coupling_fields, coupling_values
 from casadi_ik.methods.common.limits import bits
+from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import (
     ACCEPTED,
@@ -48,11 +50,18 @@ class HandFirstLayouts:
     Attributes:
         robot: The description.
         candidates: How many hand postures the stages may start from.
+        kinds: Of the contacts, by finger.
         hand: Positions in q of the hand's actuators.
     """
 
     robot: RobotDescription
     candidates: int
+    kinds: Kinds
+
+    @cached_property
+    def contacts(self) -> ContactRows:
+        """The contacts' rows."""
+        return ContactRows(self.kinds)
 
     @cached_property
     def hand(self) -> tuple[int, ...]:
@@ -71,6 +80,7 @@ class HandFirstLayouts:
                 Field("palm_origin", (3,), unit="m"),
                 Field("phase"),
                 Field("candidate", doc="index of the hand posture started from; -1: all as in q0"),
+                Field("earlier", doc="hand postures tried in earlier rounds"),
                 Field("damping"),
                 Field("growth", doc="factor of the damping if the next step gains nothing"),
                 Field("cost", doc="cost at q (or at palm and hand)"),
@@ -98,9 +108,7 @@ class HandFirstLayouts:
         n, f = len(self.robot.actuators), len(self.robot.fingers)
         return Layout(
             (
-                Field("points", (f, 3), unit="m", doc="contact points, base frame; 0 if free"),
-                Field("normals", (f, 3), doc="outward pad normals, base frame; 0 if free"),
-                Field("weights", (f, 2), doc="1 where point, normal count, 0 where free"),
+                *self.contacts.fields,
                 Field("position_tolerance", (f,), unit="m"),
                 Field("angle_tolerance", (f,), unit="rad"),
                 Field("lower", (n,), doc="lower bounds of q"),
@@ -170,7 +178,7 @@ class HandFirstLayouts:
         positions: Expr = [NOTHING] * f
         angles: Expr = [NOTHING] * f
         if tried is not None:
-            positions, chords = errors(tried.before, f)
+            positions, chords = self.contacts.errors(tried.before)
             angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
             positions = ca.if_else(p["weights"][:, 0] > 0, positions, NOTHING)
             angles = ca.if_else(p["weights"][:, 1] > 0, angles, NOTHING)
@@ -185,7 +193,7 @@ class HandFirstLayouts:
                 "margin": margin,
                 **coupling_values(self.robot, q),
                 "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
-                "restart": ca.fmax(s["candidate"], 0.0),
+                "restart": s["earlier"] + ca.fmax(s["candidate"], 0.0),
                 "accepted": accepted,
                 "phase": float(phase),
                 "status": status,

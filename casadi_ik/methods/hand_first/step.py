@@ -26,10 +26,8 @@ from casadi_ik.methods.common.balance import differs, worth_balancing
 from casadi_ik.methods.common.contact_fit import (
     Judged,
     Tried,
-    errors,
     fresh_fit,
     judge_contacts,
-    within_tolerance,
 )
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.balance_stage import balance_stage
@@ -38,6 +36,8 @@ from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_residual, fit
 from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_rows
 from casadi_ik.methods.hand_first.whole_fit import whole_step
+from casadi_ik.problem.contacts.kinds import Kinds, suffix
+from casadi_ik.problem.contacts.rows import chord, within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose
@@ -59,17 +59,20 @@ class HandFirstStep:
         layouts: State, parameters and record.
     """
 
-    def __init__(self, robot: RobotDescription, arm: SrsArm | None, candidates: int) -> None:
+    def __init__(
+        self, robot: RobotDescription, arm: SrsArm | None, candidates: int, kinds: Kinds
+    ) -> None:
         """Remember what the graph is made of.
 
         Args:
             robot: The description.
             arm: Constants of an S-R-S arm, or None: then refinement does the arm's work.
             candidates: Hand postures a solve may start from.
+            kinds: Of the contacts, by finger.
         """
         self.robot = robot
         self.arm = arm
-        self.layouts = HandFirstLayouts(robot, candidates)
+        self.layouts = HandFirstLayouts(robot, candidates, kinds)
 
     def graph(self) -> StepGraph:
         """The whole iteration."""
@@ -81,12 +84,12 @@ class HandFirstStep:
             layouts.parameters,
             layouts.record,
             stage="phase",
-            recipe=recipe(self._name, self.robot, layouts.candidates),
+            recipe=recipe(self._name, self.robot, layouts.candidates, layouts.kinds),
         )
 
     @property
     def _name(self) -> str:
-        return ca.Function.fix_name(f"hand_first_{self.robot.name}")
+        return ca.Function.fix_name(f"hand_first_{self.robot.name}{suffix(self.layouts.kinds)}")
 
     def _iteration(self) -> ca.Function:
         layouts = self.layouts
@@ -131,11 +134,12 @@ class HandFirstStep:
         exhausted = s["candidate"] >= count
         q = self._with_hand(p["start"], hand)
         contacts = hand_contacts(self.robot, hand, layouts.hand)
-        rotation, origin = best_palm(contacts, p)
+        rotation, origin = best_palm(contacts, layouts.contacts, p)
         # The hand as it is is only worth a fit if its contacts are shaped a little like these.
         own = ca.logic_and(p["nearest"], s["candidate"] == 0)
         own = ca.logic_and(own, ca.sumsqr(hand - p["start"][list(layouts.hand)]) <= 0)
-        misfit = ca.sumsqr(fit_residual(contacts, PalmAndHand(rotation, origin, hand), p))
+        fitted = PalmAndHand(rotation, origin, hand)
+        misfit = ca.sumsqr(fit_residual(contacts, layouts.contacts, fitted, p))
         skipped = ca.logic_and(own, misfit > OWN_HAND)
         after = layouts.state.pack(
             self.layouts.counted(s, Phase.CANDIDATE)
@@ -165,7 +169,7 @@ class HandFirstStep:
         columns = list(self.layouts.hand)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
-        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        judged = judge_contacts(s, p, tried, self.layouts.contacts)
         keep, reached = judged.accepted, tried.reached
         # The last candidate goes on to the arm even if it does not fit: its arm and hand are the
         # nearest there is, and refinement starts from them.
@@ -173,7 +177,7 @@ class HandFirstStep:
         onwards = ca.logic_or(judged.within, last)
         # Nor does one that fits nearly have to fit: it is balanced with the arm.
         near = ca.logic_and(
-            worth_balancing(self._left(judged, tried), len(self.robot.fingers), p),
+            worth_balancing(self._left(judged, tried), self.layouts.contacts, p),
             ca.logic_and(differs(judged.cost, s["near"]), ca.logic_not(p["alone"])),
         )
         near = ca.logic_and(near, judged.settled)
@@ -249,19 +253,19 @@ class HandFirstStep:
 
     def _refinement(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
-        tried = whole_step(self.robot, s["q"], s["damping"], p)
-        judged = judge_contacts(s, p, tried, len(self.robot.fingers))
+        contacts = self.layouts.contacts
+        tried = whole_step(self.robot, contacts, s["q"], s["damping"], p)
+        judged = judge_contacts(s, p, tried, contacts)
         # Where the robot is: if that solves, nothing moves; if it is far off, this is no short way.
         here = ca.logic_and(s["candidate"] < 0, s["spent"] < 1)
-        met = ca.logic_and(
-            here, within_tolerance(*errors(tried.before, len(self.robot.fingers)), p)
-        )
+        tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
+        met = ca.logic_and(here, within_tolerance(*contacts.errors(tried.before), *tolerances))
         far = self._far(here, tried)
         moved = ca.logic_and(judged.accepted, ca.logic_not(met))
         q = ca.if_else(moved, tried.reached, s["q"])
         solved = ca.logic_or(met, ca.logic_and(judged.settled, judged.within))
         unsolved = ca.logic_and(judged.settled, ca.logic_not(judged.within))
-        near = worth_balancing(self._left(judged, tried), len(self.robot.fingers), p)
+        near = worth_balancing(self._left(judged, tried), self.layouts.contacts, p)
         near = ca.logic_and(near, differs(judged.cost, s["balanced"]))
         near = ca.logic_and(near, unsolved)
         failed = ca.logic_or(far, ca.logic_and(unsolved, ca.logic_not(near)))
@@ -296,7 +300,7 @@ class HandFirstStep:
     def _left(self, judged: Judged, tried: Tried) -> Expr:
         """Residual of the contacts after a step was judged."""
         left = ca.if_else(judged.accepted, tried.there, tried.before)
-        return left[: 6 * len(self.robot.fingers)]
+        return left[: self.layouts.contacts.size]
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
         return with_rows(q, self.layouts.hand, hand)

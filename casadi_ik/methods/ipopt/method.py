@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.whole_nlp import NlpRun, WholeNlp, contact_errors
 from casadi_ik.problem.method import Outcome
@@ -51,8 +53,17 @@ class IpoptMethod:
 
     name = "ipopt"
 
-    def __init__(self, robot: RobotDescription, options: IpoptParameters) -> None:
-        """Remember the robot; the program is built when first needed."""
+    def __init__(
+        self, robot: RobotDescription, options: IpoptParameters, compiled: bool = True
+    ) -> None:
+        """Remember the robot; the program is built when first needed.
+
+        Args:
+            robot: The robot.
+            options: The numbers.
+            compiled: Makes no difference: Ipopt calls its graphs in the virtual machine.
+        """
+        del compiled
         self.options = options
         self._robot = robot
 
@@ -93,6 +104,18 @@ class IpoptMethod:
     def parameters(self) -> Mapping[str, Any]:
         """The parameter record as a plain mapping."""
         return dataclasses.asdict(self.options)
+
+    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+        """Not to be had.
+
+        Raises:
+            UnsupportedError: Always.
+        """
+        del problems, q0
+        raise UnsupportedError(
+            f"method {self.name!r} cannot be stepped by hand: Ipopt runs its iterations itself and "
+            "only reports them; a log holds them all"
+        )
 
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch; see `Method.run`.

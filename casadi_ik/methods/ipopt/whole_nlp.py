@@ -18,7 +18,8 @@ pull towards the start.
 
 Couplings are inside r and theta, so a four-bar or a lead screw is not a constraint of its own.
 The Hessian is exact, by CasADi's differentiation. Nothing here is shared with the other methods
-but the kinematics.
+but the kinematics: the residual and `LENGTH` are written anew on purpose, so that a fault in the
+definition that all other methods share (`problem.contacts`) shows up as a difference to this one.
 """
 
 from __future__ import annotations

@@ -32,8 +32,9 @@ from casadi_ik.methods.qiu.tasks import (
     weighted,
     weighted_damped,
 )
+from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.target import contact_errors, targets, within_tolerance
+from casadi_ik.problem.target import contact_errors, targets
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.closed_chain import closed_chain
 from casadi_ik.symbolic.measures import condition_number, singular_values
@@ -146,7 +147,7 @@ class EnhancedStep(EnhancedLayouts):
         closed = ca.SX.sym("closed", len(self.robot.actuators))
         robot, body, goals = self.robot, actuated(self.robot, closed), targets(self.robot, p)
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
-        solved = within_tolerance(positions, angles, p)
+        solved = within_tolerance(positions, angles, p["position_tolerance"], p["angle_tolerance"])
 
         others = {name: goal for name, goal in goals.items() if name != robot.thumb}
         translation, rotation = palm_motion(body, others)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.limits import limit_mask
 from casadi_ik.methods.qiu.finger_step import planar_fingers
 from casadi_ik.methods.qiu.parameters import QiuParameters
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
-from casadi_ik.problem.target import target_fields
+from casadi_ik.problem.target import target_fields, target_values
 from casadi_ik.problem.trace import (
     ANGLE_ERROR,
     LIMIT_MASK,
@@ -25,8 +25,6 @@ from casadi_ik.problem.trace import (
 from casadi_ik.robots.description import Array, RobotDescription
 from casadi_ik.symbolic.closed_chain import VIRTUAL, split
 from casadi_ik.symbolic.smooth import Expr
-
-Counts = NDArray[np.int64]
 
 NOT_MEASURED = float("nan")
 
@@ -119,36 +117,29 @@ class EnhancedLayouts:
             "closed_chain": RecordedJacobian(passive, singular=0.01, condition=1e5),
         }
 
-    def parameter_values(
-        self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool
-    ) -> dict[str, float | list[float] | Array]:
-        """Values of all parameter fields but the targets."""
+    def parameter_values(self, problems: Problems) -> dict[str, float | list[float] | Array]:
+        """Values of all parameter fields for a batch."""
         options = self.options
-        given = {
-            "position_tolerance": position_tolerance,
-            "angle_tolerance": angle_tolerance,
-            "enforce_limits": float(enforce_limits),
+        named = (name for name in self.parameters.names if hasattr(options, name))
+        return {
+            **target_values(problems),
+            "enforce_limits": float(problems.enforce_limits),
             "weights": [
                 options.virtual_weight if column == VIRTUAL else options.joint_weight
                 for column in self.chain.active
             ],
+            **{name: float(getattr(options, name)) for name in named},
         }
-        named = (name for name in self.parameters.names if hasattr(options, name))
-        return given | {name: float(getattr(options, name)) for name in named}
 
-    def first_state(self) -> dict[str, float]:
-        """Values of all state fields but q."""
+    def first_state(self, starts: Array) -> dict[str, float | Array]:
+        """Values of all state fields for starts (k, n)."""
         return {
+            "q": starts,
             "phase": float(Phase.THUMB_REACHING),
             "best": float(np.finfo(float).max),
             "waited": 0.0,
             "reached": 0.0,
         }
-
-    def phase_counts(self, states: Array, iterations: Counts) -> dict[Phase, Counts]:
-        """Iterations by phase (k,) from the last states (k, ns) and all iterations (k,)."""
-        reached = states[:, self.state.slice("reached")][:, 0].astype(np.int64)
-        return {Phase.THUMB_REACHING: reached, Phase.HAND_ALIGNMENT: iterations - reached}
 
     def row(
         self, q: Expr, positions: Expr, angles: Expr, *, phase: Phase, **measured: Expr

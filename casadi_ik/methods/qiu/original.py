@@ -5,8 +5,6 @@ from __future__ import annotations
 from functools import cached_property
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.recipe import recipe
@@ -22,8 +20,10 @@ from casadi_ik.methods.qiu.tasks import (
     palm_orientation_task,
     selective,
 )
+from casadi_ik.problem.contacts.rows import within_tolerance
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.target import contact_errors, target_fields, targets, within_tolerance
+from casadi_ik.problem.target import contact_errors, target_fields, target_values, targets
 from casadi_ik.problem.trace import (
     ANGLE_ERROR,
     LIMIT_MASK,
@@ -32,7 +32,6 @@ from casadi_ik.problem.trace import (
     STATUS,
     STEP_SIZE,
     Q,
-    RecordedJacobian,
 )
 from casadi_ik.robots.description import Array, RobotDescription
 from casadi_ik.symbolic.actuated import actuated
@@ -76,11 +75,6 @@ class OriginalStep:
             STATUS.of(robot),
         )
 
-    @property
-    def jacobians(self) -> dict[str, RecordedJacobian]:
-        """The Jacobians in the record: none."""
-        return {}
-
     def graph(self) -> StepGraph:
         """The whole iteration.
 
@@ -121,28 +115,14 @@ class OriginalStep:
         outputs = self._ending()(state, parameters, errors, step)
         return ca.Function(self._name, [state, parameters], list(outputs))
 
-    def parameter_values(
-        self, position_tolerance: Array, angle_tolerance: Array, enforce_limits: bool
-    ) -> dict[str, float | Array]:
-        """Values of all parameter fields but the targets."""
-        given = {
-            "position_tolerance": position_tolerance,
-            "angle_tolerance": angle_tolerance,
-            "enforce_limits": float(enforce_limits),
-        }
+    def parameter_values(self, problems: Problems) -> dict[str, float | Array]:
+        """Values of all parameter fields for a batch."""
         named = (name for name in self.parameters.names if hasattr(self.options, name))
-        return given | {name: float(getattr(self.options, name)) for name in named}
-
-    def first_state(self) -> dict[str, float]:
-        """Values of all state fields but q."""
-        return {}
-
-    def phase_counts(
-        self, states: Array, iterations: NDArray[np.int64]
-    ) -> dict[Phase, NDArray[np.int64]]:
-        """Iterations by phase (k,): there is but one."""
-        del states
-        return {Phase.HIERARCHY: iterations}
+        return {
+            **target_values(problems),
+            "enforce_limits": float(problems.enforce_limits),
+            **{name: float(getattr(self.options, name)) for name in named},
+        }
 
     def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
@@ -236,7 +216,7 @@ class OriginalStep:
         errors = ca.SX.sym("errors", len(self.robot.fingers), 2)
         step = ca.SX.sym("step", len(self.robot.actuators))
         robot, q, positions, angles = self.robot, s["q"], errors[:, 0], errors[:, 1]
-        solved = within_tolerance(positions, angles, p)
+        solved = within_tolerance(positions, angles, p["position_tolerance"], p["angle_tolerance"])
         q_next = kept_within(robot, q + step, p["enforce_limits"])
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
         after = self.state.pack({"q": ca.if_else(solved, q, q_next)})

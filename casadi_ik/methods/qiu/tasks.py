@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.methods.qiu.selectively_damped import selectively_damped
+from casadi_ik.problem.contacts.kinds import USUAL
+from casadi_ik.problem.contacts.rows import tip_vectors
 from casadi_ik.problem.target import Target
 from casadi_ik.symbolic.actuated import ActuatedKinematics
-from casadi_ik.symbolic.directions import normal_error
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times, weighted_damped_pinv_times
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 from casadi_ik.symbolic.so3 import euler_zyx, log_so3
@@ -63,10 +64,11 @@ def contact_tasks(
     body: ActuatedKinematics, finger: str, goal: Target, actuators: Sequence[int]
 ) -> tuple[Task, Task]:
     """A finger's contact point and normal, Qiu & Kermani 2021, eq. (3)."""
-    point, normal = body.kinematics.contact(finger)
+    tip, target = tip_vectors(body.kinematics, finger), goal.vectors
+    place, facing = USUAL.conditions
     linear, angular = body.contact_jacobian(finger, actuators)
-    position = Task(linear / MILLIMETRE, (goal.point - point) / MILLIMETRE, is_position=True)
-    return position, Task(angular, normal_error(normal, goal.normal), is_position=False)
+    position = Task(linear / MILLIMETRE, place.error(tip, target) / MILLIMETRE, is_position=True)
+    return position, Task(angular, facing.error(tip, target), is_position=False)
 
 
 def damped(damping: Expr) -> TaskSolver:

@@ -4,7 +4,7 @@ The thumb's contact is a constraint, the other fingers are what is left to minim
 
     y = J_t^# e_t + N z,    z = argmin |J_o (J_t^# e_t + N z) - e_o|^2 + damping^2 |z|^2
 
-with J_t the thumb's five rows (point and normal), N the projector into their null space (the
+with J_t the thumb's rows (five for point and normal), N the projector into their null space (the
 motions of the closed chain, one dimension per mobility, together with the other fingers' own
 joints) and J_o the rows of the other fingers. No active joints have to be chosen, so there is no
 H_p that could be singular.
@@ -17,11 +17,11 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from casadi_ik.methods.common.contact_fit import LENGTH
 from casadi_ik.methods.thumb_first.proxqp import proxqp
+from casadi_ik.problem.contacts.conditions import LENGTH, PLACE
+from casadi_ik.problem.contacts.rows import ContactRows, tip_vectors
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated
-from casadi_ik.symbolic.directions import normal_error, perpendicular
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times, project_to_null_space
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
@@ -44,10 +44,11 @@ class Linear:
     """Contacts linearised at a configuration: errors and what moves them.
 
     Attributes:
-        thumb: (5, n) rows of the thumb, positions by `LENGTH`, normals in rad.
-        thumb_error: (5, 1) what is left.
-        others: (5 (f - 1), n) rows of the other fingers.
-        others_error: (5 (f - 1), 1).
+        thumb: (m, n) rows of the thumb, places by `LENGTH`, facings in rad: five for a point and a
+            normal.
+        thumb_error: (m, 1) what is left.
+        others: (m', n) rows of the other fingers, one finger after the other.
+        others_error: (m', 1).
     """
 
     thumb: Expr
@@ -77,43 +78,55 @@ StepSolver = Callable[[Linear, Room], tuple[Expr, Expr]]
 
 def motor_scales(robot: RobotDescription) -> ca.DM:
     """(n, 1) what counts as a unit of each motor: 1 rad, or the range of a slider."""
-    ranges = [actuator.upper - actuator.lower for actuator in robot.actuators]
+    ranges = (robot.upper - robot.lower).tolist()
     units = [actuator.unit for actuator in robot.actuators]
     return ca.DM([1.0 if u == "rad" else r for u, r in zip(units, ranges, strict=True)])
 
 
-def contact_residuals(
-    robot: RobotDescription, q: Expr, p: dict[str, Expr]
+def contact_errors(
+    robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[str, Expr]
 ) -> tuple[list[Expr], list[Expr]]:
-    """What is left of every contact: points (3, 1) by `LENGTH`, normals (3, 1) [rad]; 0 if free."""
-    return _residuals(actuated(robot, q), p)
+    """What is left of every contact: places (3, 1) by `LENGTH`, facings (3, 1) [rad]; 0 if free."""
+    return _errors(actuated(robot, q), rows, p)
 
 
-def _residuals(body: ActuatedKinematics, p: dict[str, Expr]) -> tuple[list[Expr], list[Expr]]:
+def _errors(
+    body: ActuatedKinematics, rows: ContactRows, p: dict[str, Expr]
+) -> tuple[list[Expr], list[Expr]]:
     positions, angles = [], []
-    for i, name in enumerate(body.robot.finger_names):
-        point, normal = body.kinematics.contact(name)
-        positions.append(p["weights"][i, 0] * (p["points"][i, :].T - point) / LENGTH)
-        angles.append(p["weights"][i, 1] * normal_error(normal, p["normals"][i, :].T))
+    goals = zip(body.robot.finger_names, rows.kinds, rows.goals(p), strict=True)
+    for i, (name, kind, goal) in enumerate(goals):
+        tip = tip_vectors(body.kinematics, name)
+        place, facing = kind.conditions
+        positions.append(p["weights"][i, 0] * place.error(tip, goal) / LENGTH)
+        angles.append(p["weights"][i, 1] * facing.error(tip, goal))
     return positions, angles
 
 
-def linearised(robot: RobotDescription, q: Expr, p: dict[str, Expr]) -> Linear:
+def linearised(
+    robot: RobotDescription, contacts: ContactRows, q: Expr, p: dict[str, Expr]
+) -> Linear:
     """The contacts at q (n, 1); rows of what is free are zero."""
     body, scales = actuated(robot, q), motor_scales(robot)
-    positions, angles = _residuals(body, p)
+    left = _errors(body, contacts, p)
     rows: dict[bool, list[Expr]] = {True: [], False: []}
     errors: dict[bool, list[Expr]] = {True: [], False: []}
-    for i, name in enumerate(robot.finger_names):
-        linear, angular = body.contact_jacobian(name, range(q.numel()))
-        _, normal = body.kinematics.contact(name)
-        first = perpendicular(normal)
-        across = ca.horzcat(first, ca.cross(normal, first)).T
-        moved = ca.vertcat(
-            p["weights"][i, 0] * linear / LENGTH, p["weights"][i, 1] * (across @ angular)
-        )
-        rows[name == robot.thumb].append(ca.sparsify(moved) * ca.repmat(scales.T, 5, 1))
-        errors[name == robot.thumb] += [positions[i], across @ angles[i]]
+    goals = contacts.goals(p)
+    for i, (name, kind) in enumerate(zip(robot.finger_names, contacts.kinds, strict=True)):
+        moved = body.contact_jacobian(name, range(q.numel()))
+        tip = tip_vectors(body.kinematics, name)
+        mine = name == robot.thumb
+        weighted = []
+        for aspect, condition in enumerate(kind.conditions):
+            across = condition.across(tip, goals[i]) if condition.across else None
+            slope, error = moved[aspect], left[aspect][i]
+            if across is not None:
+                slope, error = across @ slope, across @ error
+            slope = p["weights"][i, aspect] * slope
+            weighted.append(slope / LENGTH if condition.aspect == PLACE else slope)
+            errors[mine].append(error)
+        together = ca.vertcat(*weighted)
+        rows[mine].append(ca.sparsify(together) * ca.repmat(scales.T, together.shape[0], 1))
     n = q.numel()
     return Linear(
         ca.vertcat(*rows[True]),

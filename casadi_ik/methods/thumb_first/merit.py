@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from casadi_ik.methods.common.contact_fit import LENGTH
-from casadi_ik.methods.thumb_first.closed_chain_step import contact_residuals
+from casadi_ik.methods.thumb_first.closed_chain_step import contact_errors
+from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 
@@ -27,15 +28,16 @@ class Merit:
     cost: Expr
 
 
-def merit(robot: RobotDescription, q: Expr, p: dict[str, Expr]) -> Merit:
+def merit(robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[str, Expr]) -> Merit:
     """Judge a configuration.
 
     Args:
         robot: The description.
+        rows: The contacts' kinds.
         q: (n, 1) the configuration.
         p: Parameters.
     """
-    positions, angles = contact_residuals(robot, q, p)
+    positions, angles = contact_errors(robot, rows, q, p)
     return Merit(
         ca.vertcat(*(LENGTH * safe_norm(x) for x in positions)),
         ca.vertcat(*(safe_norm(x) for x in angles)),

@@ -11,6 +11,8 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.methods.thumb_first.merit import Merit
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
+from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import (
     ACCEPTED,
@@ -42,10 +44,17 @@ class ThumbFirstLayouts:
     Attributes:
         robot: The description.
         options: Numbers and choices.
+        kinds: Of the contacts, by finger.
     """
 
     robot: RobotDescription
     options: ThumbFirstParameters
+    kinds: Kinds
+
+    @cached_property
+    def contacts(self) -> ContactRows:
+        """The contacts' rows."""
+        return ContactRows(self.kinds)
 
     @cached_property
     def hand(self) -> tuple[int, ...]:
@@ -82,9 +91,7 @@ class ThumbFirstLayouts:
         n, f = len(self.robot.actuators), len(self.robot.fingers)
         return Layout(
             (
-                Field("points", (f, 3), unit="m", doc="contact points, base frame; 0 if free"),
-                Field("normals", (f, 3), doc="outward pad normals, base frame; 0 if free"),
-                Field("weights", (f, 2), doc="1 where point, normal count, 0 where free"),
+                *self.contacts.fields,
                 Field("position_tolerance", (f,), unit="m"),
                 Field("angle_tolerance", (f,), unit="rad"),
                 Field("lower", (n,), doc="lower bounds of q"),
@@ -107,7 +114,7 @@ class ThumbFirstLayouts:
             ANGLE_ERROR.of(robot),
             DAMPING.of(robot, "damping of the step tried"),
             STEP_SIZE.of(robot, "largest motor change of the step tried"),
-            Field("manipulability", (), "f4", "", "of the thumb's five rows: 0 where singular"),
+            Field("manipulability", (), "f4", "", "of the thumb's rows: 0 where singular"),
             ACTIVE_MASK.of(robot),
             LIMIT_MASK.of(robot),
             RESTART.of(robot, "number of the palm estimate begun from, counted from 0"),

@@ -33,6 +33,8 @@ from casadi_ik.methods.thumb_first.closed_chain_step import (
 )
 from casadi_ik.methods.thumb_first.merit import Merit, merit
 from casadi_ik.methods.thumb_first.state import STAGES, ThumbFirstLayouts
+from casadi_ik.problem.contacts.kinds import suffix
+from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.linear_algebra import det_spd
@@ -73,12 +75,12 @@ class ThumbFirstStep(ThumbFirstLayouts):
             self.record,
             self.options.step != "proxqp",
             stage="phase",
-            recipe=recipe(self._name, self.robot, self.options),
+            recipe=recipe(self._name, self.robot, self.options, self.kinds),
         )
 
     @property
     def _name(self) -> str:
-        return ca.Function.fix_name(f"thumb_first_{self.robot.name}")
+        return ca.Function.fix_name(f"thumb_first_{self.robot.name}{suffix(self.kinds)}")
 
     def _iteration(self) -> ca.Function:
         state = ca.MX.sym("state", self.state.size)
@@ -129,7 +131,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             ),
             ca.SX.zeros(len(self.hand), 1),
         )
-        rotation, origin = best_palm(hand_contacts(self.robot, hand, self.hand), p)
+        rotation, origin = best_palm(hand_contacts(self.robot, hand, self.hand), self.contacts, p)
         return ca.Function("guess", [state, parameters], shared(hand, rotation, origin))
 
     def _begin(self) -> ca.Function:
@@ -159,7 +161,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             damping=DAMPING_START if numeric else p["first_damping"],
         )
         status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
-        record = self.row(s, p, q, Phase.CANDIDATE, status, merit(self.robot, q, p))
+        record = self.row(s, p, q, Phase.CANDIDATE, status, merit(self.robot, self.contacts, q, p))
         inputs = [state, parameters, hand, rotation, origin, arm, passed]
         return ca.Function("begin", inputs, shared(after, record, status))
 
@@ -189,7 +191,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             q,
             Phase.ARM_PLACEMENT,
             status,
-            merit(self.robot, q, p),
+            merit(self.robot, self.contacts, q, p),
             damping=s["damping"],
             step_size=tried.size,
             accepted=judged.accepted,
@@ -207,7 +209,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
     def _problem(self) -> ca.Function:
         """The Gauss-Newton problem at q, in units of `motor_scales`."""
         state, parameters, s, p = self._vectors(ca.SX)
-        linear = linearised(self.robot, s["q"], p)
+        linear = linearised(self.robot, self.contacts, s["q"], p)
         scales = motor_scales(self.robot)
         lower, upper = (p["lower"] - s["q"]) / scales, (p["upper"] - s["q"]) / scales
         outputs = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
@@ -219,13 +221,15 @@ class ThumbFirstStep(ThumbFirstLayouts):
         state, parameters, s, p = self._vectors(ca.SX)
         n = s["q"].numel()
         step, held = ca.SX.sym("step", n), ca.SX.sym("held", n)
-        thumb = ca.SX.sym("thumb", linearised(self.robot, s["q"], p).thumb.sparsity())
+        thumb = ca.SX.sym(
+            "thumb", linearised(self.robot, self.contacts, s["q"], p).thumb.sparsity()
+        )
         size = ca.mmax(ca.fabs(step))
         capped = (
             motor_scales(self.robot) * step * ca.fmin(1.0, p["step_cap"] / ca.fmax(size, 1e-12))
         )
         tried = ca.fmin(ca.fmax(s["q"] + capped, p["lower"]), p["upper"])
-        before, there = (merit(self.robot, q, p) for q in (s["q"], tried))
+        before, there = (merit(self.robot, self.contacts, q, p) for q in (s["q"], tried))
         accepted = there.cost < before.cost
         q = ca.if_else(accepted, tried, s["q"])
         left = Merit(
@@ -234,9 +238,8 @@ class ThumbFirstStep(ThumbFirstLayouts):
             ca.if_else(accepted, there.cost, before.cost),
         )
         cost = left.cost
-        solved = ca.logic_and(
-            ca.mmax(left.positions - p["position_tolerance"]) <= 0,
-            ca.mmax(left.angles - p["angle_tolerance"]) <= 0,
+        solved = within_tolerance(
+            left.positions, left.angles, p["position_tolerance"], p["angle_tolerance"]
         )
         waited = ca.if_else(cost > GAIN * before.cost, s["waited"] + 1, 0.0)
         stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > DAMPING_CEILING)

@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.methods.common.contact_fit import LENGTH, fresh_fit
+from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.diagnosis import ArmReach, HandFit
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase

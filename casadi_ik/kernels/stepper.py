@@ -1,57 +1,55 @@
-"""A solve one iteration at a time, for looking on; the loop in compiled code is the fast way."""
+"""A solve one iteration at a time, to look at it; the loop in compiled code is the fast way."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.kernels import LoopKernel
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
-from casadi_ik.problem.problems import Array, Problems
 
+Vector = NDArray[np.float64]
 
-@runtime_checkable
-class SteppedMethod(Protocol):
-    """A method that is one step graph run to its end."""
-
-    @property
-    def kernel(self) -> LoopKernel:
-        """The loop around its step."""
-        ...
-
-    def start(self, problems: Problems, q0: Array) -> tuple[Array, Array]:
-        """First states (k, ns) and parameters (k, np) of the step graph for a batch."""
-        ...
+NextRound = Callable[[int, Vector], tuple[Vector, Vector] | None]
+"""From the status and the last state of a round to the state (ns,) and the parameters (np,) of the
+next one; None if the solve is over."""
 
 
 class Stepper:
     """Runs a step graph in CasADi's virtual machine, with the iterates of the compiled loop.
 
-    Iterating over it steps until the method ends, however long that takes; a budget is the
+    Iterating over it steps until the solve is over, however long that takes; a budget is the
     caller's.
 
     Attributes:
         graph: The step.
         iteration: Steps made so far.
-        status: 0 while running, else the code with which the step ended.
+        status: 0 while running, else the code with which the solve ended.
     """
 
-    def __init__(self, graph: StepGraph, state: Array, parameters: Array) -> None:
+    def __init__(
+        self,
+        graph: StepGraph,
+        state: Vector,
+        parameters: Vector,
+        next_round: NextRound | None = None,
+    ) -> None:
         """Start.
 
         Args:
             graph: The step.
             state: (ns,) the first state.
             parameters: (np,) targets, tolerances, gains.
+            next_round: How a solve of several rounds goes on; None: there is one round.
         """
         self.graph = graph
         self.iteration = 0
         self.status = RUNNING
         self._state = np.array(state, dtype=float)
         self._parameters = np.array(parameters, dtype=float)
+        self._next_round = next_round
 
     @property
     def state(self) -> dict[str, Any]:
@@ -60,7 +58,7 @@ class Stepper:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What is constant during the solve, by name."""
+        """What is constant during a round, by name."""
         return self.graph.parameters.unpack(self._parameters.copy())
 
     def step(self) -> dict[str, Any]:
@@ -74,6 +72,11 @@ class Stepper:
         self._state = _flat(state)
         self.status = int(status)
         self.iteration += 1
+        if self.status != RUNNING and self._next_round is not None:
+            following = self._next_round(self.status, self._state)
+            if following is not None:
+                self._state, self._parameters = following
+                self.status = RUNNING
         values = self.graph.record.unpack(_flat(record))
         return {
             field.name: values[field.name].astype(field.dtype)[()] for field in self.graph.record
@@ -85,5 +88,5 @@ class Stepper:
             yield self.step()
 
 
-def _flat(vector: Any) -> NDArray[np.float64]:
+def _flat(vector: Any) -> Vector:
     return np.array(vector, dtype=float).reshape(-1)

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import platform
-import zlib
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from functools import cache
@@ -16,16 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.logs.clock import ITERATION, LogClock
-
-METADATA_NAME = "casadi_ik"
-"""Name of the metadata record that makes an MCAP file a log of ours."""
-
-FORMAT = "2"
-"""Version of the log's own conventions (topics, schemas, metadata)."""
-
-CHECKSUM = "crc32"
-"""Key of the checksum of all other entries."""
+from casadi_ik.logs.mcap.clock import ITERATION, LogClock
+from casadi_ik.logs.mcap.metadata import CHECKSUM, FORMAT, checksum
 
 PACKAGES = ("casadi", "numpy", "mcap", "pin", "proxsuite", "msgspec", "pyyaml")
 
@@ -56,12 +47,6 @@ def log_metadata(
         "parameters": json.dumps(plain(parameters)),
     }
     return {**record, CHECKSUM: checksum(record)}
-
-
-def checksum(record: Mapping[str, str]) -> str:
-    """CRC-32 of the entries but itself: MCAP has no checksum for metadata."""
-    entries = sorted((key, text) for key, text in record.items() if key != CHECKSUM)
-    return f"{zlib.crc32(json.dumps(entries).encode()):08x}"
 
 
 def machine() -> dict[str, Any]:

@@ -1,0 +1,225 @@
+"""A method that is one step graph: started, run to its end in compiled code, stepped by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.errors import RowError, UnsupportedError
+from casadi_ik.kernels import LoopKernel, StepGraph
+from casadi_ik.kernels.rows import opaque
+from casadi_ik.kernels.stepper import Stepper
+from casadi_ik.problem.method import Outcome
+from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.trace import RecordedJacobian, TraceFormat, trace_format
+from casadi_ik.robots.description import RobotDescription
+
+Counts = NDArray[np.int64]
+"""(k,) numbers of something, one per solve."""
+
+Start = tuple[Array, Array]
+"""First states (k, ns) and parameters (k, np) of a step graph."""
+
+
+class LoopedMethod(ABC):
+    """A method that is one step graph run to its end, in one or several rounds.
+
+    What a method of this kind has to say of itself are `step_graph` (the iteration, with the
+    layouts of its state, parameters and record), `begin` (where solves start) and `phase_counts`
+    (what the iterations were spent on). Batches, steps by hand and traces follow from these.
+
+    The state has a field "q" (n,), the configuration to return; the record has the fields that
+    `trace_format` names. The step ends a solve with a code of `Status`.
+
+    Attributes:
+        name: Name of the method.
+        robot: The robot.
+        options: Its parameter record, a dataclass.
+    """
+
+    name: str
+
+    max_iterations: int = 100_000
+    """Budget of a round. This one is far above what steps allow themselves that end by a status of
+    their own."""
+
+    rounds: int = 1
+    """How often a solve that has failed is begun again, the first time included."""
+
+    takes_free_contacts: bool = False
+    """Whether a finger or its normal may be left free."""
+
+    takes_fixed_actuators: bool = False
+    """Whether actuators may be fixed."""
+
+    def __init__(self, robot: RobotDescription, options: Any, compiled: bool = True) -> None:
+        """Remember what the method is made of; its loop is built when first needed.
+
+        Args:
+            robot: The robot.
+            options: The parameter record, a dataclass.
+            compiled: False keeps to CasADi's virtual machine.
+        """
+        self.robot = robot
+        self.options = options
+        self._compiled = compiled
+
+    @abstractmethod
+    def step_graph(self) -> StepGraph:
+        """The whole iteration."""
+
+    @abstractmethod
+    def begin(
+        self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
+    ) -> Start:
+        """Where the solves of a batch begin; `Layout.pack_rows` lays it out.
+
+        Args:
+            problems: k targets.
+            q0: (k, n) configurations to start from.
+            number: Of the round, from 0.
+            last: (k, ns) states in which the round before ended; None in the first.
+        """
+
+    @abstractmethod
+    def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
+        """Iterations by phase.
+
+        Args:
+            states: (k, ns) last states.
+            iterations: (k,) iterations of all rounds.
+        """
+
+    def restarts(self, states: Array) -> Counts:
+        """(k,) how often the solves began anew, from their last states (k, ns)."""
+        return np.zeros(len(states), dtype=np.int64)
+
+    @property
+    def jacobians(self) -> Mapping[str, RecordedJacobian]:
+        """The Jacobians in the record, as in `TraceFormat`."""
+        return {}
+
+    @cached_property
+    def graph(self) -> StepGraph:
+        """The step graph, made once."""
+        return self.step_graph()
+
+    @cached_property
+    def kernel(self) -> LoopKernel:
+        """The compiled loop; the virtual machine for a step that has no C code."""
+        return LoopKernel(self.graph, self._compiled)
+
+    @property
+    def trace_format(self) -> TraceFormat:
+        """How its traces are to be read."""
+        return trace_format(self.graph.record, self.robot, self.jacobians)
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """The parameter record as a plain mapping."""
+        return dataclasses.asdict(self.options)
+
+    def prepare(self) -> None:
+        """Build and compile the loop."""
+        _ = self.kernel
+
+    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+        """One target, one iteration at a time; see `Method.stepper`."""
+        self._check(problems)
+        rounds = iter(range(1, self.rounds))
+
+        def next_round(status: int, state: Array) -> Start | None:
+            number = next(rounds, None)
+            if status == Status.SOLVED or number is None:
+                return None
+            states, parameters = self.begin(problems, q0[None], number, state[None])
+            return states[0], parameters[0]
+
+        states, parameters = self.begin(problems, q0[None])
+        return Stepper(self.graph, states[0], parameters[0], next_round)
+
+    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+        """Solve a batch; see `Method.run`. No random numbers are drawn."""
+        del seed
+        self._check(problems)
+        count = len(problems)
+        iterations, seconds = np.zeros(count, dtype=np.int64), np.zeros(count)
+        records = _Records()
+        states = np.empty((count, self.graph.state.size))
+        status = np.empty(count, dtype=np.int64)
+        left, here, last = np.arange(count), q0, None
+        for number in range(self.rounds):
+            begun = time.perf_counter()
+            some = problems if last is None else problems.rows(left)
+            first, parameters = self.begin(some, here, number, last)
+            result = self.kernel.run(first, parameters, self.max_iterations, trace)
+            ended = Status.from_loop(result.status)
+            outside = time.perf_counter() - begun - result.time.sum()
+            if last is None:
+                states, status = result.states, ended
+            else:
+                states[left], status[left] = result.states, ended
+            iterations[left] += result.iterations
+            # What is done for all solves at once counts for each of them alike.
+            seconds[left] += result.time + max(outside, 0.0) / max(len(left), 1)
+            if result.rows is not None:
+                records.add(left, result.iterations, result.rows)
+            missed = np.flatnonzero(ended != Status.SOLVED)
+            if not len(missed):
+                break
+            left, here, last = left[missed], here[missed], result.states[missed]
+        counts = self.phase_counts(states, iterations)
+        return Outcome(
+            # A copy: the states are much larger and need not stay.
+            q=states[:, self.graph.state.slice("q")].copy(),
+            status=status,
+            iterations=iterations,
+            restarts=self.restarts(states),
+            time=seconds,
+            phases={phase.label: spent for phase, spent in counts.items()},
+            rows=records.by_target() if trace else None,
+        )
+
+    def _check(self, problems: Problems) -> None:
+        if problems.fixed is not None and not self.takes_fixed_actuators:
+            raise UnsupportedError(f"method {self.name!r} cannot keep actuators fixed")
+        if self.takes_free_contacts:
+            return
+        for name, array in (("contact", problems.points), ("normal", problems.normals)):
+            free = np.argwhere(np.isnan(array[..., 0]))
+            if len(free):
+                row, finger = problems.first_row + int(free[0, 0]), free[0, 1]
+                raise RowError(
+                    f"method {self.name!r} needs a {name} for every finger; row {row} has none for "
+                    f"{self.robot.finger_names[finger]!r}",
+                    row,
+                )
+
+
+class _Records:
+    """The records of a batch whose targets may take several rounds."""
+
+    def __init__(self) -> None:
+        self._rounds: list[NDArray[Any]] = []
+        self._targets: list[NDArray[np.intp]] = []
+
+    def add(self, targets: NDArray[np.intp], iterations: Counts, rows: NDArray[Any]) -> None:
+        """Add a round: the rows of some targets, (sum of their iterations,)."""
+        self._rounds.append(rows)
+        self._targets.append(np.repeat(targets, iterations))
+
+    def by_target(self) -> NDArray[Any]:
+        """The rows of all rounds, target by target."""
+        if len(self._rounds) == 1:
+            return self._rounds[0]
+        order = np.argsort(np.concatenate(self._targets), kind="stable")
+        rows = np.concatenate(list(map(opaque, self._rounds)))
+        return np.take(rows, order).view(self._rounds[0].dtype)

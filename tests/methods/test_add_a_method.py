@@ -1,0 +1,96 @@
+"""The method of docs/add_a_method.md: its very lines solve, step, batch and log."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError
+from casadi_ik.kernels.lanes import LANES
+from casadi_ik.methods import registry
+
+PAGE = Path(__file__).parents[2] / "docs" / "add_a_method.md"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The page's lines as a module; the method is known as long as these tests run."""
+    path = tmp_path_factory.mktemp("page") / "example_method.py"
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    path.write_text("\n".join(blocks), encoding="utf-8")
+    spec = importlib.util.spec_from_file_location("example_method", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    before = dict(registry._ENTRIES)
+    spec.loader.exec_module(module)
+    yield module
+    registry._ENTRIES.clear()
+    registry._ENTRIES.update(before)
+
+
+@pytest.fixture(scope="module")
+def near_home(page):
+    """Targets near home: (8, f, 3) points and normals."""
+    robot = page.robot
+    shift = 0.05 * np.random.default_rng(7).uniform(-1, 1, (8, len(robot.actuators)))
+    q = np.clip(robot.home + shift * (robot.upper - robot.lower), robot.lower, robot.upper)
+    return robot.contacts(q)
+
+
+def test_it_solves_a_batch_side_by_side(page, near_home):
+    batch = page.solver.solve_batch(*near_home)
+    assert batch.success.all(), batch.status_names
+    assert (batch.iterations > 1).all()
+    kernel = page.solver._engine.method.kernel
+    assert not kernel.compiled or kernel.lanes == LANES
+    assert page.solver.parameters["options"] == {"damping": 0.2, "max_iterations": 300}
+
+
+def test_it_is_logged_and_stepped(page, near_home, tmp_path):
+    points, normals = (array[0] for array in near_home)
+    contacts = zip(page.robot.fingers, points, normals, strict=True)
+    grasp = ik.Grasp({finger: ik.Contact(point, normal) for finger, point, normal in contacts})
+    solution = page.solver.solve(grasp, log=tmp_path / "x.mcap")
+    assert solution.success
+    rows = ik.logs.open(tmp_path / "x.mcap").iterations().rows
+    assert solution.iterations == len(rows)
+    assert (np.diff(rows["cost"]) < 0).all(), "every step gains"
+    records = list(page.solver.stepper(grasp))
+    np.testing.assert_allclose([record["q"] for record in records], rows["q"], atol=1e-9)
+
+
+def test_a_budget_that_is_used_up_is_a_status(page, near_home):
+    solver = ik.Solver(page.robot, page.DampedLeastSquares.name, options={"max_iterations": 1})
+    batch = solver.solve_batch(*near_home)
+    late = ~batch.success  # the verdict is on where the last step led
+    assert late.any()
+    assert set(batch.status_names[late]) == {"ITERATION_LIMIT"}
+
+
+def test_a_free_finger_is_refused_by_name(page, near_home):
+    points, normals = (array.copy() for array in near_home)
+    points[3, 1] = normals[3, 1] = np.nan
+    with pytest.raises(InputError, match=r"'damped-least-squares' needs a contact .* row 3"):
+        page.solver.solve_batch(points, normals)
+
+
+def test_names_are_taken_once(page):
+    method, known = page.DampedLeastSquares, page.DampedParameters
+    with pytest.raises(InputError, match="there is a method 'damped-least-squares' already"):
+        ik.register_method(method.name, "again", known, method)
+    ik.register_method(method.name, "again", known, method, replace=True)
+    assert registry.method_summary(method.name) == "again"
+    assert registry.method_names() == (*ik.METHODS, method.name)
+    with pytest.raises(InputError, match="there is a method 'ipopt' already"):
+        ik.register_method("ipopt", "mine", known, method, replace=True)
+    with pytest.raises(InputError, match="expected a dataclass"):
+        ik.register_method("other", "mine", dict, method)
+    ik.register_method("misnamed", "calls itself otherwise", known, method)
+    with pytest.raises(InputError, match="calls itself 'damped-least-squares'"):
+        ik.Solver(page.robot, "misnamed")

@@ -1,0 +1,260 @@
+"""Every condition of a contact: residual, Jacobian, errors, against formulas of its own."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
+from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_jacobian, fit_residual
+from casadi_ik.methods.hand_first.whole_fit import whole_jacobian, whole_residual
+from casadi_ik.methods.thumb_first.closed_chain_step import contact_errors, linearised
+from casadi_ik.problem.contacts.conditions import CONDITIONS, FACING, LENGTH, PLACE
+from casadi_ik.problem.contacts.kinds import ContactKind, kind_of, suffix, usual
+from casadi_ik.problem.contacts.rows import ContactRows
+from casadi_ik.symbolic.se3 import compose, exp_se3
+
+ARM = 7
+BY_ASPECT = [
+    [name for name, condition in CONDITIONS.items() if condition.aspect == aspect]
+    for aspect in (PLACE, FACING)
+]
+KINDS = [ContactKind(*names) for names in product(*BY_ASPECT)]
+WEIGHTS = np.array([[1.0, 1.0], [1.0, 0.0], [0.5, 2.0]])
+
+
+def number(value):
+    return np.array(ca.evalf(ca.densify(ca.SX(value))))
+
+
+def differences(function, x, step=1e-6):
+    """Central differences (m, n)."""
+    ahead, behind = ([function(x + sign * step * e) for e in np.eye(len(x))] for sign in (1, -1))
+    return np.column_stack([(a - b) / (2 * step) for a, b in zip(ahead, behind, strict=True)])
+
+
+def units(rng, count):
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+
+
+def data_at(robot, q, rng):
+    """Every vector a target can have, so that the contacts are met at q."""
+    frames = robot.contact_frames(q)
+    f = len(frames)
+    return {
+        "points": frames[:, :3, 3],
+        "normals": frames[:, :3, 0],
+        "tangents": frames[:, :3, 1],
+        "lines": units(rng, f),
+        "planes": units(rng, f),
+    }
+
+
+def parameters(data, weights=WEIGHTS):
+    return {name: ca.DM(value) for name, value in {**data, "weights": weights}.items()}
+
+
+def every_kind(test):
+    return pytest.mark.parametrize("kind", KINDS, ids=lambda kind: "+".join(kind))(test)
+
+
+@every_kind
+def test_jacobian_of_the_whole_is_the_slope_of_the_residual(robot, kind, rng):
+    q, other = robot.random(rng, 2)
+    p, rows = parameters(data_at(robot, other, rng)), ContactRows((kind,) * 3)
+
+    def residual(x):
+        return number(whole_residual(robot.description, rows, ca.SX(x), p)).ravel()
+
+    found = number(whole_jacobian(robot.description, rows, ca.SX(q), p))
+    assert found.shape == (rows.size, 14)
+    np.testing.assert_allclose(found, differences(residual, q), atol=2e-7)
+    assert np.linalg.matrix_rank(found) >= 5
+
+
+@every_kind
+def test_jacobian_of_the_hand_is_the_slope_of_the_residual(robot, kind, rng):
+    """Over a palm that shifts and turns, too: there it is the targets that move."""
+    q, other = robot.random(rng, 2)
+    p, rows = parameters(data_at(robot, other, rng)), ContactRows((kind,) * 3)
+    palm = robot.palm(q)
+
+    def at(x):
+        rotation, origin = compose((palm[:3, :3], palm[:3, 3]), exp_se3(ca.DM(x[:6])))
+        place = PalmAndHand(rotation, origin, ca.DM(q[ARM:] + x[6:]))
+        return hand_contacts(robot.description, ca.SX(place.hand), tuple(range(ARM, 14))), place
+
+    def residual(x):
+        contacts, place = at(x)
+        return number(fit_residual(contacts, rows, place, p)).ravel()
+
+    contacts, place = at(np.zeros(13))
+    found = number(fit_jacobian(contacts, rows, place, p))
+    np.testing.assert_allclose(found, differences(residual, np.zeros(13)), atol=2e-7)
+
+
+@every_kind
+def test_hand_and_whole_have_the_same_residual(robot, kind, rng):
+    """Lengths are the same in every frame."""
+    q, other = robot.random(rng, 2)
+    p, rows = parameters(data_at(robot, other, rng)), ContactRows((kind,) * 3)
+    palm = robot.palm(q)
+    contacts = hand_contacts(robot.description, ca.SX(q[ARM:]), tuple(range(ARM, 14)))
+    place = PalmAndHand(ca.DM(palm[:3, :3]), ca.DM(palm[:3, 3]), ca.DM(q[ARM:]))
+    hand = rows.errors(ca.DM(number(fit_residual(contacts, rows, place, p))))
+    whole = rows.errors(ca.DM(number(whole_residual(robot.description, rows, ca.SX(q), p))))
+    for one, other_one in zip(hand, whole, strict=True):
+        np.testing.assert_allclose(number(one), number(other_one), atol=1e-12)
+
+
+@every_kind
+def test_rows_of_newton_are_the_slopes_of_the_error_at_the_target(robot, kind, rng):
+    (q,) = robot.random(rng, 1)
+    p, rows = parameters(data_at(robot, q, rng), np.ones((3, 2))), ContactRows((kind,) * 3)
+
+    def errors(x):
+        both = contact_errors(robot.description, rows, ca.SX(x), p)
+        return number(ca.vertcat(*map(ca.vertcat, *both))).ravel()
+
+    assert np.abs(errors(q)).max() < 1e-7
+    linear = linearised(robot.description, rows, ca.SX(q), p)
+    found = np.vstack([number(linear.thumb), number(linear.others)])
+    slopes = -differences(errors, q)
+    np.testing.assert_allclose(found.T @ found, slopes.T @ slopes, atol=1e-5, rtol=1e-5)
+
+
+def own_errors(kind, data, frames):
+    """Distances and angles by NumPy and SciPy."""
+    off = frames[:, :3, 3] - data["points"]
+    distance = {
+        "point": np.linalg.norm(off, axis=1),
+        "line": np.linalg.norm(np.cross(data["lines"], off), axis=1),
+        "plane": np.abs(np.sum(data["planes"] * off, axis=1)),
+    }[kind.place]
+    cosine = np.sum(frames[:, :3, 0] * data["normals"], axis=1)
+    third = np.cross(data["normals"], data["tangents"])
+    goal = np.stack([data["normals"], data["tangents"], third], axis=2)
+    turned = Rotation.from_matrix(goal @ frames[:, :3, :3].transpose(0, 2, 1)).magnitude()
+    return distance, {"normal": np.arccos(cosine), "frame": turned}[kind.facing]
+
+
+@every_kind
+def test_errors_are_distances_and_angles(robot, kind, rng):
+    """Of the residual, of the rotation vectors, and as they are measured: all three agree."""
+    for q, other in robot.random(rng, 10).reshape(5, 2, 14):
+        data, rows = data_at(robot, other, rng), ContactRows((kind,) * 3)
+        p = parameters(data, np.ones((3, 2)))
+        distance, angle = own_errors(kind, data, robot.contact_frames(q))
+        residual = ca.DM(number(whole_residual(robot.description, rows, ca.SX(q), p)))
+        positions, chords = rows.errors(residual)
+        np.testing.assert_allclose(number(positions).ravel(), distance, atol=1e-9)
+        np.testing.assert_allclose(number(chords).ravel(), 2 * np.sin(angle / 2), atol=1e-9)
+        places, facings = contact_errors(robot.description, rows, ca.SX(q), p)
+        for i in range(3):
+            assert np.linalg.norm(number(places[i])) * LENGTH == pytest.approx(distance[i])
+            assert np.linalg.norm(number(facings[i])) == pytest.approx(angle[i])
+
+
+@every_kind
+def test_what_a_condition_measures(robot, kind, rng):
+    """The third way to the same numbers, on vectors alone."""
+    for q, other in robot.random(rng, 10).reshape(5, 2, 14):
+        data, frames = data_at(robot, other, rng), robot.contact_frames(q)
+        distance, angle = own_errors(kind, data, frames)
+        place, facing = kind.conditions
+        for i, frame in enumerate(frames):
+            tip = {"point": frame[:3, 3], "normal": frame[:3, 0], "tangent": frame[:3, 1]}
+            tip = {name: ca.DM(value) for name, value in tip.items()}
+            goal = {name: ca.DM(data[f"{name}s"][i]) for name in kind.data}
+            assert float(place.measure(tip, goal)) == pytest.approx(distance[i], abs=1e-12)
+            assert float(facing.measure(tip, goal)) == pytest.approx(angle[i], abs=1e-9)
+
+
+angles = st.floats(-3.1, 3.1)
+
+
+@given(turn=st.tuples(angles, angles, angles), about=st.sampled_from([0, 1, 2]))
+def test_a_frame_weighs_every_turn_alike(turn, about):
+    """The length of its residual is the chord of the angle, about whatever axis it is turned."""
+    start = Rotation.from_euler("xyz", turn)
+    axis, angle = np.eye(3)[about], abs(turn[0])
+    end = Rotation.from_rotvec(axis * angle) * start
+    tip, goal = (
+        {"normal": ca.DM(R.as_matrix()[:, 0]), "tangent": ca.DM(R.as_matrix()[:, 1])}
+        for R in (start, end)
+    )
+    residual = CONDITIONS["frame"].residual(tip, goal)
+    assert float(ca.norm_2(residual)) == pytest.approx(2 * np.sin(angle / 2), abs=1e-12)
+    vector = np.array(CONDITIONS["frame"].error(tip, goal)).ravel()
+    np.testing.assert_allclose(vector, axis * angle, atol=1e-7)
+
+
+def test_a_frame_without_a_tangent_is_a_normal(robot, rng):
+    """A tangent of zero is free, so one kernel serves fingers with and without one."""
+    q, other = robot.random(rng, 2)
+    data = data_at(robot, other, rng)
+    data["tangents"] = np.zeros((3, 3))
+    p = parameters(data, np.ones((3, 2)))
+    frame, normal = ContactRows((ContactKind("point", "frame"),) * 3), ContactRows(usual(3))
+    found, expected = (
+        rows.errors(ca.DM(number(whole_residual(robot.description, rows, ca.SX(q), p))))
+        for rows in (frame, normal)
+    )
+    for one, another in zip(found, expected, strict=True):
+        np.testing.assert_allclose(number(one), number(another), atol=1e-14)
+    one, another = (linearised(robot.description, rows, ca.SX(q), p) for rows in (frame, normal))
+    gram = [np.vstack([number(x.thumb), number(x.others)]) for x in (one, another)]
+    np.testing.assert_allclose(gram[0].T @ gram[0], gram[1].T @ gram[1], atol=1e-9)
+
+
+def test_best_palm_takes_tangents_into_account(robot, rng):
+    """One finger with its whole frame fixes the palm of a posture; point and normal do not."""
+    (q,) = robot.random(rng, 1)
+    weights = np.array([[1.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
+    p = parameters(data_at(robot, q, rng), weights)
+    contacts = hand_contacts(robot.description, ca.SX(q[ARM:]), tuple(range(ARM, 14)))
+    rows = ContactRows((ContactKind("point", "frame"),) * 3)
+    rotation, origin = best_palm(contacts, rows, p)
+    np.testing.assert_allclose(number(rotation), robot.palm(q)[:3, :3], atol=1e-3)
+    np.testing.assert_allclose(number(origin).ravel(), robot.palm(q)[:3, 3], atol=1e-3)
+
+
+def test_the_kind_follows_from_the_data():
+    assert kind_of(["point"]) == kind_of(["point", "normal"]) == ContactKind("point", "normal")
+    assert kind_of(["point", "normal", "tangent"]) == ContactKind("point", "frame")
+    assert kind_of(["point", "line"]) == ContactKind("line", "normal")
+    assert kind_of(["point", "plane", "normal", "tangent"]) == ContactKind("plane", "frame")
+
+
+def test_graphs_of_different_kinds_have_different_names():
+    names = [suffix(kinds) for kinds in product(KINDS, repeat=2)]
+    assert len(set(names)) == len(names)
+    assert suffix(usual(3)) == ""
+
+
+def test_contact_frames_hold_the_contacts(robot, coupled_robot, rng):
+    for one in (robot, coupled_robot):
+        q = one.random(rng, 20)
+        frames, (points, normals) = one.contact_frames(q), one.contacts(q)
+        assert frames.shape == (20, len(one.fingers), 4, 4)
+        np.testing.assert_allclose(frames[..., :3, 3], points, atol=1e-12)
+        np.testing.assert_allclose(frames[..., :3, 0], normals, atol=1e-12)
+        turned = np.swapaxes(frames[..., :3, :3], -1, -2) @ frames[..., :3, :3]
+        np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-12)
+        np.testing.assert_allclose(np.linalg.det(frames[..., :3, :3]), 1.0, atol=1e-12)
+        np.testing.assert_array_equal(one.contact_frames(q[0]), frames[0])
+
+
+def test_the_tangent_is_the_x_axis_of_the_described_contact_frame(robot, rng):
+    """Of the Barrett hand it runs along the last phalanx."""
+    (q,) = robot.random(rng, 1)
+    links = robot.links(q)
+    for finger, frame in zip(robot.description.fingers, robot.contact_frames(q), strict=True):
+        np.testing.assert_allclose(frame[:3, 1], links[finger.link][:3, 0], atol=1e-12)

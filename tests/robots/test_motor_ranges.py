@@ -1,0 +1,168 @@
+"""Limits of coupled joints are limits of their motors: for bounds, random draws and methods."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+import yaml
+from toy_robots import COUPLED_HAND, copy_shipped_robot, write_coupled_robot
+
+import casadi_ik as ik
+from casadi_ik.errors import DescriptionError
+from casadi_ik.files.shipped import models_folder, shipped_names
+from casadi_ik.robots.coupling_values import followed
+from casadi_ik.robots.couplings import FourBar, LeadScrew, Linear
+from casadi_ik.symbolic.couplings import follow
+
+NARROW = {
+    "left_spread": [-0.1, 0.5],
+    "left_1": [0.3, 1.1],
+    "left_3": [0.05, 0.3],
+    "right_1": [0.1, 0.4],
+    "right_spread": [-0.3, 0.4],
+    "thumb_bend": [0.4, 1.2],
+}
+"""Limits of joints that their motors could pass."""
+
+
+def narrow_robot(folder):
+    path = write_coupled_robot(folder)
+    hand = yaml.safe_load(COUPLED_HAND)
+    for joint in hand["joints"]:
+        joint["limits"] = NARROW.get(joint["name"], joint["limits"])
+    (folder / "parts" / "hand.yaml").write_text(yaml.safe_dump(hand))
+    return path
+
+
+@pytest.fixture
+def narrow(tmp_path):
+    return ik.load_robot(narrow_robot(tmp_path))
+
+
+def narrow_barrett(folder):
+    """The shipped arm with the coupled hand, whose distal joints keep to 8 to 30 deg."""
+    path = copy_shipped_robot(folder)
+    models = models_folder()
+    hand = yaml.safe_load((models / "hands" / "barrett_bh8_280_coupled.yaml").read_text())
+    for joint in hand["joints"]:
+        if joint["name"].endswith("distal"):
+            joint["limits"] = ["8 deg", "30 deg"]
+    (folder / "hand.yaml").write_text(yaml.safe_dump(hand))
+    whole = yaml.safe_load((models / "arm_hands" / "kuka_lwr_barrett_coupled.yaml").read_text())
+    whole |= {"name": "narrow", "arm": "arm.yaml", "hand": "hand.yaml"}
+    whole["home"] |= {f"bh_{finger}_proximal": "60 deg" for finger in ("thumb", "finger_2")}
+    whole["home"]["bh_finger_3_proximal"] = "60 deg"
+    path.write_text(yaml.safe_dump(whole))
+    return ik.load_robot(path)
+
+
+def test_no_random_configuration_is_beyond_a_joint_limit(narrow, rng):
+    assert narrow.beyond_limits(narrow.random(rng, 20_000)).max() <= 1e-9
+
+
+def test_the_range_is_as_wide_as_the_joints_allow(narrow):
+    """At either end of every motor that was narrowed, some joint stands at its own limit."""
+    strokes = narrow.description.strokes
+    narrowed = set()
+    for side, ends in enumerate((narrow.lower, narrow.upper)):
+        for i, name in enumerate(narrow.actuators):
+            q = narrow.home.copy()
+            q[i] = ends[i]
+            assert abs(narrow.beyond_limits(q)) <= 1e-9
+            if ends[i] != strokes[side][i]:
+                narrowed.add(name)
+                q[i] += (2 * side - 1) * 1e-6 * (strokes[1] - strokes[0])[i]
+                assert narrow.beyond_limits(q) > 1e-9
+    assert narrowed == {"spread", "screw_1", "screw_2", "thumb_bend"}
+
+
+def test_shipped_robots_keep_their_strokes_to_the_last_digit():
+    for name in shipped_names("arm_hands"):
+        robot = ik.load_robot(name)
+        np.testing.assert_array_equal(robot.lower, robot.description.strokes[0])
+        np.testing.assert_array_equal(robot.upper, robot.description.strokes[1])
+
+
+def test_numbers_are_those_of_the_graphs(rng):
+    bar = FourBar("x", 0.0297, 0.0347, 0.0084, 0.0072, 3.32939008, 4.1110)
+    screw = LeadScrew("x", 0.0522, 0.013, 0.58)
+    for coupling, low, high in ((bar, -4, 4), (screw, 0.03, 0.07), (Linear("x", -0.5, 0.1), -1, 1)):
+        joint = type("Joint", (), {"coupling": coupling})()
+        q = ca.SX.sym("q")
+        graph = ca.Function("graph", [q], [follow(joint, q)])
+        values = rng.uniform(low, high, 500)
+        expected = np.array(graph(values[None])).ravel()
+        np.testing.assert_allclose(followed(coupling, values), expected, atol=1e-12)
+
+
+def test_a_joint_that_turns_back(tmp_path):
+    """A four-bar's output turns where rod and ground align: the interval of home is kept."""
+    path = narrow_robot(tmp_path)
+    hand = yaml.safe_load((tmp_path / "parts" / "hand.yaml").read_text())
+    joints = {joint["name"]: joint for joint in hand["joints"]}
+    joints["left_2"] |= {"coupling": {"kind": "linear", "of": "screw_2"}, "limits": [-3, 3]}
+    hand["actuators"]["screw_2"] = {"limits": [-1.2, 1.2], "unit": "rad", "source": "toy"}
+    for name in ("left_3", "left_4", "right_1"):
+        joints[name]["limits"] = [-6, 6]
+    (tmp_path / "parts" / "hand.yaml").write_text(yaml.safe_dump(hand))
+    wide = ik.load_robot(path)
+    place = wide.actuators.index("screw_2")
+    q = np.tile(wide.home, (4001, 1))
+    q[:, place] = np.linspace(wide.lower[place], wide.upper[place], 4001)
+    theta = wide.joints(q)["left_3"]
+    lowest = int(theta.argmin())
+    assert 100 < lowest < 3900
+    # Both sides of the turning point reach the same height; only one of them holds home.
+    joints["left_3"]["limits"] = [float(theta[lowest]) + 0.02, 6]
+    (tmp_path / "parts" / "hand.yaml").write_text(yaml.safe_dump(hand))
+    for home in (q[50, place], q[3950, place]):
+        path.write_text(path.read_text().split("home:")[0] + f"home: {{screw_2: {home}}}\n")
+        robot = ik.load_robot(path)
+        assert robot.lower[place] <= home <= robot.upper[place]
+        turn = q[lowest, place]
+        assert (robot.upper[place] < turn) if home < turn else (robot.lower[place] > turn)
+        assert robot.beyond_limits(robot.random(np.random.default_rng(0), 5000)).max() <= 1e-9
+
+
+def test_a_motor_with_nowhere_to_go(tmp_path):
+    path = narrow_robot(tmp_path)
+    hand = tmp_path / "parts" / "hand.yaml"
+    data = yaml.safe_load(hand.read_text())
+    next(j for j in data["joints"] if j["name"] == "left_spread")["limits"] = [0.9, 1]
+    hand.write_text(yaml.safe_dump(data))
+    with pytest.raises(DescriptionError, match=r"actuators\.spread: limits: nowhere from -0\.4 to"):
+        ik.load_robot(path)
+
+
+def test_home_beyond_a_joint_limit(tmp_path):
+    path = narrow_robot(tmp_path)
+    path.write_text(path.read_text().replace("spread: 0.2", "spread: 0.8"))
+    with pytest.raises(DescriptionError, match=r"home\.spread: 0\.8 is outside the limits \["):
+        ik.load_robot(path)
+
+
+def test_home_that_is_not_given_is_within(tmp_path):
+    path = narrow_robot(tmp_path)
+    path.write_text(path.read_text().split("home:")[0])
+    robot = ik.load_robot(path)
+    assert robot.beyond_limits(robot.home) <= 1e-9
+
+
+@pytest.mark.parametrize("tolerance", [ik.Tolerance(), ik.Tolerance(1e-6, 1e-6)])
+@pytest.mark.parametrize("method", ["hand-first", "thumb-first"])
+def test_no_solve_ends_at_a_follower_beyond_its_limit(tmp_path, rng, method, tolerance):
+    robot = narrow_barrett(tmp_path)
+    points, normals = robot.contacts(robot.random(rng, 2000))
+    batch = ik.Solver(robot, method, tolerance).solve_batch(points, normals)
+    assert np.flatnonzero(~batch.success).tolist() == []
+    assert robot.beyond_limits(batch.q).max() <= 1e-9
+
+
+def test_where_limits_are_ignored_the_joints_are_free(tmp_path, rng):
+    robot = narrow_barrett(tmp_path)
+    wide = ik.load_robot("kuka_lwr_barrett_coupled")
+    points, normals = wide.contacts(wide.random(rng, 300))
+    batch = ik.Solver(robot, limits="ignore").solve_batch(points, normals)
+    assert batch.success.mean() > 0.9
+    assert not batch.limits_ok.all()
