@@ -19,7 +19,7 @@ from casadi_ik.logs import Compression, Keep, McapRecorder
 from casadi_ik.methods.qiu.parameters import FINGER_STEPS
 from casadi_ik.methods.registry import METHODS, build_method, option_names
 from casadi_ik.problem.method import PreferringMethod
-from casadi_ik.problem.preference import preference
+from casadi_ik.problem.preference import NO_PREFERENCE, preference
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
@@ -328,7 +328,7 @@ class Solver:
                 f"found {asked!r}"
             )
         if prefer is None:
-            return "limits"
+            return NO_PREFERENCE
         raise UnsupportedError(
             f"prefer: method {self.method!r} cannot choose, it takes the solution it comes to from "
             f"q0; found {prefer!r}"

@@ -7,6 +7,9 @@ from casadi_ik.errors import InputError
 PREFERENCES = ("limits", "manipulability", "q0")
 """What may be preferred: distance from the limits, manipulability of the arm, closeness to q0."""
 
+NO_PREFERENCE = "none"
+"""That of methods that cannot choose: they take the solution they come to."""
+
 
 def preference(prefer: str | None, started: bool) -> str:
     """The preference that was asked for.

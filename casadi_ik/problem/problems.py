@@ -34,7 +34,8 @@ class Problems:
         first_row: Number of the first target in the whole batch; with the seed it decides the
             random numbers of a target, so that a part of a batch gets those of the whole.
         fixed: (n,) positions of locked actuators, NaN where one may move; None: all may.
-        prefer: Which of several solutions is wanted, one of `PREFERENCES`.
+        prefer: Which of several solutions is wanted, one of `PREFERENCES`, or
+            `NO_PREFERENCE`.
     """
 
     points: Array

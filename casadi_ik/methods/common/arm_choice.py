@@ -18,12 +18,12 @@ from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.srs_arm import Spherical, SrsArm, at_angle, euler_angles, swivel
 from casadi_ik.symbolic.subexpressions import shared
 
-SAMPLES = 8
+SAMPLES = 12
 """Swivels tried in a trial for a sign of the elbow."""
 
 ZOOMS = 5
 """Trials around the best after the first; the steps shrink to a quarter each time, at last to
-0.04 deg."""
+0.03 deg."""
 
 TRIALS = 1 + ZOOMS
 
