@@ -107,6 +107,7 @@ class Solver:
         log: str | PathLike[str] | None = None,
         diagnose: bool = True,
         fixed: Mapping[str, float] | None = None,
+        prefer: str | None = None,
     ) -> Solution:
         """Solve one grasp.
 
@@ -117,6 +118,9 @@ class Solver:
             log: Path of an MCAP file to write every iteration to.
             diagnose: Whether to find out why, if it is not solved (`Solution.diagnosis`).
             fixed: Positions of actuators that are not to move, by name [rad or m].
+            prefer: Which of several solutions: "q0" (near it, motions as parts of motors' ranges;
+                what solves is not moved), "limits" (far from them), "manipulability" (of the arm).
+                None: "q0" if q0 is given, else "limits".
 
         Returns:
             The solution; not converging is its status, never an exception.
@@ -124,10 +128,12 @@ class Solver:
         Raises:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
             UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed.
+            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
-        problems = self._questions.of_grasps([grasp], fixed)
+        problems = self._questions.of_grasps(
+            [grasp], fixed, self._engine.preference(prefer, q0 is not None)
+        )
         if log is None and (quick := self._engine.quick(problems, Run(q0, seed))) is not None:
             return quick
         with self._recorder(log, seed) as recorder:
@@ -146,6 +152,7 @@ class Solver:
         fixed: Mapping[str, float] | None = None,
         keep: Keep | None = None,
         compression: Compression = "zstd",
+        prefer: str | None = None,
     ) -> BatchSolution:
         """Solve k targets.
 
@@ -163,6 +170,7 @@ class Solver:
             fixed: Positions of actuators that are not to move, by name [rad or m].
             keep: Which solves keep their iterations in the log; None: all.
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
+            prefer: As for `solve`.
 
         Returns:
             The same fields as a `Solution`, as arrays.
@@ -170,10 +178,14 @@ class Solver:
         Raises:
             InputError: Bad shapes or values; the message names row and finger.
             UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed.
+            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
-        problems = self._questions.of_arrays(points, normals, self._questions.held(fixed))
+        held, preferred = (
+            self._questions.held(fixed),
+            self._engine.preference(prefer, q0 is not None),
+        )
+        problems = self._questions.of_arrays(points, normals, held, prefer=preferred)
         with self._recorder(log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 
@@ -186,6 +198,7 @@ class Solver:
         log: str | PathLike[str] | None = None,
         diagnose: bool = False,
         fixed: Mapping[str, float] | None = None,
+        prefer: str | None = None,
     ) -> Generator[SolvedBlock, None, None]:
         """Solve targets that come block by block, in the memory that one block takes.
 
@@ -201,6 +214,7 @@ class Solver:
                 and given up if the iterator is closed before.
             diagnose: Whether to find out why, for every target that is not solved.
             fixed: Positions of actuators that are not to move, by name [rad or m].
+            prefer: As for `solve`.
 
         Yields:
             The blocks, solved.
@@ -208,13 +222,16 @@ class Solver:
         Raises:
             InputError: Bad q0, seed or jobs, or a block of the wrong shape.
             UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed.
+            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
-        held = self._questions.held(fixed)
+        held, preferred = (
+            self._questions.held(fixed),
+            self._engine.preference(prefer, q0 is not None),
+        )
 
         def ask(points: ArrayLike, normals: ArrayLike, first_row: int) -> Problems:
-            return self._questions.of_arrays(points, normals, held, first_row)
+            return self._questions.of_arrays(points, normals, held, first_row, preferred)
 
         with self._recorder(log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
@@ -303,7 +320,9 @@ class Solver:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
             UnsupportedError: The method cannot be stepped; the message says why.
         """
-        problems = self._questions.of_grasps([grasp], None)
+        problems = self._questions.of_grasps(
+            [grasp], None, self._engine.preference(None, q0 is not None)
+        )
         return self._engine.method.stepper(problems, self._questions.start(q0))
 
     def _recorder(

@@ -34,6 +34,8 @@ class Problems:
         first_row: Number of the first target in the whole batch; with the seed it decides the
             random numbers of a target, so that a part of a batch gets those of the whole.
         fixed: (n,) positions of locked actuators, NaN where one may move; None: all may.
+        prefer: Which of several solutions is wanted, one of `PREFERENCES`, or
+            `NO_PREFERENCE`.
     """
 
     points: Array
@@ -42,6 +44,7 @@ class Problems:
     enforce_limits: bool
     first_row: int = 0
     fixed: Array | None = None
+    prefer: str = "limits"
 
     def __len__(self) -> int:
         return len(self.points)

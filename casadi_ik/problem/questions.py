@@ -29,7 +29,12 @@ class Questions:
     enforce_limits: bool
 
     def of_arrays(
-        self, points: ArrayLike, normals: ArrayLike, fixed: Array | None, first_row: int = 0
+        self,
+        points: ArrayLike,
+        normals: ArrayLike,
+        fixed: Array | None,
+        first_row: int = 0,
+        prefer: str = "limits",
     ) -> Problems:
         """Targets as arrays.
 
@@ -38,20 +43,27 @@ class Questions:
             normals: (k, f, 3).
             fixed: See `Problems`.
             first_row: Number of the first target.
+            prefer: See `Problems`.
 
         Raises:
             InputError: See `target_arrays`.
         """
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row)
         tolerances = tuple(self.tolerances.values())
-        return Problems(p, n, tolerances, self.enforce_limits, first_row, fixed)
+        return Problems(p, n, tolerances, self.enforce_limits, first_row, fixed, prefer)
 
-    def of_grasps(self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None) -> Problems:
+    def of_grasps(
+        self,
+        grasps: Sequence[Grasp],
+        fixed: Mapping[str, float] | None,
+        prefer: str = "limits",
+    ) -> Problems:
         """Grasps, at least one, that share the tolerances of the first.
 
         Args:
             grasps: The grasps.
             fixed: Held actuators by name.
+            prefer: See `Problems`.
 
         Raises:
             InputError: Something else than a grasp, one with a finger that the robot has not, or
@@ -69,7 +81,12 @@ class Questions:
         )
         held = self.held(fixed)
         return Problems(
-            np.array(points), np.array(normals), tolerances, self.enforce_limits, fixed=held
+            np.array(points),
+            np.array(normals),
+            tolerances,
+            self.enforce_limits,
+            fixed=held,
+            prefer=prefer,
         )
 
     def held(self, fixed: Mapping[str, float] | None) -> Array | None:

@@ -18,7 +18,8 @@ from casadi_ik.errors import UnsupportedError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.diagnosis import Reason
-from casadi_ik.problem.method import Method, Outcome, QuickMethod
+from casadi_ik.problem.method import Method, Outcome, PreferringMethod, QuickMethod
+from casadi_ik.problem.preference import NO_PREFERENCE, preference
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.solution import BatchSolution, Solution
@@ -30,6 +31,9 @@ from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.parts import Parts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.workers import workers
+
+MANIPULABILITY = "manipulability"
+"""The preference that is seen to after the solve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +101,26 @@ class Engine:
         """
         return Tracker(self.robot, self._hand_first, self.finder)
 
+    def preference(self, prefer: str | None, started: bool) -> str:
+        """What is preferred, see `preference`.
+
+        Raises:
+            InputError: No such preference.
+            UnsupportedError: The method does not know it.
+        """
+        asked, method = preference(prefer, started), self.method
+        if isinstance(method, PreferringMethod):
+            if asked in method.preferences:
+                return asked
+            known = ", ".join(method.preferences)
+            raise UnsupportedError(f"prefer: method {method.name!r} knows {known}, found {asked!r}")
+        if prefer is None:
+            return NO_PREFERENCE
+        raise UnsupportedError(
+            f"prefer: method {method.name!r} cannot choose, it takes the solution it comes to from "
+            f"q0; found {prefer!r}"
+        )
+
     def quick(self, problems: Problems, run: Run) -> Solution | None:
         """The answer to one target if it is solved at once, by the shortest way; None: `solve` it.
 
@@ -108,7 +132,7 @@ class Engine:
             InputError: Bad q0.
         """
         method, robot = self._quick, self.robot
-        if method is None:
+        if method is None or problems.prefer == MANIPULABILITY:
             return None
         start = run.start(robot)
         if start.ndim != 1:
@@ -166,6 +190,8 @@ class Engine:
             outcome = self.method.run(asked, starts[rows], run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
+            if problems.prefer == MANIPULABILITY:
+                outcome = self._most_manipulable(asked, starts[rows], run.seed, outcome)
             batch = self._judged(asked, outcome)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
@@ -173,6 +199,8 @@ class Engine:
 
         if diagnose:
             _ = self.diagnostician
+        if problems.prefer == MANIPULABILITY:
+            _ = self.finder
         if jobs == 1 and not trace:
             yield solve(slice(0, len(problems)))
             return
@@ -188,6 +216,19 @@ class Engine:
                     yield ahead.popleft().result()
             while ahead:
                 yield ahead.popleft().result()
+
+    def _most_manipulable(
+        self, problems: Problems, starts: Array, seed: int, outcome: Outcome
+    ) -> Outcome:
+        """Every hand where it is, held by the arm of the best measure."""
+        begin, q = time.perf_counter(), outcome.q.copy()
+        rows = np.flatnonzero(outcome.status == Status.SOLVED)
+        for row in rows:
+            one = problems.rows(slice(row, row + 1))
+            q[row] = self.finder.best_arm(one, q[row], starts[row], seed, MANIPULABILITY)
+        seconds = outcome.time.copy()
+        seconds[rows] += (time.perf_counter() - begin) / max(len(rows), 1)
+        return replace(outcome, q=q, time=seconds)
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
@@ -225,9 +266,8 @@ class Engine:
         own = isinstance(self.method, HandFirstMethod)
         q, seconds = outcome.q.copy(), outcome.time.copy()
         rows = np.flatnonzero(~batch.success)
-        diagnoses = self.diagnostician.diagnose(
-            problems.rows(rows), starts[rows], q[rows] if own else None
-        )
+        unbiased = replace(problems.rows(rows), prefer="limits")
+        diagnoses = self.diagnostician.diagnose(unbiased, starts[rows], q[rows] if own else None)
         found = dict(zip(rows.tolist(), diagnoses, strict=True))
         for row, why in found.items():
             if own and why.reason is Reason.REACHABLE:

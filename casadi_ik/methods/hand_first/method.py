@@ -20,6 +20,7 @@ from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts.kinds import usual
 from casadi_ik.problem.method import Quick
+from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
@@ -31,6 +32,12 @@ UNBOUNDED = 1e3
 
 AT_LIMITS = 0.5
 """Part of the range that the wide table moves to the limits."""
+
+NEAREST = "q0"
+"""The preference for what is near the start."""
+
+TINY = 1e-9
+"""Smallest range [rad or m] a motion is measured by."""
 
 CARRIED = ("passed", "near", "balanced", "best_cost", "best_q", "counts")
 """What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
@@ -44,9 +51,11 @@ class HandFirstMethod(LoopedMethod):
 
     Attributes:
         step: Its step for this robot.
+        preferences: What it can prefer.
     """
 
     name = "hand-first"
+    preferences = PREFERENCES
     takes_free_contacts = True
     takes_fixed_actuators = True
 
@@ -93,9 +102,16 @@ class HandFirstMethod(LoopedMethod):
         self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
     ) -> Start:
         """Start with the hand postures of the round; what was found before is kept."""
-        states, parameters = self.rows(problems, q0, self.postures(problems, number))
+        postures = self.postures(problems, number)
+        if problems.prefer == NEAREST:
+            postures = self.order(postures, q0, own=number == 0)
+        states, parameters = self.rows(problems, q0, postures)
         if last is not None:
             layout = self.step.layouts.state
+            states[:, layout.slice("phase")], states[:, layout.slice("candidate")] = (
+                Phase.CANDIDATE,
+                0.0,
+            )
             for name in CARRIED:
                 states[:, layout.slice(name)] = last[:, layout.slice(name)]
             states[:, layout.slice("earlier")] = number * self.options.candidates
@@ -114,7 +130,7 @@ class HandFirstMethod(LoopedMethod):
             states[:, layout.slice(name).start].astype(np.int64)
             for name in ("earlier", "candidate")
         )
-        return earlier + np.minimum(candidate, self.options.candidates - 1)
+        return earlier + np.clip(candidate, 0, self.options.candidates - 1)
 
     def quick(self, problems: Problems, q0: Array) -> Quick | None:
         """The first round of one target; see `QuickMethod.quick`."""
@@ -123,7 +139,9 @@ class HandFirstMethod(LoopedMethod):
         try:
             first = self._singles.pop()
         except IndexError:
-            first = FirstRound(self.table, self._beginning, self.kernel, self.step.layouts)
+            first = FirstRound(
+                self.table, self._beginning, self.kernel, self.step.layouts, self.order
+            )
         found = first(problems, q0, self._terms(problems), self.max_iterations)
         self._singles.append(first)
         return found
@@ -161,10 +179,32 @@ class HandFirstMethod(LoopedMethod):
         table, wanted = (self.wide_table, number * count) if number else (self.table, count)
         return table.nearest(problems.points, problems.normals, wanted)[:, -count:]
 
+    def order(self, postures: Array, q0: Array, own: bool) -> Array:
+        """Hand postures (k, c, hand), those nearest to q0 (k, n) first.
+
+        Args:
+            postures: The postures.
+            q0: Where the robot is.
+            own: Whether its own posture comes first, instead of the last of them.
+        """
+        hand = list(self.step.layouts.hand)
+        here = q0[:, None, hand]
+        if own:
+            postures = postures[:, : max(postures.shape[1] - 1, 1)]
+        ranges = np.maximum((self.robot.upper - self.robot.lower)[hand], TINY)
+        distance = (((postures - here) / ranges) ** 2).sum(axis=2)
+        rows = np.argsort(distance, axis=1, kind="stable")[:, :, None]
+        ordered = np.take_along_axis(postures, rows, axis=1)
+        if not own or self.options.candidates == 1:
+            return ordered
+        return np.concatenate([here, ordered], axis=1)
+
     def _terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms."""
         bounds = problems.bounds(self.robot, UNBOUNDED)
-        return np.concatenate([problems.position_tolerance, problems.angle_tolerance, *bounds])
+        nearest = [float(problems.prefer == NEAREST)]
+        tolerances = problems.position_tolerance, problems.angle_tolerance
+        return np.concatenate([*tolerances, *bounds, nearest])
 
     @cached_property
     def _beginning(self) -> FunctionKernel:
