@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.errors import UnknownNameError
+from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.events.kinds import SINGULAR
 from casadi_ik.logs.events.traces import bits_of
@@ -191,6 +191,8 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
         raise UnknownNameError(f"{problem}; the log holds: {held or 'nothing'}")
     (part,) = found
     row, number = part.rows[0], int(part.solve_id[0])
+    if not np.isfinite([row["started"], row["time"]]).all():
+        raise LogError(f"solve {number} of {part.method}: its times are no numbers")
     record = next(Table("solve", (part,)).records())
     iterations = log.iterations(method=part.method, solve=number).part
     events = log.events(method=part.method, solve=number)

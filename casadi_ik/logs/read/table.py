@@ -232,6 +232,11 @@ def label_of(labels: Sequence[str], code: int) -> str:
     return (labels[code] if 0 <= code < len(labels) else "") or str(code)
 
 
+def _code_of(labels: Sequence[str], value: float) -> str:
+    """The name of a code that is kept as a float, or the number."""
+    return label_of(labels, int(value)) if np.isfinite(value) else str(value)
+
+
 def _subjects(part: Part) -> list[str]:
     """What each event is about: the Jacobian, the joints, the phases."""
     kinds = _readable(part, "kind")
@@ -242,7 +247,7 @@ def _subjects(part: Part) -> list[str]:
     for i, kind in enumerate(kinds):
         before, after = part.rows["threshold"][i], part.rows["value"][i]
         if kind == EventKind.PHASE_CHANGE.name:
-            subject = f"{label_of(phases, int(before))} -> {label_of(phases, int(after))}"
+            subject = f"{_code_of(phases, before)} -> {_code_of(phases, after)}"
         elif kind == EventKind.RESTART.name:
             subject = f"{before:.0f} -> {after:.0f}"
         elif kind in (EventKind.NEAR_SINGULAR.name, EventKind.ILL_CONDITIONED.name):
