@@ -16,8 +16,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import Compression, Keep, McapRecorder
-from casadi_ik.methods.qiu.parameters import FINGER_STEPS
-from casadi_ik.methods.registry import METHODS, build_method, option_names
+from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
@@ -80,7 +79,7 @@ class Solver:
         self.method = method
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
         self.limits = limits
-        self.options = _with_finger_step(method, options or {}, finger_step)
+        self.options = with_finger_step(method, options or {}, finger_step)
         self._questions = Questions(robot, self.tolerances, limits == "enforce")
         self._engine = Engine(
             robot, build_method(method, robot.description, self.options, compiled), compiled
@@ -343,19 +342,3 @@ class Solver:
             keep=keep,
             compression=compression,
         )
-
-
-def _with_finger_step(
-    method: str, options: Mapping[str, Any], finger_step: str | None
-) -> dict[str, Any]:
-    """Options with the finger step, if it is given and the method has one."""
-    if finger_step is None:
-        return dict(options)
-    if finger_step not in FINGER_STEPS:
-        raise InputError(
-            f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
-        )
-    if "finger_step" in options:
-        raise InputError("finger_step: found twice, expected it as argument or among the options")
-    has_one = "finger_step" in option_names(method)
-    return {**options, "finger_step": finger_step} if has_one else dict(options)
