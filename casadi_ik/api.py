@@ -25,7 +25,7 @@ from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
-from casadi_ik.solving.stream import SolvedBlock, Stream
+from casadi_ik.solving.stream import REQUIRED, SolvedBlock, Stream
 
 Array = NDArray[np.float64]
 
@@ -152,6 +152,7 @@ class Solver:
         keep: Keep | None = None,
         compression: Compression = "zstd",
         prefer: str | None = None,
+        **more: ArrayLike | None,
     ) -> BatchSolution:
         """Solve k targets.
 
@@ -170,6 +171,8 @@ class Solver:
             keep: Which solves keep their iterations in the log; None: all.
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
             prefer: As for `solve`.
+            more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
+                `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point).
 
         Returns:
             The same fields as a `Solution`, as arrays.
@@ -180,17 +183,15 @@ class Solver:
             UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
-        held, preferred = (
-            self._questions.held(fixed),
-            self._engine.preference(prefer, q0 is not None),
-        )
-        problems = self._questions.of_arrays(points, normals, held, prefer=preferred)
+        held = self._questions.held(fixed)
+        preferred = self._engine.preference(prefer, q0 is not None)
+        problems = self._questions.of_arrays(points, normals, held, more=more, prefer=preferred)
         with self._recorder(log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 
     def solve_blocks(
         self,
-        blocks: Iterable[tuple[ArrayLike, ArrayLike]],
+        blocks: Iterable[tuple[ArrayLike, ArrayLike] | Mapping[str, ArrayLike]],
         q0: ArrayLike | None = None,
         seed: int = 0,
         jobs: int = 1,
@@ -205,7 +206,8 @@ class Solver:
         target does not stop the others: it is among the faults of its block.
 
         Args:
-            blocks: Points and normals of some targets each, as for `solve_batch`.
+            blocks: Points and normals of some targets each, as for `solve_batch`; or all of its
+                arrays by name.
             q0: (n,) start of all; None is `robot.home`.
             seed: Of all random numbers, an integer >= 0.
             jobs: Threads, at least 1; a few thousand targets a block keep them busy.
@@ -224,13 +226,13 @@ class Solver:
             UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
-        held, preferred = (
-            self._questions.held(fixed),
-            self._engine.preference(prefer, q0 is not None),
-        )
+        held = self._questions.held(fixed)
+        preferred = self._engine.preference(prefer, q0 is not None)
 
-        def ask(points: ArrayLike, normals: ArrayLike, first_row: int) -> Problems:
-            return self._questions.of_arrays(points, normals, held, first_row, preferred)
+        def ask(block: Mapping[str, ArrayLike], first_row: int) -> Problems:
+            more = {name: array for name, array in block.items() if name not in REQUIRED}
+            points, normals = (block[name] for name in REQUIRED)
+            return self._questions.of_arrays(points, normals, held, first_row, more, preferred)
 
         with self._recorder(log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
@@ -268,8 +270,8 @@ class Solver:
             InputError: Bad limit, preference or q0, or a grasp the robot cannot take.
             UnsupportedError: The method is not hand-first.
         """
-        finder = self._engine.finder
         problems = self._questions.of_grasps([grasp], fixed)
+        finder = self._engine.kinds_of(problems).finder
         return finder.find(problems, self._questions.start(q0), seed, limit, prefer)
 
     def track(
@@ -300,10 +302,10 @@ class Solver:
             InputError: No grasp, bad q0, period or velocity, or a grasp the robot cannot take.
             UnsupportedError: The method is not hand-first.
         """
-        tracker = self._engine.tracker
         if not grasps:
             raise InputError("grasps: found none, expected at least one")
         problems = self._questions.of_grasps(grasps, fixed)
+        tracker = self._engine.kinds_of(problems).tracker
         travel = travel_limits(self.robot, period, velocity)
         prefer = "limits" if q0 is None else "q0"
         return tracker.track(problems, self._questions.start(q0), prefer, travel, seed)
@@ -319,10 +321,9 @@ class Solver:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
             UnsupportedError: The method cannot be stepped; the message says why.
         """
-        problems = self._questions.of_grasps(
-            [grasp], None, self._engine.preference(None, q0 is not None)
-        )
-        return self._engine.method.stepper(problems, self._questions.start(q0))
+        preferred = self._engine.preference(None, q0 is not None)
+        problems = self._questions.of_grasps([grasp], None, preferred)
+        return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
 
     def _recorder(
         self,

@@ -156,7 +156,11 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        (frames,) = self._kernels.contact_frames(self.configuration(q))
+        return self.frames_at(self.configuration(q))
+
+    def frames_at(self, q: Array) -> Array:
+        """`contact_frames` of configurations that need not be finite; NaN gives NaN."""
+        (frames,) = self._kernels.contact_frames(q)
         return frames.reshape(*frames.shape[:-2], len(self.fingers), 4, 4)
 
     def errors(self, q: ArrayLike, points: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:

@@ -56,6 +56,10 @@ example:
 TARGETS.npz holds, for k targets and the f fingers in the robot's order (`casadi-ik robots`):
   points   (k, f, 3) contact points [m], robot's base frame; NaN marks a free finger
   normals  (k, f, 3) outward pad normals; NaN marks a free normal
+and if wanted, NaN where not:
+  tangents (k, f, 3) second axes of the contact frames, orthogonal to the normals: whole poses
+  lines    (k, f, 3) a contact may be anywhere on the line through its point in this direction
+  planes   (k, f, 3) a contact may be anywhere in the plane through its point with this normal
 OUT.npz then holds:
   q (k, n), success (k,), status (k,), position_error (k, f) [m], angle_error (k, f) [rad],
   iterations, restarts (k,), time (k,) [s]

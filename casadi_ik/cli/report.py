@@ -26,7 +26,8 @@ _MEANING = {
     Status.INVALID: "a number was no longer finite",
     Status.STALLED: "the method came to a standstill",
     Status.ITERATION_LIMIT: "the budget of iterations is used up",
-    Status.UNREACHABLE: "the contacts cannot be reached",
+    Status.UNREACHABLE: "the contacts cannot be reached: there is a proof",
+    Status.NOT_FOUND: "neither a solution nor a proof that there is none",
 }
 
 

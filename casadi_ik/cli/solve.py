@@ -20,6 +20,7 @@ from casadi_ik.cli.report import solution_report
 from casadi_ik.errors import MissingExtraError
 from casadi_ik.grasps import Grasp, load_object
 from casadi_ik.problem.diagnosis import Diagnosis
+from casadi_ik.problem.proof import Proof
 from casadi_ik.problem.solution import Solution
 
 Draw = Callable[[ArmHand, Solution, Grasp, Path], object]
@@ -88,9 +89,21 @@ def as_json(solution: Solution) -> dict[str, Any]:
 
 
 def _diagnosis(diagnosis: Diagnosis) -> dict[str, Any]:
-    names = [item.name for item in fields(diagnosis) if item.name != "lazy"]
-    found = {name: getattr(diagnosis, name) for name in (*names, "reliefs", "freed", "lines")}
-    return _plain(found | {"reason": diagnosis.reason.name})
+    names = [item.name for item in fields(diagnosis) if item.name not in ("lazy", "proof")]
+    names += ["established", "reliefs", "freed", "lines"]
+    found = {name: getattr(diagnosis, name) for name in names}
+    proof = None if diagnosis.proof is None else _proof(diagnosis.proof)
+    return _plain(found | {"reason": diagnosis.reason.name, "proof": proof})
+
+
+def _proof(proof: Proof) -> dict[str, Any]:
+    return {
+        "kind": proof.kind.name,
+        "fingers": proof.fingers,
+        "boxes": proof.boxes,
+        "quantities": proof.quantities,
+        "tolerance": proof.tolerance,
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -7,7 +7,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Literal
@@ -16,8 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError
+from casadi_ik.problem.contacts.arrays import NAMES
 
 KEYS = ("points", "normals")
+"""What has to be there; the others may be."""
+
+OPTIONAL = NAMES
 
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -42,7 +46,7 @@ _UNREADABLE = (
 
 @dataclass(frozen=True)
 class TargetFile:
-    """Points and normals of k targets in an npz file; nothing in it is ever executed.
+    """Points, normals and more of k targets in an npz file; nothing in it is ever executed.
 
     Attributes:
         path: The file.
@@ -62,12 +66,10 @@ class TargetFile:
             InputError: Missing, no npz, damaged, or other arrays than expected; the message names
                 file and key.
         """
-        return sum(len(points) for points, _ in self.blocks(lambda: size))
+        return sum(len(block["points"]) for block in self.blocks(lambda: size))
 
-    def blocks(
-        self, size: Callable[[], int]
-    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        """Points and normals (up to size, f, 3), one block after the other.
+    def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, NDArray[np.float64]]]:
+        """Arrays (up to size, f, 3) by name, one block after the other.
 
         Args:
             size: Says before every block how large it may be.
@@ -75,22 +77,25 @@ class TargetFile:
         Raises:
             InputError: As `check`.
         """
-        with (
-            self._opened() as archive,
-            self._member(archive, "points") as points,
-            self._member(archive, "normals") as normals,
-        ):
-            if points.count != normals.count:
-                raise InputError(
-                    f"{self.path}: points and normals: found {points.count} and "
-                    f"{normals.count} rows, expected as many"
-                )
+        with self._opened() as archive, ExitStack() as opened:
+            there = {name.removesuffix(".npy") for name in archive.namelist()}
+            members = {
+                key: opened.enter_context(self._member(archive, key))
+                for key in (*KEYS, *(key for key in OPTIONAL if key in there))
+            }
+            count = members["points"].count
+            for key, member in members.items():
+                if member.count != count:
+                    raise InputError(
+                        f"{self.path}: points and {key}: found {count} and {member.count} rows, "
+                        "expected as many"
+                    )
             start = 0
-            while start < points.count:
-                rows = min(size(), points.count - start)
+            while start < count:
+                rows = min(size(), count - start)
                 start += rows
-                last = start == points.count
-                yield points.read(rows, last), normals.read(rows, last)
+                last = start == count
+                yield {key: member.read(rows, last) for key, member in members.items()}
 
     @contextmanager
     def _opened(self) -> Iterator[zipfile.ZipFile]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.tolerance import Tolerance
+from casadi_ik.grasps.vectors import MORE, fault, squared
 
 Array = NDArray[np.float64]
 
@@ -25,35 +26,62 @@ class Contact:
         normal: (3,) outward pad normal of the fingertip: it points out of the fingertip, into the
             object. Any length but zero, stored as a unit vector. None leaves it free.
         tolerance: When it counts as reached, or None: the solver's tolerance.
+        tangent: (3,) where the second axis of the contact frame must point
+            (`ArmHand.contact_frames`), orthogonal to the normal: with it, the whole pose of the
+            fingertip is given. None leaves the turn about the normal free.
+        line: (3,) direction of a line through the point on which the contact may be anywhere.
+        plane: (3,) normal of a plane through the point in which the contact may be anywhere.
+
+    A contact with a direction alone, wherever the fingertip is, is ``Contact(direction=...)``: its
+    point is NaN and its normal that direction.
 
     Raises:
-        InputError: A wrong shape, a number that is not finite, a zero normal, or a tolerance that
-            is none.
+        InputError: A wrong shape, a number that is not finite, a zero direction, a tangent that is
+            not orthogonal to the normal, or a tolerance that is none.
     """
 
     point: Array
     normal: Array | None = None
     tolerance: Tolerance | None = None
+    tangent: Array | None = None
+    line: Array | None = None
+    plane: Array | None = None
 
     def __init__(
         self,
-        point: ArrayLike,
+        point: ArrayLike | None = None,
         normal: ArrayLike | None = None,
         tolerance: Tolerance | None = None,
+        *,
+        tangent: ArrayLike | None = None,
+        line: ArrayLike | None = None,
+        plane: ArrayLike | None = None,
+        direction: ArrayLike | None = None,
     ) -> None:
         if tolerance is not None and not isinstance(tolerance, Tolerance):
             raise InputError(f"tolerance: found {tolerance!r}, expected a Tolerance")
-        object.__setattr__(self, "point", _vector(point, "point"))
         object.__setattr__(self, "tolerance", tolerance)
-        if normal is None:
+        given = {"normal": normal, "tangent": tangent, "line": line, "plane": plane}
+        if direction is not None:
+            others = [
+                name for name, value in {"point": point, **given}.items() if value is not None
+            ]
+            if others:
+                raise InputError(f"direction: found it beside {others[0]}, expected it alone")
+            object.__setattr__(self, "point", _frozen(np.full(3, np.nan)))
+            object.__setattr__(self, "normal", _unit(direction, "direction"))
             return
-        vector = _vector(normal, "normal")
-        length = float(np.linalg.norm(vector))
-        if length < 1e-9:
-            raise InputError(f"normal: found {vector.tolist()}, expected a direction, not zero")
-        vector = vector / length
-        vector.flags.writeable = False
-        object.__setattr__(self, "normal", vector)
+        if point is None:
+            raise InputError("point: missing, expected three numbers (or a direction alone)")
+        vectors = {"point": _vector(point, "point")}
+        vectors |= {name: _unit(v, name) for name, v in given.items() if v is not None}
+        problem = fault(vectors)
+        if problem:
+            raise InputError(problem)
+        if "tangent" in vectors:
+            vectors["tangent"] = _frozen(squared(vectors["tangent"], vectors["normal"]))
+        for name, vector in vectors.items():
+            object.__setattr__(self, name, vector)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +141,38 @@ class Grasp:
             points[row] = contact.point if known else np.nan
             normals[row] = contact.normal if known and contact.normal is not None else np.nan
         return points, normals
+
+    def more(self, fingers: Sequence[str]) -> dict[str, Array]:
+        """What the contacts have beside point and normal.
+
+        Args:
+            fingers: The robot's fingers.
+
+        Returns:
+            (f, 3) by name ("tangents", "lines", "planes"), NaN where free; only what any has.
+        """
+        found: dict[str, Array] = {}
+        for name in MORE:
+            rows = np.full((len(fingers), 3), np.nan)
+            for row, finger in enumerate(fingers):
+                vector = getattr(self.contacts.get(finger), name, None)
+                if vector is not None:
+                    rows[row] = vector
+                    found[f"{name}s"] = rows
+        return found
+
+
+def _unit(value: Any, name: str) -> Array:
+    vector = _vector(value, name)
+    length = float(np.linalg.norm(vector))
+    if length < 1e-9:
+        raise InputError(f"{name}: found {vector.tolist()}, expected a direction, not zero")
+    return _frozen(vector / length)
+
+
+def _frozen(vector: Array) -> Array:
+    vector.flags.writeable = False
+    return vector
 
 
 def _vector(value: Any, name: str) -> Array:

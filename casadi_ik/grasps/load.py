@@ -23,11 +23,15 @@ class ToleranceEntry(Struct, frozen=True):
 
 
 class ContactEntry(Struct, frozen=True):
-    """A finger's contact."""
+    """A finger's contact; ``direction`` stands alone, everything else needs a point."""
 
-    point: Vector
+    point: Vector | None = None
     normal: Vector | None = None
     tolerance: ToleranceEntry | None = None
+    tangent: Vector | None = None
+    line: Vector | None = None
+    plane: Vector | None = None
+    direction: Vector | None = None
 
 
 class ObjectEntry(Struct, frozen=True):
@@ -82,10 +86,16 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
 
 
 def _contact(entry: ContactEntry) -> Contact:
-    if entry.tolerance is None:
-        return Contact(entry.point, entry.normal)
-    tolerance = Tolerance(entry.tolerance.position, entry.tolerance.angle)
-    return Contact(entry.point, entry.normal, tolerance)
+    tolerance = entry.tolerance
+    return Contact(
+        entry.point,
+        entry.normal,
+        tolerance and Tolerance(tolerance.position, tolerance.angle),
+        tangent=entry.tangent,
+        line=entry.line,
+        plane=entry.plane,
+        direction=entry.direction,
+    )
 
 
 def shipped_grasps(robot: str) -> tuple[str, ...]:

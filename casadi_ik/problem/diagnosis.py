@@ -10,12 +10,13 @@ from functools import cached_property
 
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.problems import Array, Tolerance
+from casadi_ik.problem.proof import Proof
 
 Point = tuple[float, float, float]
 
 
 class Reason(StrEnum):
-    """Why a grasp is not solved."""
+    """Why a grasp is not solved: established by a proof, else what is likely."""
 
     HAND = "the contacts do not fit the hand, wherever the palm is"
     REACH = "the hand fits the contacts, but the arm does not reach there"
@@ -144,9 +145,9 @@ class Diagnosis:
     asked for, which takes some milliseconds; everything else is there at once.
 
     Attributes:
-        reason: The first of the reasons that holds.
-        established: Whether the grasp counts as unreachable: every start failed, the nearest
-            contacts miss by more than the tolerances together allow, and a reason was found.
+        reason: The one that is proved; without a proof the likely one, that fits what was found.
+        proof: That the grasp is impossible; None where there is none, which says nothing.
+        searches: Starts from which a solution was looked for.
         hand: The hand alone against the contacts; None for a hand without an arm.
         reach: The arm against the wrist's place; None unless the arm has a closed form and the
             hand fits.
@@ -159,7 +160,8 @@ class Diagnosis:
     """
 
     reason: Reason
-    established: bool
+    proof: Proof | None
+    searches: int
     hand: HandFit | None
     reach: ArmReach | None
     active: tuple[str, ...]
@@ -168,6 +170,11 @@ class Diagnosis:
     q: Array
     time: float
     lazy: Lazy = field(repr=False)
+
+    @property
+    def established(self) -> bool:
+        """Whether the reason is proved."""
+        return self.proof is not None
 
     @property
     def reliefs(self) -> tuple[Relief, ...]:
@@ -184,8 +191,8 @@ class Diagnosis:
         """What, by how much, and what would help: short lines in mm and degrees."""
         if self.reason is Reason.REACHABLE:
             return (str(self.reason), "reachable: hand-first solves it")
-        doubt = "" if self.established or self.reason is Reason.NOT_FOUND else "probably "
-        lines = [f"{doubt}{self.reason}", *self._why()]
+        likely = "" if self.established or self.reason is Reason.NOT_FOUND else "likely: "
+        lines = [f"{likely}{self.reason}", *self._why(), *self._grounds()]
         for relief in self._shown:
             far = ", ".join(
                 f"{name} {_length(value, relief.units[name])} {_side(value)}"
@@ -207,6 +214,12 @@ class Diagnosis:
             f"and {_length(self.enough.angle, 'rad')}"
         )
         return tuple(lines)
+
+    def _grounds(self) -> tuple[str, ...]:
+        """On what the reason rests."""
+        if self.proof is not None:
+            return self.proof.lines
+        return (f"not proved; no solution from {self.searches} starts",)
 
     @property
     def _shown(self) -> list[Relief]:

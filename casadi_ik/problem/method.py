@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.rows import split_rows
 from casadi_ik.kernels.stepper import Stepper
+from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.trace import TraceFormat
 
@@ -43,6 +44,39 @@ class Outcome:
         """The rows of each solve, views into `rows`; empty if no trace was asked for."""
         return () if self.rows is None else split_rows(self.rows, self.iterations)
 
+    @classmethod
+    def interleaved(
+        cls, places: Sequence[NDArray[np.intp]], outcomes: Sequence[Outcome]
+    ) -> Outcome:
+        """Put the outcomes of some targets each together.
+
+        Args:
+            places: Which rows of the whole the targets of an outcome are; together all of them.
+            outcomes: At least one.
+        """
+        order = np.argsort(np.concatenate(list(places)))
+
+        def whole(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+            return np.concatenate(list(parts))[order]
+
+        names = dict.fromkeys(name for one in outcomes for name in one.phases)
+        rows = None
+        if all(one.rows is not None for one in outcomes):
+            traces = [trace for one in outcomes for trace in one.trace]
+            rows = np.concatenate([traces[i] for i in order])
+        return cls(
+            q=whole([one.q for one in outcomes]),
+            status=whole([one.status for one in outcomes]),
+            iterations=whole([one.iterations for one in outcomes]),
+            restarts=whole([one.restarts for one in outcomes]),
+            time=whole([one.time for one in outcomes]),
+            phases={
+                name: whole([one.phases.get(name, np.zeros_like(one.status)) for one in outcomes])
+                for name in names
+            },
+            rows=rows,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Quick:
@@ -55,7 +89,7 @@ class Quick:
 
 
 class Method(Protocol):
-    """A named way to solve, built for one robot."""
+    """A named way to solve, built for one robot and kinds of contact."""
 
     name: str
 
@@ -73,6 +107,13 @@ class Method(Protocol):
         """Build and compile what `run` needs; afterwards `run` may be called by several threads."""
         ...
 
+    def for_kinds(self, kinds: Kinds) -> Method:
+        """The same method for contacts of other kinds; itself for its own, and if it has only one.
+
+        What it cannot take, it refuses in `run`, target by target.
+        """
+        ...
+
     def stepper(self, problems: Problems, q0: Array) -> Stepper:
         """Solve one target by hand, one iteration at a time.
 
@@ -87,7 +128,7 @@ class Method(Protocol):
         ...
 
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
-        """Solve a batch.
+        """Solve a batch of targets of its kinds.
 
         Args:
             problems: The targets.

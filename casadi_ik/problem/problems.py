@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,8 +34,10 @@ class Problems:
         first_row: Number of the first target in the whole batch; with the seed it decides the
             random numbers of a target, so that a part of a batch gets those of the whole.
         fixed: (n,) positions of locked actuators, NaN where one may move; None: all may.
-        prefer: Which of several solutions is wanted, one of `PREFERENCES`, or
-            `NO_PREFERENCE`.
+        more: (k, f, 3) what contacts have beside point and normal ("tangents", "lines",
+            "planes"), NaN where free; nothing that is free everywhere.
+        picked: (k,) numbers of the targets where they are not one after the other.
+        prefer: Which of several solutions is wanted, one of `PREFERENCES`, or `NO_PREFERENCE`.
     """
 
     points: Array
@@ -44,6 +46,8 @@ class Problems:
     enforce_limits: bool
     first_row: int = 0
     fixed: Array | None = None
+    more: Mapping[str, Array] = field(default_factory=dict)
+    picked: NDArray[np.intp] | None = None
     prefer: str = "limits"
 
     def __len__(self) -> int:
@@ -85,7 +89,22 @@ class Problems:
                 return self
             first_row = self.first_row + start
         points, normals = self.points[rows], self.normals[rows]
-        return replace(self, points=points, normals=normals, first_row=first_row)
+        more = {name: array[rows] for name, array in self.more.items()} if self.more else self.more
+        picked = None if self.picked is None else self.picked[rows]
+        return replace(
+            self, points=points, normals=normals, first_row=first_row, more=more, picked=picked
+        )
+
+    def number(self, row: int) -> int:
+        """Number of a target in the whole batch."""
+        return self.first_row + row if self.picked is None else int(self.picked[row])
+
+    def vectors(self, name: str) -> Array:
+        """(k, f, 3) "points", "normals" or something more; NaN where free."""
+        if name in ("points", "normals"):
+            found: Array = getattr(self, name)
+            return found
+        return self.more[name] if name in self.more else np.full_like(self.points, np.nan)
 
     def bounds(self, robot: RobotDescription, unbounded: float) -> tuple[Array, Array]:
         """Bounds (n,) that a method has to keep to: limits, or what the mechanisms permit.

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp, Tolerance
+from casadi_ik.problem.contacts.arrays import more_arrays
 from casadi_ik.problem.problems import Array, Problems, fixed_array, target_arrays
 
 
@@ -34,6 +35,7 @@ class Questions:
         normals: ArrayLike,
         fixed: Array | None,
         first_row: int = 0,
+        more: Mapping[str, ArrayLike | None] | None = None,
         prefer: str = "limits",
     ) -> Problems:
         """Targets as arrays.
@@ -43,14 +45,18 @@ class Questions:
             normals: (k, f, 3).
             fixed: See `Problems`.
             first_row: Number of the first target.
+            more: (k, f, 3) what contacts have beside, see `more_arrays`.
             prefer: See `Problems`.
 
         Raises:
-            InputError: See `target_arrays`.
+            InputError: See `target_arrays` and `more_arrays`.
         """
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row)
         tolerances = tuple(self.tolerances.values())
-        return Problems(p, n, tolerances, self.enforce_limits, first_row, fixed, prefer)
+        besides = more_arrays(more, p, n, first_row) if more else {}
+        return Problems(
+            p, n, tolerances, self.enforce_limits, first_row, fixed, besides, prefer=prefer
+        )
 
     def of_grasps(
         self,
@@ -86,6 +92,7 @@ class Questions:
             tolerances,
             self.enforce_limits,
             fixed=held,
+            more=_stacked([grasp.more(fingers) for grasp in grasps], len(fingers)),
             prefer=prefer,
         )
 
@@ -104,6 +111,13 @@ class Questions:
         if start.ndim != 1:
             raise InputError(f"q0: found shape {start.shape}, expected ({len(start[0])},)")
         return start
+
+
+def _stacked(parts: Sequence[Mapping[str, Array]], f: int) -> dict[str, Array]:
+    """(k, f, 3) arrays of what grasps have beside points and normals; NaN where they have none."""
+    none = np.full((f, 3), np.nan)
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: np.array([part.get(name, none) for part in parts]) for name in names}
 
 
 def tolerances_by_finger(

@@ -24,7 +24,9 @@ class Status(IntEnum):
     ITERATION_LIMIT = 3
     """The budget of iterations is used up."""
     UNREACHABLE = 4
-    """The contacts cannot be reached; the verdict says why."""
+    """The contacts cannot be reached: there is a proof, see `Diagnosis.proof`."""
+    NOT_FOUND = 5
+    """A diagnosis found neither a solution nor a proof that there is none."""
 
     @classmethod
     def from_loop(cls, codes: NDArray[np.int32]) -> NDArray[np.int64]:

@@ -62,7 +62,7 @@ def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
     points, normals = problems.points, problems.normals
     if len(problems) == 1:
         points, normals = points[0], normals[0]
-    position, angle, beyond = robot.deviations(q, points, normals)
+    position, angle, beyond = deviations(robot, problems, q)
     slack = 1 + TOLERANCE_SLACK
     placed = position <= problems.position_tolerance * slack
     faced = angle <= problems.angle_tolerance * slack
@@ -81,7 +81,7 @@ def judge_one(robot: ArmHand, problems: Problems, q: Array) -> SolvedVerdict | N
         problems: One target.
         q: (n,).
     """
-    position, angle, beyond = robot.deviations(q, problems.points[0], problems.normals[0])
+    position, angle, beyond = deviations(robot, problems, q)
     limits_ok = bool(beyond <= LIMIT_SLACK)
     if problems.enforce_limits and not limits_ok:
         return None
@@ -93,3 +93,47 @@ def judge_one(robot: ArmHand, problems: Problems, q: Array) -> SolvedVerdict | N
             return None
         contacts.append(ContactVerdict(distance, turn, True, tolerance))
     return SolvedVerdict(contacts, limits_ok)
+
+
+def deviations(robot: ArmHand, problems: Problems, q: Array) -> tuple[Array, Array, Array]:
+    """How far configurations are from their targets and beyond their limits.
+
+    Args:
+        robot: The robot.
+        problems: k targets, or one for all.
+        q: (k, n) or (n,); NaN gives NaN.
+
+    Returns:
+        (k, f) or (f,) distances [m] from the point, line or plane; as many angles [rad] between
+        the normals, or between the whole frames where there is a tangent; NaN where free; (k,) or
+        () by how much the worst actuator or joint is beyond its limits [rad or m].
+    """
+    points, normals = problems.points, problems.normals
+    if len(problems) == 1:
+        points, normals = points[0], normals[0]
+    position, angle, beyond = robot.deviations(q, points, normals)
+    if not problems.more:
+        return position, angle, beyond
+    frames = robot.frames_at(q)
+    off = frames[..., :3, 3] - points
+    for name, array in problems.more.items():
+        vectors = array[0] if len(problems) == 1 else array
+        given = np.broadcast_to(~np.isnan(vectors[..., 0]), position.shape)
+        if name == "lines":
+            position = np.where(given, np.linalg.norm(np.cross(vectors, off), axis=-1), position)
+        elif name == "planes":
+            position = np.where(given, np.abs(np.sum(vectors * off, axis=-1)), position)
+        elif name == "tangents":
+            wanted = np.stack([normals, vectors, np.cross(normals, vectors)], axis=-1)
+            angle = np.where(given, _turn(frames[..., :3, :3], wanted), angle)
+        else:
+            raise ValueError(f"there is no verdict on {name}")
+    return position, angle, beyond
+
+
+def _turn(one: Array, other: Array) -> Array:
+    """Angle [rad] between frames (..., 3, 3), exact where they nearly agree."""
+    turned = np.swapaxes(one, -1, -2) @ other
+    axis = [turned[..., i, j] - turned[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
+    cosine = turned[..., 0, 0] + turned[..., 1, 1] + turned[..., 2, 2] - 1
+    return np.arctan2(np.linalg.norm(np.stack(axis, axis=-1), axis=-1), cosine)

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import UnsupportedError
+from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.problem.diagnosis import Reason
+from casadi_ik.problem.contacts.arrays import by_kinds
+from casadi_ik.problem.contacts.kinds import Kinds, usual
+from casadi_ik.problem.diagnosis import Diagnosis, Reason
 from casadi_ik.problem.method import Method, Outcome, PreferringMethod, QuickMethod
 from casadi_ik.problem.preference import NO_PREFERENCE, preference
 from casadi_ik.problem.problems import Array, Problems
@@ -27,6 +29,8 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import judge, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.tracking import Tracker
+from casadi_ik.solving.by_kinds import PerKinds
+from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.parts import Parts
 from casadi_ik.solving.run import Run
@@ -55,19 +59,34 @@ class Engine:
         robot: The robot.
         method: The method, built for this robot.
         compiled: Whether what a diagnosis needs besides runs in compiled code.
+        kinds: Of the contacts, by finger; None: point and normal.
     """
 
     robot: ArmHand
     method: Method
     compiled: bool = True
+    kinds: Kinds | None = None
+
+    def of_kinds(self, kinds: Kinds) -> Engine:
+        """The engine for targets whose contacts are of these kinds."""
+        own = self.kinds or usual(len(kinds))
+        return self if kinds == own else self._others.of(kinds)
+
+    @cached_property
+    def _others(self) -> PerKinds[Engine]:
+        return PerKinds(
+            lambda kinds: replace(self, method=self.method.for_kinds(kinds), kinds=kinds)
+        )
 
     @cached_property
     def diagnostician(self) -> Diagnostician:
         """Who says why a target was not solved; asks hand-first, whichever the method is."""
         method = self.method
         if not isinstance(method, HandFirstMethod):
-            method = HandFirstMethod(self.robot.description, HandFirstParameters(), self.compiled)
-        return Diagnostician(self.robot, method)
+            method = HandFirstMethod(
+                self.robot.description, HandFirstParameters(), self.compiled, self.kinds
+            )
+        return Diagnostician(self.robot, method, self.compiled)
 
     @property
     def _hand_first(self) -> HandFirstMethod:
@@ -82,6 +101,17 @@ class Engine:
     @cached_property
     def _quick(self) -> QuickMethod | None:
         return self.method if isinstance(self.method, QuickMethod) else None
+
+    def kinds_of(self, problems: Problems) -> Engine:
+        """The engine for targets that are all of the same kinds.
+
+        Raises:
+            InputError: They are of several.
+        """
+        engines = {self.of_kinds(kinds) for kinds, _, _ in by_kinds(problems)}
+        if len(engines) > 1:
+            raise InputError("grasps: found contacts of several kinds, expected the same in all")
+        return engines.pop()
 
     @cached_property
     def finder(self) -> AlternativeFinder:
@@ -131,6 +161,11 @@ class Engine:
         Raises:
             InputError: Bad q0.
         """
+        if problems.more:
+            ((kinds, _, _),) = by_kinds(problems)
+            other = self.of_kinds(kinds)
+            if other is not self:
+                return other.quick(problems, run)
         method, robot = self._quick, self.robot
         if method is None or problems.prefer == MANIPULABILITY:
             return None
@@ -173,7 +208,8 @@ class Engine:
         """
         starts, recorder = run.starts(self.robot, len(problems)), run.recorder
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
-        self.method.prepare()
+        for kinds, _, _ in by_kinds(problems):
+            self.of_kinds(kinds).method.prepare()
         batches = []
         for part in self._parts(problems, starts, run):
             if recorder is not None and part.outcome.rows is not None:
@@ -185,9 +221,12 @@ class Engine:
         """Parts of the batch in order, solved, judged and diagnosed side by side."""
         trace, jobs, diagnose = run.recorder is not None, run.jobs, run.diagnose
 
+        def method(kinds: Kinds) -> Method:
+            return self.of_kinds(kinds).method
+
         def solve(rows: slice) -> _Part:
             started, asked = time.time_ns(), problems.rows(rows)
-            outcome = self.method.run(asked, starts[rows], run.seed, trace)
+            outcome = run_by_kinds(method, asked, starts[rows], run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
             if problems.prefer == MANIPULABILITY:
@@ -198,9 +237,11 @@ class Engine:
             return _Part(asked, starts[rows], started, outcome, batch)
 
         if diagnose:
-            _ = self.diagnostician
+            for kinds, _, _ in by_kinds(problems):
+                _ = self.of_kinds(kinds).diagnostician
         if problems.prefer == MANIPULABILITY:
-            _ = self.finder
+            for kinds, _, _ in by_kinds(problems):
+                _ = self.of_kinds(kinds).finder
         if jobs == 1 and not trace:
             yield solve(slice(0, len(problems)))
             return
@@ -225,7 +266,8 @@ class Engine:
         rows = np.flatnonzero(outcome.status == Status.SOLVED)
         for row in rows:
             one = problems.rows(slice(row, row + 1))
-            q[row] = self.finder.best_arm(one, q[row], starts[row], seed, MANIPULABILITY)
+            finder = self.kinds_of(one).finder
+            q[row] = finder.best_arm(one, q[row], starts[row], seed, MANIPULABILITY)
         seconds = outcome.time.copy()
         seconds[rows] += (time.perf_counter() - begin) / max(len(rows), 1)
         return replace(outcome, q=q, time=seconds)
@@ -267,8 +309,13 @@ class Engine:
         q, seconds = outcome.q.copy(), outcome.time.copy()
         rows = np.flatnonzero(~batch.success)
         unbiased = replace(problems.rows(rows), prefer="limits")
-        diagnoses = self.diagnostician.diagnose(unbiased, starts[rows], q[rows] if own else None)
-        found = dict(zip(rows.tolist(), diagnoses, strict=True))
+        found: dict[int, Diagnosis] = {}
+        for kinds, of_kinds, some in by_kinds(unbiased):
+            chosen = rows if of_kinds is None else rows[of_kinds]
+            diagnoses = self.of_kinds(kinds).diagnostician.diagnose(
+                some, starts[chosen], q[chosen] if own else None
+            )
+            found |= zip(chosen.tolist(), diagnoses, strict=True)
         for row, why in found.items():
             if own and why.reason is Reason.REACHABLE:
                 q[row] = why.q
@@ -278,8 +325,9 @@ class Engine:
             None if solved else found[row] for row, solved in enumerate(batch.success)
         )
         status = batch.status.copy()
-        unreachable = [why is not None and why.established for why in diagnoses]
-        status[unreachable] = Status.UNREACHABLE
+        for row, why in enumerate(diagnoses):
+            if why is not None and why.reason is not Reason.REACHABLE:
+                status[row] = Status.UNREACHABLE if why.established else Status.NOT_FOUND
         return replace(batch, status=status, diagnoses=diagnoses)
 
     def _block(self, part: _Part, seed: int, rows: NDArray[Any]) -> SolveBlock:

@@ -15,8 +15,11 @@ from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 
-Block = tuple[ArrayLike, ArrayLike]
-"""Points and normals (k, f, 3) of some targets."""
+REQUIRED = ("points", "normals")
+"""What every target is told by."""
+
+Block = tuple[ArrayLike, ArrayLike] | Mapping[str, ArrayLike]
+"""Points and normals (k, f, 3) of some targets; or these and more by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +43,13 @@ class Stream:
 
     Attributes:
         engine: Who solves.
-        ask: Points, normals and the number of the first target as a checked question.
+        ask: Arrays by name and the number of the first target as a checked question.
         tolerances: When a contact counts as reached, by finger.
         run: How targets are solved; one start (n,) for all of them.
     """
 
     engine: Engine
-    ask: Callable[[np.ndarray, np.ndarray, int], Problems]
+    ask: Callable[[Mapping[str, np.ndarray], int], Problems]
     tolerances: tuple[Tolerance, ...]
     run: Run
 
@@ -59,26 +62,33 @@ class Stream:
         if self.run.start(self.engine.robot).ndim != 1:
             raise InputError("q0: found several, expected one start for all targets")
         first_row = 0
-        for points, normals in blocks:
-            block = self._block(np.asarray(points), np.asarray(normals), first_row)
+        for given in blocks:
+            named = given if isinstance(given, Mapping) else dict(zip(REQUIRED, given, strict=True))
+            arrays = {name: np.asarray(array) for name, array in named.items()}
+            block = self._block(arrays, first_row)
             yield block
             first_row += len(block.solution)
 
-    def _block(self, points: np.ndarray, normals: np.ndarray, first_row: int) -> SolvedBlock:
+    def _block(self, arrays: Mapping[str, np.ndarray], first_row: int) -> SolvedBlock:
         """Solve what can be asked: a row with a fault parts those before it from those after it."""
-        if len(points) != len(normals):
-            raise InputError(
-                f"points and normals: found {len(points)} and {len(normals)} rows, expected as many"
-            )
+        count = len(arrays[REQUIRED[0]])
+        for name, array in arrays.items():
+            if len(array) != count:
+                raise InputError(
+                    f"{REQUIRED[0]} and {name}: found {count} and {len(array)} rows, expected as "
+                    "many"
+                )
         engine = self.engine
         parts: dict[int, BatchSolution] = {}
         faults: dict[int, str] = {}
-        waiting = [(0, len(points))]
+        waiting = [(0, count)]
         while waiting:
             start, stop = waiting.pop()
             rows = slice(start, stop)
             try:
-                parts[start] = self._solved(points[rows], normals[rows], first_row + start)
+                parts[start] = self._solved(
+                    {name: array[rows] for name, array in arrays.items()}, first_row + start
+                )
             except RowError as error:
                 row = error.row - first_row
                 faults[error.row] = str(error)
@@ -89,6 +99,5 @@ class Stream:
         solution = BatchSolution.joined([parts[start] for start in sorted(parts)])
         return SolvedBlock(first_row, solution, dict(sorted(faults.items())))
 
-    def _solved(self, points: np.ndarray, normals: np.ndarray, first_row: int) -> BatchSolution:
-        problems = self.ask(points, normals, first_row)
-        return self.engine.solve(problems, self.run)
+    def _solved(self, arrays: Mapping[str, np.ndarray], first_row: int) -> BatchSolution:
+        return self.engine.solve(self.ask(arrays, first_row), self.run)

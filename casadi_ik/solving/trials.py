@@ -15,7 +15,7 @@ from casadi_ik.methods.hand_first.method import UNBOUNDED, HandFirstMethod
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase
-from casadi_ik.problem.verdict import judge
+from casadi_ik.problem.verdict import deviations, judge
 
 NEVER = 1e-12
 """A tolerance that nothing meets: the loop then goes on to the minimum."""
@@ -166,8 +166,7 @@ class Descent:
 
     def misses(self, targets: Rows, q: Array) -> Array:
         """(m, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
-        points, normals = self.problems.points[targets], self.problems.normals[targets]
-        position, angle = self.trials.robot.errors(q, points, normals)
+        position, angle, _ = deviations(self.trials.robot, self.problems.rows(targets), q)
         return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
 
 

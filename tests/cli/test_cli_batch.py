@@ -139,9 +139,9 @@ def test_diagnoses_are_written_if_asked_for(
     out = tmp_path / "o.npz"
     done = run("batch", hands(30), *ROBOT, "--diagnose", "--out", out)
     with np.load(out, allow_pickle=False) as data:
-        unreachable = data["status"] == "UNREACHABLE"
+        unreachable = np.isin(data["status"], ["UNREACHABLE", "NOT_FOUND"])
         assert unreachable.sum() >= 2
-        assert set(data["reason"][unreachable]) <= {"HAND", "REACH", "LIMITS"}
+        assert set(data["reason"][unreachable]) <= {"HAND", "REACH", "LIMITS", "NOT_FOUND"}
         assert not np.isnan(data["nearest_q"][unreachable]).any()
         assert (data["reason"][data["success"]] == "").all()
         assert np.isnan(data["enough_position"][data["success"]]).all()

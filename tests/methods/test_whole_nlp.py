@@ -10,9 +10,10 @@ from toy_robots import replace, write_coupled_robot
 import casadi_ik as ik
 from casadi_ik.errors import InputError
 from casadi_ik.methods.hand_first.whole_fit import whole_residual
+from casadi_ik.methods.ipopt.contacts import LENGTH
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.watch import EXACT
-from casadi_ik.methods.ipopt.whole_nlp import LENGTH, WholeNlp, contact_errors, limited_joints
+from casadi_ik.methods.ipopt.whole_nlp import WholeNlp, limited_joints
 from casadi_ik.problem.contacts.kinds import usual
 from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.status import Status
@@ -23,7 +24,9 @@ class Program:
 
     def __init__(self, robot, **options):
         self.robot = robot
-        self.nlp = WholeNlp(robot.description, IpoptParameters(**options))
+        self.nlp = WholeNlp(
+            robot.description, IpoptParameters(**options), usual(len(robot.fingers))
+        )
 
     def targets(self, q, weights=1.0):
         points, normals = self.robot.contacts(q)
@@ -67,7 +70,7 @@ def test_residual_is_that_of_the_other_methods(robot, program, rng):
 def test_errors_of_a_residual_are_distances_and_angles(robot, program, rng):
     q, goal = robot.random(rng, 2)
     residual = np.array(program.nlp.residual(q, program.targets(goal))).ravel()
-    distances, angles = contact_errors(residual[None])
+    distances, angles = program.nlp.contacts.errors(residual[None])
     points, normals = robot.contacts(q)
     target_points, target_normals = robot.contacts(goal)
     expected = np.linalg.norm(points - target_points, axis=1)

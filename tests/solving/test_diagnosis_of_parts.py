@@ -66,7 +66,7 @@ def test_fixed_actuators(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
 
     closed = diagnosed(solver, cup[0][None], cup[1][None], fixed={"bh_spread": 2.5})
     (why,) = closed.diagnoses
-    assert closed.status_names.tolist() == ["UNREACHABLE"]
+    assert set(closed.status_names) <= {"UNREACHABLE", "NOT_FOUND"}
     assert why is not None
     assert why.reason is ik.Reason.HAND
     assert why.q[robot.actuators.index("bh_spread")] == pytest.approx(2.5)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from casadi_ik.logs.explain.row_errors import within, worst
 from casadi_ik.logs.explain.why import held
 from casadi_ik.logs.read.log import Log
 from casadi_ik.logs.read.one_solve import OneSolve
+from casadi_ik.problem.contacts.arrays import NAMES
 
 SAME = 1e-9
 """How far targets may be apart and be the same [m, or parts of a unit normal]."""
@@ -34,14 +35,19 @@ class Line:
     second: str
 
 
-def target_key(points: np.ndarray, normals: np.ndarray) -> bytes:
+def target_key(
+    points: np.ndarray, normals: np.ndarray, more: Mapping[str, np.ndarray] | None = None
+) -> bytes:
     """Equal for targets that are the same but for rounding.
 
     Args:
         points: (f, 3) [m]; NaN where free.
         normals: (f, 3); NaN where free.
+        more: (f, 3) what they have beside; NaN where free.
     """
-    rounded = np.round(np.concatenate([points, normals]).astype(float) / SAME)
+    free = np.full_like(points, np.nan)
+    besides = [free if more is None else more.get(name, free) for name in NAMES]
+    rounded = np.round(np.concatenate([points, normals, *besides]).astype(float) / SAME)
     rounded[np.isnan(rounded)] = np.inf
     return (rounded + 0.0).tobytes()
 
@@ -52,7 +58,10 @@ def side_by_side(first: OneSolve, second: OneSolve) -> list[Line]:
     Raises:
         InputError: They are not of the same target.
     """
-    keys = [target_key(each.target_points, each.target_normals) for each in (first, second)]
+    keys = [
+        target_key(each.target_points, each.target_normals, each.target_more)
+        for each in (first, second)
+    ]
     if first.fingers != second.fingers or keys[0] != keys[1]:
         raise InputError(
             f"solve {first.solve_id} of {first.method} and solve {second.solve_id} of"
@@ -180,7 +189,9 @@ def _endings(logs: Sequence[Log], method: str) -> dict[bytes, Ending]:
             continue
         part = log.solves(method=method).part
         for solve_id, row in zip(part.solve_id.tolist(), part.rows, strict=True):
-            key = target_key(row["target_points"], row["target_normals"])
+            known = row.dtype.names or ()
+            more = {name: row[f"target_{name}"] for name in NAMES if f"target_{name}" in known}
+            key = target_key(row["target_points"], row["target_normals"], more)
             ending = Ending(
                 log,
                 method,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +17,7 @@ from casadi_ik.logs.events.traces import bits_of
 from casadi_ik.logs.read.asked import Asked, asked_of
 from casadi_ik.logs.read.log import Log
 from casadi_ik.logs.read.table import Part, Table, label_of
+from casadi_ik.problem.contacts.arrays import NAMES
 from casadi_ik.problem.problems import Tolerance
 
 Array = NDArray[np.float64]
@@ -90,6 +91,8 @@ class OneSolve:
         ok: (f,) which contacts are within tolerance.
         target_points: (f, 3) [m] in the base frame; NaN if free.
         target_normals: (f, 3); NaN if free.
+        target_more: (f, 3) what contacts have beside ("tangents", "lines", "planes"), NaN if free;
+            nothing that is free everywhere.
         layout: Fields of a row of the trace.
         labels: Names of codes, bits and elements by field.
         rows: The trace, a row per iteration; none if the log has kept the totals only.
@@ -123,6 +126,7 @@ class OneSolve:
     asked: Asked
     shard: str = ""
     number: int = 0
+    target_more: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def tolerances(self) -> tuple[Tolerance, ...]:
@@ -222,7 +226,15 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
         asked=asked_of(part, source.metadata),
         shard=source.name if len(sources) > 1 else "",
         number=number - source.first,
+        target_more=_more(row),
     )
+
+
+def _more(row: np.void) -> dict[str, Array]:
+    """What the contacts have beside points and normals; logs of earlier versions have none."""
+    known = row.dtype.names or ()
+    more = {name: row[f"target_{name}"] for name in NAMES if f"target_{name}" in known}
+    return {name: array for name, array in more.items() if not np.isnan(array).all()}
 
 
 def _range(numbers: NDArray[np.int64]) -> str:

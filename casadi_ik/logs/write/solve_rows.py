@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.events.kinds import EventKind, jacobian_names
 from casadi_ik.logs.events.traces import as_matrix, words_of
+from casadi_ik.problem.contacts.arrays import NAMES
 from casadi_ik.problem.preference import NO_PREFERENCE, PREFERENCES
 from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.status import Status
@@ -41,6 +42,7 @@ def solve_format(block: SolveBlock) -> TraceFormat:
         Field("seed", (), "f8", "", "of random numbers; exact below 2**53"),
         Field("target_points", (f, 3), "f8", "m", "base frame; NaN if free"),
         Field("target_normals", (f, 3), "f8", "", "base frame; NaN if free"),
+        *(Field(f"target_{name}", (f, 3), "f8", "", "base frame; NaN if free") for name in NAMES),
         *measured,
         Field("solve_id", (), "u4"),
         Field("iterations", (), "u4", "", "over all phases and restarts"),
@@ -58,7 +60,7 @@ def solve_format(block: SolveBlock) -> TraceFormat:
     )
     of_fingers = (
         *("position_error", "angle_error", "position_tolerance", "angle_tolerance"),
-        *("target_points", "target_normals", "ok"),
+        *("target_points", "target_normals", *(f"target_{name}" for name in NAMES), "ok"),
     )
     labels = {
         **dict.fromkeys(("q", "start", "fixed_mask"), block.format.labels.get("q", ())),
@@ -88,6 +90,8 @@ def solve_rows(block: SolveBlock, events: NDArray[np.int64], layout: Layout) -> 
     rows["phase_iterations"] = np.stack(list(batch.phases.values()), axis=1)
     rows["events"] = events
     rows["target_points"], rows["target_normals"] = problems.points, problems.normals
+    for name in NAMES:
+        rows[f"target_{name}"] = problems.vectors(name)
     rows["start"], rows["seed"] = block.starts, block.seed
     if problems.fixed is not None:
         held = ~np.isnan(problems.fixed)

@@ -16,7 +16,8 @@ from casadi_ik.errors import RowError, UnsupportedError
 from casadi_ik.kernels import LoopKernel, StepGraph
 from casadi_ik.kernels.rows import opaque
 from casadi_ik.kernels.stepper import Stepper
-from casadi_ik.problem.method import Outcome
+from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.method import Method, Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat, trace_format
@@ -131,6 +132,11 @@ class LoopedMethod(ABC):
         """Build and compile the loop."""
         _ = self.kernel
 
+    def for_kinds(self, kinds: Kinds) -> Method:
+        """Itself: a method that knows points with normals only refuses all else in `run`."""
+        del kinds
+        return self
+
     def stepper(self, problems: Problems, q0: Array) -> Stepper:
         """One target, one iteration at a time; see `Method.stepper`."""
         self._check(problems)
@@ -193,10 +199,19 @@ class LoopedMethod(ABC):
             raise UnsupportedError(f"method {self.name!r} cannot keep actuators fixed")
         if self.takes_free_contacts:
             return
+        for name, array in problems.more.items():
+            given = np.argwhere(~np.isnan(array[..., 0]))
+            if len(given):
+                row, finger = problems.number(int(given[0, 0])), given[0, 1]
+                raise RowError(
+                    f"method {self.name!r} needs point and normal of every finger and knows no "
+                    f"{name}; row {row} has one for {self.robot.finger_names[finger]!r}",
+                    row,
+                )
         for name, array in (("contact", problems.points), ("normal", problems.normals)):
             free = np.argwhere(np.isnan(array[..., 0]))
             if len(free):
-                row, finger = problems.first_row + int(free[0, 0]), free[0, 1]
+                row, finger = problems.number(int(free[0, 0])), free[0, 1]
                 raise RowError(
                     f"method {self.name!r} needs a {name} for every finger; row {row} has none for "
                     f"{self.robot.finger_names[finger]!r}",

@@ -72,7 +72,8 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
 
     numbers = {key: _is_number(array[:, 0]) for key, array in vectors.items()}
     known = ca.horzcat(numbers["points"], numbers["normals"])
-    needed = ca.vertcat(*(_mover(robot, actuator, known[:, 0]) for actuator in hand))
+    asked = ca.logic_or(known[:, 0], known[:, 1])
+    needed = ca.vertcat(*(_mover(robot, actuator, asked) for actuator in hand))
     held = _bounded(here[hand], t, hand)
     tried = [
         ca.if_else(needed, _bounded(postures[i, :].T, t, hand), held)

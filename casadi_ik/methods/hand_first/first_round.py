@@ -41,6 +41,7 @@ class FirstRound:
         self._lookup = table.lookup.single(layouts.candidates)
         self._solve = loop.single()
         self._state = self._solve.result.states[0]
+        self._more = [f"{name}s" for name in layouts.contacts.data[2:]]
         self._begin = beginning.single(outputs=[self._state, self._solve.parameters])
         fields = ("q", "candidate", "counts")
         self._q, self._candidate, self._counts = (
@@ -58,13 +59,15 @@ class FirstRound:
             terms: Of the beginning.
             max_iterations: Of the loop.
         """
-        points, normals, here, common, postures = self._begin.inputs
+        points, normals, *more, here, common, postures = self._begin.inputs
         points[...], normals[...], here[...], common[...] = (
             problems.points[0],
             problems.normals[0],
             q0,
             terms,
         )
+        for vectors, name in zip(more, self._more, strict=True):
+            vectors[...] = problems.vectors(name)[0]
         known = self._lookup.inputs
         known[0][...], known[1][...] = points, normals
         self._lookup()

@@ -18,7 +18,7 @@ from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
-from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Quick
 from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Array, Problems
@@ -60,15 +60,18 @@ class HandFirstMethod(LoopedMethod):
     takes_fixed_actuators = True
 
     def __init__(
-        self, robot: RobotDescription, options: HandFirstParameters, compiled: bool = True
+        self,
+        robot: RobotDescription,
+        options: HandFirstParameters,
+        compiled: bool = True,
+        kinds: Kinds | None = None,
     ) -> None:
-        """Recognise the arm and lay out the step."""
+        """Recognise the arm and lay out the step; point and normal if no kinds are given."""
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
         self.rounds = options.rounds
-        self.step = HandFirstStep(
-            robot, _closed_form(robot), options.candidates, usual(len(robot.fingers))
-        )
+        self._kinds = kinds or usual(len(robot.fingers))
+        self.step = HandFirstStep(robot, _closed_form(robot), options.candidates, self._kinds)
         self._singles: list[FirstRound] = []
 
     def step_graph(self) -> StepGraph:
@@ -88,6 +91,12 @@ class HandFirstMethod(LoopedMethod):
     def _table(self, size: int, at_limits: float = 0.0) -> PostureTable:
         hand = self.step.layouts.hand
         return PostureTable(ArmHand(self.robot), hand, size, at_limits, compiled=self._compiled)
+
+    def for_kinds(self, kinds: Kinds) -> HandFirstMethod:
+        """The same for contacts of other kinds."""
+        if kinds == self._kinds:
+            return self
+        return HandFirstMethod(self.robot, self.options, self._compiled, kinds)
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
@@ -160,7 +169,8 @@ class HandFirstMethod(LoopedMethod):
         """
         hand = len(self.step.layouts.hand)
         tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
-        asked = problems.points, problems.normals, q0, self._terms(problems), tried
+        vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
+        asked = *vectors, q0, self._terms(problems), tried
         states, parameters = self._beginning(*asked)
         return states, parameters
 

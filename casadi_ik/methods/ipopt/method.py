@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.stepper import Stepper
+from casadi_ik.methods.ipopt.contacts import NlpContacts
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
-from casadi_ik.methods.ipopt.whole_nlp import NlpRun, WholeNlp, contact_errors
+from casadi_ik.methods.ipopt.whole_nlp import NlpRun, WholeNlp
+from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase, Status
@@ -54,7 +56,11 @@ class IpoptMethod:
     name = "ipopt"
 
     def __init__(
-        self, robot: RobotDescription, options: IpoptParameters, compiled: bool = True
+        self,
+        robot: RobotDescription,
+        options: IpoptParameters,
+        compiled: bool = True,
+        kinds: Kinds | None = None,
     ) -> None:
         """Remember the robot; the program is built when first needed.
 
@@ -62,15 +68,21 @@ class IpoptMethod:
             robot: The robot.
             options: The numbers.
             compiled: Makes no difference: Ipopt calls its graphs in the virtual machine.
+            kinds: Of the contacts, by finger; None: point and normal.
         """
         del compiled
+        self._kinds = kinds or usual(len(robot.fingers))
         self.options = options
         self._robot = robot
 
     @cached_property
     def program(self) -> WholeNlp:
         """The program; it serves every target."""
-        return WholeNlp(self._robot, self.options)
+        return WholeNlp(self._robot, self.options, self._kinds)
+
+    def for_kinds(self, kinds: Kinds) -> IpoptMethod:
+        """The same for contacts of other kinds."""
+        return self if kinds == self._kinds else IpoptMethod(self._robot, self.options, kinds=kinds)
 
     def prepare(self) -> None:
         """Build the program."""
@@ -132,11 +144,11 @@ class IpoptMethod:
         starts = np.clip(q0, robot.lower, robot.upper) if problems.enforce_limits else q0
         for row in range(count):
             begin = time.perf_counter()
-            sequence = np.random.SeedSequence([seed, problems.first_row + row])
+            sequence = np.random.SeedSequence([seed, problems.number(row)])
             runs = self._runs(starts[row], targets[row], problems, np.random.default_rng(sequence))
             best = min(runs, key=lambda run: run.cost)
             q[row] = best.q
-            status[row] = _ending(best, problems)
+            status[row] = _ending(best, problems, self.program.contacts)
             iterations[row] = sum(len(run.path) for run in runs)
             restarts[row] = len(runs) - 1
             if trace:
@@ -160,7 +172,7 @@ class IpoptMethod:
         lower, upper = problems.bounds(robot, np.inf)
         for _ in range(self.options.restarts + 1):
             runs.append(self.program.solve(start, targets, lower, upper))
-            if _ending(runs[-1], problems) is Status.SOLVED:
+            if _ending(runs[-1], problems, self.program.contacts) is Status.SOLVED:
                 break
             start = rng.uniform(robot.lower, robot.upper)
         return runs
@@ -170,10 +182,10 @@ class IpoptMethod:
         layout, count = self.program.parameters, len(problems)
         counts = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
         values = {
-            "points": np.nan_to_num(problems.points),
-            "normals": np.nan_to_num(problems.normals),
-            "weights": np.stack(counts, axis=2),
-        }
+            item.name: np.nan_to_num(problems.vectors(item.name))
+            for item in layout
+            if item.name != "weights"
+        } | {"weights": np.stack(counts, axis=2)}
         targets = np.zeros((count, layout.size))
         for item in layout:
             targets[:, layout.slice(item.name)] = values[item.name].reshape(count, item.size)
@@ -183,7 +195,7 @@ class IpoptMethod:
         rows = np.zeros(sum(len(run.path) for run in runs), dtype=self.record.dtype)
         residuals = np.concatenate([run.residuals for run in runs])
         q = np.concatenate([run.path for run in runs])
-        distances, angles = contact_errors(residuals)
+        distances, angles = self.program.contacts.errors(residuals)
         at_limit = (q <= self._robot.lower + AT_LIMIT) | (q >= self._robot.upper - AT_LIMIT)
         rows["q"] = q
         rows["cost"] = np.sum(residuals**2, axis=1)
@@ -203,9 +215,9 @@ def _step_sizes(path: Array) -> Array:
     return np.append(np.abs(np.diff(path, axis=0)).max(axis=1), np.nan)
 
 
-def _ending(run: NlpRun, problems: Problems) -> Status:
+def _ending(run: NlpRun, problems: Problems, contacts: NlpContacts) -> Status:
     """How a run ended: solved if every contact is within tolerance, whatever Ipopt thinks."""
-    distances, angles = contact_errors(run.residual[None])
+    distances, angles = contacts.errors(run.residual[None])
     met = np.all(distances <= problems.position_tolerance)
     met = met and np.all(angles <= problems.angle_tolerance)
     return Status.SOLVED if met and run.inside else run.status

@@ -3,7 +3,7 @@
 Over the actuator positions q and one slack per residual row::
 
     minimise    |s|^2 / 2  +  pull |q - start|^2 / 2   (the pull is zero but for warm starts)
-    subject to  r(q) - s = 0                  (6 f rows: positions by `LENGTH`, then normals)
+    subject to  r(q) - s = 0                  (6 f rows for points and normals)
                 lower <= q <= upper
                 lower_j <= theta_j(q) <= upper_j   (joints whose limits those of q do not imply)
 
@@ -18,8 +18,7 @@ pull towards the start.
 
 Couplings are inside r and theta, so a four-bar or a lead screw is not a constraint of its own.
 The Hessian is exact, by CasADi's differentiation. Nothing here is shared with the other methods
-but the kinematics: the residual and `LENGTH` are written anew on purpose, so that a fault in the
-definition that all other methods share (`problem.contacts`) shows up as a difference to this one.
+but the kinematics, see `methods.ipopt.contacts`.
 """
 
 from __future__ import annotations
@@ -33,20 +32,18 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.forks import ForkSafeLock
-from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.layout import Layout
+from casadi_ik.methods.ipopt.contacts import NlpContacts
 from casadi_ik.methods.ipopt.interrupts import interrupt_afterwards
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.watch import EXACT, JOINT_SLACK, Watch, within
+from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.status import Status
 from casadi_ik.robots.couplings import FourBar
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.couplings import joint_positions
 
 Array = NDArray[np.float64]
-
-LENGTH = 0.1
-"""Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
 
 NEAR = 0.1
 """Cost below which a start is taken for a solution nearly there, and Ipopt started warm."""
@@ -68,12 +65,12 @@ class NlpRun:
 
     Attributes:
         q: (n,) configuration reached, within its bounds.
-        residual: (6 f,) residual there.
+        residual: (r,) residual there.
         inside: Whether the coupled joints are within their limits there.
         status: How Ipopt ended: STALLED (at a minimum, whether it meets the contacts or not),
             ITERATION_LIMIT or INVALID.
         path: (rows, n) configurations.
-        residuals: (rows, 6 f) residuals there.
+        residuals: (rows, r) residuals there.
         barrier: (rows,) Ipopt's mu; NaN if Ipopt was not needed.
         infeasibility: (rows,) largest violation of a constraint, Ipopt's ``inf_pr``.
         regularization: (rows,) what Ipopt added to the diagonal of the Hessian.
@@ -99,22 +96,18 @@ class WholeNlp:
     """The program for one robot; targets, weights and bounds are numbers of a solve.
 
     Attributes:
-        parameters: Layout of the targets: points (f, 3) [m], normals (f, 3), weights (f, 2), 1
-            where a point (a normal) counts, 0 where it is free.
-        residual: ``(q, parameters) -> r`` (6 f, 1).
+        contacts: The contacts' rows.
+        parameters: Layout of the targets: points (f, 3) [m], normals (f, 3), what their kinds have
+            beside, weights (f, 2), 1 where a point (a normal) counts, 0 where it is free.
+        residual: ``(q, parameters) -> r`` (rows, 1).
     """
 
-    def __init__(self, robot: RobotDescription, options: IpoptParameters) -> None:
+    def __init__(self, robot: RobotDescription, options: IpoptParameters, kinds: Kinds) -> None:
         """Build the graphs and both solvers, cold and warm."""
-        n, f = len(robot.actuators), len(robot.fingers)
-        self.parameters = Layout(
-            (
-                Field("points", (f, 3), unit="m", doc="contact points, base frame; 0 if free"),
-                Field("normals", (f, 3), doc="outward pad normals, base frame; 0 if free"),
-                Field("weights", (f, 2), doc="1 where point, normal count, 0 where free"),
-            )
-        )
-        self._n, self._rows = n, 6 * f
+        n = len(robot.actuators)
+        self.contacts = NlpContacts(kinds)
+        self.parameters = Layout(self.contacts.fields)
+        self._n, self._rows = n, sum(self.contacts.sizes)
         self._lower = robot.lower
         # Sliders of millimetres and joints of radians move the contacts alike once scaled.
         metres = np.array([actuator.unit == "m" for actuator in robot.actuators])
@@ -126,7 +119,7 @@ class WholeNlp:
         )
 
         q, p = ca.SX.sym("q", n), self.parameters.symbols("p")
-        residual = contact_residual(robot, q, self.parameters.unpack(p))
+        residual = self.contacts.residual(robot, q, self.parameters.unpack(p))
         joints = joint_positions(robot, q)[limited]
         self.residual = ca.Function("residual", [q, p], [residual], ["q", "p"], ["r"])
         self._joints = ca.Function("joints", [q], [ca.densify(joints)])
@@ -246,25 +239,6 @@ _ENDINGS = {
     "Invalid_Number_Detected": Status.INVALID,
 }
 """What Ipopt's endings mean; all others leave it standing at a point."""
-
-
-def contact_residual(robot: RobotDescription, q: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
-    """Residual (6 f, 1) of all contacts at q: (point - target) / `LENGTH`, then normal - target."""
-    kinematics = actuated(robot, q).kinematics
-    positions, normals = [], []
-    for i, name in enumerate(robot.finger_names):
-        point, normal = kinematics.contact(name)
-        positions.append((point - p["points"][i, :].T) / LENGTH * p["weights"][i, 0])
-        normals.append((normal - p["normals"][i, :].T) * p["weights"][i, 1])
-    return ca.vertcat(*positions, *normals)
-
-
-def contact_errors(residuals: Array) -> tuple[Array, Array]:
-    """Distances [m] and angles [rad], (k, f) each and zero where free, of residuals (k, 6 f)."""
-    k, size = residuals.shape
-    rows = np.linalg.norm(residuals.reshape(k, size // 3, 3), axis=2)
-    f = size // 6
-    return rows[:, :f] * LENGTH, 2 * np.arcsin(np.minimum(rows[:, f:] / 2, 1.0))
 
 
 def limited_joints(robot: RobotDescription) -> list[int]:

@@ -15,7 +15,7 @@ from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.methods.thumb_first.state import STAGES
 from casadi_ik.methods.thumb_first.step import ThumbFirstStep
-from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.target import target_values
@@ -41,13 +41,18 @@ class ThumbFirstMethod(LoopedMethod):
     takes_fixed_actuators = True
 
     def __init__(
-        self, robot: RobotDescription, options: ThumbFirstParameters, compiled: bool = True
+        self,
+        robot: RobotDescription,
+        options: ThumbFirstParameters,
+        compiled: bool = True,
+        kinds: Kinds | None = None,
     ) -> None:
-        """Recognise the arm and lay out the step."""
+        """Recognise the arm and lay out the step; point and normal if no kinds are given."""
         super().__init__(robot, options, compiled)
         self.options: ThumbFirstParameters = options
         self.rounds = 1 if options.starts == 1 else 2
-        self.step = ThumbFirstStep(robot, options, usual(len(robot.fingers)), _closed_form(robot))
+        self._kinds = kinds or usual(len(robot.fingers))
+        self.step = ThumbFirstStep(robot, options, self._kinds, _closed_form(robot))
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""
@@ -60,6 +65,12 @@ class ThumbFirstMethod(LoopedMethod):
         return PostureTable(
             robot, self.step.hand, options.table, pull=options.pull, compiled=self._compiled
         )
+
+    def for_kinds(self, kinds: Kinds) -> ThumbFirstMethod:
+        """The same for contacts of other kinds."""
+        if kinds == self._kinds:
+            return self
+        return ThumbFirstMethod(self.robot, self.options, self._compiled, kinds)
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table."""
@@ -79,8 +90,10 @@ class ThumbFirstMethod(LoopedMethod):
         known = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
         values = {
             **target_values(problems),
-            "points": np.nan_to_num(problems.points),
-            "normals": np.nan_to_num(problems.normals),
+            **{
+                f"{name}s": np.nan_to_num(problems.vectors(f"{name}s"))
+                for name in self.step.contacts.data
+            },
             "weights": np.stack(known, axis=2),
             "lower": lower,
             "upper": upper,

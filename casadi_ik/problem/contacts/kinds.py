@@ -48,9 +48,9 @@ def suffix(kinds: Kinds) -> str:
 
 
 def kind_of(data: Iterable[str]) -> ContactKind:
-    """The kind of a contact that has these vectors: of every aspect the most it has data for."""
+    """The kind of a contact that has these vectors beside point and normal."""
     known, asked = set(data), {PLACE: USUAL.place, FACING: USUAL.facing}
     for condition in CONDITIONS.values():
-        if len(condition.data) > 1 and known.issuperset(condition.data[1:]):
+        if not known.isdisjoint(condition.data[1:]):
             asked[condition.aspect] = condition.name
     return ContactKind(asked[PLACE], asked[FACING])

@@ -266,9 +266,18 @@ def _between(problems: Problems, i: int) -> Problems:
         before = np.where(np.isnan(values[i - 1]), values[i], values[i - 1])
         return (1 - share) * before + share * values[i]
 
-    normals = mixed(problems.normals)
-    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
-    return replace(problems, points=mixed(problems.points), normals=normals)
+    def turned(values: Array) -> Array:
+        way = mixed(values)
+        return way / np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-12)
+
+    normals, more = turned(problems.normals), {}
+    for name, values in problems.more.items():
+        way = turned(values)
+        if name == "tangents":
+            way -= normals * np.sum(normals * way, axis=2, keepdims=True)
+            way /= np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-12)
+        more[name] = way
+    return replace(problems, points=mixed(problems.points), normals=normals, more=more)
 
 
 def travel_limits(robot: ArmHand, period: float | None, velocity: Any) -> Array | None:

@@ -21,9 +21,11 @@ from casadi_ik.problem.diagnosis import (
     Remedies,
 )
 from casadi_ik.problem.problems import Array, Problems
-from casadi_ik.problem.verdict import Verdict, judge
-from casadi_ik.solving.diagnosis.minimax import MARGIN, Closest, closest
+from casadi_ik.problem.proof import Proof, ProofKind
+from casadi_ik.problem.verdict import Verdict, deviations, judge
+from casadi_ik.solving.diagnosis.minimax import Closest, closest
 from casadi_ik.solving.diagnosis.palm_free import HandFits, PalmFree
+from casadi_ik.solving.diagnosis.prover import Prover
 from casadi_ik.solving.diagnosis.remedies import RemedyFinder
 from casadi_ik.solving.trials import Descent, Rows, Trials
 
@@ -62,12 +64,13 @@ class Diagnostician:
         method: Hand-first on that robot.
     """
 
-    def __init__(self, robot: ArmHand, method: HandFirstMethod) -> None:
+    def __init__(self, robot: ArmHand, method: HandFirstMethod, compiled: bool = True) -> None:
         """Keep robot and method; nothing is built before the first diagnosis."""
         self.robot = robot
         self.method = method
         self._trials = Trials(robot, method)
         self._palm_free = PalmFree(self._trials)
+        self._prover = Prover(robot.description, compiled)
 
     def diagnose(self, problems: Problems, q0: Array, nearest: Array | None) -> list[Diagnosis]:
         """Diagnose k targets; each as if it were alone.
@@ -104,20 +107,33 @@ class Diagnostician:
         every = np.arange(len(problems))
         descent = Descent(self._trials, problems)
         evidence, fits = self._hands(problems, q0)
-        refused = [_refused(*item) for item in evidence]
         targets, ends = self._placed(fits)
         targets, ends = np.concatenate([every, targets]), np.concatenate([nearest, ends])
+        searches = np.bincount(targets, minlength=len(every))
+        if fits is not None:
+            searches += np.bincount(fits.targets, minlength=len(every))
         best = closest(descent, targets, ends, PLACED + 1)
         clock.lap(every)
+        proofs: list[Proof | None] = [None] * len(every)
+        rows = np.flatnonzero(~self._solved(problems, best.fair))
+        if len(rows):
+            for row, proof in zip(
+                rows.tolist(), self._prover.prove(problems.rows(rows)), strict=True
+            ):
+                proofs[row] = proof
+            clock.lap(rows)
+        refused = [_refused(*item, proof) for item, proof in zip(evidence, proofs, strict=True)]
         # Where neither the hand nor the reach says no, only searching can.
         unsure = np.array([reason is None for reason in refused])
         certain = self._certain(problems, fits, best)
+        certain |= np.array([proof is not None for proof in proofs])
         for below, count, followed in SEARCHES:
             rows = np.flatnonzero(unsure | ((best.ratio < below) & ~certain))
             rows = rows[~self._solved(problems.rows(rows), best.fair[rows])]
             if len(rows):
                 some, found = problems.rows(rows), best.rows(rows)
                 best.put(rows, self._search(some, found, count, followed))
+                searches[rows] += count + 2
                 clock.lap(rows)
             unsure[:] = False
         fair = judge(self.robot, problems, best.fair)
@@ -140,7 +156,8 @@ class Diagnostician:
             clock.lap(every[i : i + 1])
             yield Diagnosis(
                 reason=reason,
-                established=reason is not Reason.NOT_FOUND and bool(best.ratio[i] >= MARGIN),
+                proof=proofs[i],
+                searches=int(searches[i]),
                 hand=hand,
                 reach=reach,
                 active=tuple(name for name, at in names if at and problems.enforce_limits),
@@ -210,7 +227,7 @@ class Diagnostician:
     def _nearest(self, problems: Problems, q: Array) -> list[dict[str, NearContact]]:
         """The contacts of configurations (k, n), beside those asked for."""
         points, normals = self.robot.contacts(q)
-        position_error, angle_error = self.robot.errors(q, problems.points, problems.normals)
+        position_error, angle_error, _ = deviations(self.robot, problems, q)
         columns = points, normals, position_error, angle_error
         rows = zip(*(column.tolist() for column in columns), strict=True)
         return [
@@ -240,7 +257,9 @@ class _Clock:
         self.seconds[targets] += (self._now - before) / len(targets)
 
 
-def _refused(hand: HandFit | None, reach: ArmReach | None) -> Reason | None:
+def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) -> Reason | None:
+    if proof is not None:
+        return Reason.REACH if proof.kind is ProofKind.REACH else Reason.HAND
     if hand is not None and not hand.fits:
         return Reason.HAND
     if reach is not None and abs(reach.excess) > REAL:
@@ -261,7 +280,8 @@ def _reachable(
 ) -> Diagnosis:
     return Diagnosis(
         reason=Reason.REACHABLE,
-        established=False,
+        proof=None,
+        searches=0,
         hand=None,
         reach=None,
         active=(),

@@ -199,7 +199,8 @@ class PalmFree:
         turn = np.einsum("ij,kmj->kim", palm[:3, :3], rotation)
         points = np.einsum("kij,kfj->kfi", turn, asked.points - origin[:, None]) + palm[:3, 3]
         normals = np.einsum("kij,kfj->kfi", turn, asked.normals)
-        return replace(asked, points=points, normals=normals)
+        more = {key: np.einsum("kij,kfj->kfi", turn, v) for key, v in asked.more.items()}
+        return replace(asked, points=points, normals=normals, more=more)
 
     def _wrist(self, problems: Problems, rotation: Array, origin: Array) -> tuple[Array, Array]:
         """(m,) distance of the wrist from the shoulder, and from what the arm can span [m]."""

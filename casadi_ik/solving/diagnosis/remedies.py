@@ -65,6 +65,10 @@ class RemedyFinder:
                 self.problems,
                 points=np.concatenate([problems.points for _, _, problems in freeings]),
                 normals=np.concatenate([problems.normals for _, _, problems in freeings]),
+                more={
+                    name: np.concatenate([problems.more[name] for _, _, problems in freeings])
+                    for name in self.problems.more
+                },
             )
             for i, q in self._solutions(asked, self._limits.tiled(len(asked))).items():
                 part, finger, _ = freeings[i]
@@ -95,13 +99,13 @@ class RemedyFinder:
             points, normals = problems.points.copy(), problems.normals.copy()
             normals[0, i] = np.nan
             if faced[i]:
-                found.append(("normal", name, replace(problems, normals=normals)))
+                found.append(("normal", name, _freed(problems, points, normals)))
             if known[i] and known.sum() > 1:
                 points[0, i] = np.nan
-                found.append(("finger", name, replace(problems, points=points, normals=normals)))
+                found.append(("finger", name, _freed(problems, points, normals)))
         if faced.sum() > 1:
             none = np.full_like(problems.normals, np.nan)
-            found.append(("normal", "all", replace(problems, normals=none)))
+            found.append(("normal", "all", _freed(problems, problems.points, none)))
         return found
 
     def _solutions(self, asked: Problems, bounds: Bounds) -> dict[int, Array]:
@@ -124,3 +128,13 @@ class RemedyFinder:
     def _solves(self, asked: Problems, q: Array, bounds: Bounds) -> NDArray[np.bool_]:
         inside = (bounds.beyond(q) == 0).all(axis=1)
         return np.logical_and(inside, self.trials.solved(asked, q, limits=False))
+
+
+def _freed(problems: Problems, points: Array, normals: Array) -> Problems:
+    """A target without what goes with the points and normals that are now free."""
+    placed, faced = ~np.isnan(points), ~np.isnan(normals)
+    more = {
+        name: np.where(placed & faced if name == "tangents" else placed, array, np.nan)
+        for name, array in problems.more.items()
+    }
+    return replace(problems, points=points.copy(), normals=normals, more=more)

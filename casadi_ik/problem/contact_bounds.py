@@ -1,0 +1,104 @@
+"""Where fingertips can be while motors are within boxes, in numpy: balls for a check of proofs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.problem.joint_bounds import joint_bounds
+from casadi_ik.problem.joint_frames import link_frames, placed
+from casadi_ik.problem.problems import Array
+from casadi_ik.robots.description import RobotDescription
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """All contacts of k boxes.
+
+    Attributes:
+        points: (k, f, 3) centres [m], palm frame; base frame if the palm does not move.
+        normals: (k, f, 3) unit.
+        radius: (k, f) how far the points can be from there [m].
+        angle: (k, f) how far the normals can be turned from there [rad].
+        effect: (k, h) what each motor adds at most, a radian counting as 0.1 m.
+        empty: (k,) whether joint limits leave nothing.
+    """
+
+    points: Array
+    normals: Array
+    radius: Array
+    angle: Array
+    effect: Array
+    empty: Flags
+
+
+def balls(
+    robot: RobotDescription,
+    motors: Sequence[str],
+    box: tuple[Array, Array],
+    limits: tuple[Array, Array],
+    fingers: Sequence[int],
+    in_palm: bool,
+) -> Balls:
+    """Balls around the contacts in the middle of the joints' ranges.
+
+    Args:
+        robot: The description.
+        motors: Names of the motors of the hand.
+        box: Their lower and upper ends (k, h).
+        limits: Of the joints of the fingers (m,).
+        fingers: Numbers of the fingers wanted.
+        in_palm: Whether in the palm frame.
+    """
+    count = len(box[0])
+    ranges, empty = {}, np.zeros(count, dtype=bool)
+    for i, (name, (low, high)) in enumerate(joint_bounds(robot, motors, *box).items()):
+        low, high = np.maximum(low, limits[0][i]), np.minimum(high, limits[1][i])
+        empty |= low > high
+        ranges[name] = (low + high) / 2, np.maximum(high - low, 0.0) / 2 + 1e-12
+    frames = link_frames(robot, {name: middle for name, (middle, _) in ranges.items()}, count)
+    kinds = {joint.name: joint for joint in robot.movable}
+    points, normals, radius, angle = [], [], [], []
+    effect = np.zeros((count, len(motors)))
+    for i in fingers:
+        finger = robot.fingers[i]
+        rotation, point = placed(frames[finger.link], finger.placement)
+        normal = rotation @ finger.normal
+        far, turned = np.zeros(count), np.zeros(count)
+        share = np.zeros_like(effect)
+        for name in reversed(finger.joints):
+            joint, half = kinds[name], ranges[name][1]
+            frame, origin = frames[joint.child]
+            sine = np.sin(np.minimum(half, np.pi) / 2)
+            if joint.type == "prismatic":
+                moved, swung = half, np.zeros(count)
+            else:
+                lever = np.linalg.norm(np.cross(frame @ joint.axis, point - origin), axis=1)
+                moved, swung = 2 * sine * (lever + far), half
+            far, turned = far + moved, turned + swung
+            k = list(motors).index(_motor(robot, name))
+            share[:, k] += moved / 0.1 + swung
+        effect = np.maximum(effect, share)
+        if in_palm:
+            palm, centre = placed(frames[robot.palm_link], robot.palm_placement)
+            point = np.einsum("kji,kj->ki", palm, point - centre)
+            normal = np.einsum("kji,kj->ki", palm, normal)
+        points.append(point)
+        normals.append(normal)
+        radius.append(far)
+        angle.append(turned)
+    stacked = (np.stack(part, axis=1) for part in (points, normals, radius, angle))
+    return Balls(*stacked, effect=effect, empty=empty)
+
+
+def _motor(robot: RobotDescription, name: str) -> str:
+    """The actuator that a joint follows in the end."""
+    joints = {joint.name: joint for joint in robot.movable}
+    while name in joints and (coupling := joints[name].coupling) is not None:
+        name = coupling.of
+    return name

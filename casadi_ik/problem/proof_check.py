@@ -1,0 +1,224 @@
+"""Checks a proof of impossibility: proves it again, in numpy, by simpler bounds and finer boxes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.problem.arm_span import arm_span
+from casadi_ik.problem.contact_bounds import Balls, Flags, balls
+from casadi_ik.problem.hand_motors import (
+    OUTWARDS,
+    endless_fingers,
+    hand_motors,
+    joint_limits,
+    motor_box,
+    motor_ends,
+)
+from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.srs_arm import reach, srs_arm
+
+if TYPE_CHECKING:
+    from casadi_ik.problem.proof import Proof
+
+SLACK = 1e-8
+"""Ten times the search's own slack for rounding [m, rad]."""
+
+MOST = 400_000
+"""Boxes after which a check gives up: the proof then counts as not confirmed."""
+
+TOGETHER = 512
+"""Boxes that are looked at in one go."""
+
+FINEST = 1e-5
+"""A box is not divided any more where its contacts move by less [0.1 m, rad]: not confirmed."""
+
+
+def holds(proof: Proof, robot: RobotDescription, target: Problems | None) -> bool:
+    """Whether a proof is about a target, states it rightly, and can be proved again."""
+    about = proof.target
+    if len(about) != 1 or (target is not None and not _same(about, target)):
+        return False
+    numbers = [
+        robot.finger_names.index(name) for name in proof.fingers if name in robot.finger_names
+    ]
+    known = ~np.isnan(about.points[0, :, 0])
+    if len(numbers) != len(proof.fingers) or not numbers or not known[numbers].all():
+        return False
+    pairs = zip(proof.tolerance, about.tolerances, strict=True)
+    if any(p.position < a.position or p.angle < a.angle for p, a in pairs):
+        return False
+    asked = replace(about, tolerance=tuple(proof.tolerance))
+    return _Search(robot, asked, numbers, proof.kind.name).refutes()
+
+
+def _same(one: Problems, other: Problems) -> bool:
+    arrays = ((one.points, other.points), (one.normals, other.normals))
+    fixed = [np.zeros(0) if item.fixed is None else item.fixed for item in (one, other)]
+    return (
+        all(np.array_equal(a, b, equal_nan=True) for a, b in arrays)
+        and np.array_equal(fixed[0], fixed[1], equal_nan=True)
+        and one.tolerances == other.tolerances
+        and one.enforce_limits == other.enforce_limits
+    )
+
+
+class _Search:
+    """Divides the hand's box until every part is refuted."""
+
+    def __init__(
+        self, robot: RobotDescription, asked: Problems, fingers: list[int], kind: str
+    ) -> None:
+        self.robot, self.asked, self.fingers, self.kind = robot, asked, fingers, kind
+        self.motors = hand_motors(robot)
+        self.in_palm = any(j.type != "fixed" for j in robot.chain(robot.palm_link))
+        self.limits = joint_limits(robot, asked)
+        self.points, self.normals = asked.points[0, fingers], asked.normals[0, fingers]
+        self.loose = asked.position_tolerance[fingers] + SLACK
+        self.turned = asked.angle_tolerance[fingers] + SLACK
+
+    def refutes(self) -> bool:
+        ends = motor_box(self.robot, self.asked)
+        endless = endless_fingers(self.robot, ends)
+        if any(endless[i] for i in self.fingers):
+            return False
+        waiting, seen = [ends[None]], 0
+        while waiting:
+            boxes = waiting.pop()
+            seen += len(boxes)
+            if seen > MOST:
+                return False
+            found = balls(
+                self.robot,
+                self.motors,
+                (boxes[:, 0], boxes[:, 1]),
+                self.limits,
+                self.fingers,
+                self.in_palm,
+            )
+            left = np.flatnonzero(~(found.empty | self._refuted(found)))
+            boxes, effect = boxes[left], found.effect[left]
+            rows, widest = np.arange(len(left)), effect.argmax(axis=1)
+            if (effect[rows, widest] < FINEST).any():
+                return False
+            middle = boxes.mean(axis=1)[rows, widest]
+            low, high = boxes.copy(), boxes.copy()
+            low[rows, 1, widest], high[rows, 0, widest] = middle, middle
+            halves = np.concatenate([low, high])
+            waiting += [halves[i : i + TOGETHER] for i in range(0, len(halves), TOGETHER)]
+        return True
+
+    def _refuted(self, found: Balls) -> Flags:
+        radius, angle = found.radius + self.loose, found.angle + self.turned
+        if not self.in_palm:
+            apart = np.linalg.norm(self.points - found.points, axis=2) > radius
+            facing = _angle(self.normals, found.normals) > angle
+            return (apart | facing).any(axis=1)
+        refuted = self._pairs(found, radius, angle)
+        refuted[~refuted] = self._rigid(found, radius, angle, ~refuted)
+        if self.kind == "REACH":
+            refuted |= self._reach(found, radius)
+        return refuted
+
+    def _pairs(self, found: Balls, radius: Array, angle: Array) -> Flags:
+        """Distances of points, angles of normals, angles of normals and lines."""
+        refuted = np.zeros(len(radius), dtype=bool)
+        for i, j in combinations(range(len(self.fingers)), 2):
+            asked, here = self.points[j] - self.points[i], found.points[:, j] - found.points[:, i]
+            give = radius[:, i] + radius[:, j]
+            far, length = np.linalg.norm(asked), np.linalg.norm(here, axis=1)
+            refuted |= np.abs(length - far) > give + SLACK * far
+            between = _angle(self.normals[i], self.normals[j])
+            now = _angle(found.normals[:, i], found.normals[:, j])
+            refuted |= np.abs(now - between) > angle[:, i] + angle[:, j]
+            # The line between the points turns by no more than asin(give / length).
+            with np.errstate(divide="ignore", invalid="ignore"):
+                tilt = np.arcsin(np.clip(give / far, 0.0, 1.0))
+                tilt[give >= far] = np.pi
+                for n in (i, j):
+                    now = _angle(found.normals[:, n], here)
+                    refuted |= np.abs(now - _angle(self.normals[n], asked)) > angle[:, n] + tilt
+        return refuted
+
+    def _rigid(self, found: Balls, radius: Array, angle: Array, rows: Flags) -> Flags:
+        """The best weighted rigid fit (Kabsch) against what the balls would allow."""
+        w = 1 / radius[rows] ** 2
+        chord = 2 * np.sin(np.minimum(angle[rows], np.pi) / 2)
+        known = ~np.isnan(self.normals[:, 0])
+        v = known / chord**2
+        facing = np.nan_to_num(self.normals)
+        total = w.sum(axis=1, keepdims=True)
+        x = found.points[rows] - ((w[:, :, None] * found.points[rows]).sum(axis=1) / total)[:, None]
+        y = self.points - ((w[:, :, None] * self.points).sum(axis=1) / total)[:, None]
+        S = np.einsum("kf,kfi,kfj->kij", w, x, y)
+        S += np.einsum("kf,kfi,fj->kij", v, found.normals[rows], facing)
+        sizes = np.linalg.svd(S, compute_uv=False)
+        trace = sizes[:, 0] + sizes[:, 1] + np.sign(np.linalg.det(S)) * sizes[:, 2]
+        size = (w * ((x**2).sum(axis=2) + (y**2).sum(axis=2)) + 2 * v).sum(axis=1)
+        allowed = len(self.fingers) + known.sum()
+        return size * (1 - 1e-9) - 2 * trace > allowed
+
+    def _reach(self, found: Balls, radius: Array) -> Flags:
+        """Where the wrist can be, from each contact and from all, against the arm's span."""
+        shoulder, wrist, near, far = self._arm
+        away = np.linalg.norm(self.points - shoulder, axis=1)
+        arm = np.linalg.norm(wrist - found.points, axis=2)
+        out = (away - arm - radius > far) | (arm - radius - away > far)
+        out |= away + arm + radius < near
+        centre, give = self._carried(found, radius, wrist)
+        distance = np.linalg.norm(centre - shoulder, axis=1)
+        return out.any(axis=1) | (distance - give > far) | (distance + give < near)
+
+    def _carried(self, found: Balls, radius: Array, wrist: Array) -> tuple[Array, Array]:
+        """A ball (k, 3), (k,) that holds the wrist: a weighted sum of contacts and normals."""
+        known = ~np.isnan(self.normals[:, 0])
+        chord = 2 * np.sin(np.minimum(found.angle + self.turned, np.pi) / 2)
+        first, origin = found.points[:, :1], self.points[0]
+        # The first contact, and from there along the differences of the others and the normals.
+        columns = np.concatenate([found.points[:, 1:] - first, found.normals[:, known]], axis=1)
+        goals = np.concatenate([self.points[1:] - origin, self.normals[known]])
+        loose = np.concatenate([radius[:, 1:] + radius[:, :1], chord[:, known]], axis=1)
+        A = columns / loose[:, :, None]
+        normal = np.einsum("kfi,kfj->kij", A, A)
+        normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        across = wrist - first[:, 0]
+        solved = np.linalg.solve(normal, across[:, :, None])[:, :, 0]
+        share = np.einsum("kfi,ki->kf", A, solved) / loose
+        rest = across - np.einsum("kf,kfi->ki", share, columns)
+        n = len(self.fingers) - 1
+        give = np.linalg.norm(rest, axis=1) + SLACK
+        give += radius[:, 0] * np.abs(1 - share[:, :n].sum(axis=1))
+        give += (np.abs(share[:, :n]) * radius[:, 1:]).sum(axis=1)
+        give += (np.abs(share[:, n:]) * chord[:, known]).sum(axis=1)
+        return origin + share @ goals, give
+
+    @cached_property
+    def _arm(self) -> tuple[Array, Array, float, float]:
+        """Shoulder, wrist in the palm, and what their distance can be [m]."""
+        try:
+            arm = srs_arm(self.robot)
+        except UnsupportedError:
+            general = arm_span(self.robot)
+            assert general is not None
+            return general.shoulder, general.wrist, *general.span(self.asked)
+        elbow = self.robot.arm_actuators[3]
+        lower, upper = (np.clip(end, -1e3, 1e3) for end in motor_ends(self.robot, self.asked))
+        ends = reach(arm, lower[elbow] - OUTWARDS, upper[elbow] + OUTWARDS)
+        near, far = (float(end) for end in ends)
+        return arm.shoulder, arm.wrist_in_palm, near - SLACK, far + SLACK
+
+
+def _angle(a: Array, b: Array) -> Array:
+    """Angles of vectors along the last axis [rad]; NaN where one is NaN."""
+    a, b = (
+        a / np.linalg.norm(a, axis=-1, keepdims=True),
+        b / np.linalg.norm(b, axis=-1, keepdims=True),
+    )
+    apart, together = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
+    return 2 * np.arctan2(apart, together)

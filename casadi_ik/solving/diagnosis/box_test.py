@@ -1,0 +1,96 @@
+"""Whether no hand within a box of its coordinates can meet a target: one test, as a graph.
+
+Every contact of such a hand lies in a ball (`contact_ranges`), every contact asked for within its
+tolerances. Hence inequalities between what is kept by all motions of the palm, and between that
+and what the arm can do. All are necessary: what is refuted is impossible, what is not may be, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import casadi as ca
+
+from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.problem.problems import Array
+from casadi_ik.solving.diagnosis.box_contacts import BoxContact, box_contacts
+from casadi_ik.solving.diagnosis.hand_space import HandSpace
+from casadi_ik.solving.diagnosis.pair_rows import pair_rows
+from casadi_ik.solving.diagnosis.rigid_bound import rigid_excess
+from casadi_ik.solving.diagnosis.wrist_bound import Wrist, wrist_excess
+from casadi_ik.symbolic.smooth import Expr
+
+LENGTH = 0.1
+"""A length that counts as much as one radian [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoxTest:
+    """The step for one robot.
+
+    Attributes:
+        space: The hand's coordinates.
+        wrist: The arm; None if the palm does not move.
+    """
+
+    space: HandSpace
+    wrist: Wrist | None
+
+    def graph(self) -> FunctionGraph:
+        """The graph.
+
+        Returns:
+            ``(lower, upper, joint_lower, joint_upper, points, normals, tolerance, asked, span) ->
+            (refuted, scores)``: coordinates (h,), joints of the fingers (m,), contacts (f, 3),
+            tolerances and what is asked (f, 2), the wrist's smallest and largest distance (2,).
+            Refuted by the hand and by the reach (2,) where > 0; scores (h,): what each coordinate
+            leaves open.
+        """
+        robot = self.space.robot
+        h, m, f = len(self.space.motors), len(self.space.joints), len(robot.fingers)
+        shapes = {"lower": (h, 1), "upper": (h, 1), "joint_lower": (m, 1), "joint_upper": (m, 1)}
+        shapes |= {"points": (f, 3), "normals": (f, 3), "tolerance": (f, 2), "asked": (f, 2)}
+        shapes |= {"span": (2, 1)}
+        name = ca.Function.fix_name(f"{robot.name}_box_test")
+
+        def build() -> ca.Function:
+            symbols = {key: ca.SX.sym(key, *shape) for key, shape in shapes.items()}
+            outputs = [ca.densify(output) for output in self._outputs(symbols)]
+            return ca.Function(
+                name, list(symbols.values()), outputs, list(shapes), ["refuted", "scores"]
+            )
+
+        place: tuple[Array, ...] = () if self.wrist is None else self.wrist.points
+        known = recipe(name, robot, place)
+        return FunctionGraph(name, build, shapes, ((2, 1), (h, 1)), known)
+
+    def _outputs(self, p: dict[str, ca.SX]) -> tuple[Expr, Expr]:
+        ranges = self.space.ranges(p["lower"], p["upper"])
+        half = (p["upper"] - p["lower"]) / 2
+        contacts = box_contacts(self.space, ranges, half, p, self.wrist is not None)
+        hand, reach = [ca.SX(-1)], [ca.SX(-1)]
+        for i, name in enumerate(self.space.joints):
+            hand.append(ranges[name].lower - p["joint_upper"][i])
+            hand.append(p["joint_lower"][i] - ranges[name].upper)
+        if self.wrist is None:
+            hand += [test for contact in contacts for test in contact.alone()]
+        else:
+            pairs = [row for a, b in combinations(contacts, 2) for row in pair_rows(a, b)]
+            hand += [ca.fabs(row.value) - row.plain for row in pairs]
+            hand.append(rigid_excess(contacts))
+            reach += wrist_excess(contacts, self.wrist, p["span"])
+        refuted = ca.vertcat(ca.mmax(ca.vertcat(*hand)), ca.mmax(ca.vertcat(*reach)))
+        return refuted, self._scores(contacts, p["asked"])
+
+    def _scores(self, contacts: list[BoxContact], asked: Expr) -> Expr:
+        """By coordinate, the most that it moves a finger."""
+        found = []
+        for k in range(len(self.space.motors)):
+            most = ca.SX(0)
+            for i, contact in enumerate(contacts):
+                share = asked[i, 0] * contact.moved[k] / LENGTH + asked[i, 1] * contact.turned[k]
+                most = ca.fmax(most, share)
+            found.append(most)
+        return ca.vertcat(*found)

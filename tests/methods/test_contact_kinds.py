@@ -1,0 +1,381 @@
+"""Contacts of every kind, asked of every method: solved, judged by others, kept, asked again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays_of
+
+import casadi_ik as ik
+from casadi_ik.errors import DescriptionError, InputError, RowError
+from casadi_ik.grasps.vectors import MORE
+from casadi_ik.logs import one_solve
+from casadi_ik.problem.contacts.arrays import NAMES, by_kinds, more_arrays
+from casadi_ik.problem.contacts.conditions import CONDITIONS
+from casadi_ik.problem.contacts.kinds import ContactKind, usual
+from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.verdict import judge
+from casadi_ik.solving.diagnosis.prover import Prover
+
+METHODS = ("hand-first", "thumb-first", "ipopt")
+PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
+SIDE, UP = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.0, 1.0])
+TIGHT = ik.Tolerance(1e-4, 1e-3)
+
+
+def frames(robot, seed=3):
+    """Contact frames (f, 4, 4) of a configuration near home."""
+    spread = 0.05 * (robot.upper - robot.lower)
+    q = robot.home + np.random.default_rng(seed).uniform(-1, 1, len(spread)) * spread
+    return robot.contact_frames(np.clip(q, robot.lower, robot.upper))
+
+
+def contact(kind: str, frame: np.ndarray) -> ik.Contact:
+    """A contact of a kind that a fingertip at this frame meets, its point elsewhere if allowed."""
+    point, normal, tangent = frame[:3, 3], frame[:3, 0], frame[:3, 1]
+    across = np.cross(UP, SIDE)
+    return {
+        "point": lambda: ik.Contact(point),
+        "point and normal": lambda: ik.Contact(point, normal),
+        "pose": lambda: ik.Contact(point, normal, tangent=tangent),
+        "line": lambda: ik.Contact(point + 0.03 * SIDE, line=SIDE),
+        "line and normal": lambda: ik.Contact(point - 0.02 * SIDE, normal, line=SIDE),
+        "plane": lambda: ik.Contact(point + 0.03 * across, plane=UP),
+        "plane and pose": lambda: ik.Contact(
+            point + 0.02 * across, normal, tangent=tangent, plane=UP
+        ),
+        "direction": lambda: ik.Contact(direction=normal),
+    }[kind]()
+
+
+KINDS = (
+    *("point", "point and normal", "pose", "line", "line and normal", "plane"),
+    *("plane and pose", "direction"),
+)
+
+
+def off(frame: np.ndarray, asked: ik.Contact) -> tuple[float, float]:
+    """Distance [m] and angle [rad] of a fingertip from a contact, NaN where free."""
+    beside, angle = frame[:3, 3] - asked.point, np.nan
+    distance = float(np.linalg.norm(beside))
+    if asked.line is not None:
+        distance = float(np.linalg.norm(beside - asked.line * (asked.line @ beside)))
+    if asked.plane is not None:
+        distance = abs(float(asked.plane @ beside))
+    if asked.normal is not None:
+        angle = float(np.arccos(np.clip(asked.normal @ frame[:3, 0], -1, 1)))
+    if asked.tangent is not None:
+        axes = np.stack([asked.normal, asked.tangent, np.cross(asked.normal, asked.tangent)], 1)
+        cosine = (np.trace(axes.T @ frame[:3, :3]) - 1) / 2
+        angle = float(np.arccos(np.clip(cosine, -1, 1)))
+    return distance, angle
+
+
+def pinocchio_frames(oracle, q):
+    """Contact frames (f, 4, 4) from the written URDF by pinocchio."""
+    poses, found = oracle.frames(q), []
+    for finger in oracle.robot.description.fingers:
+        pose = poses[f"{finger.name}_contact"]
+        axes = [finger.normal, finger.tangent, np.cross(finger.normal, finger.tangent)]
+        frame = pose.copy()
+        frame[:3, :3] = pose[:3, :3] @ np.stack(axes, axis=1)
+        found.append(frame)
+    return np.array(found)
+
+
+@pytest.fixture(scope="module")
+def solvers(robot):
+    """In the virtual machine: every combination of kinds would be compiled else."""
+    return {name: ik.Solver(robot, name, TIGHT, compiled=False) for name in METHODS}
+
+
+def test_contact_frames_are_pinocchios(robot, coupled_robot, oracle, coupled_oracle, rng):
+    for one, other in ((robot, oracle), (coupled_robot, coupled_oracle)):
+        for q in one.random(rng, 5):
+            np.testing.assert_allclose(one.contact_frames(q), pinocchio_frames(other, q), atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("method", METHODS)
+def test_every_kind_is_solved(robot, oracle, solvers, method, kind):
+    """The thumb of that kind, the others with point and normal; judged by pinocchio as well."""
+    at = frames(robot)
+    contacts = {
+        name: contact(kind if name == robot.thumb else "point and normal", frame)
+        for name, frame in zip(robot.fingers, at, strict=True)
+    }
+    solution = solvers[method].solve(ik.Grasp(contacts))
+    assert solution.success, solution
+    there = pinocchio_frames(oracle, solution.q)
+    for i, name in enumerate(robot.fingers):
+        distance, angle = off(there[i], contacts[name])
+        verdict = solution.contacts[name]
+        np.testing.assert_allclose(verdict.position_error, distance, atol=1e-8)
+        np.testing.assert_allclose(verdict.angle_error, angle, atol=1e-6)
+        assert not distance > TIGHT.position
+        assert not angle > TIGHT.angle
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_whole_poses_of_all_fingers(robot, oracle, solvers, method):
+    """More is asked than the hand has joints for, so from the configuration that has them."""
+    at = frames(robot)
+    contacts = dict(zip(robot.fingers, (contact("pose", frame) for frame in at), strict=True))
+    solution = solvers[method].solve(ik.Grasp(contacts))
+    assert solution.success, solution
+    for frame, wanted in zip(pinocchio_frames(oracle, solution.q), at, strict=True):
+        np.testing.assert_allclose(frame[:3, :3], wanted[:3, :3], atol=2e-3)
+
+
+def test_a_fingertip_turned_about_its_normal_misses_its_pose(robot):
+    """The verdict's angle of a pose is that of the whole frame."""
+    at = frames(robot)
+    q = robot.home + np.random.default_rng(3).uniform(-1, 1, 14) * 0.05 * (
+        robot.upper - robot.lower
+    )
+    q = np.clip(q, robot.lower, robot.upper)
+    points, normals, tangents = at[:, :3, 3], at[:, :3, 0], at[:, :3, 1]
+    turned = np.cos(0.3) * tangents + np.sin(0.3) * np.cross(normals, tangents)
+    for asked_for, expected in ((tangents, 0.0), (turned, 0.3)):
+        asked = Problems(
+            points[None],
+            normals[None],
+            TIGHT,
+            enforce_limits=True,
+            more={"tangents": asked_for[None]},
+        )
+        found = judge(robot, asked, q[None])
+        np.testing.assert_allclose(found.angle_error, expected, atol=1e-9)
+        assert found.all_ok[0] == (expected == 0)
+
+
+@pytest.mark.parametrize("method", PAPER)
+def test_the_papers_methods_say_what_they_need(robot, method):
+    points, normals, tangents = (frames(robot)[None, :, :3, i] for i in (3, 0, 1))
+    solver = ik.Solver(robot, method, finger_step="closed-form", compiled=False)
+    with pytest.raises(RowError, match=r"needs point and normal of every finger.*row 0.*'thumb'"):
+        solver.solve_batch(points, normals, tangents=tangents)
+    with pytest.raises(RowError, match="needs a contact for every finger"):
+        solver.solve(ik.Grasp({"thumb": ik.Contact(direction=UP)}))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_target_has_the_same_answer_in_any_company(robot, solvers, method):
+    """Its own kinds decide which kernel solves it, and its number the random numbers."""
+    at = np.array([frames(robot, seed) for seed in range(4)])
+    points, normals, tangents = at[..., :3, 3], at[..., :3, 0], at[..., :3, 1].copy()
+    planes = np.full_like(points, np.nan)
+    tangents[1], tangents[2, 1:], planes[3, 0] = np.nan, np.nan, UP
+    more = {"tangents": tangents, "planes": planes}
+    solver = solvers[method]
+    batch = solver.solve_batch(points, normals, seed=3, **more)
+    assert batch.success.all()
+    blocks = [
+        {"points": points[i : i + 1], "normals": normals[i : i + 1]}
+        | {name: array[i : i + 1] for name, array in more.items()}
+        for i in range(4)
+    ]
+    apart = [block.solution for block in solver.solve_blocks(blocks, seed=3)]
+    for i, one in enumerate(apart):
+        np.testing.assert_array_equal(one.q[0], batch.q[i])
+        np.testing.assert_array_equal(one.angle_error[0], batch.angle_error[i])
+        assert one.iterations[0] == batch.iterations[i]
+
+
+def test_rows_of_a_log_belong_to_their_solves(robot, solvers, tmp_path: Path):
+    """Targets of several kinds are solved in groups, but logged in their order."""
+    at = np.array([frames(robot, seed) for seed in range(4)])
+    points, normals, tangents = at[..., :3, 3], at[..., :3, 0], at[..., :3, 1].copy()
+    tangents[[0, 2]] = np.nan
+    path = tmp_path / "kinds.mcap"
+    batch = solvers["hand-first"].solve_batch(points, normals, tangents=tangents, log=path)
+    log = ik.logs.open(path)
+    for i in range(4):
+        solve = one_solve(log, i)
+        assert len(solve.rows) == batch.iterations[i]
+        np.testing.assert_array_equal(solve.target_points, points[i])
+        assert ("tangents" in solve.target_more) == (i % 2 == 1)
+        if i % 2:
+            np.testing.assert_allclose(solve.target_more["tangents"], tangents[i], atol=1e-15)
+
+
+def test_what_was_asked_stands_in_the_log(robot, solvers, tmp_path: Path):
+    """And asked again it has the same answer."""
+    kinds = dict(zip(robot.fingers, ("plane and pose", "line", "direction"), strict=True))
+    grasp = ik.Grasp(
+        {
+            name: contact(kinds[name], frame)
+            for name, frame in zip(robot.fingers, frames(robot), strict=True)
+        }
+    )
+    path = tmp_path / "asked.mcap"
+    first = solvers["ipopt"].solve(grasp, log=path)
+    solve = one_solve(ik.logs.open(path))
+    asked = {"points": solve.target_points, "normals": solve.target_normals, **solve.target_more}
+    for name, one in grasp.contacts.items():
+        row = robot.fingers.index(name)
+        for vector in ("point", "normal", *MORE):
+            given = getattr(one, vector)
+            logged = asked.get(f"{vector}s", np.full((3, 3), np.nan))[row]
+            np.testing.assert_array_equal(logged, np.full(3, np.nan) if given is None else given)
+    free = np.isnan(solve.target_points[:, 0])
+    again = {}
+    for row, name in enumerate(robot.fingers):
+        more = {
+            key[:-1]: array[row]
+            for key, array in solve.target_more.items()
+            if not np.isnan(array[row]).any()
+        }
+        normal = solve.target_normals[row]
+        if free[row]:
+            again[name] = ik.Contact(direction=normal)
+        else:
+            given = None if np.isnan(normal).any() else normal
+            again[name] = ik.Contact(solve.target_points[row], given, **more)
+    second = solvers["ipopt"].solve(ik.Grasp(again))
+    np.testing.assert_allclose(second.q, first.q, atol=1e-6)
+    assert second.status == first.status
+
+
+def test_why_a_pose_is_not_solved(robot, solvers):
+    """The diagnosis asks with tangents as well: what helps is to leave one free."""
+    at = frames(robot)
+    normals, tangents = at[:, :3, 0], at[:, :3, 1].copy()
+    tangents[1] = np.cos(1.2) * tangents[1] + np.sin(1.2) * np.cross(normals[1], tangents[1])
+    contacts = {
+        name: ik.Contact(at[i, :3, 3], normals[i], tangent=tangents[i])
+        for i, name in enumerate(robot.fingers)
+    }
+    solution = solvers["hand-first"].solve(ik.Grasp(contacts))
+    assert not solution.success
+    assert solution.diagnosis is not None
+    assert solution.diagnosis.nearest["finger_2"].angle_error > 0.1
+    assert ("normal", "finger_2") in [(one.part, one.finger) for one in solution.diagnosis.freed]
+
+
+FILE = """\
+robot: kuka_lwr_barrett
+contacts:
+  thumb: {{{thumb}}}
+  finger_2: {{point: [0.5, 0.0, 0.6], normal: [0, 1, 0]}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("thumb", "expected"),
+    [
+        ("point: [0.5, 0.1, 0.6], normal: [0, -1, 0], tangent: [0, 0, 2]", {"tangent": UP}),
+        ("point: [0.5, 0.1, 0.6], line: [0, 0, 3]", {"line": UP, "normal": None}),
+        ("point: [0.5, 0.1, 0.6], plane: [0, 0, 1], normal: [0, -1, 0]", {"plane": UP}),
+        ("direction: [0, 0, 0.5]", {"normal": UP, "tangent": None}),
+    ],
+)
+def test_grasp_files(tmp_path: Path, thumb, expected):
+    path = tmp_path / "grasp.yaml"
+    path.write_text(FILE.format(thumb=thumb))
+    found = ik.load_grasp(path).contacts["thumb"]
+    for name, value in expected.items():
+        np.testing.assert_array_equal(getattr(found, name), value)
+    assert np.isnan(found.point).all() == ("direction" in thumb)
+
+
+@pytest.mark.parametrize(
+    ("thumb", "message"),
+    [
+        ("normal: [0, -1, 0]", "contacts.thumb.point: missing"),
+        ("point: [0, 0, 1], tangent: [0, 0, 1]", "thumb.tangent: found one without a normal"),
+        (
+            "point: [0, 0, 1], normal: [0, -1, 0], tangent: [0, -1, 1]",
+            r"thumb.tangent: found \[0.0, -0.7071\d+, 0.7071\d+\] at 45 deg to the normal",
+        ),
+        ("point: [0, 0, 1], line: [0, 0, 0]", "thumb.line: found .* expected a direction"),
+        ("point: [0, 0, 1], line: [0, 0, 1], plane: [0, 0, 1]", "thumb.line and plane: found both"),
+        ("point: [0, 0, 1], direction: [0, 0, 1]", "thumb.direction: found it beside point"),
+        ("point: [0, 0, 1], tangents: [0, 0, 1]", "tangents"),
+    ],
+)
+def test_bad_grasp_files(tmp_path: Path, thumb, message):
+    path = tmp_path / "grasp.yaml"
+    path.write_text(FILE.format(thumb=thumb))
+    with pytest.raises(DescriptionError, match=message) as caught:
+        ik.load_grasp(path)
+    assert str(path) in str(caught.value)
+
+
+def test_bad_arrays(robot):
+    points, normals, tangents = (frames(robot)[None, :, :3, i] for i in (3, 0, 1))
+    tilted = tangents + 0.01 * normals
+    lone = np.where(np.arange(3)[:, None] == 1, np.nan, normals)
+    for bad, facing, message in (
+        (tilted, normals, "row 4, finger 0: tangent: .* expected 90 deg"),
+        (tangents, lone, "row 4, finger 1: tangent: found one without a normal"),
+        (np.where(tangents > 0, np.nan, tangents), normals, "expected finite numbers"),
+        (0 * tangents, normals, "row 4, finger 0: tangent: .* not zero"),
+    ):
+        with pytest.raises(RowError, match=message) as caught:
+            more_arrays({"tangents": bad}, points, facing, first_row=4)
+        assert caught.value.row == 4
+    with pytest.raises(InputError, match=r"tangents: found shape \(1, 3\), expected \(1, 3, 3\)"):
+        more_arrays({"tangents": tangents[..., 0]}, points, normals)
+
+
+@given(
+    free=arrays_of.arrays(bool, (5, 3, 3)),
+    line=st.booleans(),
+)
+def test_every_target_is_in_one_group_of_its_kinds(free, line):
+    """Groups are disjoint, cover the batch and have what their targets have; numbers are kept."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(5, 3, 3))
+    more = {}
+    for i, name in enumerate(("tangents", "lines" if line else "planes")):
+        array = rng.normal(size=(5, 3, 3))
+        array[free[..., i]] = np.nan
+        if not np.isnan(array).all():
+            more[name] = array
+    asked = Problems(points, points, TIGHT, enforce_limits=True, first_row=10, more=more)
+    seen = []
+    for kinds, rows, some in by_kinds(asked):
+        rows = np.arange(5) if rows is None else rows
+        seen += rows.tolist()
+        assert [some.number(i) for i in range(len(some))] == (10 + rows).tolist()
+        for name, array in more.items():
+            given = ~np.isnan(array[rows][..., 0])
+            if name == "tangents":
+                given = np.repeat(given.any(axis=1)[:, None], 3, axis=1)
+                asks = [kind.facing == "frame" for kind in kinds]
+            else:
+                asks = [kind.place == name[:-1] for kind in kinds]
+            np.testing.assert_array_equal(given, np.tile(asks, (len(rows), 1)))
+    assert sorted(seen) == [0, 1, 2, 3, 4]
+
+
+def test_the_tables_agree():
+    """Every vector that a grasp can have is needed by a condition, and the other way round."""
+    needed = {name for condition in CONDITIONS.values() for name in condition.data}
+    assert needed == {"point", "normal", *MORE}
+    assert NAMES == ("tangents", "lines", "planes")
+    assert [kinds for kinds, _, _ in by_kinds(_plain())] == [usual(3)]
+    assert ContactKind() == ContactKind("point", "normal")
+
+
+def _plain() -> Problems:
+    return Problems(np.zeros((2, 3, 3)), np.zeros((2, 3, 3)), TIGHT, enforce_limits=True)
+
+
+def test_no_proof_counts_a_contact_that_may_slide(robot):
+    """Its point is far out of reach; the plane through it is not."""
+    at = frames(robot)
+    points, normals = at[None, :, :3, 3].copy(), at[None, :, :3, 0]
+    points[0, 0, :2] += 5.0
+    planes = np.full((1, 3, 3), np.nan)
+    planes[0, 0] = UP
+    prover = Prover(robot.description, compiled=False)
+    asked = Problems(points, normals, TIGHT, enforce_limits=True)
+    assert prover.prove(asked)[0] is not None
+    slides = Problems(points, normals, TIGHT, enforce_limits=True, more={"planes": planes})
+    assert prover.prove(slides)[0] is None

@@ -1,0 +1,208 @@
+"""Unreachable only with a proof: never of what can be reached, and each can be checked again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from robot_variants import derived_robot
+from toy_robots import write_coupled_robot
+
+import casadi_ik as ik
+from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.proof import Proof, ProofKind
+from casadi_ik.solving.diagnosis.prover import Prover
+
+Array = NDArray[np.float64]
+BLIND = [[0, 100, 48, 78, 48, 48, 48], [0, 90, 48, 78, 46, 60, 31], [4, 94, 48, 78, 48, 47, 48]]
+"""Hands (spread, thumb, finger 2, finger 3) [deg] that a lookup of postures tells badly apart."""
+
+ROBOTS = ["kuka_lwr_barrett", "kuka_lwr_barrett_coupled", "ar10", "baxter_ar10"]
+
+
+def asked(targets: tuple[Array, Array], position: float, angle: float, limits: bool) -> Problems:
+    return Problems(*targets, ik.Tolerance(position, angle), limits)
+
+
+def moved(targets: tuple[Array, Array], rng: np.random.Generator, metres: float, angle: float):
+    """Every contact moved and every normal turned by so much, any way."""
+    points, normals = targets
+    shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
+    points = points + metres * shift / np.linalg.norm(shift, axis=2, keepdims=True)
+    turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
+    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    return points, normals * np.cos(angle) + turn * np.sin(angle)
+
+
+@pytest.fixture(scope="module", params=ROBOTS)
+def any_robot(request: pytest.FixtureRequest) -> ik.ArmHand:
+    return ik.load_robot(request.param)
+
+
+@pytest.fixture(scope="module")
+def prover(robot: ik.ArmHand) -> Prover:
+    return Prover(robot.description)
+
+
+@pytest.mark.parametrize("tolerance", [1e-12, 1e-6, 5e-3, 2e-2])
+@pytest.mark.parametrize("limits", [True, False])
+def test_no_proof_of_what_can_be_reached(
+    any_robot: ik.ArmHand, tolerance: float, limits: bool
+) -> None:
+    rng = np.random.default_rng(1)
+    q = any_robot.random(rng, 12)
+    chance = rng.random(q.shape)
+    q[4:] = np.where(chance < 0.2, any_robot.lower, np.where(chance > 0.8, any_robot.upper, q))[4:]
+    if not limits:
+        turning = np.array([a.unit == "rad" for a in any_robot.description.actuators])
+        q[:, turning] = rng.uniform(-9, 9, (12, turning.sum()))
+    angle = 10 * tolerance
+    # Contacts of which only the tolerance makes that they can be reached, too.
+    part = rng.choice([0.0, 0.9, 0.99]) if tolerance > 1e-9 else 0.0
+    targets = moved(any_robot.contacts(q), rng, part * tolerance, part * angle)
+    proofs = Prover(any_robot.description).prove(asked(targets, tolerance, angle, limits))
+    assert proofs == [None] * 12
+
+
+@settings(max_examples=15)
+@given(
+    place=st.lists(st.floats(0, 1), min_size=14, max_size=14),
+    part=st.floats(0, 0.99),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_no_proof_within_tolerance(
+    robot: ik.ArmHand, prover: Prover, place: list[float], part: float, seed: int
+) -> None:
+    q = robot.lower + np.array(place) * (robot.upper - robot.lower)
+    rng = np.random.default_rng(seed)
+    targets = moved(robot.contacts(q[None]), rng, part * 5e-3, part * np.deg2rad(3))
+    assert prover.prove(asked(targets, 5e-3, np.deg2rad(3), True)) == [None]
+
+
+def test_blind_hands_are_never_unreachable(robot: ik.ArmHand) -> None:
+    """Hands that the solve itself may miss: they used to be called unreachable."""
+    rng = np.random.default_rng(3)
+    q = robot.random(rng, 30)
+    q[:, 7:] = np.clip(
+        np.deg2rad(np.array(BLIND)[np.arange(30) % 3] + rng.uniform(-1, 1, (30, 7))),
+        robot.lower[7:],
+        robot.upper[7:],
+    )
+    batch = ik.Solver(robot).solve_batch(*robot.contacts(q), diagnose=True)
+    assert "UNREACHABLE" not in batch.status_names
+    missed = batch.status_names[~batch.success]
+    assert set(missed) <= {"NOT_FOUND"}
+
+
+def test_ignored_limits_and_tiny_tolerances_are_never_unreachable(robot: ik.ArmHand) -> None:
+    rng = np.random.default_rng(4)
+    q = rng.uniform(-np.pi, np.pi, (40, len(robot.actuators)))
+    free = ik.Solver(robot, limits="ignore")
+    assert "UNREACHABLE" not in free.solve_batch(*robot.contacts(q), diagnose=True).status_names
+    strict = ik.Solver(robot, tolerance=ik.Tolerance(1e-12, 1e-12))
+    targets = robot.contacts(robot.random(rng, 20))
+    assert "UNREACHABLE" not in strict.solve_batch(*targets, diagnose=True).status_names
+
+
+def test_coupled_mechanisms_and_other_arms(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Chains of couplings, a prismatic thumb, an arm without a closed form."""
+    coupled = ik.load_robot(write_coupled_robot(tmp_path_factory.mktemp("coupled")))
+    bent = derived_robot(tmp_path_factory.mktemp("bent"), elbow_offset=0.045)
+    for robot in (coupled, bent):
+        rng, prover = np.random.default_rng(5), Prover(robot.description)
+        q = robot.random(rng, 200)
+        q = q[robot.beyond_limits(q) <= 0][:16]
+        targets = robot.contacts(q)
+        for limits in (True, False):
+            assert prover.prove(asked(targets, 1e-9, 1e-9, limits)) == [None] * len(q)
+        far = targets[0] + 5.0, targets[1]
+        proofs = prover.prove(asked(far, 5e-3, 0.05, True))
+        assert all(proof is not None and proof.check(robot) for proof in proofs)
+
+
+def impossible(robot: ik.ArmHand) -> dict[str, tuple[Array, Array]]:
+    points, normals = robot.contacts(robot.random(np.random.default_rng(6), 12))
+    centre = points.mean(axis=1, keepdims=True)
+    return {
+        "far": (points + np.array([1.8, 0, 0]), normals),
+        "apart": (centre + 6 * (points - centre), normals),
+        "shoulder": (points - centre + np.array([0, 0, 0.31]), normals),
+    }
+
+
+def test_proofs_can_be_checked(robot: ik.ArmHand, prover: Prover) -> None:
+    kinds = set()
+    for targets in impossible(robot).values():
+        problems = asked(targets, 5e-3, np.deg2rad(3), True)
+        proofs = [proof for proof in prover.prove(problems) if proof is not None]
+        assert len(proofs) >= 11
+        for proof in proofs[:4]:
+            assert proof.check(robot)
+            assert proof.check(robot, proof.target)
+            kinds.add(proof.kind)
+    assert kinds == {ProofKind.HAND, ProofKind.REACH}
+
+
+def test_a_finger_of_a_fixed_hand() -> None:
+    robot = ik.load_robot("ar10")
+    points, normals = robot.contacts(robot.home)
+    points[2] += [0, 0.05, 0.05]
+    (proof,) = Prover(robot.description).prove(
+        asked((points[None], normals[None]), 5e-3, np.deg2rad(3), True)
+    )
+    assert proof is not None
+    assert (proof.kind, proof.fingers) == (ProofKind.FINGER, (robot.fingers[2],))
+    assert proof.check(robot)
+
+
+def test_a_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
+    targets = impossible(robot)
+    apart, shoulder = (
+        prover.prove(asked(targets[name], 5e-3, np.deg2rad(3), True))[0]
+        for name in ("apart", "shoulder")
+    )
+    assert isinstance(apart, Proof)
+    assert isinstance(shoulder, Proof)
+    loose = tuple(ik.Tolerance(1.0, 3.0) for _ in robot.fingers)
+    tight = tuple(ik.Tolerance(1e-4, 1e-4) for _ in robot.fingers)
+    q = robot.home[None]
+    reachable = asked(robot.contacts(q), 5e-3, np.deg2rad(3), True)
+    assert not replace(apart, tolerance=loose).check(robot)
+    assert not replace(apart, tolerance=tight).check(robot)
+    assert not replace(apart, fingers=apart.fingers[:1]).check(robot)
+    assert not replace(apart, fingers=()).check(robot)
+    assert not replace(apart, fingers=("nobody",)).check(robot)
+    assert not replace(apart, target=reachable).check(robot)
+    assert not apart.check(robot, reachable)
+    # Without the arm nothing is wrong with contacts in the shoulder.
+    assert not replace(shoulder, kind=ProofKind.HAND).check(robot)
+
+
+def test_what_is_not_proved_is_not_unreachable(
+    robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best answer, the starts tried and the likely reason, marked as such."""
+    solver = ik.Solver(robot)
+    monkeypatch.setattr(
+        solver._engine.diagnostician._prover, "prove", lambda problems: [None] * len(problems)
+    )
+    points, normals = ik.load_grasp("cup").arrays(robot.fingers)
+    far = {n: ik.Contact(points[i] - [1, 0, 0], normals[i]) for i, n in enumerate(robot.fingers)}
+    solution = solver.solve(ik.Grasp(far))
+    assert solution.status is ik.Status.NOT_FOUND
+    diagnosis = solution.diagnosis
+    assert diagnosis is not None
+    assert (diagnosis.proof, diagnosis.established) == (None, False)
+    assert diagnosis.searches > 2
+    assert diagnosis.lines[0] == f"likely: {ik.Reason.REACH}"
+    assert any(line.startswith("not proved; no solution from") for line in diagnosis.lines)
+
+
+def test_codes_of_the_log_stay() -> None:
+    assert [status.name for status in sorted(ik.Status)] == [
+        *("INVALID", "RUNNING", "SOLVED", "STALLED", "ITERATION_LIMIT", "UNREACHABLE", "NOT_FOUND")
+    ]
