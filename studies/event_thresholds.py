@@ -24,6 +24,7 @@ from targets import any_configuration, random_arm_targets
 
 import casadi_ik as ik
 from casadi_ik.logs import EventKind, EventRules, Keep, McapRecorder
+from casadi_ik.logs.write.measured import measured_format
 from casadi_ik.problem.recorder import SolveBlock
 
 FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0)
@@ -79,7 +80,7 @@ class Caught:
 
 def trials(block: SolveBlock) -> Iterator[Trial]:
     """Rules for every Jacobian of a method, for stalls and for oscillations."""
-    known = block.format.jacobians
+    known = measured_format(block.format).jacobians
     silent = dict.fromkeys(known, 0.0), dict.fromkeys(known, math.inf)
     for name, jacobian in known.items():
         for factor in FACTORS:
@@ -170,6 +171,8 @@ def main(arguments: list[str] | None = None) -> None:
     solvers = (
         ik.Solver(barrett, "enhanced-dls", finger_step="closed-form"),
         ik.Solver(barrett, "enhanced-sdls", finger_step="closed-form"),
+        ik.Solver(barrett, "hand-first"),
+        ik.Solver(barrett, "thumb-first"),
         ik.Solver(ar10, "hand-first"),
     )
     parts = [section(solver, options.count, options.seed) for solver in solvers]

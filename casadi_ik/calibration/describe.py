@@ -13,7 +13,6 @@ from casadi_ik.calibration.model import tilted
 from casadi_ik.calibration.result import Calibration
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.shipped import resolve
-from casadi_ik.robots.couplings import FourBar, LeadScrew
 from casadi_ik.robots.load import load_description
 from casadi_ik.symbolic.couplings import joint_positions
 from casadi_ik.symbolic.so3 import exp_so3, matrix_to_rpy
@@ -107,7 +106,7 @@ def _widen(joints: dict[str, dict[str, Any]], names: set[str], path: Path) -> No
     strokes = np.linspace(*robot.strokes, GRID)
     ranges = np.array(positions(strokes.T))
     for joint, values in zip(robot.movable, ranges, strict=True):
-        if joint.name in names and isinstance(joint.coupling, LeadScrew | FourBar):
+        if joint.name in names and joint.coupling is not None and joint.coupling.slope is None:
             low, high = float(values.min()), float(values.max())
             joints[joint.name]["limits"] = [
                 joint.lower if low >= joint.lower else low - MARGIN,

@@ -17,11 +17,9 @@ from numpy.typing import NDArray
 
 from casadi_ik.calibration.parameters import Parameter
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.robots.couplings import FourBar, LeadScrew
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
-from casadi_ik.symbolic import four_bar, lead_screw
-from casadi_ik.symbolic.couplings import linkage
+from casadi_ik.symbolic.couplings import follow
 from casadi_ik.symbolic.directions import perpendicular
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.so3 import exp_so3
@@ -116,7 +114,7 @@ class HandModel:
             if name not in positions:
                 joint = joints[name]
                 source = position(joint.coupling.of)  # type: ignore[union-attr]
-                positions[name] = _follow(joint, source, symbols)
+                positions[name] = follow(joint, source, _Numbers(joint, symbols))
             return positions[name]
 
         entry = self.robot.finger(finger)
@@ -144,22 +142,14 @@ def tilted(axis: Array, tilts: Expr) -> Expr:
     return exp_so3(across @ tilts) @ ca.DM(axis.tolist())
 
 
-def _follow(joint: Joint, source: Expr, symbols: dict[str, Expr]) -> Expr:
-    """Position of a coupled joint, the coupling's numbers being symbols where they are free."""
-    coupling = joint.coupling
+class _Numbers:
+    """The numbers of a joint's coupling, symbols where they are free."""
 
-    def number(key: str) -> Expr:
-        return symbols.get(f"{joint.name}.{key}", getattr(coupling, key))
+    def __init__(self, joint: Joint, symbols: dict[str, Expr]) -> None:
+        self._joint, self._symbols = joint, symbols
 
-    if isinstance(coupling, LeadScrew):
-        angle = lead_screw.angle_from_slider(source, number("b"), number("c"))
-        return angle - number("theta_0")
-    if isinstance(coupling, FourBar):
-        bar = four_bar.FourBar(*(number(key) for key in "pqgh"), branch=linkage(coupling).branch)
-        # Continuous about the known pose, whatever the estimate of its angle.
-        theta_3 = four_bar.theta3(number("phi_0") + source, bar, coupling.theta_3_0)
-        return theta_3 - number("theta_3_0")
-    return source if coupling is None else coupling.ratio * source + coupling.offset
+    def __getattr__(self, key: str) -> Expr:
+        return self._symbols.get(f"{self._joint.name}.{key}", getattr(self._joint.coupling, key))
 
 
 def _vector(symbols: dict[str, Expr], owner: str, part: str, nominal: Array) -> Expr:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from casadi_ik.errors import InputError
-from casadi_ik.robots.couplings import FourBar, LeadScrew
 from casadi_ik.robots.description import Joint, RobotDescription
 
 GROUPS = ("linkage", "axes", "tips")
@@ -115,18 +114,15 @@ def hand_parameters(
 
 
 def _coupling(joint: Joint, spread: Priors) -> list[Parameter]:
-    keys: tuple[str, ...] = ()
-    if isinstance(joint.coupling, LeadScrew):
-        keys = ("b", "c", "theta_0")
-    elif isinstance(joint.coupling, FourBar):
-        keys = ("p", "q", "g", "h", "phi_0", "theta_3_0")
-    found = []
-    for key in keys:
-        is_length = len(key) == 1
-        prior, unit = (spread.length, "m") if is_length else (spread.angle, "rad")
-        nominal = float(getattr(joint.coupling, key))
-        found.append(Parameter(joint.name, "coupling", key, nominal, prior, unit))
-    return found
+    coupling = joint.coupling
+    if coupling is None:
+        return []
+    kinds = ((coupling.lengths, spread.length, "m"), (coupling.angles, spread.angle, "rad"))
+    return [
+        Parameter(joint.name, "coupling", key, float(getattr(coupling, key)), prior, unit)
+        for keys, prior, unit in kinds
+        for key in keys
+    ]
 
 
 def _axis(joint: Joint, spread: Priors) -> list[Parameter]:

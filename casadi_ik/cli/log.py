@@ -188,7 +188,7 @@ def named(items: Sequence[Any], why: str) -> str:
 
 def _methods(log: logs.Log) -> RenderableType:
     right = ("solves", "iterations")
-    rows = table("method", *right, "status", "events", right=right)
+    rows = table("method", *right, "status", "smallest sigma", "events", right=right)
     for method, counts in log.info().counts.items():
         statuses = _counter(log.solves(method=method), "status")
         kinds = _counter(log.events(method=method), "kind")
@@ -197,9 +197,23 @@ def _methods(log: logs.Log) -> RenderableType:
             str(counts["solve"]),
             str(counts["iteration"]),
             _counted(statuses),
+            _smallest(log.solves(method=method)),
             _counted(kinds),
         )
     return rows
+
+
+def _smallest(solves: logs.Table) -> str:
+    """Smallest singular value of every Jacobian over all solves, or that it was not measured."""
+    field = "lowest_sigma"
+    if field not in solves.names:
+        return "not measured"
+    values = np.concatenate([[np.full(solves.rows[field].shape[1], np.nan)], solves.rows[field]])
+    lowest = np.fmin.reduce(values, axis=0).tolist()
+    return "\n".join(
+        f"{plain_name(name)} {'not measured' if math.isnan(value) else f'{value:.2g}'}"
+        for name, value in zip(solves.labels[field], lowest, strict=True)
+    )
 
 
 def _counter(table: logs.Table, field: str) -> Counter[str]:

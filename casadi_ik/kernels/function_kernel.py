@@ -22,8 +22,8 @@ from casadi_ik.kernels.outcome import SLICE, Outcome, check
 SYMBOL = "casadi_ik_map"
 
 
-class _Job(ctypes.Structure):
-    """`map_job` of drivers/map.c."""
+class MapJob(ctypes.Structure):
+    """`map_job` of drivers/map_job.c."""
 
     _fields_ = (
         ("inputs", ctypes.c_void_p),
@@ -59,7 +59,7 @@ class SingleCall:
         targets = (ctypes.c_void_p * len(outputs))(*map(memory, outputs))
         steps = (ctypes.c_int64 * max(len(inputs), len(outputs)))()
         self._kept = sources, targets, steps
-        self._job = _Job(
+        self._job = MapJob(
             *map(ctypes.addressof, (sources, steps, targets, steps)), count=1, next=0, slice=SLICE
         )
         self._reference = ctypes.byref(self._job)
@@ -114,7 +114,7 @@ class FunctionKernel:
 
     def _load(self) -> ctypes.CDLL | None:
         counts = {"N_IN": len(self.input_shapes), "N_OUT": len(self.output_shapes)}
-        driver = define(counts) + driver_text("map")
+        driver = define(counts) + driver_text("map_job") + driver_text("map")
         return load_library(self.name, lambda: self._function, driver, SYMBOL, self._graph.recipe)
 
     @cached_property
@@ -231,7 +231,7 @@ class FunctionKernel:
         sources = (ctypes.c_void_p * len(arrays))(*map(memory, arrays))
         strides = (ctypes.c_int64 * len(arrays))(*steps)
         targets = (ctypes.c_void_p * len(outputs))(*map(memory, outputs))
-        job = _Job(
+        job = MapJob(
             ctypes.addressof(sources),
             ctypes.addressof(strides),
             ctypes.addressof(targets),

@@ -59,12 +59,13 @@ class _Function:
         return f"LANES_TARGET static int {name}({given}) {{"
 
 
-def lanes_source(function: ca.Function, driver: str) -> str:
+def lanes_source(function: ca.Function, driver: str, quick: bool = False) -> str:
     """The text of a library of the function for four solves side by side.
 
     Args:
         function: Dense and row-major.
         driver: C text of the driver, with its constants.
+        quick: Whether sines and cosines may differ from the C library's in the last place.
 
     Raises:
         UnsuitedError: The outermost function has no form for vectors, or one needs memory or can
@@ -83,6 +84,7 @@ def lanes_source(function: ca.Function, driver: str) -> str:
             "#define CASADI_SYMBOL_EXPORT static",
             text,
             driver_text("lanes"),
+            driver_text("lanes_trigonometry") if quick else "",
             *(f"#undef casadi_{own}\n#define casadi_{own} lanes_{own}" for own in RENAMED),
             f"static const lanes lanes_zeros[{zeros[1] if zeros else 1}];",
             *(line for each in inner for line in _side_by_side(each, room)),

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,6 +176,28 @@ class RecordedJacobian:
     condition: float = math.inf
 
 
+class Measures(Protocol):
+    """Numbers that follow from the rows of a trace, and are measured when it goes to a log."""
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """What they add to a row, all of dtype "f4"."""
+        ...
+
+    @property
+    def jacobians(self) -> Mapping[str, RecordedJacobian]:
+        """The Jacobians among them, as in `TraceFormat`."""
+        ...
+
+    def prepare(self) -> None:
+        """Build and compile what is needed."""
+        ...
+
+    def __call__(self, rows: NDArray[Any]) -> NDArray[np.float32]:
+        """The values (m, fields) of rows (m,); NaN where there is nothing to measure."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class TraceFormat:
     """How to read a trace.
@@ -186,17 +209,20 @@ class TraceFormat:
             elements along the first axis of any other field ("q": actuator names).
         jacobians: What there is to know of the Jacobians in fields ``sigma_<name>`` and
             ``condition_<name>``, by name. One that is not named here is never near singular.
+        measures: What a log adds to the rows; None: nothing.
     """
 
     layout: Layout
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     jacobians: Mapping[str, RecordedJacobian] = field(default_factory=dict)
+    measures: Measures | None = None
 
 
 def trace_format(
     layout: Layout,
     robot: RobotDescription,
     jacobians: Mapping[str, RecordedJacobian] | None = None,
+    measures: Measures | None = None,
 ) -> TraceFormat:
     """How to read the traces of a method.
 
@@ -204,6 +230,7 @@ def trace_format(
         layout: Fields of a row: the standard ones, and the method's own.
         robot: The robot.
         jacobians: As in `TraceFormat`.
+        measures: As in `TraceFormat`.
 
     Raises:
         InputError: A standard field is not what it is elsewhere, or a required one is missing.
@@ -224,4 +251,4 @@ def trace_format(
                 )
         if names := standard.labels(robot):
             labels[standard.name] = names
-    return TraceFormat(layout, labels, jacobians or {})
+    return TraceFormat(layout, labels, jacobians or {}, measures)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 
 from casadi_ik.errors import DescriptionError
-from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear
 from casadi_ik.robots.description import Actuator, Joint
+
+LONGEST_NAME = 100
+"""Characters of a name."""
 
 
 def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: Path) -> None:
@@ -34,28 +35,17 @@ def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: P
             )
     for joint in joints.values():
         _check_coupling(joint, joints, {actuator.name for actuator in actuators}, path)
-        expected = {LeadScrew: "m", FourBar: "rad"}.get(type(joint.coupling))
-        if expected and joint.coupling and units[joint.coupling.of] != expected:
+        if (coupling := joint.coupling) is None:
+            continue
+        if coupling.source_unit and units[coupling.of] != coupling.source_unit:
             raise DescriptionError(
-                f"{path}: joint {joint.name!r}: coupling.of: {joint.coupling.of!r} is in "
-                f"{units[joint.coupling.of]}, expected something in {expected}"
+                f"{path}: joint {joint.name!r}: coupling.of: {coupling.of!r} is in "
+                f"{units[coupling.of]}, expected something in {coupling.source_unit}"
             )
-        if isinstance(joint.coupling, LeadScrew):
-            _check_triangle(joint, {actuator.name: actuator for actuator in actuators}, path)
-
-
-def _check_triangle(joint: Joint, actuators: dict[str, Actuator], path: Path) -> None:
-    """Whether a slider closes its triangle over the whole stroke."""
-    coupling = joint.coupling
-    if isinstance(coupling, LeadScrew) and coupling.of in actuators:
-        slider = actuators[coupling.of]
-        low, high = abs(coupling.b - coupling.c), coupling.b + coupling.c
-        if not low <= slider.lower < slider.upper <= high:
-            raise DescriptionError(
-                f"{path}: joint {joint.name!r}: coupling: {slider.name!r} goes from "
-                f"{slider.lower:.6g} to {slider.upper:.6g} m, expected within |b - c| = {low:.6g} "
-                f"and b + c = {high:.6g} m"
-            )
+        motor = next((one for one in actuators if one.name == coupling.of), None)
+        if motor is not None:
+            where = f"{path}: joint {joint.name!r}: coupling"
+            coupling.check_stroke(motor.name, motor.lower, motor.upper, where)
 
 
 def _check_coupling(
@@ -84,34 +74,22 @@ def _check_coupling(
         )
 
 
-def check_numbers(coupling: Coupling | None, where: str) -> None:
-    """Whether a coupling's numbers describe a mechanism."""
-    if isinstance(coupling, Linear):
-        if coupling.ratio == 0:
-            raise DescriptionError(f"{where}.ratio: is zero, so the joint would not move")
-        return
-    if coupling is None:
-        return
-    for length in "bc" if isinstance(coupling, LeadScrew) else "pqgh":
-        positive(getattr(coupling, length), f"{where}.{length}")
-    if isinstance(coupling, FourBar):
-        # Rod and coupler have to span the distance from the crank's pin to the rod's pivot.
-        p, q, g, h = coupling.p, coupling.q, coupling.g, coupling.h
-        span = math.sqrt(max(p * p + g * g - 2 * p * g * math.cos(coupling.phi_0), 0.0))
-        if not abs(q - h) < span < q + h:
-            raise DescriptionError(
-                f"{where}.phi_0: at {coupling.phi_0:.6g} rad q and h cannot span {span:.6g} m, "
-                f"expected a pose in which the linkage closes, not stretched or folded"
-            )
-
-
 def unique(names: Iterable[str], where: str) -> None:
     """Refuse a name that appears twice."""
     seen: set[str] = set()
     for name in names:
+        usable(name, where)
         if name in seen:
             raise DescriptionError(f"{where}: {name!r} appears twice")
         seen.add(name)
+
+
+def usable(name: str, where: str) -> None:
+    """Refuse a name that is empty, or too long to be read in a table or a file's name."""
+    if not 0 < len(name) <= LONGEST_NAME:
+        raise DescriptionError(
+            f"{where}: found a name of {len(name)} characters, expected 1 to {LONGEST_NAME}"
+        )
 
 
 def known_link(link: str, root: str, joints: list[Joint], where: str) -> str:

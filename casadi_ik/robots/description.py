@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import UnknownNameError
-from casadi_ik.robots.couplings import Coupling, LeadScrew
+from casadi_ik.robots.couplings import Coupling
 from casadi_ik.robots.motor_ranges import motor_ranges
 
 Array = NDArray[np.float64]
@@ -169,10 +169,11 @@ class RobotDescription:
         lower = dict.fromkeys(self.actuator_names, -np.inf)
         upper = dict.fromkeys(self.actuator_names, np.inf)
         for joint in self.movable:
-            screw = joint.coupling
-            if isinstance(screw, LeadScrew) and screw.of in lower:
-                lower[screw.of] = max(lower[screw.of], abs(screw.b - screw.c))
-                upper[screw.of] = min(upper[screw.of], screw.b + screw.c)
+            coupling = joint.coupling
+            if coupling is not None and coupling.of in lower:
+                least, most = coupling.stroke
+                lower[coupling.of] = max(lower[coupling.of], least)
+                upper[coupling.of] = min(upper[coupling.of], most)
         return _frozen(list(lower.values())), _frozen(list(upper.values()))
 
     @cached_property

@@ -7,7 +7,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from casadi_ik.robots.couplings import FourBar, LeadScrew, Linear
 from casadi_ik.robots.description import Array, RobotDescription
 
 LINK_RADIUS = {"arm": 0.055, "mount": 0.03, "hand": 0.009}
@@ -21,7 +20,7 @@ def to_urdf(robot: RobotDescription) -> str:
 
     Every link gets simple cylinders from its frame to its children, and every finger a fixed
     link ``<finger>_contact`` whose frame is the contact frame. A joint that follows an actuator
-    or joint linearly becomes a mimic joint; lead-screw and four-bar couplings have no URDF form:
+    or joint linearly becomes a mimic joint; other couplings have no URDF form:
     their joints stay independent (set them from `ArmHand.joints`), with the coupling as a comment.
 
     Args:
@@ -45,7 +44,7 @@ def to_urdf(robot: RobotDescription) -> str:
         if joint.type == "fixed":
             continue
         ElementTree.SubElement(element, "axis", xyz=_numbers(joint.axis))
-        if isinstance(joint.coupling, LeadScrew | FourBar):
+        if joint.coupling is not None and joint.coupling.slope is None:
             element.append(ElementTree.Comment(f" {joint.coupling} "))
         velocity = joint.velocity if math.isfinite(joint.velocity) else 10.0
         ElementTree.SubElement(
@@ -83,9 +82,9 @@ def _leaders(robot: RobotDescription) -> dict[str, tuple[str, float, float]]:
     mimics: dict[str, tuple[str, float, float]] = {}
     for joint in robot.movable:
         ratio, offset, source = 1.0, 0.0, joint
-        while isinstance(coupling := source.coupling, Linear):
-            offset += ratio * coupling.offset
-            ratio *= coupling.ratio
+        while (coupling := source.coupling) is not None and coupling.slope is not None:
+            offset += ratio * coupling.slope[1]
+            ratio *= coupling.slope[0]
             if coupling.of not in joints:
                 leader, first_ratio, first_offset = first.setdefault(
                     coupling.of, (joint.name, ratio, offset)

@@ -210,6 +210,8 @@ class Engine:
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
         for kinds, _, _ in by_kinds(problems):
             self.of_kinds(kinds).method.prepare()
+        if recorder is not None and (measures := self.method.trace_format.measures) is not None:
+            measures.prepare()
         batches = []
         for part in self._parts(problems, starts, run):
             if recorder is not None and part.outcome.rows is not None:

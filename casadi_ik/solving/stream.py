@@ -64,7 +64,7 @@ class Stream:
         first_row = 0
         for given in blocks:
             named = given if isinstance(given, Mapping) else dict(zip(REQUIRED, given, strict=True))
-            arrays = {name: np.asarray(array) for name, array in named.items()}
+            arrays = {name: np.asanyarray(array) for name, array in named.items()}
             block = self._block(arrays, first_row)
             yield block
             first_row += len(block.solution)

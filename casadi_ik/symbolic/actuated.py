@@ -75,6 +75,13 @@ class ActuatedKinematics:
         return angular_velocity_to_euler_zyx(angles) @ angular
 
 
+def motor_scales(robot: RobotDescription) -> ca.DM:
+    """(n, 1) what counts as a unit of each motor: 1 rad, or the range of a slider."""
+    ranges = (robot.upper - robot.lower).tolist()
+    units = [actuator.unit for actuator in robot.actuators]
+    return ca.DM([1.0 if u == "rad" else r for u, r in zip(units, ranges, strict=True)])
+
+
 def actuated(robot: RobotDescription, q: ca.SX) -> ActuatedKinematics:
     """Kinematics over the actuated coordinates.
 

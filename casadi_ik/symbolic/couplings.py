@@ -1,12 +1,81 @@
-"""From actuators to joints: the map theta = c(q) and its Jacobian."""
+"""From actuators to joints: the map theta = c(q) and its Jacobian, by kind of coupling."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import casadi as ca
 
-from casadi_ik.robots.couplings import FourBar, LeadScrew
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic import four_bar, lead_screw
+from casadi_ik.symbolic.smooth import Expr
+
+
+class CouplingRow(NamedTuple):
+    """The graphs of a kind of coupling.
+
+    All take the coupling's numbers (anything with their names as attributes: the data, or symbols
+    where a calibration estimates them), the position of what is followed [rad or m] and the data as
+    described, from which branches are taken.
+
+    Attributes:
+        follow: Position of the joint [rad or m].
+        rate: Its derivative by the position of what it follows.
+        toggle: Squared sine of the transmission angle, see `toggle_margins`; None if the kind has
+            no singular position.
+    """
+
+    follow: Callable[[Any, Expr, Any], Expr]
+    rate: Callable[[Any, Expr, Any], Expr]
+    toggle: Callable[[Any, Expr, Any], Expr] | None = None
+
+
+def linkage(numbers: Any, known: FourBar) -> four_bar.Linkage:
+    """A four-bar with the branch of the known pose (phi_0, theta_3_0) of its description."""
+    described = four_bar.Linkage(known.p, known.q, known.g, known.h)
+    branch = four_bar.branch_from_pose(described, known.phi_0, known.theta_3_0)
+    return four_bar.Linkage(numbers.p, numbers.q, numbers.g, numbers.h, branch)
+
+
+def _bent(numbers: Any, source: Expr, known: FourBar) -> Expr:
+    # Continuous about the known pose, whatever the estimate of its angle.
+    bar, phi = linkage(numbers, known), numbers.phi_0 + source
+    return four_bar.theta3(phi, bar, known.theta_3_0) - numbers.theta_3_0
+
+
+ROWS: dict[type[Any], CouplingRow] = {
+    Linear: CouplingRow(
+        follow=lambda c, source, _: c.ratio * source + c.offset,
+        rate=lambda c, _, __: ca.DM(c.ratio),
+    ),
+    LeadScrew: CouplingRow(
+        follow=lambda c, s, _: lead_screw.angle_from_slider(s, c.b, c.c) - c.theta_0,
+        rate=lambda c, s, _: lead_screw.angle_rate(s, c.b, c.c),
+        toggle=lambda c, s, _: lead_screw.toggle(s, c.b, c.c),
+    ),
+    FourBar: CouplingRow(
+        follow=_bent,
+        rate=lambda c, x, known: four_bar.theta3_rate(c.phi_0 + x, linkage(c, known)),
+        toggle=lambda c, x, known: four_bar.toggle(c.phi_0 + x, linkage(c, known)),
+    ),
+}
+"""The kinds of couplings."""
+
+
+def coupling_row(coupling: Coupling) -> CouplingRow:
+    """The row of a coupling's kind.
+
+    Raises:
+        UnsupportedError: There is none.
+    """
+    try:
+        return ROWS[type(coupling)]
+    except KeyError:
+        kind = type(coupling).__name__
+        raise UnsupportedError(f"coupling: no graphs for the kind {kind}") from None
 
 
 def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
@@ -24,7 +93,7 @@ def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
 
 
 def toggle_margins(robot: RobotDescription, q: ca.SX) -> dict[str, ca.SX]:
-    """How far every lead screw and four-bar is from its singular (toggle) position.
+    """How far every mechanism that has a singular (toggle) position is from it.
 
     Args:
         robot: The description.
@@ -39,12 +108,14 @@ def toggle_margins(robot: RobotDescription, q: ca.SX) -> dict[str, ca.SX]:
     margins = {}
     for joint in robot.movable:
         coupling = joint.coupling
-        if isinstance(coupling, LeadScrew):
-            margins[joint.name] = lead_screw.toggle(values[coupling.of], coupling.b, coupling.c)
-        elif isinstance(coupling, FourBar):
-            phi = coupling.phi_0 + values[coupling.of]
-            margins[joint.name] = four_bar.toggle(phi, linkage(coupling))
+        if coupling is not None and (toggle := coupling_row(coupling).toggle) is not None:
+            margins[joint.name] = toggle(coupling, values[coupling.of], coupling)
     return margins
+
+
+def has_toggle(joint: Joint) -> bool:
+    """Whether a joint follows through a mechanism that has a singular position."""
+    return joint.coupling is not None and coupling_row(joint.coupling).toggle is not None
 
 
 def _positions(robot: RobotDescription, q: ca.SX) -> dict[str, ca.SX]:
@@ -62,20 +133,31 @@ def _positions(robot: RobotDescription, q: ca.SX) -> dict[str, ca.SX]:
     return values
 
 
-def follow(joint: Joint, source: ca.SX) -> ca.SX:
-    """Position of a coupled joint [rad or m] from the position of what it follows."""
+def follow(joint: Joint, source: Expr, numbers: Any = None) -> Expr:
+    """Position of a joint [rad or m] from the position of what it follows.
+
+    Args:
+        joint: The joint; one that follows nothing stands where the source does.
+        source: [rad or m].
+        numbers: Other numbers of the coupling, as attributes; None: those described.
+    """
     coupling = joint.coupling
-    if isinstance(coupling, LeadScrew):
-        return lead_screw.angle_from_slider(source, coupling.b, coupling.c) - coupling.theta_0
-    if isinstance(coupling, FourBar):
-        reference = coupling.theta_3_0
-        return four_bar.theta3(coupling.phi_0 + source, linkage(coupling), reference) - reference
     if coupling is None:
         return source
-    return coupling.ratio * source + coupling.offset
+    return coupling_row(coupling).follow(numbers or coupling, source, coupling)
 
 
-def linkage(coupling: FourBar) -> four_bar.FourBar:
-    """A described four-bar with the branch of its known pose (phi_0, theta_3_0)."""
-    bar = four_bar.FourBar(coupling.p, coupling.q, coupling.g, coupling.h)
-    return bar._replace(branch=four_bar.branch_from_pose(bar, coupling.phi_0, coupling.theta_3_0))
+def coupling_rate(joint: Joint, source: Expr) -> Expr:
+    """Rate d theta / d source of a joint that follows something: eq. (10), for every coupling.
+
+    Args:
+        joint: The joint; one that follows nothing has rate 1.
+        source: Position of what it follows [rad or m].
+
+    Returns:
+        For a four-bar f of eq. (11), for a lead screw the derivative of eq. (8) [rad/m].
+    """
+    coupling = joint.coupling
+    if coupling is None:
+        return ca.DM(1)
+    return coupling_row(coupling).rate(coupling, source, coupling)

@@ -27,7 +27,7 @@ MIN_SINE = 1e-9
 """|sin(phi + theta3 - psi)| is kept above it; this bounds every rate at a toggle."""
 
 
-class FourBar(NamedTuple):
+class Linkage(NamedTuple):
     """Lengths of crank p, rod q, ground g and coupler h (one unit), and the branch +-1."""
 
     p: Expr
@@ -37,7 +37,7 @@ class FourBar(NamedTuple):
     branch: Expr = -1
 
 
-def coefficients(phi: Expr, bar: FourBar) -> tuple[Expr, Expr, Expr]:
+def coefficients(phi: Expr, bar: Linkage) -> tuple[Expr, Expr, Expr]:
     """A, B, C [length^2] of A cos(psi) + B sin(psi) = C, as printed below eq. (9)."""
     p, q, g, h = bar[:4]
     c, s = ca.cos(phi), ca.sin(phi)
@@ -45,7 +45,7 @@ def coefficients(phi: Expr, bar: FourBar) -> tuple[Expr, Expr, Expr]:
     return pq2 * c - 2 * g * q, pq2 * s, (g * g + p * p + q * q - h * h) - (2 * p * g) * c
 
 
-def toggle(phi: Expr, bar: FourBar) -> Expr:
+def toggle(phi: Expr, bar: Linkage) -> Expr:
     """Distance from the singular position: sin^2 of the angle between rod and coupler.
 
     (A^2 + B^2 - C^2) / (2 q h)^2: 1 where rod and coupler stand at right angles, 0 where they
@@ -55,13 +55,13 @@ def toggle(phi: Expr, bar: FourBar) -> Expr:
     return (A * A + B * B - C * C) / ((2 * bar.q * bar.h) * (2 * bar.q * bar.h))
 
 
-def psi(phi: Expr, bar: FourBar) -> Expr:
+def psi(phi: Expr, bar: Linkage) -> Expr:
     """Rod angle psi [rad] in (-pi, pi]: atan2(B, A) + sigma acos(C / sqrt(A^2 + B^2))."""
     rod, _ = _rod(phi, bar)
     return ca.atan2(rod[1], rod[0])
 
 
-def theta3(phi: Expr, bar: FourBar, reference: Expr = 0.0) -> Expr:
+def theta3(phi: Expr, bar: Linkage, reference: Expr = 0.0) -> Expr:
     """Angle theta3 [rad] of the distal phalanx against the middle one: eq. (9).
 
     Args:
@@ -78,7 +78,7 @@ def theta3(phi: Expr, bar: FourBar, reference: Expr = 0.0) -> Expr:
     return reference + ca.atan2(y * ct - x * st, x * ct + y * st)
 
 
-def theta3_rate(phi: Expr, bar: FourBar) -> Expr:
+def theta3_rate(phi: Expr, bar: Linkage) -> Expr:
     """Coupling f = d theta3 / d phi of both branches: eq. (11) with a = p. Dimensionless.
 
     Its numerator p sin(psi - phi) - h sin(phi + theta3 - psi) is g sin(psi), the lever of O about
@@ -89,7 +89,7 @@ def theta3_rate(phi: Expr, bar: FourBar) -> Expr:
     return (2 * bar.g * bar.q) * s / (bar.branch * root)
 
 
-def psi_rate(phi: Expr, bar: FourBar) -> Expr:
+def psi_rate(phi: Expr, bar: Linkage) -> Expr:
     """Rod rate d psi / d phi = p sin(theta3) / [q sin(phi + theta3 - psi)]. Dimensionless."""
     (c, s), root = _rod(phi, bar)
     cp, sp = ca.cos(phi), ca.sin(phi)
@@ -98,7 +98,7 @@ def psi_rate(phi: Expr, bar: FourBar) -> Expr:
     return 2 * bar.p * across / (bar.branch * root)
 
 
-def phi_from_theta3(theta: Expr, bar: FourBar, inverse_branch: Expr, reference: Expr = 0.0) -> Expr:
+def phi_from_theta3(theta: Expr, bar: Linkage, inverse_branch: Expr, reference: Expr = 0.0) -> Expr:
     """Crank angle phi [rad] of a given theta3 [rad]: the inverse of eq. (9).
 
     Q stands at r = p + h e^(i theta3) in the crank's frame, and |Q - C| = q leaves two angles,
@@ -124,7 +124,7 @@ def phi_from_theta3(theta: Expr, bar: FourBar, inverse_branch: Expr, reference: 
     return reference + ca.atan2(sine * cr - cosine * sr, cosine * cr + sine * sr)
 
 
-def branch_from_pose(bar: FourBar, phi: float, theta: float) -> int:
+def branch_from_pose(bar: Linkage, phi: float, theta: float) -> int:
     """Branch (+1 or -1) of a numeric linkage in a known pose.
 
     Args:
@@ -144,12 +144,12 @@ def branch_from_pose(bar: FourBar, phi: float, theta: float) -> int:
     return min((-1, 1), key=distance)
 
 
-def inverse_branch_from_pose(bar: FourBar, phi: float) -> int:
+def inverse_branch_from_pose(bar: Linkage, phi: float) -> int:
     """Branch (+1 or -1) for `phi_from_theta3` of a numeric linkage in the pose phi [rad]."""
     return 1 if float(psi(ca.DM(phi), bar)) >= 0 else -1
 
 
-def _rod(phi: Expr, bar: FourBar) -> tuple[tuple[Expr, Expr], Expr]:
+def _rod(phi: Expr, bar: Linkage) -> tuple[tuple[Expr, Expr], Expr]:
     """(cos psi, sin psi) and the root sqrt(A^2 + B^2 - C^2), kept from vanishing."""
     A, B, C = coefficients(phi, bar)
     floor = 2 * bar.q * bar.h * MIN_SINE

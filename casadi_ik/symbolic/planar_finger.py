@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.robots.couplings import Linear
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic.kinematics import forward, number
 
@@ -126,10 +125,10 @@ def _spread(
         return None, 1.0, 0.0
     if joint.coupling is None:
         return robot.actuator_index(joint.name), 1.0, 0.0
-    if not isinstance(joint.coupling, Linear) or joint.coupling.of not in robot.actuator_names:
-        raise UnsupportedError(f"{where}: {joint.name} does not follow a motor linearly")
     coupling = joint.coupling
-    return robot.actuator_index(coupling.of), coupling.ratio, coupling.offset
+    if coupling.slope is None or coupling.of not in robot.actuator_names:
+        raise UnsupportedError(f"{where}: {joint.name} does not follow a motor linearly")
+    return robot.actuator_index(coupling.of), *coupling.slope
 
 
 def _reference(

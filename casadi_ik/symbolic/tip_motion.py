@@ -17,11 +17,9 @@ from functools import cached_property
 import casadi as ca
 
 from casadi_ik.errors import InputError
-from casadi_ik.robots.couplings import FourBar, LeadScrew
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
-from casadi_ik.symbolic import four_bar, lead_screw
-from casadi_ik.symbolic.couplings import joint_positions, linkage
+from casadi_ik.symbolic.couplings import coupling_rate, joint_positions
 from casadi_ik.symbolic.kinematics import number
 from casadi_ik.symbolic.screws import Screw, ScrewChain, Screws, screw_chain_to_contact
 from casadi_ik.symbolic.smooth import Expr
@@ -196,21 +194,3 @@ def relative_chain(robot: RobotDescription, reference: str, finger: str) -> TipC
     )
     signs = (-1,) * len(back.joints[shared:]) + (1,) * len(out.joints[shared:])
     return TipChain(robot, chain, signs)
-
-
-def coupling_rate(joint: Joint, source: Expr) -> Expr:
-    """Rate d theta / d source of a joint that follows something: eq. (10), for every coupling.
-
-    Args:
-        joint: The joint; one that follows nothing has rate 1.
-        source: Position of what it follows [rad or m].
-
-    Returns:
-        For a four-bar f of eq. (11), for a lead screw the derivative of eq. (8) [rad/m].
-    """
-    coupling = joint.coupling
-    if isinstance(coupling, LeadScrew):
-        return lead_screw.angle_rate(source, coupling.b, coupling.c)
-    if isinstance(coupling, FourBar):
-        return four_bar.theta3_rate(coupling.phi_0 + source, linkage(coupling))
-    return ca.DM(1 if coupling is None else coupling.ratio)

@@ -91,6 +91,7 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path, command:
         kept(summary(table)),
         "![Success by object](success.png)",
         "![Iterations of solved cases](iterations.png)",
+        "Dashed: the mean that the paper prints for the method of that colour.",
         "## Convergence",
         "The worst error over all contacts in units of its tolerance, limits ignored, of the first "
         "targets that were solved and the first that were not.",

@@ -96,7 +96,7 @@ def test_four_bars_close(ar10):
             side = np.sign(np.imag((pin - bar.g).conj() * (bar.h * np.exp(1j * beta))))
             assert set(side) == {-1.0}
             assert np.abs(np.diff(joints[joint.name])).max() < 0.02
-            assert linkage(bar).branch == -1
+            assert linkage(bar, bar).branch == -1
             seen += 1
     assert seen == 4
 
@@ -134,7 +134,7 @@ def test_slider_to_joint_and_back(ar10):
             np.testing.assert_allclose(np.array(back).ravel(), expected, atol=1e-15)
         elif isinstance(coupling, FourBar):
             phi = coupling.phi_0 + joints[coupling.of]
-            bar, middle = linkage(coupling), phi.mean()
+            bar, middle = linkage(coupling, coupling), phi.mean()
             for value, expected in zip(values[20:], phi[20:], strict=True):
                 side = four_bar.inverse_branch_from_pose(bar, expected)
                 back = four_bar.phi_from_theta3(
@@ -202,7 +202,7 @@ def test_the_four_bar_keeps_its_branch_to_the_toggle(ar10):
     index = next(j for j in ar10.description.movable if j.name == "index_distal")
     bar = index.coupling
     assert isinstance(bar, FourBar)
-    linked = linkage(bar)
+    linked = linkage(bar, bar)
     end = brentq(lambda phi: float(four_bar.toggle(ca.DM(phi), linked)), 3.33, 6.2)
     phi = np.linspace(bar.phi_0, end, 2000)
     values = [float(four_bar.theta3(ca.DM(x), linked, bar.theta_3_0)) for x in phi]

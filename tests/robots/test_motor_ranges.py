@@ -11,7 +11,6 @@ from toy_robots import COUPLED_HAND, copy_shipped_robot, write_coupled_robot
 import casadi_ik as ik
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.shipped import models_folder, shipped_names
-from casadi_ik.robots.coupling_values import followed
 from casadi_ik.robots.couplings import FourBar, LeadScrew, Linear
 from casadi_ik.symbolic.couplings import follow
 
@@ -93,7 +92,7 @@ def test_numbers_are_those_of_the_graphs(rng):
         graph = ca.Function("graph", [q], [follow(joint, q)])
         values = rng.uniform(low, high, 500)
         expected = np.array(graph(values[None])).ravel()
-        np.testing.assert_allclose(followed(coupling, values), expected, atol=1e-12)
+        np.testing.assert_allclose(coupling.followed(values), expected, atol=1e-12)
 
 
 def test_a_joint_that_turns_back(tmp_path):

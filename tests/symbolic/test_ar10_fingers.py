@@ -32,7 +32,7 @@ def test_eq_12_index(ar10, rng):
     motion = tip.at(q)
     bar = joint(ar10, "index_distal").coupling
     assert isinstance(bar, FourBar)
-    f = four_bar.theta3_rate(bar.phi_0 + motion.joints["index_middle"], linkage(bar))
+    f = four_bar.theta3_rate(bar.phi_0 + motion.joints["index_middle"], linkage(bar, bar))
     s = motion.screws.jacobian
     printed = ca.horzcat(s[:, 0], s[:, 1] + f * s[:, 2])
     rates = []
@@ -77,7 +77,7 @@ def test_round_trips_over_the_full_strokes(ar10):
             np.testing.assert_allclose(np.array(back).ravel(), slider, atol=1e-15)
             assert (np.diff(joints[each.name]) > 0).all()
         else:
-            bar = linkage(coupling)
+            bar = linkage(coupling, coupling)
             for middle, distal in zip(joints[coupling.of], joints[each.name], strict=True):
                 phi = coupling.phi_0 + middle
                 branch = four_bar.inverse_branch_from_pose(bar, phi)

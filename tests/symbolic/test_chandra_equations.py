@@ -15,8 +15,8 @@ from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError
+from casadi_ik.symbolic import couplings, four_bar, lead_screw, screws, se3, tip_motion
 from casadi_ik.symbolic import dual_quaternion as dq
-from casadi_ik.symbolic import four_bar, lead_screw, screws, se3, tip_motion
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.tip_motion import TipChain, finger_chain, relative_chain
 
@@ -30,7 +30,7 @@ EQUATIONS = {
     7: screws.Screws.displacements,
     8: lead_screw.angle_from_slider,
     9: four_bar.theta3,
-    10: tip_motion.coupling_rate,
+    10: couplings.coupling_rate,
     11: four_bar.theta3_rate,
     12: tip_motion.TipMotion.joint_jacobian,
     13: dq.error,
@@ -127,7 +127,7 @@ def test_eq_12_is_the_display_of_the_paper(toy, rng):
     tip = finger_chain(toy.description, "left")
     assert tip.drivers == ("left_spread", "left_1", "left_2")
     motion = tip.at(q)
-    bar = four_bar.FourBar(0.0297, 0.0347, 0.0084, 0.0072, -1)
+    bar = four_bar.Linkage(0.0297, 0.0347, 0.0084, 0.0072, -1)
     f = four_bar.theta3_rate(3.32939008 + motion.joints["left_2"], bar)
     s = motion.screws.jacobian  # left_spread, left_1, left_2, left_3, left_4
     printed = ca.horzcat(s[:, 0], s[:, 1], s[:, 2] + f * (s[:, 3] - 0.5 * s[:, 4]))

@@ -7,17 +7,17 @@ from algebra_samples import gradient, graph
 
 from casadi_ik.errors import InputError
 from casadi_ik.symbolic import four_bar
-from casadi_ik.symbolic.four_bar import FourBar
+from casadi_ik.symbolic.four_bar import Linkage
 from casadi_ik.symbolic.lead_screw import angle_from_slider
 
 S, B = (1, 1), (5, 1)
-AR10 = FourBar(2.97, 3.47, 0.84, 0.72, -1)
+AR10 = Linkage(2.97, 3.47, 0.84, 0.72, -1)
 AR10_PHI = 3.32939008
 AR10_RANGE = np.linspace(0, 1.225, 200)
 
 
 def bar(b):
-    return FourBar(b[0], b[1], b[2], b[3], b[4])
+    return Linkage(b[0], b[1], b[2], b[3], b[4])
 
 
 psi = graph(lambda phi, b: four_bar.psi(phi, bar(b)), S, B)
@@ -53,7 +53,7 @@ def test_loop_closes_to_rounding_on_both_branches():
         assert float(toggle(phi, b)) == pytest.approx(np.sin(beta - rod) ** 2, abs=1e-12)
         branches.append(sigma)
         # psi as printed below eq. (9), with sigma for the minus sign
-        A, Bc, C = (float(x) for x in four_bar.coefficients(ca.DM(phi), FourBar(*b)))
+        A, Bc, C = (float(x) for x in four_bar.coefficients(ca.DM(phi), Linkage(*b)))
         printed = np.arctan2(Bc, A) + sigma * np.arccos(C / np.hypot(A, Bc))
         assert np.cos(printed - rod) == pytest.approx(1, abs=1e-12)
     assert {-1.0, 1.0} == set(branches)
@@ -121,7 +121,7 @@ def test_inverse_round_trip():
             continue
         count += 1
         theta = float(theta3(phi, b, 0))
-        branch = four_bar.inverse_branch_from_pose(FourBar(*b), phi)
+        branch = four_bar.inverse_branch_from_pose(Linkage(*b), phi)
         assert float(inverse(theta, b, branch, phi + 0.5)) == pytest.approx(phi, abs=1e-10)
     assert count > 200
 
@@ -146,9 +146,9 @@ def test_branch_from_a_known_pose():
     assert four_bar.branch_from_pose(AR10, AR10_PHI, 2.09) == 1
     for b, phi in linkages(50, seed=6):
         theta = float(theta3(phi, b, 0))
-        assert four_bar.branch_from_pose(FourBar(*b), phi, theta) == b[4]
+        assert four_bar.branch_from_pose(Linkage(*b), phi, theta) == b[4]
     with pytest.raises(InputError, match="cannot be assembled"):
-        four_bar.branch_from_pose(FourBar(1.0, 0.1, 3.0, 0.1), 3.0, 0.0)
+        four_bar.branch_from_pose(Linkage(1.0, 0.1, 3.0, 0.1), 3.0, 0.0)
 
 
 def test_beyond_assembly_everything_stays_finite_and_the_measure_says_so():

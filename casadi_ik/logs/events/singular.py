@@ -14,6 +14,8 @@ from casadi_ik.logs.events.rules import EventRules
 from casadi_ik.logs.events.traces import Rows, Traces, entries
 from casadi_ik.problem.trace import CONDITION, SIGMA, RecordedJacobian, TraceFormat
 
+NONE: Rows = np.zeros(0, np.intp)
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -68,11 +70,13 @@ def near_singular(
     """
     if SIGMA in jacobian.columns and jacobian.singular > 0:
         value, limit = _column(traces, jacobian, SIGMA), jacobian.singular
-        row = entries(traces, value < limit, ~(value <= limit * rules.release))
+        begun = value < limit
+        row = entries(traces, begun, ~(value <= limit * rules.release)) if begun.any() else NONE
         yield EventKind.NEAR_SINGULAR, row, value[row].astype(float), limit
     if CONDITION in jacobian.columns and jacobian.condition < math.inf:
         value, limit = _column(traces, jacobian, CONDITION), jacobian.condition
-        row = entries(traces, value > limit, ~(value >= limit / rules.release))
+        begun = value > limit
+        row = entries(traces, begun, ~(value >= limit / rules.release)) if begun.any() else NONE
         yield EventKind.ILL_CONDITIONED, row, value[row].astype(float), limit
 
 
@@ -95,4 +99,4 @@ def nearest_singular(
 
 def _column(traces: Traces, jacobian: Measured, kind: str) -> NDArray[np.floating]:
     name, column = jacobian.columns[kind]
-    return traces.matrix(name)[:, column]
+    return np.ascontiguousarray(traces.matrix(name)[:, column])

@@ -144,7 +144,10 @@ def entries(traces: Traces, begun: Bools, ended: Bools) -> Rows:
     """
     if not begun.any():
         return np.zeros(0, np.intp)
-    decided = np.flatnonzero(begun | ended)
+    # Most solves have none: only the others need be looked at row by row.
+    concerned = np.zeros(len(traces.counts), dtype=bool)
+    concerned[traces.solve[begun]] = True
+    decided = np.flatnonzero((begun | ended) & concerned[traces.solve])
     before = np.concatenate([[-1], decided[:-1]])
     fresh = ended[before] | (traces.solve[before] != traces.solve[decided])
     fresh[0] = True

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from casadi_ik.logs.explain.phrases import errors, listed, number, plain_name
 from casadi_ik.logs.explain.row_errors import errors_of, within, worst
 from casadi_ik.logs.read.one_solve import OneSolve, Stretch
+from casadi_ik.problem.trace import SIGMA
 
 STRETCHES_SHOWN = 6
 """More stretches than this are told phase by phase."""
@@ -158,7 +159,7 @@ def _singularities(solve: OneSolve) -> Iterator[str]:
             thresholds[event.jacobian] = event.threshold
     for jacobian, iterations in entries.items():
         line = f"{plain_name(jacobian)} near singular from iteration {iterations[0]} on"
-        name = f"sigma_{jacobian}"
+        name = SIGMA + jacobian
         if name in solve.layout.names and solve.rows[name].ndim == 1:
             sigma = solve.rows[name].astype(float)
             below = int((sigma < thresholds[jacobian]).sum())
@@ -170,9 +171,16 @@ def _singularities(solve: OneSolve) -> Iterator[str]:
         if len(iterations) > 1:
             line += f", entered {len(iterations)} times"
         yield line
-    for name in solve.layout.names:
-        jacobian = name.removeprefix("sigma_")
-        if jacobian == name or jacobian in entries or np.isnan(sigma := solve.columns(name)).all():
+    measured = [name for name in solve.layout.names if name.startswith(SIGMA)]
+    if not measured:
+        yield "singular values: not measured"
+    for name in measured:
+        jacobian = name.removeprefix(SIGMA)
+        if jacobian in entries:
+            continue
+        sigma = solve.columns(name)
+        if np.isnan(sigma).all():
+            yield f"singular values of the {plain_name(jacobian)}: not measured"
             continue
         lowest, usual = float(np.nanmin(sigma)), float(np.nanmedian(sigma))
         if lowest < DIP * usual:
@@ -180,6 +188,11 @@ def _singularities(solve: OneSolve) -> Iterator[str]:
             yield (
                 f"smallest singular value of the {plain_name(jacobian)} down to {number(lowest)} in"
                 f" iteration {row} (median {number(usual)})"
+            )
+        else:
+            yield (
+                f"{plain_name(jacobian)} never near singular: smallest singular value"
+                f" {number(lowest)}"
             )
 
 
@@ -244,7 +257,7 @@ def _at_the_end(solve: OneSolve) -> Iterator[str]:
         event.jacobian: event.threshold for event in solve.events if event.kind == "NEAR_SINGULAR"
     }
     for jacobian, threshold in singular.items():
-        sigma = solve.columns(f"sigma_{jacobian}")[last]
+        sigma = solve.columns(SIGMA + jacobian)[last]
         if np.any(sigma < threshold):
             yield f"at its end the {plain_name(jacobian)} is near singular"
     at_limit = held(solve)

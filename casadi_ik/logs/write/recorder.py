@@ -12,7 +12,7 @@ import json
 import os
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -32,6 +32,7 @@ from casadi_ik.logs.mcap.metadata import METADATA_NAME
 from casadi_ik.logs.mcap.summary import Summary
 from casadi_ik.logs.write.chunk_stream import ChunkStream
 from casadi_ik.logs.write.keep import Keep
+from casadi_ik.logs.write.measured import measured_format, measured_rows
 from casadi_ik.logs.write.messages import block_messages
 from casadi_ik.logs.write.provenance import log_metadata
 from casadi_ik.logs.write.solve_rows import solve_format, solve_rows
@@ -46,8 +47,9 @@ URDF_ATTACHMENT = "robot.urdf"
 
 @dataclass(frozen=True, eq=False)
 class _Method:
-    """What a method's solves look like in this log."""
+    """What a method's solves look like: their rows as given, and as they stand in this log."""
 
+    given: TraceFormat
     form: TraceFormat
     fingers: tuple[str, ...]
     formats: Mapping[str, TraceFormat]
@@ -132,6 +134,8 @@ class McapRecorder:
             return
         self._check(block)
         method = self._method(block)
+        rows = measured_rows(method.given, block.rows)
+        block = replace(block, format=method.form, rows=rows)
         counts = block.batch.iterations
         events = detect_events(block.format, block.rows, counts, self._rules)
         kinds = len(EventKind)
@@ -185,7 +189,7 @@ class McapRecorder:
             raise LogError(f"{where}: the rows are not of their layout, or not {expected}")
         known = self._methods.get(block.method)
         if known is not None:
-            same = known.form.layout == block.format.layout and known.form.labels == (
+            same = known.given.layout == block.format.layout and known.given.labels == (
                 block.format.labels
             )
             if not same or known.fingers != block.fingers:
@@ -207,27 +211,28 @@ class McapRecorder:
         known = self._methods.get(block.method)
         if known is not None:
             return known
+        form = measured_format(block.format)
         formats = {
-            "iteration": block.format,
-            "solve": solve_format(block),
-            "event": event_format(block.format),
+            "iteration": form,
+            "solve": solve_format(replace(block, format=form)),
+            "event": event_format(form),
         }
         texts = {kind: schema.schema_text(f.layout, f.labels) for kind, f in formats.items()}
         channels = {}
-        for kind, form in formats.items():
+        for kind, text in texts.items():
             number = len(schema.KINDS) * len(self._methods) + len(channels) + 1
-            name = schema.schema_name(kind, block.method, block.format.layout, len(block.fingers))
+            name = schema.schema_name(kind, block.method, form.layout, len(block.fingers))
             metadata = {
                 "offered_qos_profiles": "",
                 "method": block.method,
-                "labels": json.dumps({key: list(names) for key, names in form.labels.items()}),
+                "labels": json.dumps({k: list(names) for k, names in formats[kind].labels.items()}),
             }
             self._chunks.define(
-                Schema(number, texts[kind].encode(), "ros2msg", name),
+                Schema(number, text.encode(), "ros2msg", name),
                 Channel(number, schema.topic(block.method, kind), "cdr", metadata, number),
             )
             channels[kind] = number
-        method = _Method(block.format, block.fingers, formats, channels)
+        method = _Method(block.format, form, block.fingers, formats, channels)
         self._methods[block.method] = method
         return method
 

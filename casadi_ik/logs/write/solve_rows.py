@@ -123,7 +123,6 @@ def _lowest(block: SolveBlock) -> NDArray[np.float32]:
             one = TraceFormat(Layout((item,)), block.format.labels)
             columns = [names.index(name) for name in jacobian_names(one)]
             values = as_matrix(block.rows[item.name])
-            lowest[np.flatnonzero(some)[:, None], columns] = np.fmin.reduceat(
-                values, starts, axis=0
-            )
+            for column, value in zip(columns, values.T, strict=True):
+                lowest[some, column] = np.fmin.reduceat(np.ascontiguousarray(value), starts)
     return lowest

@@ -6,9 +6,8 @@ import casadi as ca
 
 from casadi_ik.kernels.layout import Field
 from casadi_ik.problem.trace import RecordedJacobian
-from casadi_ik.robots.couplings import FourBar, LeadScrew
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.couplings import toggle_margins
+from casadi_ik.symbolic.couplings import has_toggle, toggle_margins
 from casadi_ik.symbolic.smooth import Expr
 
 NEAR_TOGGLE = 0.03
@@ -16,7 +15,7 @@ NEAR_TOGGLE = 0.03
 
 
 def coupling_fields(robot: RobotDescription) -> tuple[Field, ...]:
-    """The field of the record; none for a robot without lead screws and four-bars."""
+    """The field of the record; none for a robot whose couplings have no toggle position."""
     if not _motors(robot):
         return ()
     doc = "smallest squared sine of the transmission angles, 0 at a toggle"
@@ -37,11 +36,11 @@ def coupling_jacobian(robot: RobotDescription) -> dict[str, RecordedJacobian]:
 
 
 def _motors(robot: RobotDescription) -> tuple[str, ...]:
-    """The actuators behind lead screws and four-bars."""
+    """The actuators behind mechanisms that have a toggle position."""
     sources = {joint.name: joint.coupling.of for joint in robot.movable if joint.coupling}
     found: dict[str, None] = {}
     for joint in robot.movable:
-        if isinstance(joint.coupling, LeadScrew | FourBar):
+        if has_toggle(joint):
             name = joint.name
             while name in sources and name not in robot.actuator_names:
                 name = sources[name]

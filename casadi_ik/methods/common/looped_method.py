@@ -17,6 +17,7 @@ from casadi_ik.kernels import LoopKernel, StepGraph
 from casadi_ik.kernels.rows import opaque
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Method, Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase, Status
@@ -47,6 +48,12 @@ class LoopedMethod(ABC):
     """
 
     name: str
+
+    phases_without_arm: tuple[Phase, ...] = ()
+    """Phases in which the arm's part of q means nothing yet: its Jacobian is not measured there."""
+
+    follows_closed_chain: bool = False
+    """Whether a log measures the closed chain of arm and thumb, since the method moves along it."""
 
     max_iterations: int = 100_000
     """Budget of a round. This one is far above what steps allow themselves that end by a status of
@@ -118,10 +125,19 @@ class LoopedMethod(ABC):
         """The compiled loop; the virtual machine for a step that has no C code."""
         return LoopKernel(self.graph, self._compiled)
 
+    @cached_property
+    def _measures(self) -> JacobianMeasures:
+        return JacobianMeasures(
+            self.robot,
+            without_arm=self.phases_without_arm,
+            closed_chain=self.follows_closed_chain,
+            compiled=self._compiled,
+        )
+
     @property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        return trace_format(self.graph.record, self.robot, self.jacobians)
+        return trace_format(self.graph.record, self.robot, self.jacobians, self._measures)
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -7,15 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
+from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.methods.common.looped_method import Counts, LoopedMethod, Start
-from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.methods.hand_first.restarts import LATER, VALLEYS, Restarts
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts.kinds import Kinds, usual
@@ -29,9 +29,6 @@ from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
-
-AT_LIMITS = 0.5
-"""Part of the range that the wide table moves to the limits."""
 
 NEAREST = "q0"
 """The preference for what is near the start."""
@@ -47,7 +44,7 @@ were balanced in vain, and what was found."""
 class HandFirstMethod(LoopedMethod):
     """`hand-first`: contacts fix palm and hand, the arm follows in closed form.
 
-    A round takes the next best hand postures of a table; nearly all targets need one round only.
+    A round takes other hand postures, see `Restarts`; nearly all targets need one round only.
 
     Attributes:
         step: Its step for this robot.
@@ -56,6 +53,7 @@ class HandFirstMethod(LoopedMethod):
 
     name = "hand-first"
     preferences = PREFERENCES
+    phases_without_arm = (Phase.CANDIDATE, Phase.HAND_FIT)
     takes_free_contacts = True
     takes_fixed_actuators = True
 
@@ -69,7 +67,7 @@ class HandFirstMethod(LoopedMethod):
         """Recognise the arm and lay out the step; point and normal if no kinds are given."""
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
-        self.rounds = options.rounds
+        self.rounds = options.rounds + LATER
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(robot, _closed_form(robot), options.candidates, self._kinds)
         self._singles: list[FirstRound] = []
@@ -79,18 +77,9 @@ class HandFirstMethod(LoopedMethod):
         return self.step.graph()
 
     @cached_property
-    def table(self) -> PostureTable:
-        """The hand postures that targets are compared with."""
-        return self._table(self.options.table)
-
-    @cached_property
-    def wide_table(self) -> PostureTable:
-        """Many more postures, a good part of them at limits, for targets the first round misses."""
-        return self._table(self.options.wide_table, AT_LIMITS)
-
-    def _table(self, size: int, at_limits: float = 0.0) -> PostureTable:
-        hand = self.step.layouts.hand
-        return PostureTable(ArmHand(self.robot), hand, size, at_limits, compiled=self._compiled)
+    def hands(self) -> Restarts:
+        """The hand postures that rounds begin from."""
+        return Restarts(self.robot, self.step.layouts.hand, self.options, self._compiled)
 
     def for_kinds(self, kinds: Kinds) -> HandFirstMethod:
         """The same for contacts of other kinds."""
@@ -100,7 +89,7 @@ class HandFirstMethod(LoopedMethod):
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
-        _ = self.kernel, self.table, self._beginning
+        _ = self.kernel, self.hands.table, self._beginning
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:
@@ -111,16 +100,9 @@ class HandFirstMethod(LoopedMethod):
         self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
     ) -> Start:
         """Start with the hand postures of the round; what was found before is kept."""
-        postures = self.postures(problems, number)
-        if problems.prefer == NEAREST:
-            postures = self.order(postures, q0, own=number == 0)
-        states, parameters = self.rows(problems, q0, postures)
+        states, parameters = self._round(problems, q0, number, last)
         if last is not None:
             layout = self.step.layouts.state
-            states[:, layout.slice("phase")], states[:, layout.slice("candidate")] = (
-                Phase.CANDIDATE,
-                0.0,
-            )
             for name in CARRIED:
                 states[:, layout.slice(name)] = last[:, layout.slice(name)]
             states[:, layout.slice("earlier")] = number * self.options.candidates
@@ -149,13 +131,15 @@ class HandFirstMethod(LoopedMethod):
             first = self._singles.pop()
         except IndexError:
             first = FirstRound(
-                self.table, self._beginning, self.kernel, self.step.layouts, self.order
+                self.hands.table, self._beginning, self.kernel, self.step.layouts, self.order
             )
         found = first(problems, q0, self._terms(problems), self.max_iterations)
         self._singles.append(first)
         return found
 
-    def rows(self, problems: Problems, q0: Array, postures: Array) -> tuple[Array, Array]:
+    def rows(
+        self, problems: Problems, q0: Array, postures: Array, begun: bool = False
+    ) -> tuple[Array, Array]:
         """States and parameters of the loop, to be changed before `run_rows`.
 
         Args:
@@ -163,6 +147,7 @@ class HandFirstMethod(LoopedMethod):
             q0: (k, n).
             postures: (k, candidates, hand) hand postures to start from, or (k, 1, hand). Motors
                 that move free fingers only stay as in q0.
+            begun: Whether a solution near q0 was looked for before, if one is wanted.
 
         Returns:
             (k, ...) states and parameters.
@@ -172,6 +157,10 @@ class HandFirstMethod(LoopedMethod):
         vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
         asked = *vectors, q0, self._terms(problems), tried
         states, parameters = self._beginning(*asked)
+        if begun:
+            layout = self.step.layouts.state
+            states[:, layout.slice("phase")] = float(Phase.CANDIDATE)
+            states[:, layout.slice("candidate")] = 0.0
         return states, parameters
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
@@ -179,15 +168,34 @@ class HandFirstMethod(LoopedMethod):
         return self.kernel.run(states, parameters, self.max_iterations, trace)
 
     def postures(self, problems: Problems, number: int) -> Array:
-        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
+        """Candidates (k, candidates, hand) of a round whose postures look like the targets.
 
         Args:
             problems: k targets.
-            number: The round.
+            number: The round, below `options.rounds`.
         """
-        count = self.options.candidates
-        table, wanted = (self.wide_table, number * count) if number else (self.table, count)
-        return table.nearest(problems.points, problems.normals, wanted)[:, -count:]
+        return self.hands.from_tables(problems, number)
+
+    def _round(self, problems: Problems, q0: Array, number: int, last: Array | None) -> Start:
+        """What a round begins with, the memory of those before aside."""
+        later, layouts = number - self.options.rounds, self.step.layouts
+        if later < 0 or last is None:
+            postures = self.postures(problems, number)
+            if problems.prefer == NEAREST:
+                postures = self.order(postures, q0, own=last is None)
+            return self.rows(problems, q0, postures, begun=last is not None)
+        if later < VALLEYS:
+            best = last[:, layouts.state.slice("best_q")]
+            return self.rows(problems, q0, self.hands.along_valley(problems, best, later), True)
+        anywhere = self.hands.anywhere(problems, later - VALLEYS)
+        states, parameters = self.rows(problems, q0, anywhere[None][:, :, list(layouts.hand)], True)
+        # The first of them begins as a whole: what stands in the way may be arm and hand together.
+        lower, upper = (parameters[:, layouts.parameters.slice(end)] for end in ("lower", "upper"))
+        states[:, layouts.state.slice("q")] = np.clip(anywhere[0], lower, upper)
+        states[:, layouts.state.slice("phase")] = float(Phase.REFINEMENT)
+        for name, value in fresh_fit().items():
+            states[:, layouts.state.slice(name)] = value
+        return states, parameters
 
     def order(self, postures: Array, q0: Array, own: bool) -> Array:
         """Hand postures (k, c, hand), those nearest to q0 (k, n) first.

@@ -18,6 +18,7 @@ from casadi_ik.methods.ipopt.contacts import NlpContacts
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.whole_nlp import NlpRun, WholeNlp
 from casadi_ik.problem.contacts.kinds import Kinds, usual
+from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase, Status
@@ -110,7 +111,11 @@ class IpoptMethod:
     @property
     def trace_format(self) -> TraceFormat:
         """How its traces are to be read."""
-        return trace_format(self.record, self._robot)
+        return trace_format(self.record, self._robot, measures=self._measures)
+
+    @cached_property
+    def _measures(self) -> JacobianMeasures:
+        return JacobianMeasures(self._robot)
 
     @property
     def parameters(self) -> Mapping[str, Any]:

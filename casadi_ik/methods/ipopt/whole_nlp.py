@@ -39,7 +39,6 @@ from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.watch import EXACT, JOINT_SLACK, Watch, within
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.status import Status
-from casadi_ik.robots.couplings import FourBar
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.couplings import joint_positions
 
@@ -244,7 +243,7 @@ _ENDINGS = {
 def limited_joints(robot: RobotDescription) -> list[int]:
     """Joints whose limits the bounds of q do not imply: positions in `robot.joint_names`.
 
-    Every joint depends on one actuator, and all couplings but the four-bar are monotone, so the
+    Every joint depends on one actuator, and where all couplings on the way are monotone, the
     ends of the actuator's range tell.
     """
     q = ca.SX.sym("q", len(robot.actuators))
@@ -258,7 +257,7 @@ def limited_joints(robot: RobotDescription) -> list[int]:
     for i, joint in enumerate(robot.movable):
         bent, current = False, joint
         while current is not None and current.coupling is not None:
-            bent |= isinstance(current.coupling, FourBar)
+            bent |= not current.coupling.monotone
             current = by_name.get(current.coupling.of)
         if joint.coupling is not None and (bent or beyond[i] or not np.isfinite(ends[:, i]).all()):
             found.append(i)

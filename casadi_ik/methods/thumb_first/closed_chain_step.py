@@ -21,7 +21,7 @@ from casadi_ik.methods.thumb_first.proxqp import proxqp
 from casadi_ik.problem.contacts.conditions import LENGTH, PLACE
 from casadi_ik.problem.contacts.rows import ContactRows, tip_vectors
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated
+from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated, motor_scales
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times, project_to_null_space
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
@@ -74,13 +74,6 @@ class Room:
 
 StepSolver = Callable[[Linear, Room], tuple[Expr, Expr]]
 """Gives the step (n, 1) and which motors it holds at their limits (n, 1)."""
-
-
-def motor_scales(robot: RobotDescription) -> ca.DM:
-    """(n, 1) what counts as a unit of each motor: 1 rad, or the range of a slider."""
-    ranges = (robot.upper - robot.lower).tolist()
-    units = [actuator.unit for actuator in robot.actuators]
-    return ca.DM([1.0 if u == "rad" else r for u, r in zip(units, ranges, strict=True)])
 
 
 def contact_errors(

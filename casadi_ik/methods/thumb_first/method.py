@@ -37,6 +37,7 @@ class ThumbFirstMethod(LoopedMethod):
     """
 
     name = "thumb-first"
+    follows_closed_chain = True
     takes_free_contacts = True
     takes_fixed_actuators = True
 

@@ -29,16 +29,15 @@ from casadi_ik.methods.thumb_first.closed_chain_step import (
     Linear,
     Room,
     linearised,
-    motor_scales,
 )
 from casadi_ik.methods.thumb_first.merit import Merit, merit
 from casadi_ik.methods.thumb_first.state import STAGES, ThumbFirstLayouts
 from casadi_ik.problem.contacts.kinds import suffix
 from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.symbolic.actuated import motor_scales
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.linear_algebra import det_spd
-from casadi_ik.symbolic.smooth import Expr, safe_sqrt
+from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
 
@@ -203,7 +202,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         *problem, lower, upper, damping = self._problem()(state, parameters)
         solve = STEP_SOLVERS[self.options.step]
         step, held = solve(Linear(*problem), Room(lower, upper, damping))
-        outputs = self._take()(state, parameters, problem[0], step, held)
+        outputs = self._take()(state, parameters, step, held)
         return ca.Function("alignment", [state, parameters], list(outputs))
 
     def _problem(self) -> ca.Function:
@@ -221,9 +220,6 @@ class ThumbFirstStep(ThumbFirstLayouts):
         state, parameters, s, p = self._vectors(ca.SX)
         n = s["q"].numel()
         step, held = ca.SX.sym("step", n), ca.SX.sym("held", n)
-        thumb = ca.SX.sym(
-            "thumb", linearised(self.robot, self.contacts, s["q"], p).thumb.sparsity()
-        )
         size = ca.mmax(ca.fabs(step))
         capped = (
             motor_scales(self.robot) * step * ca.fmin(1.0, p["step_cap"] / ca.fmax(size, 1e-12))
@@ -269,11 +265,10 @@ class ThumbFirstStep(ThumbFirstLayouts):
             left,
             damping=s["damping"],
             step_size=ca.mmax(ca.fabs(tried - s["q"])),
-            manipulability=safe_sqrt(det_spd(thumb @ thumb.T)),
             active_mask=bits(held),
             accepted=accepted,
         )
-        inputs = [state, parameters, thumb, step, held]
+        inputs = [state, parameters, step, held]
         return ca.Function("take", inputs, shared(after, record, status))
 
     def _next(

@@ -1,0 +1,58 @@
+/* map.c for four samples side by side: see there. Where the last turn has less than four, its last
+ * sample is there several times.
+ *
+ * Expects the macros N_IN, N_OUT, SIZES_IN and SIZES_OUT (doubles of each, as initialisers), TOTAL
+ * (their sum).
+ */
+
+EXPORT int casadi_ik_has_lanes(void) {
+#if defined(__x86_64__)
+  __builtin_cpu_init();
+  return __builtin_cpu_supports("avx2") != 0;
+#else
+  return 1;
+#endif
+}
+
+EXPORT LANES_TARGET int casadi_ik_map_lanes(map_job *job) {
+  static const int sizes_in[] = SIZES_IN, sizes_out[] = SIZES_OUT;
+  workspace space;
+  lanes *inputs[N_IN], *outputs[N_OUT], *place;
+  int64_t ticks = 0, sample[LANES];
+  double limit;
+  int i, k, lane, outcome = set_up(&space, TOTAL);
+  if (outcome != DONE) return outcome;
+  place = space.extra;
+  for (i = 0; i < N_IN; place += sizes_in[i++]) inputs[i] = place;
+  for (i = 0; i < N_OUT; place += sizes_out[i++]) outputs[i] = place;
+  limit = monotonic() + job->slice;
+  for (; job->next < job->count; job->next += LANES) {
+    if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {
+      outcome = SLICE_OVER;
+      break;
+    }
+    for (lane = 0; lane < LANES; ++lane) {
+      sample[lane] = job->next + lane < job->count ? job->next + lane : job->count - 1;
+    }
+    for (i = 0; i < N_IN; ++i) {
+      for (lane = 0; lane < LANES; ++lane) {
+        const double *from = job->inputs[i] + sample[lane] * job->input_steps[i];
+        for (k = 0; k < sizes_in[i]; ++k) ((double *) inputs[i])[k * LANES + lane] = from[k];
+      }
+    }
+    for (i = 0; i < N_IN; ++i) space.arg[i] = inputs[i];
+    for (i = 0; i < N_OUT; ++i) space.res[i] = outputs[i];
+    if (STEP(space.arg, space.res, space.iw, space.w, (1 << LANES) - 1)) {
+      outcome = STEP_FAILED;
+      break;
+    }
+    for (i = 0; i < N_OUT; ++i) {
+      for (lane = 0; lane < LANES; ++lane) {
+        double *to = job->outputs[i] + sample[lane] * job->output_steps[i];
+        for (k = 0; k < sizes_out[i]; ++k) to[k] = ((const double *) outputs[i])[k * LANES + lane];
+      }
+    }
+  }
+  give_back(&space);
+  return outcome;
+}

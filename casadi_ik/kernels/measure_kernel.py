@@ -1,0 +1,102 @@
+"""A function of many samples, four at a time: for what is measured, not for what is solved.
+
+The values are those of the compiled function up to the last places of its sines and cosines, which
+nothing that is iterated may depend on.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.errors import KernelError
+from casadi_ik.kernels.buffered import doubles, memory
+from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.function_kernel import FunctionKernel, MapJob
+from casadi_ik.kernels.lanes import lanes_source
+from casadi_ik.kernels.lanes_lines import UnsuitedError
+from casadi_ik.kernels.outcome import SLICE, Outcome, check
+
+logger = logging.getLogger(__name__)
+
+SYMBOL = "casadi_ik_map_lanes"
+
+
+class MeasureKernel:
+    """Evaluates a function of one vector for a batch of them; threads may call it at once."""
+
+    def __init__(self, graph: FunctionGraph, compiled: bool = True) -> None:
+        """Keep the function; it is compiled when first needed.
+
+        Args:
+            graph: One column in, one column out.
+            compiled: False keeps to the virtual machine.
+        """
+        self._graph = graph
+        self._compiled = compiled
+        ((self._n_in, _),) = graph.inputs.values()
+        ((self._n_out, _),) = graph.outputs
+
+    def prepare(self) -> None:
+        """Compile it."""
+        if self._map is None:
+            _ = self._one_by_one
+
+    @cached_property
+    def _one_by_one(self) -> FunctionKernel:
+        """For machines without vectors of four doubles."""
+        return FunctionKernel(self._graph, self._compiled)
+
+    @cached_property
+    def _map(self) -> Any:
+        if not self._compiled:
+            return None
+        constants = {"N_IN": 1, "N_OUT": 1, "TOTAL": self._n_in + self._n_out}
+        sizes = f"#define SIZES_IN {{{self._n_in}}}\n#define SIZES_OUT {{{self._n_out}}}\n"
+        driver = define(constants) + sizes + driver_text("map_job") + driver_text("map_lanes")
+        try:
+            library = load_library(
+                f"{self._graph.name}_lanes",
+                lambda: row_major(self._graph.function),
+                driver,
+                SYMBOL,
+                self._graph.recipe,
+                partial(lanes_source, quick=True),
+            )
+        except UnsuitedError as error:
+            logger.info("%s: one sample at a time: %s", self._graph.name, error)
+            return None
+        except KernelError as error:
+            logger.warning("%s: one sample at a time: %s", self._graph.name, error)
+            return None
+        return None if library is None or not library.casadi_ik_has_lanes() else library[SYMBOL]
+
+    def __call__(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values (k, m) for samples (k, n).
+
+        Raises:
+            KernelError: The function itself reports a failure.
+        """
+        given = doubles(samples)
+        if self._map is None or not len(given):
+            (values,) = self._one_by_one(given)
+            return values.reshape(len(given), self._n_out)
+        values = np.empty((len(given), self._n_out))
+        steps = [(ctypes.c_int64 * 1)(size) for size in (self._n_in, self._n_out)]
+        places = [(ctypes.c_void_p * 1)(memory(array)) for array in (given, values)]
+        job = MapJob(
+            *(ctypes.addressof(item) for pair in zip(places, steps, strict=True) for item in pair),
+            len(given),
+            0,
+            SLICE,
+        )
+        while (code := self._map(ctypes.byref(job))) != Outcome.DONE:
+            check(self._graph.name, code)
+        return values

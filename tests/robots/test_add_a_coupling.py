@@ -1,0 +1,128 @@
+"""A fourth kind of coupling, the lines of docs/add_a_coupling.md, in a copy of the package."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from toy_robots import replace, write_coupled_robot
+
+import casadi_ik as ik
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.robots.couplings import CouplingKind
+from casadi_ik.symbolic.couplings import coupling_rate, follow, has_toggle
+
+ROOT = Path(__file__).parents[2]
+
+SCRIPT = """
+import sys
+import casadi as ca
+import numpy as np
+import casadi_ik as ik
+from casadi_ik.calibration.parameters import hand_parameters
+from casadi_ik.symbolic.couplings import coupling_rate, follow, joint_positions
+
+robot = ik.load_robot(sys.argv[1])
+rng = np.random.default_rng(3)
+joint = next(joint for joint in robot.description.movable if joint.name == "left_4")
+q = robot.random(rng, 1)[0]
+moved = robot.joints(q)
+assert np.isclose(moved["left_4"], -0.5 * moved["left_3"] + 0.2 * moved["left_3"] ** 2)
+
+s = ca.SX.sym("s")
+both = ca.Function("both", [s], [follow(joint, s), coupling_rate(joint, s)])
+source, step = rng.uniform(-1, 1, 50), 1e-6
+position, rate = (np.array(value).ravel() for value in both(source[None]))
+np.testing.assert_allclose(joint.coupling.followed(source), position, atol=1e-14)
+ahead, behind = (joint.coupling.followed(source + side) for side in (step, -step))
+np.testing.assert_allclose(rate, (ahead - behind) / (2 * step), atol=1e-8)
+
+motors = ca.SX.sym("q", len(q))
+theta = joint_positions(robot.description, motors)
+jacobian = ca.Function("jacobian", [motors], [ca.jacobian(theta, motors)])
+slider = robot.actuators.index("screw_2")
+shift = np.eye(len(q))[slider] * 1e-7
+names = robot.description.joint_names
+ends = [np.array([robot.joints(q + side)[name] for name in names]) for side in (shift, -shift)]
+column = np.array(jacobian(q))[:, slider]
+np.testing.assert_allclose((ends[0] - ends[1]) / 2e-7, column, rtol=1e-5, atol=1e-5)
+
+assert "Quadratic(of='left_3', rise=-0.5, curve=0.2)" in robot.urdf()
+names = [parameter.name for parameter in hand_parameters(robot.description, ["left"])]
+assert {"left_4.rise", "left_4.curve"} <= set(names)
+
+points, normals = robot.contacts(robot.home + 0.1 * (q - robot.home))
+contacts = zip(robot.fingers, points, normals)
+grasp = ik.Grasp({name: ik.Contact(point, normal) for name, point, normal in contacts})
+solution = ik.Solver(robot, compiled=False).solve(grasp, diagnose=False)
+assert solution.success, solution
+"""
+
+
+def package_with_the_page(folder: Path) -> None:
+    """A copy of the package with the page's two blocks in their places."""
+    shutil.copytree(
+        ROOT / "casadi_ik", folder / "casadi_ik", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    (folder / "models").symlink_to(ROOT / "models")
+    text = (ROOT / "docs" / "add_a_coupling.md").read_text(encoding="utf-8")
+    data, row = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    described = folder / "casadi_ik" / "robots" / "couplings.py"
+    union = "Coupling = Linear | LeadScrew | FourBar"
+    replace(described, union, f"{data}\n\n{union} | Quadratic")
+    graphs = folder / "casadi_ik" / "symbolic" / "couplings.py"
+    replace(graphs, "FourBar, LeadScrew, Linear\n", "FourBar, LeadScrew, Linear, Quadratic\n")
+    replace(graphs, '}\n"""The kinds of couplings."""', f'{row}}}\n"""The kinds of couplings."""')
+
+
+def test_a_kind_is_added_in_two_files(tmp_path):
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "package").mkdir()
+    path = write_coupled_robot(tmp_path / "robot")
+    replace(
+        tmp_path / "robot" / "parts" / "hand.yaml",
+        "coupling: {kind: linear, of: left_3, ratio: -0.5, offset: 0.05}",
+        "coupling: {kind: quadratic, of: left_3, rise: -0.5, curve: 0.2}",
+    )
+    package_with_the_page(tmp_path / "package")
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(path)],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "package")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+class Wire(CouplingKind, frozen=True, tag="wire"):
+    """A kind that says nothing of itself."""
+
+
+def test_an_unknown_kind_is_an_error(coupled_robot):
+    """It is never taken for a four-bar, nor passed over."""
+    (joint,) = (joint for joint in coupled_robot.description.movable if joint.name == "left_4")
+    wired = dataclasses.replace(joint, coupling=Wire("left_3"))  # type: ignore[arg-type]
+    for ask in (follow, coupling_rate):
+        with pytest.raises(UnsupportedError, match="no graphs for the kind Wire"):
+            ask(wired, ca.SX.sym("s"))
+    with pytest.raises(UnsupportedError, match="Wire"):
+        has_toggle(wired)
+    with pytest.raises(NotImplementedError, match="Wire"):
+        wired.coupling.followed(np.zeros(1))
+    joints = coupled_robot.description.joints
+    described = dataclasses.replace(
+        coupled_robot.description,
+        joints=tuple(wired if one is joint else one for one in joints),
+    )
+    with pytest.raises(UnsupportedError, match="Wire"):
+        ik.ArmHand(described).contacts(coupled_robot.home)
