@@ -25,7 +25,7 @@ class FirstRound:
         beginning: FunctionKernel,
         loop: LoopKernel,
         layouts: HandFirstLayouts,
-        order: Callable[[Array, Array, bool], Array],
+        order: Callable[[Problems, Array, Array, bool], Array],
     ) -> None:
         """Lay the arrays out; all kernels must be compiled.
 
@@ -73,7 +73,7 @@ class FirstRound:
         self._lookup()
         self._postures.take(self._lookup.found[0], axis=0, out=postures, mode="clip")
         if problems.prefer == "q0":
-            postures[...] = self._order(postures[None], q0[None], True)[0]
+            postures[...] = self._order(problems, q0[None], postures[None], True)[0]
         self._begin()
         self._solve(max_iterations)
         if self._solve.result.status[0] != Status.SOLVED:

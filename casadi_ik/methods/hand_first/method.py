@@ -182,7 +182,7 @@ class HandFirstMethod(LoopedMethod):
         if later < 0 or last is None:
             postures = self.postures(problems, number)
             if problems.prefer == NEAREST:
-                postures = self.order(postures, q0, own=last is None)
+                postures = self.order(problems, q0, postures, own=last is None)
             return self.rows(problems, q0, postures, begun=last is not None)
         if later < VALLEYS:
             best = last[:, layouts.state.slice("best_q")]
@@ -197,16 +197,17 @@ class HandFirstMethod(LoopedMethod):
             states[:, layouts.state.slice(name)] = value
         return states, parameters
 
-    def order(self, postures: Array, q0: Array, own: bool) -> Array:
-        """Hand postures (k, c, hand), those nearest to q0 (k, n) first.
+    def order(self, problems: Problems, q0: Array, postures: Array, own: bool) -> Array:
+        """Hand postures (k, c, hand), the nearest first.
 
         Args:
+            problems: The targets.
+            q0: (k, n) where the robot is.
             postures: The postures.
-            q0: Where the robot is.
             own: Whether its own posture comes first, instead of the last of them.
         """
         hand = list(self.step.layouts.hand)
-        here = q0[:, None, hand]
+        here = np.clip(q0, *problems.bounds(self.robot, UNBOUNDED))[:, None, hand]
         if own:
             postures = postures[:, : max(postures.shape[1] - 1, 1)]
         ranges = np.maximum((self.robot.upper - self.robot.lower)[hand], TINY)
