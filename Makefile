@@ -4,12 +4,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 OUT := out/demo
-SOLVE := $(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup.mcap --out $(OUT)/cup.json
+SOLVE := $(BIN)/casadi-ik solve cup --log $(OUT)/cup.mcap --out $(OUT)/cup.json
+PAPER := $(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup_paper.mcap
 
 .PHONY: help demo test lint bench notebooks clean
 
 help:
-	@echo "make demo       set up and solve the grasp of a real object: verdict, picture, log"
+	@echo "make demo       set up and solve the grasp of a real object, by our method and the paper's"
 	@echo "make test       set up and run the tests"
 	@echo "make lint       style, types, layers"
 	@echo "make bench      timings on this machine"
@@ -30,11 +31,13 @@ $(VENV)/dev.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
 	$(PIP) install --quiet -c constraints.txt -e ".[test,lint]"
 	touch $@ $(VENV)/demo.stamp
 
+# The grasp of a real object by the default method, then by the paper's, and the two side by side.
 demo: $(VENV)/demo.stamp
 	@mkdir -p $(OUT)
 	@# Without OpenGL there is no picture (the first call says so); verdict and log there are.
 	$(SOLVE) --picture $(OUT)/cup.png || { [ $$? -eq 2 ] && $(SOLVE); }
-	$(BIN)/casadi-ik log info $(OUT)/cup.mcap
+	$(PAPER)
+	$(BIN)/casadi-ik log compare $(OUT)/cup.mcap $(OUT)/cup_paper.mcap
 
 test: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -n auto

@@ -76,6 +76,7 @@ class Solver:
             raise InputError(f"robot: found {robot!r}, expected what load_robot returns")
         if limits not in LIMITS:
             raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMITS)}")
+        self._asked = (robot, method, tolerance, limits, finger_step, options, compiled)
         self.robot = robot
         self.method = method
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
@@ -85,6 +86,10 @@ class Solver:
         self._engine = Engine(
             robot, build_method(method, robot.description, self.options, compiled), compiled
         )
+
+    def __reduce__(self) -> tuple[type[Solver], tuple[Any, ...]]:
+        """What it was made from; a copy finds the compiled kernels on the machine it comes to."""
+        return type(self), self._asked
 
     def __repr__(self) -> str:
         return f"<Solver {self.method} on {self.robot.name}, limits {self.limits}>"

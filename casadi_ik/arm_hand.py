@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
+from casadi_ik.grasps.arrays import real_array
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
 
@@ -26,6 +27,10 @@ class ArmHand:
     def __init__(self, description: RobotDescription) -> None:
         """Wrap a description; kernels are compiled when first used and cached on the machine."""
         self.description = description
+
+    def __reduce__(self) -> tuple[type[ArmHand], tuple[RobotDescription]]:
+        """Its data; a copy finds the compiled kernels on the machine it comes to."""
+        return type(self), (self.description,)
 
     def __repr__(self) -> str:
         return f"<ArmHand {self.name}: {len(self.actuators)} actuators, fingers {self.fingers}>"
@@ -78,9 +83,9 @@ class ArmHand:
         if q is None:
             return self.home.copy()
         try:
-            array = np.array(q, dtype=float)
+            array = real_array(q)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{name}: found {q!r}, expected numbers") from error
+            raise InputError(f"{name}: found {q!r}, expected numbers: {error}") from error
         n = len(self.actuators)
         if array.ndim not in (1, 2) or array.shape[-1] != n:
             raise InputError(f"{name}: found shape {array.shape}, expected ({n},) or (k, {n})")

@@ -35,8 +35,24 @@ def _escaped(character: str) -> str:
     return character.encode("unicode_escape", "surrogatepass").decode("ascii")
 
 
+LONGEST = 600
+"""Characters of a message; of a longer one the beginning and the end are kept."""
+
+
+def shortened(text: str) -> str:
+    """A text of any length as one of a few hundred characters, fit for a terminal."""
+    text = printable(text)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 200]} [...] {text[-180:]}"
+
+
 class CasadiIKError(Exception):
-    """Base of every error that casadi_ik raises on purpose."""
+    """Base of every error that casadi_ik raises on purpose.
+
+    Its text is printable and short, whatever the file holds that it speaks of.
+    """
+
+    def __str__(self) -> str:
+        return shortened(super().__str__())
 
 
 class DescriptionError(CasadiIKError):

@@ -31,6 +31,17 @@ VARIANTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 )
 
 
+SHOWN = range(1, 16)
+"""Iterations that are drawn."""
+
+CURVES = (
+    ("one start, ProxQP", PAPER, 4.0, "o-"),
+    ("one start, freeze", OURS, 1.5, "o-"),
+    ("all starts, freeze", "#1f9d55", 1.5, "o:"),
+)
+"""Lines, their colours and widths: the first two nearly coincide, so one is wider."""
+
+
 def bent_targets(robot: ik.ArmHand, count: int, rng: np.random.Generator) -> Targets:
     """The shipped grasps' hands with distal joints from 25 to 45 deg, on random arms."""
     names = ik.shipped_grasps(robot.name)
@@ -54,12 +65,15 @@ def main() -> None:
         "bent": bent_targets(robot, given.count, rng),
     }
     lines, batches, scale = [], {}, {}
+    scale_solver = ik.Solver(robot, "hand-first")
     for name, targets in sets.items():
-        reference = ik.Solver(robot, "hand-first").solve_batch(*targets)
+        scale_solver.solve_batch(*targets)  # no time holds a first use
+        reference = scale_solver.solve_batch(*targets)
         scale[name] = reference.time.sum() / reference.iterations.sum()
     for label, method, settings in VARIANTS:
         solver = ik.Solver(robot, method, **settings)
         cells = []
+        solver.solve_batch(*(part[:8] for part in sets["grasps"]))
         for name, targets in sets.items():
             batch = batches[label, name] = solver.solve_batch(*targets)
             solved = batch.success
@@ -72,16 +86,15 @@ def main() -> None:
 
     drawn, grid = figure(1, 2, 5.0, 3.6)
     for axes, name in zip(grid[0], sets, strict=True):
-        for label, color, width in (
-            ("one start, ProxQP", PAPER, 4.0),
-            ("one start, freeze", OURS, 1.5),
-        ):
-            taken = np.sort(batches[label, name].iterations[batches[label, name].success])
-            share = 100 * np.arange(1, len(taken) + 1) / len(batches[label, name])
-            axes.step(taken, share, where="post", color=color, lw=width, label=label)
-        axes.set_xlim(0, 12)
-        axes.legend(frameon=False, fontsize=9, loc="lower right")
-        title(axes, f"{name}: solved within so many iterations", "iterations", "solved [%]")
+        for label, color, width, marker in CURVES:
+            batch = batches[label, name]
+            within = [(batch.iterations[batch.success] <= i).sum() for i in SHOWN]
+            left = 100 * (1 - np.array(within) / len(batch))
+            drawn_at = np.where(left > 0, left, np.nan)
+            axes.plot(SHOWN, drawn_at, marker, color=color, lw=width, ms=2 * width, label=label)
+        axes.set(yscale="log", ylim=(50 / given.count / len(grasps), 150), xticks=SHOWN[1::2])
+        axes.legend(frameon=False, fontsize=9, loc="upper right")
+        title(axes, f"{name}: not yet solved", "iterations", "not yet solved [%]")
     total = given.count * len(grasps)
     text = f"""
 # thumb-first: one start, all starts, and two ways to keep to limits

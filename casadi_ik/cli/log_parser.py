@@ -50,7 +50,7 @@ def add_log(commands: Any) -> None:
     info.description = "Methods, solves, iterations, events, size and origin of logs."
     _files(info)
     for name, text, run in (
-        ("solves", "list solves: what became of them", _solves),
+        ("solves", "list solves and how they ended", _solves),
         ("events", "list events: singularities, limits, stalls, ...", _events),
     ):
         parser = _action(actions, name, text, run)

@@ -26,15 +26,22 @@ def check_outputs(outputs: Iterable[tuple[str, Path | None]], inputs: Iterable[P
     Raises:
         OutputError: The message names path and option.
     """
-    taken = {target_of(path): "the input" for path in inputs}
+    taken: dict[object, str] = {}
+    for path in inputs:
+        with contextlib.suppress(OSError):
+            taken |= dict.fromkeys(_identities(target_of(path)), "the input")
     for option, path in outputs:
         if path is None:
             continue
-        where, target = f"{path}: {option}", target_of(path)
-        if target in taken:
-            raise OutputError(f"{where}: found the file of {taken[target]}, expected another")
-        taken[target] = option
+        where = f"{path}: {option}"
         try:
+            target = target_of(path)
+            same = _identities(target)
+            for identity in same:
+                if identity in taken:
+                    owner = taken[identity]
+                    raise OutputError(f"{where}: found the file of {owner}, expected another")
+            taken |= dict.fromkeys(same, option)
             _refuse_special(target)
             part = part_of(target)
             part.touch(exist_ok=False)
@@ -78,6 +85,15 @@ def writing(path: Path, option: str) -> Iterator[None]:
 def folder_of(path: Path) -> Path:
     """The folder an output will stand in, whatever links lead there."""
     return target_of(path).parent
+
+
+def _identities(target: Path) -> list[object]:
+    """By what a file is known: its path, and its place on the disk if it is there (hard links)."""
+    try:
+        found = target.stat()
+    except OSError:
+        return [target]
+    return [target, (found.st_dev, found.st_ino)]
 
 
 def _refuse_special(target: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from casadi_ik.errors import printable
+from casadi_ik.errors import shortened
 
 PROGRAM = "casadi-ik"
 """What the command is called."""
@@ -15,6 +15,6 @@ def say(kind: str, text: str) -> None:
 
     Args:
         kind: What it is about: "error", "warning".
-        text: The rest; line breaks in it become spaces.
+        text: The rest; line breaks in it become spaces, and it is cut to a few hundred characters.
     """
-    print(f"{PROGRAM}: {kind}: {printable(' '.join(text.split()))}", file=sys.stderr)  # noqa: T201
+    print(f"{PROGRAM}: {kind}: {shortened(' '.join(text.split()))}", file=sys.stderr)  # noqa: T201

@@ -28,6 +28,12 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 
+LONGEST_HEADER = 10_064
+"""Bytes of the longest header that numpy reads, magic and padding included."""
+
+HARMLESS, MOST_UNPACKED = 2**28, 200
+"""Bytes that any member may unpack to, and beyond that how many times its own size."""
+
 _UNREADABLE = (
     ValueError,
     EOFError,
@@ -100,6 +106,8 @@ class TargetFile:
     @contextmanager
     def _opened(self) -> Iterator[zipfile.ZipFile]:
         try:
+            if self.path.exists() and not (self.path.is_file() or self.path.is_dir()):
+                raise InputError(f"{self.path}: no plain file, expected an npz file")
             if self.path.is_file() and not zipfile.is_zipfile(self.path):
                 raise InputError(
                     f"{self.path}: not an npz file, expected one with points and normals"
@@ -137,7 +145,22 @@ class TargetFile:
                 raise InputError(f"{where}: found shape {shape}, {expected}")
             if shape[0] == 0:
                 raise InputError(f"{where}: found no targets, {expected}")
+            if shape[0] < 0:
+                raise InputError(f"{where}: found shape {shape}, {expected}")
+            _check_size(where, archive.getinfo(name), shape[0] * self.fingers * 3 * dtype.itemsize)
             yield _Member(where, stream, shape[0], self.fingers, dtype, column_major)
+
+
+def _check_size(where: str, member: zipfile.ZipInfo, size: int) -> None:
+    """Whether a member holds what its shape says, and is no bomb."""
+    if not size <= member.file_size <= size + LONGEST_HEADER:
+        problem = "fewer" if member.file_size < size else "more"
+        raise InputError(f"{where}: damaged: {problem} bytes than its shape says")
+    if member.file_size > max(HARMLESS, MOST_UNPACKED * member.compress_size):
+        raise InputError(
+            f"{where}: unpacks to {member.file_size >> 20} MiB from {member.compress_size} bytes, "
+            f"expected at most {MOST_UNPACKED} times its size"
+        )
 
 
 class _Member:

@@ -1,7 +1,4 @@
-"""Reading description files: YAML with units in, checked data out.
-
-Numbers may carry a unit (``90 deg``, ``50 mm``, ``110 deg/s``); without one they are SI.
-"""
+"""Reading description files: YAML with units in, checked data out."""
 
 from __future__ import annotations
 
@@ -13,28 +10,26 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.units import (
+    QUANTITY,
+    UNITS,
+    Length,
+    Pure,
+    Turn,
+    check_units,
+    in_si,
+    item_name,
+    units_in,
+)
+from casadi_ik.files.yaml_text import parse_yaml
 
 T = TypeVar("T")
-Vector = tuple[float, float, float]
-
-UNITS = {
-    "": 1.0,
-    "rad": 1.0,
-    "deg": math.pi / 180.0,
-    "m": 1.0,
-    "cm": 1e-2,
-    "mm": 1e-3,
-    "rad/s": 1.0,
-    "deg/s": math.pi / 180.0,
-    "m/s": 1.0,
-    "mm/s": 1e-3,
-    "kg": 1.0,
-}
-_QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z/]*)\s*$")
+Vector = tuple[Pure, Pure, Pure]
+Point = tuple[Length, Length, Length]
+Angles = tuple[Turn, Turn, Turn]
 
 
 class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -44,8 +39,8 @@ class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Frame(Struct, frozen=True):
     """A pose relative to the parent: xyz [m], then rpy about the fixed axes [rad] (as URDF)."""
 
-    xyz: Vector = (0.0, 0.0, 0.0)
-    rpy: Vector = (0.0, 0.0, 0.0)
+    xyz: Point = (0.0, 0.0, 0.0)
+    rpy: Angles = (0.0, 0.0, 0.0)
 
 
 def frame_matrix(frame: Frame) -> NDArray[np.float64]:
@@ -64,50 +59,28 @@ def frame_matrix(frame: Frame) -> NDArray[np.float64]:
     return pose
 
 
-# libyaml where PyYAML has it: a tenth of the time.
-_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
-class _UniqueKeyLoader(_SafeLoader):
-    """YAML's own loader keeps the last of two equal keys without a word; this one objects."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, (str, int, float)) and key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key!r} appears twice", key_node.start_mark
-                )
-            if isinstance(key, (str, int, float)):
-                seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
 def read_yaml(path: Path) -> Any:
     """Parse a YAML file; quantities with units become SI floats.
 
     Raises:
-        DescriptionError: The file is missing, unreadable, not UTF-8 or not YAML.
+        DescriptionError: See `parse_yaml`.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise DescriptionError(f"{path}: cannot be read: {reason}") from error
-    try:
-        data = yaml.load(text, Loader=_UniqueKeyLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise DescriptionError(f"{path}{where}: not valid YAML: {problem}") from error
-    except (ValueError, RecursionError) as error:  # an impossible date, a bottomless nesting
-        raise DescriptionError(f"{path}: not valid YAML: {error}") from error
-    try:
-        return _with_units(data)
-    except RecursionError as error:
-        raise DescriptionError(f"{path}: nested too deeply, or holds itself") from error
+    return in_si(parse_yaml(path))
+
+
+def read(path: Path, type_: type[T]) -> tuple[T, dict[str, str]]:
+    """Read a YAML file of a type; every unit has to be of the dimension that its place has.
+
+    Returns:
+        The entry, and the units in the file by key ("home.spread": "deg").
+
+    Raises:
+        DescriptionError: With file, key, what was found and what was expected.
+    """
+    raw = parse_yaml(path)
+    entry = convert(in_si(raw), type_, path)
+    check_units(raw, type_, path)
+    return entry, units_in(raw)
 
 
 def convert(data: Any, type_: type[T], path: Path) -> T:
@@ -126,7 +99,7 @@ def convert(data: Any, type_: type[T], path: Path) -> T:
         if in_key:
             text = f"one of its keys is no text: {text}"
         elif isinstance(value, str):
-            match = _QUANTITY.match(value)
+            match = QUANTITY.match(value)
             if match and "float" in text:
                 text = f"unknown unit {match[2]!r}; known: {', '.join(filter(None, UNITS))}"
             text = f"found {value!r}, {text}"
@@ -150,7 +123,7 @@ def _numbers(value: Any, key: str) -> Iterator[tuple[str, float]]:
             yield from _numbers(item, f"{key}.{name}" if key else str(name))
     elif isinstance(value, list):
         for i, item in enumerate(value):
-            yield from _numbers(item, f"{key}[{i}]")
+            yield from _numbers(item, f"{key}[{item_name(value, i)}]")
     elif isinstance(value, float):
         yield key, value
 
@@ -175,7 +148,7 @@ def _culprit(data: Any, type_: type[Any], place: str, message: str) -> tuple[str
             key += f".{name}"
         else:
             step = int(part[1:-1]) if part.startswith("[") else part[1:]
-            key += part
+            key += f"[{item_name(value, step)}]" if isinstance(step, int) else part
         steps.append(step)
         value = value[step]
     return key.lstrip("."), value
@@ -196,15 +169,3 @@ def _replaced(data: Any, steps: list[Any], value: Any) -> Any:
     copy = data.copy()
     copy[steps[0]] = _replaced(data[steps[0]], steps[1:], value)
     return copy
-
-
-def _with_units(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _with_units(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_with_units(item) for item in value]
-    if isinstance(value, str):
-        match = _QUANTITY.match(value)
-        if match and match[2] in UNITS:
-            return float(match[1]) * UNITS[match[2]]
-    return value

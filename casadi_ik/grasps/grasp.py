@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
+from casadi_ik.grasps.arrays import real_array, unit_vectors
 from casadi_ik.grasps.tolerance import Tolerance
 from casadi_ik.grasps.vectors import MORE, fault, squared
 
@@ -117,6 +118,11 @@ class Grasp:
                 )
         object.__setattr__(self, "contacts", MappingProxyType(dict(self.contacts)))
 
+    def __reduce__(self) -> tuple[type[Grasp], tuple[Any, ...]]:
+        """Its fields; the mapping that cannot be changed is made anew."""
+        held = self.robot, self.name, self.object, self.object_pose, dict(self.posture)
+        return type(self), (dict(self.contacts), *held)
+
     def arrays(self, fingers: Sequence[str]) -> tuple[Array, Array]:
         """Points and normals in the order of the given fingers.
 
@@ -163,11 +169,10 @@ class Grasp:
 
 
 def _unit(value: Any, name: str) -> Array:
-    vector = _vector(value, name)
-    length = float(np.linalg.norm(vector))
-    if length < 1e-9:
-        raise InputError(f"{name}: found {vector.tolist()}, expected a direction, not zero")
-    return _frozen(vector / length)
+    vector, zero = unit_vectors(_vector(value, name))
+    if zero:
+        raise InputError(f"{name}: found [0.0, 0.0, 0.0], expected a direction, not zero")
+    return _frozen(vector)
 
 
 def _frozen(vector: Array) -> Array:
@@ -177,7 +182,7 @@ def _frozen(vector: Array) -> Array:
 
 def _vector(value: Any, name: str) -> Array:
     try:
-        array = np.array(value, dtype=float)
+        array = real_array(value)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: found {value!r}, expected three numbers") from error
     if array.shape != (3,):

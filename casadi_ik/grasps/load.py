@@ -9,8 +9,9 @@ from pathlib import Path
 import msgspec
 
 from casadi_ik.errors import DescriptionError, InputError
-from casadi_ik.files.reading import Frame, Struct, Vector, convert, frame_matrix, read_yaml
+from casadi_ik.files.reading import Frame, Point, Struct, Vector, frame_matrix, read
 from casadi_ik.files.shipped import resolve, shipped_names
+from casadi_ik.files.units import AnyValue, Length, Turn
 from casadi_ik.grasps.grasp import Contact, Grasp
 from casadi_ik.grasps.tolerance import Tolerance
 
@@ -18,14 +19,14 @@ from casadi_ik.grasps.tolerance import Tolerance
 class ToleranceEntry(Struct, frozen=True):
     """When a contact counts as reached; what is left out is as everywhere."""
 
-    position: float = Tolerance.position
-    angle: float = Tolerance.angle
+    position: Length = Tolerance.position
+    angle: Turn = Tolerance.angle
 
 
 class ContactEntry(Struct, frozen=True):
     """A finger's contact; ``direction`` stands alone, everything else needs a point."""
 
-    point: Vector | None = None
+    point: Point | None = None
     normal: Vector | None = None
     tolerance: ToleranceEntry | None = None
     tangent: Vector | None = None
@@ -48,7 +49,7 @@ class GraspFile(Struct, frozen=True):
     robot: str = ""
     description: str = ""
     object: ObjectEntry | None = None
-    posture: dict[str, float] = msgspec.field(default_factory=dict)
+    posture: dict[str, AnyValue] = msgspec.field(default_factory=dict)
 
 
 def load_grasp(name_or_path: str | Path) -> Grasp:
@@ -62,7 +63,7 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
         DescriptionError: The file is missing or malformed; the message names file and key.
     """
     path = resolve(name_or_path, "grasps")
-    entry = convert(read_yaml(path), GraspFile, path)
+    entry, _ = read(path, GraspFile)
     contacts: dict[str, Contact] = {}
     for finger, contact in entry.contacts.items():
         try:

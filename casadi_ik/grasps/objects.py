@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.reading import Struct, convert, read_yaml
+from casadi_ik.files.reading import Struct, read
 from casadi_ik.files.shipped import resolve
+from casadi_ik.files.units import Mass
 from casadi_ik.grasps.meshes import Mesh
 from casadi_ik.grasps.shapes import Shape
 
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 class MassEntry(Struct, frozen=True):
     """A mass [kg] and where it is from."""
 
-    value: float
+    value: Mass
     source: str
 
 
@@ -79,7 +80,7 @@ def load_object(name_or_path: str | Path) -> GraspObject:
         DescriptionError: The file is missing or malformed; the message names file and key.
     """
     path = resolve(name_or_path, "objects")
-    entry = convert(read_yaml(path), ObjectFile, path)
+    entry, _ = read(path, ObjectFile)
     problem = entry.shape.check()
     if problem:
         raise DescriptionError(f"{path}: shape.{problem}")

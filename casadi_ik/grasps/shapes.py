@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.files.units import Length
 from casadi_ik.grasps import meshes
 from casadi_ik.grasps.meshes import Mesh
 
@@ -69,7 +70,7 @@ class Primitive(
 class Sphere(Primitive, frozen=True, tag="sphere", kw_only=True):
     """A ball of a diameter [m]."""
 
-    diameter: float
+    diameter: Length
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         distance, normal = _polar(points, np.array([0.0, 0.0, 1.0]))
@@ -87,8 +88,8 @@ class Sphere(Primitive, frozen=True, tag="sphere", kw_only=True):
 class Cylinder(Primitive, frozen=True, tag="cylinder", kw_only=True):
     """A circular cylinder along z: diameter and height [m]."""
 
-    diameter: float
-    height: float
+    diameter: Length
+    height: Length
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         distance, normal = _polar(points[:, :2], np.array([1.0, 0.0]))
@@ -102,9 +103,9 @@ class Cylinder(Primitive, frozen=True, tag="cylinder", kw_only=True):
 class EllipticCylinder(Primitive, frozen=True, tag="elliptic-cylinder", kw_only=True):
     """An elliptic cylinder along z: full axes along x (width) and y (depth), height [m]."""
 
-    width: float
-    depth: float
-    height: float
+    width: Length
+    depth: Length
+    height: Length
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         distance, normal = _ellipse(points[:, :2], np.array([self.width / 2, self.depth / 2]))
@@ -119,7 +120,7 @@ class EllipticCylinder(Primitive, frozen=True, tag="elliptic-cylinder", kw_only=
 class Box(Primitive, frozen=True, tag="box", kw_only=True):
     """A box with edges along x, y and z: size [m]."""
 
-    size: tuple[float, float, float]
+    size: tuple[Length, Length, Length]
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         excess = np.abs(points) - np.asarray(self.size) / 2
@@ -153,9 +154,9 @@ class BentCapsule(Primitive, frozen=True, tag="bent-capsule", kw_only=True):
         width: Along y, from the convex side's middle to the tips [m].
     """
 
-    diameter: float
-    length: float
-    width: float
+    diameter: Length
+    length: Length
+    width: Length
 
     @property
     def radius(self) -> float:

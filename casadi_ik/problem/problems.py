@@ -10,16 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.grasps import Tolerance
+from casadi_ik.grasps.arrays import real_array, unit_vectors
 from casadi_ik.robots.description import RobotDescription
 
 Array = NDArray[np.float64]
 
 LIMITS = ("enforce", "ignore")
 """How joint limits are taken: as part of being solved, or not at all (the paper's reading)."""
-
-
-UNIT = 1e-15
-"""A normal whose length is so near to 1 has been normalised before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,9 +173,9 @@ def target_arrays(
     arrays = []
     for name, value in (("points", points), ("normals", normals)):
         try:
-            array = np.array(value, dtype=float)
+            array = real_array(value)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{name}: expected an array of numbers") from error
+            raise InputError(f"{name}: expected an array of numbers: {error}") from error
         if array.ndim != 3 or array.shape[1:] != (f, 3):
             raise InputError(f"{name}: found shape {array.shape}, expected (k, {f}, 3)")
         if np.isfinite(array).all():
@@ -193,18 +190,17 @@ def target_arrays(
     p, n = arrays
     if len(p) != len(n):
         raise InputError(f"points and normals: found {len(p)} and {len(n)} rows, expected as many")
-    length = np.sqrt(np.einsum("kfi,kfi->kf", n, n))
-    _refuse(length < 1e-9, first_row, "normals", "is zero, expected a direction")
+    # What is a unit normal stays as it is: a contact gives the same target here and in a `Grasp`.
+    unit, zero = unit_vectors(n)
+    _refuse(zero, first_row, "normals", "is zero, expected a direction")
     free_point = np.isnan(p[..., 0])
-    lone = free_point & ~np.isnan(length)
+    lone = free_point & ~np.isnan(n[..., 0])
     _refuse(lone, first_row, "normals", "is given for a finger without a point")
     empty = np.flatnonzero(free_point.all(axis=1))
     if len(empty):
         row = first_row + int(empty[0])
         raise RowError(f"points: row {row} has no contact at all", row)
-    # What is a unit normal stays as it is: a contact gives the same target here and in a `Grasp`.
-    length[np.abs(length - 1) < UNIT] = 1.0
-    return p, n / length[..., None]
+    return p, unit
 
 
 def _refuse(bad: NDArray[np.bool_], first_row: int, name: str, problem: str) -> None:

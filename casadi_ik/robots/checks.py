@@ -8,6 +8,9 @@ from pathlib import Path
 from casadi_ik.errors import DescriptionError
 from casadi_ik.robots.description import Actuator, Joint
 
+LONGEST_NAME = 100
+"""Characters of a name."""
+
 
 def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: Path) -> None:
     """Whether every coupling ends at an actuator, and every actuator moves something.
@@ -75,9 +78,18 @@ def unique(names: Iterable[str], where: str) -> None:
     """Refuse a name that appears twice."""
     seen: set[str] = set()
     for name in names:
+        usable(name, where)
         if name in seen:
             raise DescriptionError(f"{where}: {name!r} appears twice")
         seen.add(name)
+
+
+def usable(name: str, where: str) -> None:
+    """Refuse a name that is empty, or too long to be read in a table or a file's name."""
+    if not 0 < len(name) <= LONGEST_NAME:
+        raise DescriptionError(
+            f"{where}: found a name of {len(name)} characters, expected 1 to {LONGEST_NAME}"
+        )
 
 
 def known_link(link: str, root: str, joints: list[Joint], where: str) -> str:

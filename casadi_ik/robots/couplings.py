@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.units import AnyValue, Length, Pure, Turn
 
 Array = NDArray[np.float64]
 
@@ -109,8 +110,8 @@ class Linear(CouplingKind, frozen=True, tag="linear"):
         offset: [rad] or [m].
     """
 
-    ratio: float = 1.0
-    offset: float = 0.0
+    ratio: Pure = 1.0
+    offset: AnyValue = 0.0
 
     def check(self, where: str) -> None:
         """Whether the joint moves at all."""
@@ -138,9 +139,9 @@ class LeadScrew(CouplingKind, frozen=True, tag="lead-screw"):
         theta_0: Triangle angle at which the joint reads zero [rad].
     """
 
-    b: float
-    c: float
-    theta_0: float = 0.0
+    b: Length
+    c: Length
+    theta_0: Turn = 0.0
 
     source_unit: ClassVar[str] = "m"
     lengths: ClassVar[tuple[str, ...]] = ("b", "c")
@@ -181,12 +182,12 @@ class FourBar(CouplingKind, frozen=True, tag="four-bar"):
             the loop to the last digit.
     """
 
-    p: float
-    q: float
-    g: float
-    h: float
-    phi_0: float
-    theta_3_0: float
+    p: Length
+    q: Length
+    g: Length
+    h: Length
+    phi_0: Turn
+    theta_3_0: Turn
 
     source_unit: ClassVar[str] = "rad"
     lengths: ClassVar[tuple[str, ...]] = ("p", "q", "g", "h")

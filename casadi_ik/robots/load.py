@@ -12,8 +12,8 @@ from casadi_ik.files.reading import (
     Frame,
     T,
     Vector,
-    convert,
     frame_matrix,
+    read,
     read_yaml,
     refuse_non_finite,
 )
@@ -24,6 +24,7 @@ from casadi_ik.robots.checks import (
     known_source,
     positive,
     unique,
+    usable,
 )
 from casadi_ik.robots.description import Actuator, Array, Finger, Joint, RobotDescription
 from casadi_ik.robots.motor_ranges import motor_ranges
@@ -55,7 +56,8 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
         DescriptionError: A file is missing or malformed; the message names file and key.
     """
     path = resolve(name_or_path, "arm_hands")
-    top = _read(path, ArmHandFile)
+    top, units = _read(path, ArmHandFile)
+    usable(top.name, f"{path}: name")
     hand_path, hand = _part(top.hand, "hand", HandFile, path)
     joints: list[Joint] = []
     actuators: list[Actuator] = []
@@ -92,15 +94,14 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
         thumb=top.thumb,
         palm_link=palm_link,
         palm_placement=_freeze(_pose(hand.palm)),
-        home=_home(top.home, actuators, joints, path),
+        home=_home(top.home, units, actuators, joints, path),
         sources=sources,
     )
 
 
-def _read(path: Path, type_: type[T]) -> T:
-    data = read_yaml(path)
-    refuse_non_finite(data, path)
-    return convert(data, type_, path)
+def _read(path: Path, type_: type[T]) -> tuple[T, dict[str, str]]:
+    refuse_non_finite(read_yaml(path), path)
+    return read(path, type_)
 
 
 def _part(name_or_path: str | T, key: str, type_: type[T], beside: Path) -> tuple[Path, T]:
@@ -111,7 +112,7 @@ def _part(name_or_path: str | T, key: str, type_: type[T], beside: Path) -> tupl
         path = resolve(name_or_path, f"{key}s", beside=beside)
     except (UnknownNameError, DescriptionError) as error:
         raise DescriptionError(f"{beside}: {key}: {error}") from error
-    return path, _read(path, type_)
+    return path, _read(path, type_)[0]
 
 
 def _told_apart(new: dict[str, str], known: dict[str, str], owner: str) -> dict[str, str]:
@@ -293,7 +294,11 @@ def _tangent(given: Vector | None, normal: Array, where: str) -> Array:
 
 
 def _home(
-    home: dict[str, float], actuators: list[Actuator], joints: list[Joint], path: Path
+    home: dict[str, float],
+    units: dict[str, str],
+    actuators: list[Actuator],
+    joints: list[Joint],
+    path: Path,
 ) -> Array:
     """The home position; where the file gives none, the position nearest to zero."""
     names = [actuator.name for actuator in actuators]
@@ -301,6 +306,12 @@ def _home(
         if name not in names:
             raise DescriptionError(
                 f"{path}: home.{name}: no such actuator; known: {', '.join(names)}"
+            )
+    for actuator in actuators:
+        unit = units.get(f"home.{actuator.name}", actuator.unit)
+        if unit != actuator.unit:
+            raise DescriptionError(
+                f"{path}: home.{actuator.name}: found a number in {unit}, expected {actuator.unit}"
             )
     asked = np.array([home.get(name, 0.0) for name in names])
     movable = [joint for joint in joints if joint.type != "fixed"]

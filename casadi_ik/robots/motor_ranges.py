@@ -116,20 +116,21 @@ def _narrowed(moved: list[Follower], actuator: Actuator, near: float) -> tuple[f
         return worst
 
     inside = min(max(near, actuator.lower), actuator.upper)
-    q = np.unique([*np.linspace(actuator.lower, actuator.upper, GRID), inside])
+    grid: Array = np.append(np.linspace(actuator.lower, actuator.upper, GRID), inside)
+    grid.sort()
     for _ in range(ZOOMS):
-        q = _finer(q, excess(q))
-    allowed = excess(q) <= 0
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], allowed, [False]])))
+        grid = _finer(grid, excess(grid))
+    edges = np.flatnonzero(np.diff(excess(grid) <= 0, prepend=False, append=False)).tolist()
     runs = [(first, last - 1) for first, last in zip(edges[::2], edges[1::2], strict=True)]
     if not runs:
         return None
+    q: list[float] = grid.tolist()
     first, last = max(
         runs, key=lambda run: (q[run[0]] <= inside <= q[run[1]], q[run[1]] - q[run[0]])
     )
     low = q[0] if first == 0 else _edge(excess, q[first - 1], q[first])
     high = q[-1] if last == len(q) - 1 else _edge(excess, q[last + 1], q[last])
-    return (float(low), float(high)) if low < high else None
+    return (low, high) if low < high else None
 
 
 def _finer(q: Array, excess: Array) -> Array:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from casadi_ik.files.reading import Frame, Struct, Vector
+from casadi_ik.files.reading import Angles, Frame, Point, Struct, Vector
+from casadi_ik.files.units import AnyValue, JointRate, JointValue
 from casadi_ik.robots.couplings import Coupling
 
 
@@ -15,19 +16,19 @@ class JointEntry(Struct, frozen=True):
     parent: str
     child: str
     axis: Vector
-    limits: tuple[float, float]
+    limits: tuple[JointValue, JointValue]
     source: str
     type: str = "revolute"
     origin: Frame = Frame()
-    velocity: float | None = None
+    velocity: JointRate | None = None
     coupling: Coupling | None = None
 
 
 class ActuatorEntry(Struct, frozen=True):
     """A motor; limits and velocity are the joint's where it drives a joint of the same name."""
 
-    limits: tuple[float, float] | None = None
-    velocity: float | None = None
+    limits: tuple[JointValue, JointValue] | None = None
+    velocity: JointRate | None = None
     unit: str = "rad"
     source: str = ""
 
@@ -36,8 +37,8 @@ class LinkFrame(Struct, frozen=True):
     """A frame on a link."""
 
     link: str
-    xyz: Vector = (0.0, 0.0, 0.0)
-    rpy: Vector = (0.0, 0.0, 0.0)
+    xyz: Point = (0.0, 0.0, 0.0)
+    rpy: Angles = (0.0, 0.0, 0.0)
     source: str = ""
 
 
@@ -51,8 +52,8 @@ class ContactEntry(Struct, frozen=True):
     link: str
     normal: Vector
     source: str
-    xyz: Vector = (0.0, 0.0, 0.0)
-    rpy: Vector = (0.0, 0.0, 0.0)
+    xyz: Point = (0.0, 0.0, 0.0)
+    rpy: Angles = (0.0, 0.0, 0.0)
     tangent: Vector | None = None
 
 
@@ -92,6 +93,6 @@ class ArmHandFile(Struct, frozen=True):
     fingers: list[str]
     arm: str | None = None
     mount: Frame = Frame()
-    home: dict[str, float] = msgspec.field(default_factory=dict)
+    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     sources: dict[str, str] = msgspec.field(default_factory=dict)
     description: str = ""

@@ -12,6 +12,8 @@ from casadi_ik.symbolic import dual_quaternion as dq
 
 Array = NDArray[np.float64]
 
+SLIDERS = "sliders in steps of 0.1 mm"
+
 
 def translation(target: dict[str, Array]) -> Array:
     """Point of a target pose [m]."""
@@ -41,10 +43,15 @@ def finish(
     names: str = "yz",
     frame: str = "hand base",
 ) -> None:
-    """Goal, labels and legend of a figure."""
+    """Goal, titles, labels and legend of a figure."""
     goal = 1e3 * translation({"pose": pose})
     path.plot(*goal[list(axes)], "k+", ms=12, label="goal")
     path.set(xlabel=f"{names[0]} [mm], {frame}", ylabel=f"{names[1]} [mm]", aspect="equal")
     path.set_adjustable("datalim")
+    path.set_title("Path of the fingertip, a dot per step", size=10, loc="left")
     path.legend(frameon=False, fontsize=8)
-    norms.set(xlabel="step", ylabel="screw error norm", ylim=(1e-9, 5))
+    norms.set_title("How the error falls", size=10, loc="left")
+    norms.set(xlabel="step", ylabel="screw error norm, eq. (17)", ylim=(1e-9, 5))
+    for style, label in (("-", "exact sliders"), (":", SLIDERS)):
+        norms.plot([], [], style, color="black", label=label)
+    norms.legend(frameon=False, fontsize=8)

@@ -76,6 +76,8 @@ def draw_iterations(table: pl.DataFrame, path: Path) -> None:
         panel.set(yscale="log", ylim=(0.02, 110))
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("share of the solved cases [%]")
+    panels[0].plot([], [], color="black", ls="--", lw=1, label="mean printed in the paper")
+    panels[0].legend(fontsize="small")
     panels[1].legend(fontsize="small")
     _save(figure, path)
 

@@ -22,6 +22,8 @@ try:
     from runner.run import run
     from runner.study import Setting, Study, TargetSet
 except ModuleNotFoundError as error:
+    if error.name is None or error.name.startswith(("casadi_ik", "runner")):
+        raise
     raise MissingExtraError(
         f"studies need {error.name}, which is not installed: pip install casadi-ik[studies]"
     ) from error

@@ -36,7 +36,6 @@ def test_contact_normalises_and_freezes() -> None:
     ("make", "says"),
     [
         (lambda: Contact([0, 0, 0], [0, 0, 0]), "normal: .*not zero"),
-        (lambda: Contact([0, 0, 0], [0, 1e-12, 0]), "normal: .*not zero"),
         (lambda: Contact([0, np.nan, 0]), "point: .*finite"),
         (lambda: Contact([0, 0, 0], [np.inf, 0, 0]), "normal: .*finite"),
         (lambda: Contact([0, 0]), r"point: found shape \(2,\), expected \(3,\)"),

@@ -137,3 +137,24 @@ def test_evenly(dimensions):
     counts = np.array([np.histogram(column, 10, (0, 1))[0] for column in points.T])
     assert np.abs(counts - 100).max() <= 25
     np.testing.assert_array_equal(points[:10], evenly(10, dimensions))
+
+
+def test_varied_postures_differ_and_begin_with_the_nearest(robot, table, rng):
+    points, normals = robot.contacts(robot.random(rng, 300))
+    nearest = table.nearest(points, normals, 1)
+    varied = table.varied(points, normals, 8, 48, 0.2)
+    np.testing.assert_array_equal(varied[:, 0], nearest[:, 0])
+    places = varied / (robot.upper - robot.lower)[list(HAND)]
+    apart = np.sqrt(np.mean((places[:, :, None] - places[:, None]) ** 2, axis=3))
+    assert np.median(apart[:, *np.triu_indices(8, 1)].min(axis=1)) >= 0.2
+    few = table.varied(points, normals, 8, 8, 0.9)
+    np.testing.assert_array_equal(few[:, 0], nearest[:, 0])
+    for row, alike in zip(few, table.nearest(points, normals, 8), strict=True):
+        assert {tuple(posture) for posture in row} == {tuple(posture) for posture in alike}
+
+
+def test_a_table_beyond_limits(robot):
+    bounds = robot.lower - 0.5, robot.upper + 0.5
+    table = PostureTable(robot, HAND, 256, bounds=bounds)
+    assert (table.postures < robot.lower[7:]).any(axis=0).all()
+    assert (table.postures > robot.upper[7:]).any(axis=0).all()

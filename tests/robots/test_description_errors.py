@@ -16,7 +16,7 @@ PALM = "palm: {link: bh_base, xyz: [0, 0, 80 mm], source: palm}"
 SHIPPED = {
     # name: (file, text, its replacement, the key, what is said)
     "unknown key, robot": ("robot", "thumb: thumb", "tumb: thumb", "(top level)", "tumb"),
-    "unknown key, joint": ("arm", "axis:", "achsis:", "joints[0]", "achsis"),
+    "unknown key, joint": ("arm", "axis:", "achsis:", "joints[lwr_joint_1]", "achsis"),
     "unknown key, contact": ("hand", "normal:", "nrmal:", "fingers.thumb", "nrmal"),
     "missing key": ("hand", "root: bh_base", "", "(top level)", "`root`"),
     "missing finger": (
@@ -103,7 +103,7 @@ SHIPPED = {
         "hand",
         COUPLED,
         "coupling: {kind: wire, of: bh_spread}",
-        "joints[2].coupling.kind",
+        "joints[bh_finger_2_spread].coupling.kind",
         "'wire'",
     ),
     "coupling ratio": (
@@ -190,7 +190,7 @@ SHIPPED = {
         "joint 'lwr_joint_1': velocity",
         "expected > 0",
     ),
-    "missing source": ("arm", ", source: centro}", "}", "joints[0]", "`source`"),
+    "missing source": ("arm", ", source: centro}", "}", "joints[lwr_joint_1]", "`source`"),
     "empty source": ("arm", "source: centro", "source: ''", "joint 'lwr_joint_1': source", "empty"),
     "unknown source": (
         "arm",
@@ -245,10 +245,22 @@ SHIPPED = {
         "home.bh_spread",
         "wide",
     ),
-    "unknown unit": ("arm", "110 mm", "110 inch", "joints[0].origin.xyz[2]", "unknown unit 'inch'"),
-    "not finite": ("arm", "110 mm", ".nan", "joints[0].origin.xyz[2]", "finite"),
+    "unknown unit": (
+        "arm",
+        "110 mm",
+        "110 inch",
+        "joints[lwr_joint_1].origin.xyz[2]",
+        "unknown unit 'inch'",
+    ),
+    "not finite": ("arm", "110 mm", ".nan", "joints[lwr_joint_1].origin.xyz[2]", "finite"),
     "wrong type": ("hand", "joints:\n", "joints: 3\nspare:\n", "joints", "expected `array`"),
-    "wrong length": ("arm", "limits: [-170 deg, 170 deg]", "limits: [1]", "joints[0].limits", "2"),
+    "wrong length": (
+        "arm",
+        "limits: [-170 deg, 170 deg]",
+        "limits: [1]",
+        "joints[lwr_joint_1].limits",
+        "2",
+    ),
     "wrong type in contact": (
         "hand",
         "normal: [0, 1, 0]",
@@ -258,7 +270,7 @@ SHIPPED = {
     ),
     "unknown hand": ("robot", "hand: hand.yaml", "hand: fist", "hand", "no shipped hand is called"),
     "missing arm file": ("robot", "arm: arm.yaml", "arm: gone.yaml", "arm", "no such file"),
-    "frame key": ("arm", "origin: {xyz", "origin: {zyx", "joints[0].origin", "zyx"),
+    "frame key": ("arm", "origin: {xyz", "origin: {zyx", "joints[lwr_joint_1].origin", "zyx"),
 }
 
 

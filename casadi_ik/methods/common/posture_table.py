@@ -8,12 +8,16 @@ stage starts from postures that nearly fit, wherever the palm may be.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.kernels import LookupKernel
 from casadi_ik.methods.common.contact_shape import contact_shape
 from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.problem.problems import Array
+
+CHUNK = 256
+"""Targets whose postures are compared with each other at once."""
 
 
 class PostureTable:
@@ -32,6 +36,7 @@ class PostureTable:
         at_limits: float = 0.0,
         pull: float = 0.0,
         compiled: bool = True,
+        bounds: tuple[Array, Array] | None = None,
     ) -> None:
         """Spread the postures and note the shape of their contacts.
 
@@ -41,18 +46,21 @@ class PostureTable:
             size: Number of postures.
             at_limits: Part of the range [0, 1) that is moved to the limits, half to either: hands
                 stand at their limits more often than an even spread would.
-            pull: How much the distance from a given posture counts besides the contacts' shape:
+            pull: How much the distance from a given posture counts along with the contacts' shape:
                 different hands may have contacts of nearly the same shape.
             compiled: Whether lookups run in compiled code.
+            bounds: (n,) lower and upper, the robot's limits unless given.
         """
         columns = list(hand)
+        lower, upper = (ends[columns] for ends in bounds or (robot.lower, robot.upper))
         q = np.tile(robot.home, (size, 1))
         spread = (evenly(size, len(columns)) - 0.5) / (1 - at_limits) + 0.5
         spread = np.clip(spread, 0.0, 1.0)
-        q[:, columns] = robot.lower[columns] + spread * (robot.upper - robot.lower)[columns]
+        q[:, columns] = lower + spread * (upper - lower)
         self.postures = q[:, columns]
         self._pulled = pull > 0
-        half_ranges = (robot.upper - robot.lower)[columns] / 2
+        self._ranges = upper - lower
+        half_ranges = self._ranges / 2
         scales = np.sqrt(pull / len(columns)) / half_ranges
         key = contact_shape(len(robot.fingers), scales if self._pulled else ())
         contacts = robot.contacts(q)
@@ -75,3 +83,45 @@ class PostureTable:
         """
         asked = (points, normals, near) if self._pulled else (points, normals)
         return self.postures[self.lookup(count, *asked)]
+
+    def varied(self, points: Array, normals: Array, count: int, pool: int, similar: float) -> Array:
+        """The postures shaped most like the targets of those that differ from each other.
+
+        The nearest comes first; then always the nearest that is not like one taken before. What
+        is left over follows where there are no others.
+
+        Args:
+            points: (k, f, 3) [m], NaN where free.
+            normals: (k, f, 3), NaN where free.
+            count: How many, at most the pool.
+            pool: From how many of the nearest they are taken.
+            similar: Root mean square of the motors' differences, of their ranges, below which
+                postures are alike.
+
+        Returns:
+            (k, count, hand) postures.
+        """
+        pool = min(max(pool, count), len(self.postures))
+        parts = [
+            self._chosen(
+                self.lookup(pool, points[i : i + CHUNK], normals[i : i + CHUNK]), count, similar
+            )
+            for i in range(0, len(points), CHUNK)
+        ]
+        return np.concatenate(parts) if parts else self.nearest(points, normals, count)
+
+    def _chosen(self, rows: NDArray[np.int64], count: int, similar: float) -> Array:
+        """Of rows (k, pool) in order of nearness those that differ, (k, count, hand)."""
+        places = self.postures[rows] / np.where(self._ranges > 0, self._ranges, 1.0)
+        every = np.arange(len(rows))
+        closest = np.full(rows.shape, np.inf)
+        taken = np.zeros(rows.shape, dtype=bool)
+        chosen = np.empty((len(rows), count), dtype=np.intp)
+        for place in range(count):
+            # The first that differs; where none is left, the first that is not taken.
+            rank = taken * 2 + (closest < similar)
+            chosen[:, place] = pick = rank.argmin(axis=1)
+            taken[every, pick] = True
+            apart = places - places[every, pick][:, None]
+            np.minimum(closest, np.sqrt(np.mean(apart * apart, axis=2)), out=closest)
+        return self.postures[rows[every[:, None], chosen]]

@@ -7,15 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
+from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.methods.common.looped_method import Counts, LoopedMethod, Start
-from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.methods.hand_first.restarts import LATER, VALLEYS, Restarts
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts.kinds import Kinds, usual
@@ -29,9 +29,6 @@ from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
 
-AT_LIMITS = 0.5
-"""Part of the range that the wide table moves to the limits."""
-
 CARRIED = ("passed", "near", "balanced", "best_cost", "best_q", "counts")
 """What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
 were balanced in vain, and what was found."""
@@ -40,7 +37,7 @@ were balanced in vain, and what was found."""
 class HandFirstMethod(LoopedMethod):
     """`hand-first`: contacts fix palm and hand, the arm follows in closed form.
 
-    A round takes the next best hand postures of a table; nearly all targets need one round only.
+    A round takes other hand postures, see `Restarts`; nearly all targets need one round only.
 
     Attributes:
         step: Its step for this robot.
@@ -61,7 +58,7 @@ class HandFirstMethod(LoopedMethod):
         """Recognise the arm and lay out the step; point and normal if no kinds are given."""
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
-        self.rounds = options.rounds
+        self.rounds = options.rounds + LATER
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(robot, _closed_form(robot), options.candidates, self._kinds)
         self._singles: list[FirstRound] = []
@@ -71,18 +68,9 @@ class HandFirstMethod(LoopedMethod):
         return self.step.graph()
 
     @cached_property
-    def table(self) -> PostureTable:
-        """The hand postures that targets are compared with."""
-        return self._table(self.options.table)
-
-    @cached_property
-    def wide_table(self) -> PostureTable:
-        """Many more postures, a good part of them at limits, for targets the first round misses."""
-        return self._table(self.options.wide_table, AT_LIMITS)
-
-    def _table(self, size: int, at_limits: float = 0.0) -> PostureTable:
-        hand = self.step.layouts.hand
-        return PostureTable(ArmHand(self.robot), hand, size, at_limits, compiled=self._compiled)
+    def hands(self) -> Restarts:
+        """The hand postures that rounds begin from."""
+        return Restarts(self.robot, self.step.layouts.hand, self.options, self._compiled)
 
     def for_kinds(self, kinds: Kinds) -> HandFirstMethod:
         """The same for contacts of other kinds."""
@@ -92,7 +80,7 @@ class HandFirstMethod(LoopedMethod):
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
-        _ = self.kernel, self.table, self._beginning
+        _ = self.kernel, self.hands.table, self._beginning
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:
@@ -103,7 +91,7 @@ class HandFirstMethod(LoopedMethod):
         self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
     ) -> Start:
         """Start with the hand postures of the round; what was found before is kept."""
-        states, parameters = self.rows(problems, q0, self.postures(problems, number))
+        states, parameters = self._round(problems, q0, number, last)
         if last is not None:
             layout = self.step.layouts.state
             for name in CARRIED:
@@ -133,7 +121,7 @@ class HandFirstMethod(LoopedMethod):
         try:
             first = self._singles.pop()
         except IndexError:
-            first = FirstRound(self.table, self._beginning, self.kernel, self.step.layouts)
+            first = FirstRound(self.hands.table, self._beginning, self.kernel, self.step.layouts)
         found = first(problems, q0, self._terms(problems), self.max_iterations)
         self._singles.append(first)
         return found
@@ -162,15 +150,31 @@ class HandFirstMethod(LoopedMethod):
         return self.kernel.run(states, parameters, self.max_iterations, trace)
 
     def postures(self, problems: Problems, number: int) -> Array:
-        """Candidates (k, candidates, hand) of a round: first from the table, then the wide one.
+        """Candidates (k, candidates, hand) of a round whose postures look like the targets.
 
         Args:
             problems: k targets.
-            number: The round.
+            number: The round, below `options.rounds`.
         """
-        count = self.options.candidates
-        table, wanted = (self.wide_table, number * count) if number else (self.table, count)
-        return table.nearest(problems.points, problems.normals, wanted)[:, -count:]
+        return self.hands.from_tables(problems, number)
+
+    def _round(self, problems: Problems, q0: Array, number: int, last: Array | None) -> Start:
+        """What a round begins with, the memory of those before aside."""
+        later, layouts = number - self.options.rounds, self.step.layouts
+        if later < 0 or last is None:
+            return self.rows(problems, q0, self.postures(problems, number))
+        if later < VALLEYS:
+            best = last[:, layouts.state.slice("best_q")]
+            return self.rows(problems, q0, self.hands.along_valley(problems, best, later))
+        anywhere = self.hands.anywhere(problems, later - VALLEYS)
+        states, parameters = self.rows(problems, q0, anywhere[None][:, :, list(layouts.hand)])
+        # The first of them begins as a whole: what stands in the way may be arm and hand together.
+        lower, upper = (parameters[:, layouts.parameters.slice(end)] for end in ("lower", "upper"))
+        states[:, layouts.state.slice("q")] = np.clip(anywhere[0], lower, upper)
+        states[:, layouts.state.slice("phase")] = float(Phase.REFINEMENT)
+        for name, value in fresh_fit().items():
+            states[:, layouts.state.slice(name)] = value
+        return states, parameters
 
     def _terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms."""

@@ -1,0 +1,209 @@
+"""Where the rounds of hand-first begin: hand postures, each round's of another kind.
+
+The first round compares the target with a table of postures. The next ones compare it with a table
+many times as large, half of it at limits, and take only postures that differ from each other: the
+neighbours of one that failed fail as well. What all of them miss is one of two things. Its fit has
+come to rest in a long valley, where the contacts hardly move while the hand does: so the next
+round begins along it, to either side of the best fit so far. Or no table holds its like: then
+postures drawn from anywhere follow, and a whole configuration of arm and hand.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.methods.common.even_spread import evenly
+from casadi_ik.methods.common.posture_table import PostureTable
+from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.robots.description import RobotDescription
+
+AT_LIMITS = 0.5
+"""Part of the range that the wide table moves to the limits."""
+
+SIMILAR = 0.25
+"""Postures nearer to each other than this [root mean square, of the motors' ranges] are alike."""
+
+POOL = 3
+"""From so many times as many postures as are wanted those that differ are taken."""
+
+STRIDES = (
+    0.05,
+    -0.05,
+    0.1,
+    -0.1,
+    0.2,
+    -0.2,
+    0.4,
+    -0.4,
+    0.03,
+    -0.03,
+    0.15,
+    -0.15,
+    0.3,
+    -0.3,
+    0.8,
+    -0.8,
+)
+"""How far along a valley a hand begins anew [rad of the motor that moves most], round by round."""
+
+AT_END = 1e-6
+"""A motor this near to a limit [rad or m] stays there while its hand moves along a valley."""
+
+HELD = 1e6
+"""What holds a motor at its limit, in a matrix of squared slopes of order one."""
+
+NUDGE = 1e-6
+"""Difference [rad or m] from which slopes are taken."""
+
+VALLEYS = 3
+"""Rounds along the directions in which the contacts move least, after those of the tables."""
+
+LATER = VALLEYS + 2
+"""With two more from anywhere: rounds after those of the tables."""
+
+
+class Restarts:
+    """The hand postures that a robot's solves begin from."""
+
+    def __init__(
+        self,
+        robot: RobotDescription,
+        hand: tuple[int, ...],
+        options: HandFirstParameters,
+        compiled: bool,
+    ) -> None:
+        """Remember what the tables are made of; they are filled when first asked.
+
+        Args:
+            robot: The description.
+            hand: Positions in q of the hand's actuators.
+            options: How many postures there are.
+            compiled: Whether lookups run in compiled code.
+        """
+        self._robot = ArmHand(robot)
+        self._hand = list(hand)
+        self._options = options
+        self._compiled = compiled
+
+    @cached_property
+    def table(self) -> PostureTable:
+        """The hand postures of the first round."""
+        return self._table(self._options.table)
+
+    @cached_property
+    def wide_table(self) -> PostureTable:
+        """Many more postures, a good part of them at limits."""
+        return self._table(self._options.wide_table, AT_LIMITS)
+
+    @cached_property
+    def free_table(self) -> PostureTable:
+        """As many postures, limits ignored."""
+        return self._table(self._options.wide_table, bounds=self._everywhere)
+
+    def from_tables(self, problems: Problems, number: int) -> Array:
+        """Postures (k, candidates, hand) of a round whose postures look like the targets.
+
+        Args:
+            problems: k targets.
+            number: The round, from 0.
+        """
+        count = self._options.candidates
+        points, normals = problems.points, problems.normals
+        if not number:
+            return self.table.nearest(points, normals, count)
+        # Where limits are ignored a hand may stand on either side of them.
+        free = not problems.enforce_limits and number % 2
+        table = self.free_table if free else self.wide_table
+        wanted = number * count
+        return table.varied(points, normals, wanted, POOL * wanted, SIMILAR)[:, -count:]
+
+    def along_valley(self, problems: Problems, q: Array, which: int) -> Array:
+        """Postures (k, candidates, hand) to either side of a fit that came to rest.
+
+        Args:
+            problems: k targets.
+            q: (k, n) where it did.
+            which: The round. Even ones keep motors at a limit there; odd ones do not.
+        """
+        size = self._size
+        columns = self._hand
+        rigid, slopes = self._slopes(q, problems)
+        if self._robot.description.arm_actuators:
+            # The palm follows as well as it can: what is left of a motor's motion counts.
+            base = np.linalg.qr(rigid)[0]
+            slopes = slopes - base @ (base.transpose(0, 2, 1) @ slopes)
+        squares = slopes.transpose(0, 2, 1) @ slopes
+        if which % 2 == 0:
+            ends = np.minimum(q - self._robot.lower, self._robot.upper - q)[:, columns]
+            held = ends < AT_END
+            squares += np.eye(len(columns)) * (held * HELD)[:, None]
+        chosen = np.linalg.eigh(squares)[1][:, :, 0]
+        chosen = chosen / np.abs(chosen).max(axis=1, keepdims=True)
+        first = (which + 1) // 2 * self._options.candidates
+        strides = np.resize(np.roll(STRIDES, -first), self._options.candidates)
+        return q[:, None, columns] + strides[:, None] * (chosen * size)[:, None]
+
+    def anywhere(self, problems: Problems, number: int) -> Array:
+        """Whole configurations (candidates, n), evenly spread, other ones in every round."""
+        lower, upper = self._everywhere
+        if problems.enforce_limits:
+            lower, upper = self._robot.lower, self._robot.upper
+        count = self._options.candidates
+        spread = evenly((number + 1) * count, len(lower))[-count:]
+        return lower + spread * (upper - lower)
+
+    def _slopes(self, q: Array, problems: Problems) -> tuple[Array, Array]:
+        """How the contacts move with the palm (k, 6 f, 6) and with the hand (k, 6 f, h)."""
+        k, size, columns = len(q), self._size, self._hand
+        moved = np.repeat(q[:, None], len(columns) + 1, axis=1)
+        for place, column in enumerate(columns):
+            moved[:, place + 1, column] += NUDGE * size[place]
+        points, normals = self._robot.contacts(moved.reshape(-1, q.shape[1]))
+        shape = (k, len(columns) + 1, *points.shape[1:])
+        points = points.reshape(shape) / LENGTH
+        normals = normals.reshape(shape)
+        counts = ~np.isnan(np.stack([problems.points, problems.normals], axis=1))
+        both = np.stack([points, normals], axis=2)
+        slopes = (both[:, 1:] - both[:, :1]) / NUDGE * counts[:, None]
+        turns = np.cross(np.eye(3)[:, None, None], both[:, None, 0]) * counts[:, None]
+        shifts = np.zeros((k, 3, *counts.shape[1:]))
+        shifts[:, np.arange(3), 0, :, np.arange(3)] = 1
+        rigid = np.concatenate([shifts * counts[:, None], turns], axis=1)
+        return _as_columns(rigid), _as_columns(slopes)
+
+    @property
+    def _size(self) -> Array:
+        """(hand,) a radian of every motor, or half the range of a slider [m]."""
+        units = [self._robot.description.actuators[column].unit for column in self._hand]
+        ranges = (self._robot.upper - self._robot.lower)[self._hand]
+        return np.where([unit == "rad" for unit in units], 1.0, ranges / 2)
+
+    @property
+    def _everywhere(self) -> tuple[Array, Array]:
+        """(n,) bounds where limits are ignored: a full turn, or what the mechanisms permit."""
+        description = self._robot.description
+        middle = (self._robot.lower + self._robot.upper) / 2
+        far = np.where([a.unit == "rad" for a in description.actuators], np.pi, 0.0)
+        lower = np.minimum(middle - far, self._robot.lower)
+        upper = np.maximum(middle + far, self._robot.upper)
+        ends = description.mechanical
+        return np.maximum(lower, ends[0]), np.minimum(upper, ends[1])
+
+    def _table(
+        self, size: int, at_limits: float = 0.0, bounds: tuple[Array, Array] | None = None
+    ) -> PostureTable:
+        hand = tuple(self._hand)
+        return PostureTable(
+            self._robot, hand, size, at_limits, compiled=self._compiled, bounds=bounds
+        )
+
+
+def _as_columns(motions: Array) -> Array:
+    """(k, m, 2, f, 3) motions of all contacts as matrices (k, 6 f, m)."""
+    k, m = motions.shape[:2]
+    return motions.reshape(k, m, -1).transpose(0, 2, 1)

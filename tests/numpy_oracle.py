@@ -1,0 +1,90 @@
+"""Forward kinematics and limits in numpy alone, many configurations at once.
+
+Nothing of the package's own arithmetic is used: only the numbers of the description.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+import casadi_ik as ik
+from casadi_ik.robots import FourBar, LeadScrew
+
+
+def joint_positions(robot: ik.ArmHand, q: np.ndarray) -> dict[str, np.ndarray]:
+    """Positions (k,) of actuators and movable joints by name."""
+    values = dict(zip(robot.actuators, q.T, strict=True))
+    joints = {joint.name: joint for joint in robot.description.movable}
+
+    def value(name: str) -> np.ndarray:
+        if name not in values:
+            coupling = joints[name].coupling
+            values[name] = _coupled(coupling, value(coupling.of))
+        return values[name]
+
+    for name in joints:
+        value(name)
+    return values
+
+
+def _coupled(coupling, x: np.ndarray) -> np.ndarray:
+    if isinstance(coupling, LeadScrew):
+        b, c = coupling.b, coupling.c
+        return np.arccos((b * b + c * c - x * x) / (2 * b * c)) - coupling.theta_0
+    if isinstance(coupling, FourBar):
+        return _four_bar(coupling, coupling.phi_0 + x)
+    return coupling.ratio * x + coupling.offset
+
+
+def _four_bar(bar: FourBar, phi: np.ndarray) -> np.ndarray:
+    """Coupler angle by intersecting two circles, of both the one like the known pose."""
+    pin = bar.p * np.exp(1j * phi)
+    line = bar.g - pin
+    along = (np.abs(line) ** 2 + bar.h**2 - bar.q**2) / (2 * np.abs(line))
+    across = np.sqrt(bar.h**2 - along**2)
+    unit = line / np.abs(line)
+    found = []
+    for side in (1, -1):
+        angle = np.angle((along + side * 1j * across) * unit * np.exp(-1j * phi))
+        found.append((angle - bar.theta_3_0 + np.pi) % (2 * np.pi) - np.pi)
+    return np.where(np.abs(found[0]).mean() < np.abs(found[1]).mean(), found[0], found[1])
+
+
+def contacts(robot: ik.ArmHand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals as `ArmHand.contacts`."""
+    values = joint_positions(robot, q)
+    poses = {robot.description.root: np.tile(np.eye(4), (len(q), 1, 1))}
+    for joint in robot.description.joints:
+        pose = poses[joint.parent] @ joint.placement
+        if joint.type == "prismatic":
+            moved = np.tile(np.eye(4), (len(q), 1, 1))
+            moved[:, :3, 3] = values[joint.name][:, None] * joint.axis
+            pose = pose @ moved
+        elif joint.type == "revolute":
+            pose = pose @ _turned(joint.axis, values[joint.name])
+        poses[joint.child] = pose
+    points, normals = [], []
+    for finger in robot.description.fingers:
+        pose = poses[finger.link] @ finger.placement
+        points.append(pose[:, :3, 3])
+        normals.append(pose[:, :3, :3] @ finger.normal)
+    return np.stack(points, axis=1), np.stack(normals, axis=1)
+
+
+def _turned(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    pose = np.tile(np.eye(4), (len(angle), 1, 1))
+    sine, versine = np.sin(angle)[:, None, None], 1 - np.cos(angle)[:, None, None]
+    pose[:, :3, :3] += sine * cross + versine * (cross @ cross)
+    return pose
+
+
+def beyond_limits(robot: ik.ArmHand, q: np.ndarray) -> np.ndarray:
+    """(k,) by how much the worst actuator or joint is beyond what its file allows."""
+    values = joint_positions(robot, q)
+    limited = [*robot.description.actuators, *robot.description.movable]
+    return np.max(
+        [np.maximum(x.lower - values[x.name], values[x.name] - x.upper) for x in limited], axis=0
+    )
