@@ -35,7 +35,7 @@ def first_use(methods: tuple[str, ...], later: int) -> Section:
             warm = [_run(method, cache) for _ in range(later)]
         imported, answered = (min(times) for times in zip(*warm, strict=True))
         rows.append((method, f"{cold:.1f} s", f"{1e3 * answered:.0f} ms", f"{imported:.2f} s"))
-    columns = "method", "empty cache", "full cache", "import besides"
+    columns = "method", "empty cache", "full cache", "import apart"
     note = (
         "Wall time in a new process from `load_robot` to the first answer: kernels are generated "
         f"and compiled, or found on disk (the fastest of {later})."

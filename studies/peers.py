@@ -1,4 +1,4 @@
-"""The same targets, restarts and rule of success for other solvers: who solves, and how fast.
+"""The same targets, restarts and rule of success for other solvers: success and speed.
 
     pip install -e ".[peers]"
     python studies/peers.py --count 300
@@ -68,7 +68,7 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class Run:
-    """What became of some targets.
+    """The answers to some targets.
 
     Attributes:
         solved: Part of the targets that our verdict accepts [0, 1].

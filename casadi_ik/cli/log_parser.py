@@ -50,7 +50,7 @@ def add_log(commands: Any) -> None:
     info.description = "Methods, solves, iterations, events, size and origin of logs."
     _files(info)
     for name, text, run in (
-        ("solves", "list solves: what became of them", _solves),
+        ("solves", "list solves and how they ended", _solves),
         ("events", "list events: singularities, limits, stalls, ...", _events),
     ):
         parser = _action(actions, name, text, run)
@@ -76,6 +76,13 @@ def _add_about_one(actions: Any) -> None:
         metavar="FILE.png",
         type=file_name(".png"),
         help="where to (default: named after log, method and solve, in this folder)",
+    )
+    plot.add_argument(
+        "--range",
+        metavar=("FIRST", "LAST"),
+        nargs=2,
+        type=whole(0),
+        help="iterations drawn (default: all); long runs hide what happens at their beginning",
     )
     compare = _action(actions, "compare", "two methods on the same targets", _compare)
     _files(compare)

@@ -19,8 +19,8 @@ from pathlib import Path
 
 from casadi_ik.errors import KernelError
 from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.kernels.driver_code import SLICE
 from casadi_ik.kernels.folders import NO_ROOM
-from casadi_ik.kernels.outcome import SLICE
 
 # No contraction: with fused multiply-adds the iterates would differ from the VM's. Errno of sqrt
 # and friends is never read, and without it they are single instructions of the same value. All

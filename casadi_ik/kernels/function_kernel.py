@@ -16,8 +16,8 @@ from casadi_ik.kernels.buffered import BufferedFunction, doubles, memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
 from casadi_ik.kernels.function_graph import FunctionGraph
-from casadi_ik.kernels.outcome import SLICE, Outcome, check
 
 SYMBOL = "casadi_ik_map"
 
@@ -72,7 +72,7 @@ class SingleCall:
         """
         self._job.next = 0
         code = self._run(self._reference)
-        if code != Outcome.DONE:
+        if code != DriverCode.DONE:
             check(self._name, code)
 
 
@@ -240,7 +240,7 @@ class FunctionKernel:
             0,
             SLICE,
         )
-        while (code := self._map(ctypes.byref(job))) != Outcome.DONE:
+        while (code := self._map(ctypes.byref(job))) != DriverCode.DONE:
             check(self.name, code)
 
     def _run_vm(

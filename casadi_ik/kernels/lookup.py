@@ -14,9 +14,9 @@ from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
-from casadi_ik.kernels.outcome import SLICE, Outcome, check
 
 SYMBOL = "casadi_ik_lookup"
 
@@ -79,7 +79,7 @@ class SingleLookup:
         """Look up."""
         self._job.next = 0
         code = self._run(self._reference)
-        if code != Outcome.DONE:
+        if code != DriverCode.DONE:
             check(self._name, code)
 
 
@@ -160,7 +160,7 @@ class LookupKernel:
         self, arrays: list[NDArray[np.float64]], steps: list[int], found: NDArray[np.int64]
     ) -> None:
         job, _kept = self._job(arrays, found, steps)
-        while (code := self._lookup(ctypes.byref(job))) != Outcome.DONE:
+        while (code := self._lookup(ctypes.byref(job))) != DriverCode.DONE:
             check(self.key.name, code)
 
     def _job(

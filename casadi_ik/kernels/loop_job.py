@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.buffered import memory
+from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
 from casadi_ik.kernels.loop_result import FIRST_ROWS, LoopResult
-from casadi_ik.kernels.outcome import SLICE, Outcome, check
 from casadi_ik.kernels.rows import opaque
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
@@ -104,9 +104,9 @@ class CompiledBatch:
 
     def _run(self, loop: Any) -> None:
         self._rows_to(FIRST_ROWS)
-        while (code := loop(ctypes.byref(self.job))) != Outcome.DONE:
+        while (code := loop(ctypes.byref(self.job))) != DriverCode.DONE:
             check(self.name, code)
-            if code == Outcome.ROWS_FULL:
+            if code == DriverCode.ROWS_FULL:
                 self._rows_to(2 * self.job.capacity)
         self._rows_to(self.job.used)
 
@@ -156,5 +156,5 @@ class SingleSolve:
         result, job = self.result, self._batch.job
         result.iterations[0], result.status[0], result.time[0] = 0, RUNNING, 0.0
         job.solve, job.max_iterations = 0, max_iterations
-        while (code := self._loop(self._reference)) != Outcome.DONE:
+        while (code := self._loop(self._reference)) != DriverCode.DONE:
             check(self._batch.name, code)

@@ -18,11 +18,11 @@ from casadi_ik.errors import KernelError
 from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel, MapJob
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
-from casadi_ik.kernels.outcome import SLICE, Outcome, check
 
 logger = logging.getLogger(__name__)
 
@@ -97,6 +97,6 @@ class MeasureKernel:
             0,
             SLICE,
         )
-        while (code := self._map(ctypes.byref(job))) != Outcome.DONE:
+        while (code := self._map(ctypes.byref(job))) != DriverCode.DONE:
             check(self._graph.name, code)
         return values

@@ -92,8 +92,8 @@ class RobotKernels:
             return [ca.vertcat(*positions), ca.vertcat(*angles), self._excess(q)]
 
         f = len(self._robot.finger_names)
-        besides = {"points": (f, 3), "normals": (f, 3)}
-        return self._kernel("deviations", build, besides, [(f, 1), (f, 1), (1, 1)])
+        targets = {"points": (f, 3), "normals": (f, 3)}
+        return self._kernel("deviations", build, targets, [(f, 1), (f, 1), (1, 1)])
 
     @cached_property
     def beyond(self) -> FunctionKernel:
@@ -132,13 +132,13 @@ class RobotKernels:
         self,
         name: str,
         build: Callable[..., list[ca.SX]],
-        besides: Mapping[str, Shape],
+        others: Mapping[str, Shape],
         outputs: Sequence[Shape],
     ) -> FunctionKernel:
-        """The kernel of a function of q and what is given besides."""
+        """The kernel of a function of q and other inputs."""
         # A robot's name may be anything; a function's may not.
         full = ca.Function.fix_name(f"{self._robot.name}_{name}")
-        inputs = {"q": (len(self._robot.actuators), 1), **besides}
+        inputs = {"q": (len(self._robot.actuators), 1), **others}
 
         def function() -> ca.Function:
             symbols = [ca.SX.sym(key, *shape) for key, shape in inputs.items()]

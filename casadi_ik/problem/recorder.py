@@ -1,4 +1,4 @@
-"""What a solver hands over about its solves, and to whom: plain arrays and one protocol.
+"""What a solver hands over to a recorder of its solves: plain arrays and one protocol.
 
 The solvers own this contract and know nothing of files; the logs implement it.
 """
@@ -62,7 +62,7 @@ class SolveBlock:
 
 
 class Recorder(Protocol):
-    """Whoever keeps what happened in the solves."""
+    """Keeps the iterations of solves."""
 
     def record(self, block: SolveBlock) -> None:
         """Take finished solves; the caller leaves the arrays alone from then on."""

@@ -58,7 +58,7 @@ class Engine:
     Attributes:
         robot: The robot.
         method: The method, built for this robot.
-        compiled: Whether what a diagnosis needs besides runs in compiled code.
+        compiled: Whether the additional graphs of a diagnosis run in compiled code.
         kinds: Of the contacts, by finger; None: point and normal.
     """
 
@@ -80,7 +80,7 @@ class Engine:
 
     @cached_property
     def diagnostician(self) -> Diagnostician:
-        """Who says why a target was not solved; asks hand-first, whichever the method is."""
+        """Finds why a target was not solved, with hand-first, whichever the method is."""
         method = self.method
         if not isinstance(method, HandFirstMethod):
             method = HandFirstMethod(
@@ -115,7 +115,7 @@ class Engine:
 
     @cached_property
     def finder(self) -> AlternativeFinder:
-        """Who finds several solutions.
+        """Finds several solutions.
 
         Raises:
             UnsupportedError: The method is not hand-first.
@@ -124,7 +124,7 @@ class Engine:
 
     @cached_property
     def tracker(self) -> Tracker:
-        """Who follows moving grasps.
+        """Follows moving grasps.
 
         Raises:
             UnsupportedError: The method is not hand-first.
@@ -304,7 +304,7 @@ class Engine:
     def _diagnosed(
         self, problems: Problems, starts: Array, outcome: Outcome, batch: BatchSolution
     ) -> BatchSolution:
-        """Say why; where hand-first's own diagnosis comes upon a solution, that is the answer."""
+        """Find the reasons; a solution found by hand-first's own diagnosis is the answer."""
         if batch.success.all():
             return replace(batch, diagnoses=(None,) * len(batch))
         own = isinstance(self.method, HandFirstMethod)

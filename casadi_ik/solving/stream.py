@@ -24,7 +24,7 @@ Block = tuple[ArrayLike, ArrayLike] | Mapping[str, ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class SolvedBlock:
-    """What became of a block.
+    """The answers to a block.
 
     Attributes:
         first_row: Number of its first target among all.
@@ -42,7 +42,7 @@ class Stream:
     """How blocks are solved.
 
     Attributes:
-        engine: Who solves.
+        engine: Solves.
         ask: Arrays by name and the number of the first target as a checked question.
         tolerances: When a contact counts as reached, by finger.
         run: How targets are solved; one start (n,) for all of them.

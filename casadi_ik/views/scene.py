@@ -69,7 +69,7 @@ def draw_solution(
     view: View | None = None,
     dpi: float = DPI,
 ) -> Figure:
-    """Draw what became of a grasp.
+    """Draw the answer to a grasp.
 
     Args:
         robot: The robot that was solved for.

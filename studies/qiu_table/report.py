@@ -19,7 +19,7 @@ INTRODUCTION = """
 *Targets.* Each of the 12 shipped grasps (computed pinches of YCB objects) keeps its hand posture;
 the arm is drawn uniformly within its limits, and forward kinematics gives contact points and
 normals that are reachable by construction (section III of the paper). *Solved:* every contact
-within 5 mm and 3 deg; "within limits" asks besides that every joint is within its limits, and the
+within 5 mm and 3 deg; "within limits" also asks that every joint is within its limits, and the
 method keeps to them in every iteration. *One start* from the robot's home for the paper's methods,
 at most 10,000 iterations. Means of iterations and time are over solved cases, as in the paper.
 Intervals are 95 % confidence (Wilson's for rates). `n` is the number of targets; the paper's is

@@ -1,4 +1,4 @@
-"""What became of a solve, and what it met on its way, in words; from its trace alone.
+"""How a solve ended, and the events on its way, in words; from its trace alone.
 
 Nothing here is a cause that was proven: what is said to have happened together, happened together.
 """

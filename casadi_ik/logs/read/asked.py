@@ -1,4 +1,4 @@
-"""What a solve was asked besides its contacts: all that its answer follows from."""
+"""The question of a solve apart from its contacts: all that its answer follows from."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ class Log:
         event: Names = None,
         phase: Names = None,
     ) -> Table:
-        """Solves: what was asked, what became of it, totals of iterations and events.
+        """Solves: the question, the answer, totals of iterations and events.
 
         Raises:
             UnknownNameError: No such method, status, event or phase.

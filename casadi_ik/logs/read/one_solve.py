@@ -98,7 +98,7 @@ class OneSolve:
         rows: The trace, a row per iteration; none if the log has kept the totals only.
         events: What happened, by iteration.
         parameters: What the solver was set to.
-        asked: What it was asked besides its targets.
+        asked: The question apart from its targets.
         shard: Name of the shard it comes from, if the log has several.
         number: Its number there; random numbers follow from it and the seed.
     """

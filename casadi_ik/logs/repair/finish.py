@@ -19,7 +19,7 @@ except ImportError:  # Windows: no lock
 
 @dataclass(frozen=True)
 class Finished:
-    """What became of a log.
+    """The result of repairing a log.
 
     Attributes:
         path: The file.

@@ -1,4 +1,4 @@
-"""What is kept of a solve besides its iterations: a row of fixed size."""
+"""What is kept of a solve apart from its iterations: a row of fixed size."""
 
 from __future__ import annotations
 

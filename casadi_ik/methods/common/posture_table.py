@@ -46,7 +46,7 @@ class PostureTable:
             size: Number of postures.
             at_limits: Part of the range [0, 1) that is moved to the limits, half to either: hands
                 stand at their limits more often than an even spread would.
-            pull: How much the distance from a given posture counts besides the contacts' shape:
+            pull: How much the distance from a given posture counts along with the contacts' shape:
                 different hands may have contacts of nearly the same shape.
             compiled: Whether lookups run in compiled code.
             bounds: (n,) lower and upper, the robot's limits unless given.

@@ -60,7 +60,7 @@ INSIDE = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class NlpRun:
-    """What became of one start; a row per iteration, the start itself first.
+    """The run from one start; a row per iteration, the start itself first.
 
     Attributes:
         q: (n,) configuration reached, within its bounds.

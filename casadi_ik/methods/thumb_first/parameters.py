@@ -17,7 +17,7 @@ class ThumbFirstParameters:
     Attributes:
         starts: Palm estimates a solve may begin from, each from another hand posture.
         table: Hand postures that the target's shape is compared with to find them.
-        pull: How much a posture's distance from the start's hand counts besides the shape.
+        pull: How much a posture's distance from the start's hand counts along with the shape.
         step: "freeze": the joint that violates its limits most is fixed there and the step is
             solved again. "proxqp": the same problem as a quadratic program (ProxQP, Bambade et
             al. 2022), in CasADi's virtual machine; slower.

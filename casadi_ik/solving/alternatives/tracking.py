@@ -78,7 +78,7 @@ class Tracker:
     """Follows moving grasps on one robot."""
 
     def __init__(self, robot: ArmHand, method: HandFirstMethod, finder: AlternativeFinder) -> None:
-        """Take hand-first on the robot and who finds its alternatives."""
+        """Take hand-first on the robot and the finder of its alternatives."""
         self._robot = robot
         self._trials = Trials(robot, method)
         self._finder = finder

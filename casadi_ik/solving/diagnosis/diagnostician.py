@@ -33,7 +33,7 @@ TOGETHER = 64
 """Targets that are diagnosed in the same runs of the compiled loop."""
 
 PLACED = 2
-"""Fitted hands that the arm follows, besides what hand-first came to."""
+"""Fitted hands that the arm follows, in addition to the one of hand-first."""
 
 SEARCHES = ((8.0, 24, 4), (4.0, 96, 8), (1.5, 256, 32))
 """If the contacts are missed by less than a factor, so many further starts are tried, whatever hand

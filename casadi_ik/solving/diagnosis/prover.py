@@ -42,7 +42,7 @@ TINY = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What became of k searches: whether proved, boxes, and whether the arm was needed."""
+    """The results of k searches: whether proved, boxes, and whether the arm was needed."""
 
     proved: NDArray[np.bool_]
     boxes: NDArray[np.int64]

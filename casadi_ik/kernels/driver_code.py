@@ -11,7 +11,7 @@ SLICE = 0.2
 """Seconds after which a driver returns to Python, so that Ctrl-C works; then it is called again."""
 
 
-class Outcome(IntEnum):
+class DriverCode(IntEnum):
     """Return values of the drivers (drivers/common.c)."""
 
     DONE = 0
@@ -31,9 +31,9 @@ def check(name: str, code: int) -> None:
         CancelledError: This thread has been told to stop.
     """
     stop_if_cancelled()
-    if code == Outcome.NO_MEMORY:
+    if code == DriverCode.NO_MEMORY:
         raise MemoryError(f"{name}: no work memory")
-    if code == Outcome.NO_CHECKOUT:
+    if code == DriverCode.NO_CHECKOUT:
         raise KernelError(f"{name}: too many calls at once of a function with memory objects")
-    if code == Outcome.STEP_FAILED:
+    if code == DriverCode.STEP_FAILED:
         raise KernelError(f"{name}: the function reports a failure")
