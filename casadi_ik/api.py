@@ -16,8 +16,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import Compression, Keep, McapRecorder
-from casadi_ik.methods.qiu.parameters import FINGER_STEPS
-from casadi_ik.methods.registry import METHODS, build_method, option_names
+from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
@@ -81,7 +80,7 @@ class Solver:
         self.method = method
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
         self.limits = limits
-        self.options = _with_finger_step(method, options or {}, finger_step)
+        self.options = with_finger_step(method, options or {}, finger_step)
         self._questions = Questions(robot, self.tolerances, limits == "enforce")
         self._engine = Engine(
             robot, build_method(method, robot.description, self.options, compiled), compiled
@@ -112,6 +111,7 @@ class Solver:
         log: str | PathLike[str] | None = None,
         diagnose: bool = True,
         fixed: Mapping[str, float] | None = None,
+        prefer: str | None = None,
     ) -> Solution:
         """Solve one grasp.
 
@@ -122,6 +122,9 @@ class Solver:
             log: Path of an MCAP file to write every iteration to.
             diagnose: Whether to find out why, if it is not solved (`Solution.diagnosis`).
             fixed: Positions of actuators that are not to move, by name [rad or m].
+            prefer: Which of several solutions: "q0" (near it, motions as parts of motors' ranges;
+                what solves is not moved), "limits" (far from them), "manipulability" (of the arm).
+                None: "q0" if q0 is given, else "limits".
 
         Returns:
             The solution; not converging is its status, never an exception.
@@ -129,10 +132,12 @@ class Solver:
         Raises:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
             UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed.
+            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
-        problems = self._questions.of_grasps([grasp], fixed)
+        problems = self._questions.of_grasps(
+            [grasp], fixed, self._engine.preference(prefer, q0 is not None)
+        )
         if log is None and (quick := self._engine.quick(problems, Run(q0, seed))) is not None:
             return quick
         with self._recorder(log, seed) as recorder:
@@ -151,6 +156,7 @@ class Solver:
         fixed: Mapping[str, float] | None = None,
         keep: Keep | None = None,
         compression: Compression = "zstd",
+        prefer: str | None = None,
         **more: ArrayLike | None,
     ) -> BatchSolution:
         """Solve k targets.
@@ -169,6 +175,7 @@ class Solver:
             fixed: Positions of actuators that are not to move, by name [rad or m].
             keep: Which solves keep their iterations in the log; None: all.
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
+            prefer: As for `solve`.
             more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
                 `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point).
 
@@ -178,11 +185,12 @@ class Solver:
         Raises:
             InputError: Bad shapes or values; the message names row and finger.
             UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed.
+            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
         held = self._questions.held(fixed)
-        problems = self._questions.of_arrays(points, normals, held, more=more)
+        preferred = self._engine.preference(prefer, q0 is not None)
+        problems = self._questions.of_arrays(points, normals, held, more=more, prefer=preferred)
         with self._recorder(log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 
@@ -195,6 +203,7 @@ class Solver:
         log: str | PathLike[str] | None = None,
         diagnose: bool = False,
         fixed: Mapping[str, float] | None = None,
+        prefer: str | None = None,
     ) -> Generator[SolvedBlock, None, None]:
         """Solve targets that come block by block, in the memory that one block takes.
 
@@ -211,6 +220,7 @@ class Solver:
                 and given up if the iterator is closed before.
             diagnose: Whether to find out why, for every target that is not solved.
             fixed: Positions of actuators that are not to move, by name [rad or m].
+            prefer: As for `solve`.
 
         Yields:
             The blocks, solved.
@@ -218,15 +228,16 @@ class Solver:
         Raises:
             InputError: Bad q0, seed or jobs, or a block of the wrong shape.
             UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed.
+            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
         """
         held = self._questions.held(fixed)
+        preferred = self._engine.preference(prefer, q0 is not None)
 
         def ask(block: Mapping[str, ArrayLike], first_row: int) -> Problems:
             more = {name: array for name, array in block.items() if name not in REQUIRED}
             points, normals = (block[name] for name in REQUIRED)
-            return self._questions.of_arrays(points, normals, held, first_row, more)
+            return self._questions.of_arrays(points, normals, held, first_row, more, preferred)
 
         with self._recorder(log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
@@ -315,7 +326,8 @@ class Solver:
             InputError: Bad q0, or a grasp the robot or the method cannot take.
             UnsupportedError: The method cannot be stepped; the message says why.
         """
-        problems = self._questions.of_grasps([grasp], None)
+        preferred = self._engine.preference(None, q0 is not None)
+        problems = self._questions.of_grasps([grasp], None, preferred)
         return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
 
     def _recorder(
@@ -336,19 +348,3 @@ class Solver:
             keep=keep,
             compression=compression,
         )
-
-
-def _with_finger_step(
-    method: str, options: Mapping[str, Any], finger_step: str | None
-) -> dict[str, Any]:
-    """Options with the finger step, if it is given and the method has one."""
-    if finger_step is None:
-        return dict(options)
-    if finger_step not in FINGER_STEPS:
-        raise InputError(
-            f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
-        )
-    if "finger_step" in options:
-        raise InputError("finger_step: found twice, expected it as argument or among the options")
-    has_one = "finger_step" in option_names(method)
-    return {**options, "finger_step": finger_step} if has_one else dict(options)

@@ -81,6 +81,7 @@ def batch(arguments: argparse.Namespace) -> Answer:
         arguments.log,
         arguments.diagnose,
         fixed,
+        arguments.prefer,
     )
     totals = BatchTotals()
     with growing_npz(arguments.out, "--out") as npz, closing(blocks), _progress(count) as show:

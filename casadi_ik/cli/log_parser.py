@@ -77,6 +77,13 @@ def _add_about_one(actions: Any) -> None:
         type=file_name(".png"),
         help="where to (default: named after log, method and solve, in this folder)",
     )
+    plot.add_argument(
+        "--range",
+        metavar=("FIRST", "LAST"),
+        nargs=2,
+        type=whole(0),
+        help="iterations drawn (default: all); long runs hide what happens at their beginning",
+    )
     compare = _action(actions, "compare", "two methods on the same targets", _compare)
     _files(compare)
     compare.add_argument("--solve", metavar="N", type=whole(0), help="of the first method")

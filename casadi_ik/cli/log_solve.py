@@ -66,6 +66,7 @@ def plot(arguments: argparse.Namespace) -> Answer:
             out,
             events=log.events(**chosen),
             tolerance=min(solve.tolerances, key=lambda each: each.position),
+            span=tuple(arguments.range) if arguments.range else None,
             title=f"{solve.method} · solve {solve.solve_id} · {solve.iterations} iterations"
             f" · {solve.status}",
         )

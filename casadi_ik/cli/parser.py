@@ -12,6 +12,7 @@ from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.say import PROGRAM
 from casadi_ik.cli.values import assignment, file_name, numbers, one_of, positive, whole
 from casadi_ik.errors import InputError
+from casadi_ik.problem.preference import PREFERENCES
 
 if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
@@ -172,6 +173,13 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         help="start: a number per actuator [rad or m], spaces or commas between; last on the line "
         "(default: home)",
+    )
+    parser.add_argument(
+        "--prefer",
+        metavar="|".join(PREFERENCES),
+        type=one_of(*PREFERENCES),
+        help="which of several solutions: far from its limits, with a manipulable arm, or near the "
+        "start (default: q0 if it is given, else limits)",
     )
     parser.add_argument(
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"

@@ -45,7 +45,15 @@ def solve(arguments: argparse.Namespace) -> Answer:
     draw = _drawing(path, grasp) if picture is not None else None
     solver = the_solver(arguments, robot)
     with located(str(path)):
-        solution = solver.solve(grasp, q0, arguments.seed, arguments.log, arguments.diagnose, fixed)
+        solution = solver.solve(
+            grasp,
+            q0,
+            arguments.seed,
+            arguments.log,
+            arguments.diagnose,
+            fixed,
+            arguments.prefer,
+        )
     if out is not None:
         text = json.dumps(as_json(solution), indent=2, allow_nan=False) + "\n"
         write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))

@@ -12,7 +12,7 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.ipopt.method import IpoptMethod
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.qiu.method import EnhancedMethod, OriginalMethod
-from casadi_ik.methods.qiu.parameters import OriginalParameters, QiuParameters
+from casadi_ik.methods.qiu.parameters import FINGER_STEPS, OriginalParameters, QiuParameters
 from casadi_ik.methods.thumb_first.method import ThumbFirstMethod
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.problem.method import Method
@@ -146,6 +146,27 @@ def option_names(name: str) -> tuple[str, ...]:
         UnknownNameError: No such method.
     """
     return _entry(name).options
+
+
+def with_finger_step(
+    method: str, options: Mapping[str, Any], finger_step: str | None
+) -> dict[str, Any]:
+    """Options with the finger step, if it is given and the method has one.
+
+    Raises:
+        UnknownNameError: No such method.
+        InputError: No such finger step, or it is among the options as well.
+    """
+    if finger_step is None:
+        return dict(options)
+    if finger_step not in FINGER_STEPS:
+        raise InputError(
+            f"finger_step: found {finger_step!r}, expected one of {', '.join(FINGER_STEPS)}"
+        )
+    if "finger_step" in options:
+        raise InputError("finger_step: found twice, expected it as argument or among the options")
+    has_one = "finger_step" in option_names(method)
+    return {**options, "finger_step": finger_step} if has_one else dict(options)
 
 
 def build_method(

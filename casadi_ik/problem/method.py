@@ -143,6 +143,18 @@ class Method(Protocol):
 
 
 @runtime_checkable
+class PreferringMethod(Protocol):
+    """A method that can prefer one of several solutions.
+
+    Attributes:
+        preferences: Those of `PREFERENCES` it knows: "q0" it follows itself where `Problems` say
+            so, "limits" is what it does else.
+    """
+
+    preferences: tuple[str, ...]
+
+
+@runtime_checkable
 class QuickMethod(Protocol):
     """A method with a shorter way to the same answer for one easy target."""
 

@@ -34,6 +34,7 @@ class Problems:
         more: (k, f, 3) what contacts have beside point and normal ("tangents", "lines",
             "planes"), NaN where free; nothing that is free everywhere.
         picked: (k,) numbers of the targets where they are not one after the other.
+        prefer: Which of several solutions is wanted, one of `PREFERENCES`, or `NO_PREFERENCE`.
     """
 
     points: Array
@@ -44,6 +45,7 @@ class Problems:
     fixed: Array | None = None
     more: Mapping[str, Array] = field(default_factory=dict)
     picked: NDArray[np.intp] | None = None
+    prefer: str = "limits"
 
     def __len__(self) -> int:
         return len(self.points)

@@ -36,6 +36,7 @@ class Questions:
         fixed: Array | None,
         first_row: int = 0,
         more: Mapping[str, ArrayLike | None] | None = None,
+        prefer: str = "limits",
     ) -> Problems:
         """Targets as arrays.
 
@@ -45,6 +46,7 @@ class Questions:
             fixed: See `Problems`.
             first_row: Number of the first target.
             more: (k, f, 3) what contacts have beside, see `more_arrays`.
+            prefer: See `Problems`.
 
         Raises:
             InputError: See `target_arrays` and `more_arrays`.
@@ -52,14 +54,22 @@ class Questions:
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row)
         tolerances = tuple(self.tolerances.values())
         besides = more_arrays(more, p, n, first_row) if more else {}
-        return Problems(p, n, tolerances, self.enforce_limits, first_row, fixed, besides)
+        return Problems(
+            p, n, tolerances, self.enforce_limits, first_row, fixed, besides, prefer=prefer
+        )
 
-    def of_grasps(self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None) -> Problems:
+    def of_grasps(
+        self,
+        grasps: Sequence[Grasp],
+        fixed: Mapping[str, float] | None,
+        prefer: str = "limits",
+    ) -> Problems:
         """Grasps, at least one, that share the tolerances of the first.
 
         Args:
             grasps: The grasps.
             fixed: Held actuators by name.
+            prefer: See `Problems`.
 
         Raises:
             InputError: Something else than a grasp, one with a finger that the robot has not, or
@@ -83,6 +93,7 @@ class Questions:
             self.enforce_limits,
             fixed=held,
             more=_stacked([grasp.more(fingers) for grasp in grasps], len(fingers)),
+            prefer=prefer,
         )
 
     def held(self, fixed: Mapping[str, float] | None) -> Array | None:

@@ -60,6 +60,7 @@ class Phase(IntEnum):
     HIERARCHY = 7
     WHOLE_SYSTEM = 8
     BALANCE = 9
+    ARM_CHOICE = 10
 
     @property
     def label(self) -> str:

@@ -20,7 +20,8 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
-from casadi_ik.problem.method import Method, Outcome, QuickMethod
+from casadi_ik.problem.method import Method, Outcome, PreferringMethod, QuickMethod
+from casadi_ik.problem.preference import NO_PREFERENCE, preference
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.solution import BatchSolution, Solution
@@ -34,6 +35,9 @@ from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.parts import Parts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.workers import workers
+
+MANIPULABILITY = "manipulability"
+"""The preference that is seen to after the solve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +131,26 @@ class Engine:
         """
         return Tracker(self.robot, self._hand_first, self.finder)
 
+    def preference(self, prefer: str | None, started: bool) -> str:
+        """What is preferred, see `preference`.
+
+        Raises:
+            InputError: No such preference.
+            UnsupportedError: The method does not know it.
+        """
+        asked, method = preference(prefer, started), self.method
+        if isinstance(method, PreferringMethod):
+            if asked in method.preferences:
+                return asked
+            known = ", ".join(method.preferences)
+            raise UnsupportedError(f"prefer: method {method.name!r} knows {known}, found {asked!r}")
+        if prefer is None:
+            return NO_PREFERENCE
+        raise UnsupportedError(
+            f"prefer: method {method.name!r} cannot choose, it takes the solution it comes to from "
+            f"q0; found {prefer!r}"
+        )
+
     def quick(self, problems: Problems, run: Run) -> Solution | None:
         """The answer to one target if it is solved at once, by the shortest way; None: `solve` it.
 
@@ -143,7 +167,7 @@ class Engine:
             if other is not self:
                 return other.quick(problems, run)
         method, robot = self._quick, self.robot
-        if method is None:
+        if method is None or problems.prefer == MANIPULABILITY:
             return None
         start = run.start(robot)
         if start.ndim != 1:
@@ -207,6 +231,8 @@ class Engine:
             outcome = run_by_kinds(method, asked, starts[rows], run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
+            if problems.prefer == MANIPULABILITY:
+                outcome = self._most_manipulable(asked, starts[rows], run.seed, outcome)
             batch = self._judged(asked, outcome)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
@@ -215,6 +241,9 @@ class Engine:
         if diagnose:
             for kinds, _, _ in by_kinds(problems):
                 _ = self.of_kinds(kinds).diagnostician
+        if problems.prefer == MANIPULABILITY:
+            for kinds, _, _ in by_kinds(problems):
+                _ = self.of_kinds(kinds).finder
         if jobs == 1 and not trace:
             yield solve(slice(0, len(problems)))
             return
@@ -230,6 +259,20 @@ class Engine:
                     yield ahead.popleft().result()
             while ahead:
                 yield ahead.popleft().result()
+
+    def _most_manipulable(
+        self, problems: Problems, starts: Array, seed: int, outcome: Outcome
+    ) -> Outcome:
+        """Every hand where it is, held by the arm of the best measure."""
+        begin, q = time.perf_counter(), outcome.q.copy()
+        rows = np.flatnonzero(outcome.status == Status.SOLVED)
+        for row in rows:
+            one = problems.rows(slice(row, row + 1))
+            finder = self.kinds_of(one).finder
+            q[row] = finder.best_arm(one, q[row], starts[row], seed, MANIPULABILITY)
+        seconds = outcome.time.copy()
+        seconds[rows] += (time.perf_counter() - begin) / max(len(rows), 1)
+        return replace(outcome, q=q, time=seconds)
 
     def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
         verdict = judge(self.robot, problems, outcome.q)
@@ -267,8 +310,9 @@ class Engine:
         own = isinstance(self.method, HandFirstMethod)
         q, seconds = outcome.q.copy(), outcome.time.copy()
         rows = np.flatnonzero(~batch.success)
+        unbiased = replace(problems.rows(rows), prefer="limits")
         found: dict[int, Diagnosis] = {}
-        for kinds, of_kinds, some in by_kinds(problems.rows(rows)):
+        for kinds, of_kinds, some in by_kinds(unbiased):
             chosen = rows if of_kinds is None else rows[of_kinds]
             diagnoses = self.of_kinds(kinds).diagnostician.diagnose(
                 some, starts[chosen], q[chosen] if own else None

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -22,7 +21,12 @@ from casadi_ik.views.strips import draw_strip, events_strip, limits_strip, mark_
 Array = NDArray[np.float64]
 
 COLORS = ("#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6", "#c2334d", "#0f8b8d")
-"""Of the lines of a panel."""
+"""Of the lines of a panel; where there are more of them, dashes tell the rounds apart."""
+
+DASHES = ("-", (0, (4, 1.2)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)))
+
+LONG = 400
+"""From so many iterations on, lines are thin: thick ones would fill the panel."""
 
 PHASE_COLORS = ("#f3f1ec", "#fbecd9", "#deebf7", "#e3f2e1")
 """By the code of the phase."""
@@ -47,12 +51,14 @@ class Panel:
         lines: Values (k,) by name; NaN where not computed.
         bound: What has to be fallen below, if anything.
         linear: Whether the scale is linear; otherwise logarithmic.
+        thresholds: Below what each line is an event, by its name.
     """
 
     label: str
     lines: dict[str, Array]
     bound: float | None = None
     linear: bool = False
+    thresholds: dict[str, float] = field(default_factory=dict)
 
 
 def draw_convergence(
@@ -61,6 +67,7 @@ def draw_convergence(
     *,
     events: Table | None = None,
     tolerance: Tolerance | None = None,
+    span: tuple[int, int] | None = None,
     title: str = "",
     dpi: float = DPI,
 ) -> Figure:
@@ -73,6 +80,7 @@ def draw_convergence(
         path: PNG file to write, if any.
         events: Its events, e.g. ``log.events(method="hand-first", solve=3)``.
         tolerance: What counts as reached; `Tolerance()` unless said.
+        span: First and last iteration drawn; all unless said.
         title: Above the picture; method, number of iterations and ending unless said.
         dpi: Dots per inch.
 
@@ -80,39 +88,56 @@ def draw_convergence(
         The figure, which belongs to no pyplot window.
 
     Raises:
-        InputError: No iterations, or those of several solves.
+        InputError: No iterations, those of several solves, or none in the span.
         PictureError: The file cannot be written.
     """
     if len(iterations.rows) == 0:
         raise InputError("iterations: none to draw")
     if len(np.unique(iterations.solve_id)) > 1:
         raise InputError("iterations: of several solves, expected one (give a solve)")
-    panels = _panels(iterations, tolerance or Tolerance())
+    count = len(iterations.rows)
+    first, last = span or (0, count - 1)
+    if not 0 <= first <= last < count:
+        raise InputError(f"span: found {first} to {last}, expected within 0 to {count - 1}")
+    panels = _panels(iterations, tolerance or Tolerance(), _thresholds(events))
+    for panel in panels:
+        for values in panel.lines.values():
+            values[:first] = values[last + 1 :] = np.nan  # the scale is that of what is seen
     strips = [strip for strip in (events_strip(events), limits_strip(iterations)) if strip.rows]
     heights = [1.0] * len(panels) + [0.12 + 0.11 * len(strip.rows) for strip in strips]
-    figure = new_figure(9.0, 1.0 + 1.7 * sum(heights), dpi)
+    figure = new_figure(9.0, 1.25 + 1.7 * sum(heights), dpi)
     grid = figure.subplots(
         len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
     )[:, 0]
     for axes in grid:
         _dress(axes, iterations)
     for axes, panel in zip(grid, panels, strict=False):
-        _draw(axes, panel)
+        _draw(axes, panel, last - first + 1)
         mark_events(axes, events)
     for axes, strip in zip(grid[len(panels) :], strips, strict=True):
         draw_strip(axes, strip)
     grid[-1].set_xlabel("iteration", color=INK)
     grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    grid[-1].set_xlim(-0.5, len(iterations.rows) - 0.5)
+    grid[-1].set_xlim(first - 0.5, last + 0.5)
     _head(figure, iterations, title)
     inches = float(figure.get_size_inches()[1])
-    figure.tight_layout(rect=(0.0, 0.0, 1.0, 1 - 0.55 / inches), h_pad=0.6)
+    figure.tight_layout(rect=(0.0, 0.0, 1.0, 1 - 0.8 / inches), h_pad=0.6)
     if path is not None:
         save_picture(figure, path)
     return figure
 
 
-def _panels(iterations: Table, tolerance: Tolerance) -> list[Panel]:
+def _thresholds(events: Table | None) -> dict[str, float]:
+    """Thresholds of the singular values that were passed, by the Jacobian's name."""
+    records = events.records() if events is not None and len(events) else ()
+    return {
+        record["subject"].replace("_", " "): float(record["threshold"])
+        for record in records
+        if record["kind"] == "NEAR_SINGULAR"
+    }
+
+
+def _panels(iterations: Table, tolerance: Tolerance, thresholds: dict[str, float]) -> list[Panel]:
     names = iterations.names
     bounds = {
         "position_error": 1e3 * tolerance.position,
@@ -128,7 +153,7 @@ def _panels(iterations: Table, tolerance: Tolerance) -> list[Panel]:
         if name.startswith("sigma_"):
             sigmas |= _lines(iterations, name, 1.0, 1e-9)
     if sigmas:
-        panels.append(Panel("smallest singular value", sigmas))
+        panels.append(Panel("smallest singular value", sigmas, thresholds=thresholds))
     if "q" in names:
         joints = _lines(iterations, "q", 1.0, -np.inf)
         panels.append(
@@ -150,18 +175,25 @@ def _lines(iterations: Table, name: str, factor: float, smallest: float) -> dict
     return lines
 
 
-def _draw(axes: Axes, panel: Panel) -> None:
-    marker = "." if len(next(iter(panel.lines.values()))) <= 60 else ""
+def _draw(axes: Axes, panel: Panel, shown: int) -> None:
+    """Draw a panel of so many iterations."""
+    marker = "." if shown <= 60 else ""
+    long = shown >= LONG
     many = len(panel.lines) > len(COLORS)
     for i, (label, values) in enumerate(panel.lines.items()):
         axes.plot(
             values,
-            color=matplotlib.colormaps["tab20"](i % 20) if many else COLORS[i % len(COLORS)],
-            lw=1.2 if many else max(2.8 - 0.7 * i, 1.2),  # equal lines must not hide one another
+            color=COLORS[i % len(COLORS)],
+            ls=DASHES[i // len(COLORS) % len(DASHES)],
+            # Equal lines must not hide one another.
+            lw=0.7 if long else 1.2 if many else max(2.8 - 0.7 * i, 1.2),
             marker="" if many else marker,
             markersize=5,
             label=label.replace("_", " "),
         )
+        if label in panel.thresholds:
+            style = {"color": COLORS[i % len(COLORS)], "lw": 1.0, "ls": (0, (1, 1.5))}
+            axes.axhline(panel.thresholds[label], label=f"{label}: near singular", **style)
     if not panel.linear:
         axes.set_yscale("log")
     if panel.bound is not None:
@@ -227,8 +259,8 @@ def _head(figure: Figure, iterations: Table, title: str) -> None:
     ]
     figure.legend(
         handles=handles,
-        loc="center right",
-        bbox_to_anchor=(0.995, top),
+        loc="center left",
+        bbox_to_anchor=(0.005, top - 0.28 / float(figure.get_size_inches()[1])),
         ncols=len(handles),
         frameon=False,
         fontsize=10,

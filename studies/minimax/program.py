@@ -13,6 +13,7 @@ from several starts; what any of them finds to be within tolerance is proved to 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -53,16 +54,18 @@ class Nearest:
 class MinimaxProgram:
     """The program for one robot with one tolerance; contacts are numbers of a solve."""
 
-    def __init__(self, robot: ik.ArmHand, tolerance: ik.Tolerance) -> None:
+    def __init__(self, robot: ik.ArmHand, tolerance: ik.Tolerance, fingers: Sequence[str]) -> None:
         """Build the graphs and the solver.
 
         Args:
             robot: The robot.
             tolerance: Of all contacts.
+            fingers: Those that have a contact; the others are free.
         """
         self._robot = robot
+        self._rows = [robot.fingers.index(name) for name in fingers]
         description = robot.description
-        n, f = len(robot.actuators), len(robot.fingers)
+        n, f = len(robot.actuators), len(fingers)
         ranges = robot.upper - robot.lower
         # Sliders of millimetres and joints of radians move the contacts alike once scaled.
         x, w = ca.SX.sym("x", n), ca.SX.sym("w")
@@ -71,7 +74,7 @@ class MinimaxProgram:
         kinematics = actuated(description, q).kinematics
         chord = 2 * np.sin(tolerance.angle / 2)
         squares = []
-        for i, name in enumerate(robot.fingers):
+        for i, name in enumerate(fingers):
             point, normal = kinematics.contact(name)
             squares.append(ca.sumsqr(point - points[i, :].T) / tolerance.position**2)
             squares.append(ca.sumsqr(normal - normals[i, :].T) / chord**2)
@@ -102,7 +105,8 @@ class MinimaxProgram:
             normals: (f, 3).
             starts: (s, n) configurations to begin with.
         """
-        robot, asked = self._robot, np.concatenate([points.T.ravel(), normals.T.ravel()])
+        robot, rows = self._robot, self._rows
+        asked = np.concatenate([points[rows].T.ravel(), normals[rows].T.ravel()])
         n, ranges = len(robot.lower), robot.upper - robot.lower
         best, best_q = np.inf, starts[0]
         for number, start in enumerate(starts, 1):

@@ -32,7 +32,13 @@ def repeated(solve: OneSolve) -> ik.Solution:
     }
     asked = solve.asked
     solver = ik.Solver(ik.load_robot(solve.robot), solve.method, limits=asked.limits)
-    return solver.solve(ik.Grasp(contacts), q0=asked.start, seed=asked.seed, fixed=asked.fixed)
+    return solver.solve(
+        ik.Grasp(contacts),
+        q0=asked.start,
+        seed=asked.seed,
+        fixed=asked.fixed,
+        prefer=asked.prefer,
+    )
 
 
 @pytest.mark.parametrize("limits", ["enforce", "ignore"])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from casadi_ik.errors import LogError
 from casadi_ik.logs.events.traces import bits_of
 from casadi_ik.logs.read.table import Part, element_name
+from casadi_ik.problem.preference import NO_PREFERENCE
 from casadi_ik.problem.problems import Tolerance
 
 
@@ -33,6 +34,8 @@ class Asked:
         seed: Of its random numbers, which follow from the number of the solve as well.
         start: (n,) where it began [rad or m]; None in logs of earlier versions.
         fixed: Actuators that were held, and where [rad or m].
+        prefer: Which of several solutions was wanted; None: the method cannot choose, or the log
+            is of an earlier version.
     """
 
     tolerances: tuple[Tolerance, ...]
@@ -40,6 +43,7 @@ class Asked:
     seed: int = 0
     start: NDArray[np.float64] | None = None
     fixed: Mapping[str, float] = field(default_factory=dict)
+    prefer: str | None = None
 
 
 def asked_of(part: Part, metadata: Mapping[str, Any]) -> Asked:
@@ -59,6 +63,8 @@ def asked_of(part: Part, metadata: Mapping[str, Any]) -> Asked:
         tolerances = tuple(Tolerance(**known.tolerance.get(finger, {})) for finger in fingers)
         return Asked(tolerances, known.limits, seed)
     names = part.labels["q"]
+    known = part.rows.dtype.names or ()
+    prefer = part.labels["prefer"][int(row["prefer"])] if "prefer" in known else NO_PREFERENCE
     (held,) = bits_of(np.atleast_1d(row["fixed_mask"])[None])
     pairs = zip(row["position_tolerance"].tolist(), row["angle_tolerance"].tolist(), strict=True)
     return Asked(
@@ -67,4 +73,5 @@ def asked_of(part: Part, metadata: Mapping[str, Any]) -> Asked:
         seed=int(row["seed"]),
         start=row["start"],
         fixed={element_name(names, int(i)): float(row["start"][i]) for i in np.flatnonzero(held)},
+        prefer=None if prefer == NO_PREFERENCE else prefer,
     )

@@ -11,6 +11,7 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.events.kinds import EventKind, jacobian_names
 from casadi_ik.logs.events.traces import as_matrix, words_of
 from casadi_ik.problem.contacts.arrays import NAMES
+from casadi_ik.problem.preference import NO_PREFERENCE, PREFERENCES
 from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import TraceFormat
@@ -53,6 +54,7 @@ def solve_format(block: SolveBlock) -> TraceFormat:
         Field("success", (), "u1", "", "1: solved"),
         Field("limits_ok", (), "u1", "", "1: every actuator and joint within its limits"),
         Field("limits_enforced", (), "u1", "", "1: being solved included the limits"),
+        Field("prefer", (), "u1", "", "which of several solutions was wanted"),
         Field("ok", (f,), "u1", "", "1: contact within tolerance"),
         Field("kept", (), "u1", "", "1: every iteration and event is in the log"),
     )
@@ -67,6 +69,7 @@ def solve_format(block: SolveBlock) -> TraceFormat:
         "phase_iterations": phases,
         "events": tuple(kind.name for kind in EventKind),
         "status": STATUSES,
+        "prefer": (NO_PREFERENCE, *PREFERENCES),
     }
     return TraceFormat(layout, labels)
 
@@ -96,6 +99,7 @@ def solve_rows(block: SolveBlock, events: NDArray[np.int64], layout: Layout) -> 
         padded = np.pad(held, (0, -len(held) % 32))
         rows["fixed_mask"] = words_of(padded[None]).reshape(rows["fixed_mask"].shape[1:])
     rows["limits_enforced"] = problems.enforce_limits
+    rows["prefer"] = (NO_PREFERENCE, *PREFERENCES).index(problems.prefer)
     for name in ("position_tolerance", "angle_tolerance"):
         rows[name] = getattr(problems, name)
     for name in (

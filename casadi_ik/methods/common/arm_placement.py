@@ -38,6 +38,10 @@ ALLOWED = -1e-9
 """Margin [rad] that still counts as within limits: rounding at a root."""
 
 
+NO_MARGIN = -1e9
+"""Margin before any arm was seen."""
+
+
 def place_arm(arm: SrsArm, palm: Pose, lower: Expr, upper: Expr, trial: Expr) -> tuple[Expr, Expr]:
     """Try the swivels of one iteration.
 

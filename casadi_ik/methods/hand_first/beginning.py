@@ -9,6 +9,7 @@ import casadi as ca
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.recipe import recipe
+from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.problem.contacts.kinds import suffix
 from casadi_ik.problem.status import Phase
@@ -26,6 +27,7 @@ def terms(robot: RobotDescription) -> Layout:
             Field("angle_tolerance", (f,), unit="rad"),
             Field("lower", (n,), doc="lower bounds of q"),
             Field("upper", (n,), doc="upper bounds of q"),
+            Field("nearest", doc="1 if the solution nearest to where the robot is is wanted"),
         )
     )
 
@@ -77,13 +79,14 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
         ca.if_else(needed, _bounded(postures[i, :].T, t, hand), held)
         for i in range(layouts.candidates)
     ]
+    start = _bounded(here, t, list(range(n)))
     parameters = layouts.parameters.pack(
         {
             **{key: _or_zero(array, numbers[key]) for key, array in vectors.items()},
             "weights": known,
             "reach": 1.0,
             "alone": 0.0,
-            "start": _bounded(here, t, list(range(n))),
+            "start": start,
             "postures": ca.horzcat(*tried).T,
             **t,
         }
@@ -92,11 +95,13 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
     state = layouts.state.pack(
         zero
         | {
-            "q": here,
+            "q": start,
             "best_q": here,
-            "phase": float(Phase.CANDIDATE),
             "best_cost": sys.float_info.max,
+            "phase": ca.if_else(t["nearest"], float(Phase.REFINEMENT), float(Phase.CANDIDATE)),
+            "candidate": -t["nearest"],
         }
+        | fresh_fit()
     )
     inputs = [*vectors.values(), here, given, postures]
     return ca.Function(name, inputs, shared(state, parameters))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from casadi_ik.kernels import FunctionKernel, LoopKernel
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.state import STAGE_LABELS, HandFirstLayouts
@@ -23,6 +25,7 @@ class FirstRound:
         beginning: FunctionKernel,
         loop: LoopKernel,
         layouts: HandFirstLayouts,
+        order: Callable[[Problems, Array, Array, bool], Array],
     ) -> None:
         """Lay the arrays out; all kernels must be compiled.
 
@@ -31,7 +34,9 @@ class FirstRound:
             beginning: See `steps.hand_first_beginning`.
             loop: The loop.
             layouts: Of its step.
+            order: See `HandFirstMethod.order`.
         """
+        self._order = order
         self._postures = table.postures
         self._lookup = table.lookup.single(layouts.candidates)
         self._solve = loop.single()
@@ -67,6 +72,8 @@ class FirstRound:
         known[0][...], known[1][...] = points, normals
         self._lookup()
         self._postures.take(self._lookup.found[0], axis=0, out=postures, mode="clip")
+        if problems.prefer == "q0":
+            postures[...] = self._order(problems, q0[None], postures[None], True)[0]
         self._begin()
         self._solve(max_iterations)
         if self._solve.result.status[0] != Status.SOLVED:

@@ -20,6 +20,7 @@ from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Quick
+from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
@@ -28,6 +29,12 @@ from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
+
+NEAREST = "q0"
+"""The preference for what is near the start."""
+
+TINY = 1e-9
+"""Smallest range [rad or m] a motion is measured by."""
 
 CARRIED = ("passed", "near", "balanced", "best_cost", "best_q", "counts")
 """What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
@@ -41,9 +48,11 @@ class HandFirstMethod(LoopedMethod):
 
     Attributes:
         step: Its step for this robot.
+        preferences: What it can prefer.
     """
 
     name = "hand-first"
+    preferences = PREFERENCES
     phases_without_arm = (Phase.CANDIDATE, Phase.HAND_FIT)
     takes_free_contacts = True
     takes_fixed_actuators = True
@@ -112,7 +121,7 @@ class HandFirstMethod(LoopedMethod):
             states[:, layout.slice(name).start].astype(np.int64)
             for name in ("earlier", "candidate")
         )
-        return earlier + np.minimum(candidate, self.options.candidates - 1)
+        return earlier + np.clip(candidate, 0, self.options.candidates - 1)
 
     def quick(self, problems: Problems, q0: Array) -> Quick | None:
         """The first round of one target; see `QuickMethod.quick`."""
@@ -121,12 +130,16 @@ class HandFirstMethod(LoopedMethod):
         try:
             first = self._singles.pop()
         except IndexError:
-            first = FirstRound(self.hands.table, self._beginning, self.kernel, self.step.layouts)
+            first = FirstRound(
+                self.hands.table, self._beginning, self.kernel, self.step.layouts, self.order
+            )
         found = first(problems, q0, self._terms(problems), self.max_iterations)
         self._singles.append(first)
         return found
 
-    def rows(self, problems: Problems, q0: Array, postures: Array) -> tuple[Array, Array]:
+    def rows(
+        self, problems: Problems, q0: Array, postures: Array, begun: bool = False
+    ) -> tuple[Array, Array]:
         """States and parameters of the loop, to be changed before `run_rows`.
 
         Args:
@@ -134,6 +147,7 @@ class HandFirstMethod(LoopedMethod):
             q0: (k, n).
             postures: (k, candidates, hand) hand postures to start from, or (k, 1, hand). Motors
                 that move free fingers only stay as in q0.
+            begun: Whether a solution near q0 was looked for before, if one is wanted.
 
         Returns:
             (k, ...) states and parameters.
@@ -143,6 +157,10 @@ class HandFirstMethod(LoopedMethod):
         vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
         asked = *vectors, q0, self._terms(problems), tried
         states, parameters = self._beginning(*asked)
+        if begun:
+            layout = self.step.layouts.state
+            states[:, layout.slice("phase")] = float(Phase.CANDIDATE)
+            states[:, layout.slice("candidate")] = 0.0
         return states, parameters
 
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
@@ -162,12 +180,15 @@ class HandFirstMethod(LoopedMethod):
         """What a round begins with, the memory of those before aside."""
         later, layouts = number - self.options.rounds, self.step.layouts
         if later < 0 or last is None:
-            return self.rows(problems, q0, self.postures(problems, number))
+            postures = self.postures(problems, number)
+            if problems.prefer == NEAREST:
+                postures = self.order(problems, q0, postures, own=last is None)
+            return self.rows(problems, q0, postures, begun=last is not None)
         if later < VALLEYS:
             best = last[:, layouts.state.slice("best_q")]
-            return self.rows(problems, q0, self.hands.along_valley(problems, best, later))
+            return self.rows(problems, q0, self.hands.along_valley(problems, best, later), True)
         anywhere = self.hands.anywhere(problems, later - VALLEYS)
-        states, parameters = self.rows(problems, q0, anywhere[None][:, :, list(layouts.hand)])
+        states, parameters = self.rows(problems, q0, anywhere[None][:, :, list(layouts.hand)], True)
         # The first of them begins as a whole: what stands in the way may be arm and hand together.
         lower, upper = (parameters[:, layouts.parameters.slice(end)] for end in ("lower", "upper"))
         states[:, layouts.state.slice("q")] = np.clip(anywhere[0], lower, upper)
@@ -176,10 +197,33 @@ class HandFirstMethod(LoopedMethod):
             states[:, layouts.state.slice(name)] = value
         return states, parameters
 
+    def order(self, problems: Problems, q0: Array, postures: Array, own: bool) -> Array:
+        """Hand postures (k, c, hand), the nearest first.
+
+        Args:
+            problems: The targets.
+            q0: (k, n) where the robot is.
+            postures: The postures.
+            own: Whether its own posture comes first, instead of the last of them.
+        """
+        hand = list(self.step.layouts.hand)
+        here = np.clip(q0, *problems.bounds(self.robot, UNBOUNDED))[:, None, hand]
+        if own:
+            postures = postures[:, : max(postures.shape[1] - 1, 1)]
+        ranges = np.maximum((self.robot.upper - self.robot.lower)[hand], TINY)
+        distance = (((postures - here) / ranges) ** 2).sum(axis=2)
+        rows = np.argsort(distance, axis=1, kind="stable")[:, :, None]
+        ordered = np.take_along_axis(postures, rows, axis=1)
+        if not own or self.options.candidates == 1:
+            return ordered
+        return np.concatenate([here, ordered], axis=1)
+
     def _terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms."""
         bounds = problems.bounds(self.robot, UNBOUNDED)
-        return np.concatenate([problems.position_tolerance, problems.angle_tolerance, *bounds])
+        nearest = [float(problems.prefer == NEAREST)]
+        tolerances = problems.position_tolerance, problems.angle_tolerance
+        return np.concatenate([*tolerances, *bounds, nearest])
 
     @cached_property
     def _beginning(self) -> FunctionKernel:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,7 +32,10 @@ from casadi_ik.problem.trace import (
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
 
-STAGES = (Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT, Phase.BALANCE)
+STAGES = (
+    *(Phase.REFINEMENT, Phase.CANDIDATE, Phase.HAND_FIT, Phase.ARM_PLACEMENT),
+    *(Phase.BALANCE, Phase.ARM_CHOICE),
+)
 """The stages in the order of their codes."""
 
 STAGE_LABELS = tuple(stage.label for stage in STAGES)
@@ -75,7 +79,7 @@ class HandFirstLayouts:
                 Field("palm_rotation", (3, 3)),
                 Field("palm_origin", (3,), unit="m"),
                 Field("phase"),
-                Field("candidate", doc="index of the hand posture started from"),
+                Field("candidate", doc="index of the hand posture started from; -1: all as in q0"),
                 Field("earlier", doc="hand postures tried in earlier rounds"),
                 Field("damping"),
                 Field("growth", doc="factor of the damping if the next step gains nothing"),
@@ -88,6 +92,8 @@ class HandFirstLayouts:
                 Field("balanced", doc="cost of the refinement last balanced, 0: none"),
                 Field("margin", doc="best margin of the arm so far, negative: a violation"),
                 Field("arm", (len(self.robot.arm_actuators),), doc="arm with the best margin"),
+                Field("swivel", unit="rad", doc="swivel of the arm nearest to the start"),
+                Field("elbow", doc="its sign of the elbow"),
                 Field("starts", doc="starts of the numeric arm stage so far"),
                 Field("passed", doc="how far the palm of the last start was from the one wanted"),
                 Field("best_cost", doc="smallest cost of a whole configuration so far"),
@@ -109,7 +115,8 @@ class HandFirstLayouts:
                 Field("upper", (n,), doc="upper bounds of q"),
                 Field("reach", doc="weight of the arm's reach while the hand is fitted"),
                 Field("alone", doc="1 if a solve ends with the hand's fit, and the arm stays out"),
-                Field("start", (n,), doc="where a stage that needs a start begins"),
+                Field("start", (n,), doc="where the robot is, within bounds"),
+                Field("nearest", doc="1 if the solution nearest to the start is wanted"),
                 Field("postures", (self.candidates, len(self.hand)), doc="hand postures to try"),
             )
         )
@@ -186,9 +193,15 @@ class HandFirstLayouts:
                 "margin": margin,
                 **coupling_values(self.robot, q),
                 "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
-                "restart": s["earlier"] + s["candidate"],
+                "restart": s["earlier"] + ca.fmax(s["candidate"], 0.0),
                 "accepted": accepted,
                 "phase": float(phase),
                 "status": status,
             }
         )
+
+
+def with_rows(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
+    """Replace some of the entries of q."""
+    places = {row: i for i, row in enumerate(rows)}
+    return ca.vertcat(*(values[places[i]] if i in places else q[i] for i in range(q.numel())))

@@ -8,41 +8,48 @@ hand fit    one damped step of palm pose and hand posture;
 placement   try some swivels of the arm for that palm pose;
 refinement  one damped step of all motors, from the least violating arm, where the arm cannot
             follow exactly or has no closed form;
+choice      some swivels of the arm, the nearest to where the robot is, if that is wanted; such a
+            solve begins with a refinement of the whole configuration if it nearly solves already,
+            and with the hand as it is;
 balance     one step of all motors towards the smallest largest error, where least squares misses
             the tolerances by little.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import casadi as ca
 
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
-from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, place_arm
+from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, NO_MARGIN, place_arm
 from casadi_ik.methods.common.balance import differs, worth_balancing
 from casadi_ik.methods.common.contact_fit import (
-    EXACT,
     Judged,
     Tried,
     fresh_fit,
-    judge,
     judge_contacts,
 )
-from casadi_ik.methods.common.numeric_arm import STARTS, nearest_start, pose_step
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.balance_stage import balance_stage
-from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
-from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts
+from casadi_ik.methods.hand_first.choice_stage import choice_stage
+from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_residual, fit_step
+from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
+from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_rows
 from casadi_ik.methods.hand_first.whole_fit import whole_step
 from casadi_ik.problem.contacts.kinds import Kinds, suffix
+from casadi_ik.problem.contacts.rows import chord, within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
+
+WHOLE = 0.5
+"""Cost up to which a start is refined as a whole (three contacts off by 4 cm each)."""
+
+OWN_HAND = 0.5
+"""Cost, with the best palm, up to which the hand as it is is fitted before other hands."""
 
 
 class HandFirstStep:
@@ -95,9 +102,9 @@ class HandFirstStep:
         }
         if self.robot.arm_actuators:
             stages[Phase.HAND_FIT] = self._hand_fit()
-            stages[Phase.ARM_PLACEMENT] = (
-                self._placement() if self.arm else self._numeric_placement()
-            )
+            stages[Phase.ARM_PLACEMENT] = self._placement() if self.arm else numeric_stage(layouts)
+        if self.arm is not None:
+            stages[Phase.ARM_CHOICE] = choice_stage(layouts, self.arm)
         phases = [phase for phase in STAGES if phase in stages]
         cases = [stages[phase] for phase in phases]
         choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
@@ -126,18 +133,24 @@ class HandFirstStep:
         )
         exhausted = s["candidate"] >= count
         q = self._with_hand(p["start"], hand)
-        rotation, origin = best_palm(
-            hand_contacts(self.robot, hand, layouts.hand), layouts.contacts, p
-        )
+        contacts = hand_contacts(self.robot, hand, layouts.hand)
+        rotation, origin = best_palm(contacts, layouts.contacts, p)
+        # The hand as it is is only worth a fit if its contacts are shaped a little like these.
+        own = ca.logic_and(p["nearest"], s["candidate"] == 0)
+        own = ca.logic_and(own, ca.sumsqr(hand - p["start"][list(layouts.hand)]) <= 0)
+        fitted = PalmAndHand(rotation, origin, hand)
+        misfit = ca.sumsqr(fit_residual(contacts, layouts.contacts, fitted, p))
+        skipped = ca.logic_and(own, misfit > OWN_HAND)
         after = layouts.state.pack(
             self.layouts.counted(s, Phase.CANDIDATE)
             | {
                 "q": ca.if_else(exhausted, s["best_q"], q),
                 "palm_rotation": rotation,
                 "palm_origin": origin,
-                "phase": float(self._after_candidate),
+                "phase": ca.if_else(skipped, float(Phase.CANDIDATE), float(self._after_candidate)),
+                "candidate": s["candidate"] + skipped,
                 "cost": 0.0,
-                "margin": -1e9,
+                "margin": NO_MARGIN,
                 "starts": 0.0,
             }
             | fresh_fit()
@@ -178,7 +191,7 @@ class HandFirstStep:
                 "palm_origin": ca.if_else(keep, reached.origin, x.origin),
                 "phase": ca.if_else(
                     judged.settled,
-                    ca.if_else(onwards, float(Phase.ARM_PLACEMENT), float(Phase.CANDIDATE)),
+                    ca.if_else(onwards, self._arm_stage(p), float(Phase.CANDIDATE)),
                     float(Phase.HAND_FIT),
                 ),
                 "candidate": s["candidate"]
@@ -193,6 +206,11 @@ class HandFirstStep:
         record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged.accepted)
         return ca.Function("hand_fit", [state, parameters], shared(after, record, status))
 
+    def _arm_stage(self, p: dict[str, Expr]) -> Expr:
+        if self.arm is None:
+            return ca.SX(float(Phase.ARM_PLACEMENT))
+        return ca.if_else(p["nearest"], float(Phase.ARM_CHOICE), float(Phase.ARM_PLACEMENT))
+
     def _placement(self) -> ca.Function:
         state = ca.MX.sym("state", self.layouts.state.size)
         parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
@@ -203,57 +221,6 @@ class HandFirstStep:
         found = place_arm(self.arm, palm, p["lower"][arm], p["upper"][arm], s["spent"])
         outputs = self._place()(state, parameters, *found)
         return ca.Function("placement", [state, parameters], list(outputs))
-
-    def _numeric_placement(self) -> ca.Function:
-        """A step towards the palm pose; the first of a start begins at a row of the table."""
-        state = ca.MX.sym("state", self.layouts.state.size)
-        parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
-        s = self.layouts.state.unpack(state)
-        begin = nearest_start(self.robot)
-        arm = ca.MX.sym("arm", len(self.robot.arm_actuators))
-        inputs = [ca.MX.sym("rotation", 3, 3), ca.MX.sym("origin", 3), ca.MX.sym("passed"), arm]
-        fresh = ca.Function("fresh", inputs, list(begin(*inputs[:3])))
-        same = ca.Function("same", inputs, [arm, inputs[2]])
-        now = s["q"][list(self.robot.arm_actuators)]
-        palm = (s["palm_rotation"], s["palm_origin"])
-        chosen = ca.Function.if_else("start", fresh, same)(s["spent"] < 1, *palm, s["passed"], now)
-        outputs = self._pose_step()(state, parameters, *chosen)
-        return ca.Function("placement", [state, parameters], list(outputs))
-
-    def _pose_step(self) -> ca.Function:
-        state, parameters, s, p = self._inputs()
-        rows = list(self.robot.arm_actuators)
-        arm, passed = ca.SX.sym("arm", len(rows)), ca.SX.sym("passed")
-        inside = ca.fmin(ca.fmax(arm, p["lower"][rows]), p["upper"][rows])
-        palm = Pose(s["palm_rotation"], s["palm_origin"])
-        tried = pose_step(self.robot, inside, palm, s["damping"], p)
-        judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
-        now = ca.if_else(judged.accepted, tried.reached, inside)
-        margin = -ca.sqrt(judged.cost)
-        better = margin > s["margin"]
-        best, best_margin = ca.if_else(better, now, s["arm"]), ca.fmax(margin, s["margin"])
-        exact = judged.cost < EXACT * EXACT
-        starts = s["starts"] + judged.settled
-        leave = ca.logic_or(exact, starts >= STARTS)
-        q = self._with_arm(s["q"], ca.if_else(leave, best, now))
-        after = self.layouts.state.pack(
-            self.layouts.counted(s, Phase.ARM_PLACEMENT)
-            | judged.fit
-            | {
-                "q": q,
-                "cost": s["cost"],
-                "phase": ca.if_else(leave, float(Phase.REFINEMENT), float(Phase.ARM_PLACEMENT)),
-                "margin": best_margin,
-                "arm": best,
-                "starts": starts,
-                "passed": passed,
-            }
-        )
-        solved = ca.logic_and(exact, s["fits"] > 0)
-        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self.layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
-        inputs = [state, parameters, arm, passed]
-        return ca.Function("pose_step", inputs, shared(after, record, status))
 
     def _place(self) -> ca.Function:
         """Keep the best arm so far; take it if it is within limits."""
@@ -286,15 +253,23 @@ class HandFirstStep:
 
     def _refinement(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
-        tried = whole_step(self.robot, self.layouts.contacts, s["q"], s["damping"], p)
-        judged = judge_contacts(s, p, tried, self.layouts.contacts)
-        q = ca.if_else(judged.accepted, tried.reached, s["q"])
-        solved = ca.logic_and(judged.settled, judged.within)
+        contacts = self.layouts.contacts
+        tried = whole_step(self.robot, contacts, s["q"], s["damping"], p)
+        judged = judge_contacts(s, p, tried, contacts)
+        # Where the robot is: if that solves, nothing moves; if it is far off, this is no short way.
+        here = ca.logic_and(s["candidate"] < 0, s["spent"] < 1)
+        tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
+        met = ca.logic_and(here, within_tolerance(*contacts.errors(tried.before), *tolerances))
+        far = self._far(here, tried)
+        moved = ca.logic_and(judged.accepted, ca.logic_not(met))
+        q = ca.if_else(moved, tried.reached, s["q"])
+        solved = ca.logic_or(met, ca.logic_and(judged.settled, judged.within))
         unsolved = ca.logic_and(judged.settled, ca.logic_not(judged.within))
         near = worth_balancing(self._left(judged, tried), self.layouts.contacts, p)
         near = ca.logic_and(near, differs(judged.cost, s["balanced"]))
         near = ca.logic_and(near, unsolved)
-        failed = ca.logic_and(unsolved, ca.logic_not(near))
+        failed = ca.logic_or(far, ca.logic_and(unsolved, ca.logic_not(near)))
+        near = ca.logic_and(near, ca.logic_not(far))
         better = judged.cost < s["best_cost"]
         after = self.layouts.state.pack(
             self.layouts.counted(s, Phase.REFINEMENT)
@@ -313,8 +288,14 @@ class HandFirstStep:
             | judged.fit
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged.accepted)
+        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, moved)
         return ca.Function("refinement", [state, parameters], shared(after, record, status))
+
+    def _far(self, here: Expr, tried: Tried) -> Expr:
+        """Whether a start is so far from the contacts that refining it is not worth it."""
+        if not self.robot.arm_actuators:
+            return ca.SX(0)
+        return ca.logic_and(here, ca.sumsqr(tried.before) > WHOLE)
 
     def _left(self, judged: Judged, tried: Tried) -> Expr:
         """Residual of the contacts after a step was judged."""
@@ -322,13 +303,7 @@ class HandFirstStep:
         return left[: self.layouts.contacts.size]
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
-        return _with(q, self.layouts.hand, hand)
+        return with_rows(q, self.layouts.hand, hand)
 
     def _with_arm(self, q: Expr, arm: Expr) -> Expr:
-        return _with(q, self.robot.arm_actuators, arm)
-
-
-def _with(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
-    """Replace some of the entries of q."""
-    places = {row: i for i, row in enumerate(rows)}
-    return ca.vertcat(*(values[places[i]] if i in places else q[i] for i in range(q.numel())))
+        return with_rows(q, self.robot.arm_actuators, arm)

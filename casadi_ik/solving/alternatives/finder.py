@@ -15,15 +15,13 @@ from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.preference import preference
 from casadi_ik.problem.problems import Array, Problems
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
 from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.measures import manipulability
-
-PREFERENCES = ("limits", "manipulability", "q0")
-"""What may be preferred: distance from the limits, manipulability, closeness to q0."""
 
 DISTINCT = 0.05
 """Configurations count as different if a motor differs by this part of its range."""
@@ -114,8 +112,7 @@ class AlternativeFinder:
         """
         if not isinstance(limit, (int, np.integer)) or limit < 1:
             raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
-        if prefer not in PREFERENCES:
-            raise InputError(f"prefer: found {prefer!r}, expected one of {', '.join(PREFERENCES)}")
+        preference(prefer, started=True)
         limits = self._trials.limits(problems)
         found: list[_Found] = []
         for number, q in enumerate(self._postures(problems, q0, limits)):
@@ -127,6 +124,23 @@ class AlternativeFinder:
         keys = np.stack([self._score(q, q0, prefer), self._margins(q, self._arm)])
         order = [i for i in np.lexsort(-keys[::-1]) if solved[i]][:limit]
         return tuple(self._described(problems, found[i], q0) for i in order)
+
+    def best_arm(self, problems: Problems, q: Array, q0: Array, seed: int, prefer: str) -> Array:
+        """The solution (n,) with the hand where a given one has it, and the best arm for it.
+
+        Args:
+            problems: One target.
+            q: (n,) a solution.
+            q0: (n,) where the robot is.
+            seed: Of the starts of arms without a closed form.
+            prefer: One of `PREFERENCES`.
+        """
+        limits = self._trials.limits(problems)
+        found = self._arms(problems, q, 0, limits, q0, seed, prefer)
+        every = np.stack([q, *(item.q for item in found)])
+        solved = self._trials.solved(problems, every, problems.enforce_limits)
+        every = every[solved] if solved.any() else q[None]
+        return every[int(np.argmax(self._score(every, q0, prefer)))]
 
     def _postures(self, problems: Problems, q0: Array, limits: Bounds) -> list[Array]:
         """Solutions (n,) with different hands, from every candidate of every round."""

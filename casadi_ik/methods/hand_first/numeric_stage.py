@@ -1,0 +1,69 @@
+"""Arm placement for arms without a closed form: damped steps towards the palm pose."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from casadi_ik.methods.common.contact_fit import EXACT, judge
+from casadi_ik.methods.common.numeric_arm import STARTS, nearest_start, pose_step
+from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.subexpressions import shared
+
+
+def numeric_stage(layouts: HandFirstLayouts) -> ca.Function:
+    """A step towards the palm pose; the first of a start begins at a row of the table."""
+    state = ca.MX.sym("state", layouts.state.size)
+    parameters = ca.MX.sym("parameters", layouts.parameters.size)
+    s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
+    begin = nearest_start(layouts.robot)
+    arm = ca.MX.sym("arm", len(layouts.robot.arm_actuators))
+    inputs = [ca.MX.sym("rotation", 3, 3), ca.MX.sym("origin", 3), ca.MX.sym("passed"), arm]
+    fresh = ca.Function("fresh", inputs, list(begin(*inputs[:3])))
+    same = ca.Function("same", inputs, [arm, inputs[2]])
+    now = s["q"][list(layouts.robot.arm_actuators)]
+    palm = (s["palm_rotation"], s["palm_origin"])
+    # The first start is the arm as it is, if a solution near it is wanted.
+    own = ca.logic_and(p["nearest"], s["starts"] < 1)
+    first = ca.logic_and(s["spent"] < 1, ca.logic_not(own))
+    chosen = ca.Function.if_else("start", fresh, same)(first, *palm, s["passed"], now)
+    outputs = _pose_step(layouts)(state, parameters, *chosen)
+    return ca.Function("placement", [state, parameters], list(outputs))
+
+
+def _pose_step(layouts: HandFirstLayouts) -> ca.Function:
+    state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
+    s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
+    rows = list(layouts.robot.arm_actuators)
+    arm, passed = ca.SX.sym("arm", len(rows)), ca.SX.sym("passed")
+    inside = ca.fmin(ca.fmax(arm, p["lower"][rows]), p["upper"][rows])
+    palm = Pose(s["palm_rotation"], s["palm_origin"])
+    tried = pose_step(layouts.robot, inside, palm, s["damping"], p)
+    judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
+    now = ca.if_else(judged.accepted, tried.reached, inside)
+    margin = -ca.sqrt(judged.cost)
+    better = margin > s["margin"]
+    best, best_margin = ca.if_else(better, now, s["arm"]), ca.fmax(margin, s["margin"])
+    exact = judged.cost < EXACT * EXACT
+    starts = s["starts"] + judged.settled
+    leave = ca.logic_or(exact, starts >= STARTS)
+    q = with_rows(s["q"], rows, ca.if_else(leave, best, now))
+    after = layouts.state.pack(
+        layouts.counted(s, Phase.ARM_PLACEMENT)
+        | judged.fit
+        | {
+            "q": q,
+            "cost": s["cost"],
+            "phase": ca.if_else(leave, float(Phase.REFINEMENT), float(Phase.ARM_PLACEMENT)),
+            "margin": best_margin,
+            "arm": best,
+            "starts": starts,
+            "passed": passed,
+        }
+    )
+    solved = ca.logic_and(exact, s["fits"] > 0)
+    status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
+    record = layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
+    inputs = [state, parameters, arm, passed]
+    return ca.Function("pose_step", inputs, shared(after, record, status))

@@ -1,0 +1,114 @@
+"""From where the robot is to the nearest solution: nothing moves in vain, and paths do not jump.
+
+Mostly in the virtual machine, whose iterates are those of compiled code.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError, UnsupportedError
+
+EXACT = ik.Tolerance(1e-6, 1e-6)
+
+
+def distance(robot, q, q0):
+    """Euclidean distance, every motor as a part of its range."""
+    return np.linalg.norm((q - q0) / (robot.upper - robot.lower), axis=-1)
+
+
+def path(robot, rng, steps):
+    """Configurations along a smooth motion whose contacts move by about 0.25 mm a step."""
+    start = robot.lower + (robot.upper - robot.lower) * rng.uniform(0.3, 0.7, len(robot.lower))
+    direction = rng.normal(size=len(start)) * (robot.upper - robot.lower)
+    points = [robot.contacts(start + sign * 1e-6 * direction)[0] for sign in (0, 1)]
+    speed = np.linalg.norm(points[1] - points[0], axis=-1).max() / 1e-6
+    return start + np.arange(steps)[:, None] * direction * 0.25e-3 / speed
+
+
+def test_what_solves_already_is_not_moved(robot, rng):
+    q = robot.random(rng, 50)
+    solver = ik.Solver(robot, compiled=False)
+    batch = solver.solve_batch(*robot.contacts(q), q0=q)
+    assert batch.success.all()
+    np.testing.assert_array_equal(batch.q, q)
+    assert batch.iterations.max() <= 1
+    alone = solver.solve(_grasp(robot, q[0]), q0=q[0])
+    np.testing.assert_array_equal(alone.q, q[0])
+
+
+def test_along_paths_of_small_steps_nothing_jumps(robot, rng):
+    """It was up to 208 degrees."""
+    solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
+    for _ in range(4):
+        wanted = path(robot, rng, 40)
+        q = wanted[0]
+        for one in wanted[1:]:
+            points, normals = robot.contacts(one)
+            batch = solver.solve_batch(points[None], normals[None], q0=q)
+            assert batch.success.all()
+            assert np.abs(batch.q[0] - q).max() < np.radians(3)
+            q = batch.q[0]
+
+
+def test_every_target_is_solved_from_anywhere_and_nearer_than_without_preference(robot, rng):
+    q, q0 = robot.random(rng, 300), robot.random(rng, 300)
+    solver, targets = ik.Solver(robot, tolerance=EXACT, compiled=False), robot.contacts(q)
+    near = solver.solve_batch(*targets, q0=q0)
+    far = solver.solve_batch(*targets, q0=q0, prefer="limits")
+    assert near.success.all()
+    assert far.success.all()
+    nearer = distance(robot, near.q, q0) <= distance(robot, far.q, q0) + 1e-6
+    assert nearer.mean() > 0.98
+    np.testing.assert_array_equal(far.q, solver.solve_batch(*targets).q)
+
+
+def test_nearest_of_those_that_are_seen(robot, rng):
+    q, q0 = robot.random(rng, 12), robot.random(rng, 12)
+    solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
+    batch = solver.solve_batch(*robot.contacts(q), q0=q0)
+    found = [
+        solver.solve_all(_grasp(robot, one), prefer="q0", q0=start, limit=1)[0].distance
+        for one, start in zip(q, q0, strict=True)
+    ]
+    ratio = distance(robot, batch.q, q0) / np.array(found)
+    assert np.median(ratio) < 1.01
+
+
+def test_alone_and_in_a_batch_the_same(robot, rng):
+    q, q0 = robot.random(rng, 8), robot.random(rng, 8)
+    q0[4:] = np.clip(q[4:] + 0.02, robot.lower, robot.upper)
+    solver = ik.Solver(robot)
+    batch = solver.solve_batch(*robot.contacts(q), q0=q0)
+    for row in range(8):
+        alone = solver.solve(_grasp(robot, q[row]), q0=q0[row])
+        np.testing.assert_allclose(alone.q, batch.q[row], atol=1e-6)
+        assert alone.iterations == batch.iterations[row]
+
+
+def test_manipulability(robot, rng):
+    q = robot.random(rng, 3)
+    solver = ik.Solver(robot, compiled=False)
+    targets = robot.contacts(q)
+    best = solver.solve_batch(*targets, prefer="manipulability")
+    usual = solver.solve_batch(*targets)
+    assert best.success.all()
+    finder = solver._engine.finder
+    assert (finder._measured(best.q) >= finder._measured(usual.q) * (1 - 1e-9)).all()
+
+
+def test_what_cannot_be_preferred(robot):
+    q = robot.home
+    with pytest.raises(InputError, match="prefer: found 'near', expected one of"):
+        ik.Solver(robot, compiled=False).solve(_grasp(robot, q), prefer="near")
+    with pytest.raises(UnsupportedError, match="method 'ipopt' cannot choose"):
+        ik.Solver(robot, "ipopt").solve(_grasp(robot, q), q0=q, prefer="q0")
+
+
+def _grasp(robot, q):
+    points, normals = robot.contacts(q)
+    return ik.Grasp(
+        {name: ik.Contact(points[i], normals[i]) for i, name in enumerate(robot.fingers)}
+    )
