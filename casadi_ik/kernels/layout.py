@@ -168,9 +168,8 @@ class Layout:
                     f"or {(count, *item.shape)}"
                 )
             target = vectors[:, self._slices[item.name]]
-            target[...] = (
-                value.reshape(count, -1) if len(expected) > len(item.shape) else (value.reshape(-1))
-            )
+            one_each = len(expected) > len(item.shape)
+            target[...] = value.reshape(count, item.size) if one_each else value.reshape(-1)
         return vectors
 
     def _check_names(self, values: Mapping[str, Any]) -> None:

@@ -51,7 +51,7 @@ def test_bad_grasp_file(name: str, refused: Callable[..., str], tmp_path: Path) 
         ("point", [1, 2, 3, 4], "contacts.thumb.point: expected"),
         ("point", ["a", "b", "c"], "contacts.thumb.point[0]: found 'a', expected"),
         ("point", ["1 inch", 0, 0], "unknown unit 'inch'"),
-        ("point", None, "contacts.thumb.point: expected"),
+        ("point", None, "contacts.thumb.point: missing, expected three numbers"),
         ("point", {"x": 1}, "contacts.thumb.point: expected"),
         ("colour", "red", "colour"),
     ],

@@ -49,7 +49,7 @@ def test_topics_and_times(decoded: Decoded, solve: OneSolve) -> None:
         "/joint_states": "sensor_msgs/msg/JointState",
         "/ik/targets": "foxglove.SceneUpdate",
         "/ik/contacts": "foxglove.SceneUpdate",
-        "/ik/iteration": "casadi_ik/msg/IterationEnhancedDlsQ14F3J3",
+        "/ik/iteration": "casadi_ik/msg/IterationEnhancedDlsQ14F3J5",
         "/ik/messages": "foxglove.Log",
     }
     expected = [solve.started + 10_000_000 * i for i in range(len(solve.rows))]

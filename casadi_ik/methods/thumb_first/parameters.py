@@ -27,7 +27,7 @@ class ThumbFirstParameters:
 
     starts: int = 32
     table: int = 8192
-    pull: float = 3.0
+    pull: float = 6.0
     step: str = "freeze"
     damping: float = 0.03
     step_cap: float = 0.3
