@@ -10,6 +10,7 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.methods.hand_first.restarts import LATER
 
 STEPPED = [name for name in ik.METHODS if name != "ipopt"]
 
@@ -31,7 +32,10 @@ def same_as_the_log(solver: ik.Solver, grasp: ik.Grasp, path: Path) -> ik.Soluti
         assert stepper.status == solution.status
     np.testing.assert_allclose(stepper.state["q"], solution.q, atol=1e-8)
     for record, row in zip(records, rows, strict=True):
-        assert set(record) == set(row.dtype.names)
+        assert set(record) <= set(row.dtype.names)
+        # What else is in a log is measured of finished traces.
+        more = set(row.dtype.names) - set(record)
+        assert all(name.startswith(("sigma_", "condition_")) for name in more)
         np.testing.assert_allclose(record["q"], row["q"], atol=1e-8)
         for name in ("phase", "status"):
             assert record[name] == row[name]
@@ -61,7 +65,7 @@ def test_steps_go_through_all_rounds(method: str, tmp_path) -> None:
     )
     solution = same_as_the_log(solver, away, tmp_path / "x.mcap")
     assert solution.status is ik.Status.STALLED
-    assert solution.restarts == (5 if method == "hand-first" else 2)
+    assert solution.restarts == (2 * (3 + LATER) - 1 if method == "hand-first" else 2)
 
 
 def test_state_and_parameters_are_named_and_cannot_be_spoilt(stepped_solver: ik.Solver) -> None:

@@ -15,7 +15,8 @@ class HandFirstParameters:
         table: Hand postures the targets' shapes are compared with.
         candidates: Of those, how many a round of the compiled loop may start from.
         wide_table: The same for the rounds after the first.
-        rounds: Rounds before a target is given up; each takes the next best candidates.
+        rounds: Rounds that begin from the tables, each from the next best candidates. After them
+            some begin elsewhere (`restarts.LATER`), before a target is given up.
     """
 
     table: int = 1024
