@@ -103,7 +103,17 @@ def test_other_fingers_are_refused_with_the_reason(own_robot, case):
     hand = own_robot.with_name("hand.yaml")
     replace(hand, old, new)
     if case == "spread":
-        replace(hand, "bh_spread: {limits", "bh_spread: {unit: m, limits")
+        in_degrees = "bh_spread: {limits: [0 deg, 180 deg], velocity: 2 rad/s"
+        replace(hand, in_degrees, "bh_spread: {unit: m, limits: [0 m, 3.14 m], velocity: 2 m/s")
+        replace(own_robot, "bh_spread: 30 deg", "bh_spread: 0.5 m")
+    if case == "prismatic":
+        replace(own_robot, "bh_finger_2_distal: 10 deg", "bh_finger_2_distal: 10 mm")
+        start = "     origin: {xyz: [70 mm, 0, 0], rpy: [0, 0, 37.544 deg]},\n     limits: "
+        finger = "type: prismatic, parent: bh_finger_2_link_2, child: bh_finger_2_link_3"
+        head = f"{finger}, axis: [0, 0, 1],\n{start}"
+        replace(
+            hand, f"{head}[0 deg, 48 deg], velocity: 2 rad/s", f"{head}[0, 48 mm], velocity: 2 m/s"
+        )
     with pytest.raises(UnsupportedError) as caught:
         planar_finger(load_description(own_robot), "finger_2")
     message = str(caught.value)
