@@ -8,8 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError
@@ -26,8 +25,6 @@ from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.stream import REQUIRED, SolvedBlock, Stream
-
-Array = NDArray[np.float64]
 
 
 class Solver:

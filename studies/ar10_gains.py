@@ -18,13 +18,11 @@ import casadi as ca
 import numpy as np
 from ar10.figures import draw_run, finish, translation
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from runner import command, markdown_table, program
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.symbolic import dual_quaternion as dq
-
-Array = NDArray[np.float64]
 
 TABLE_I = {0.1: (-1.37181, -3.89763), 0.5: (-0.196327, -0.373781), 1.0: (-0.598718, -0.714857)}
 """Chandra et al. 2019, Table I: final error in X and Y [mm] by gain, index finger."""

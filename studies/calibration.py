@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from runner.page import markdown_table
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.calibration import (
     LOSSES,
     Calibration,
@@ -30,8 +31,6 @@ from casadi_ik.calibration import (
     simulate,
     true_values,
 )
-
-Array = NDArray[np.float64]
 
 FINGER = "index"
 NOISE = (2e-4, math.radians(0.5))

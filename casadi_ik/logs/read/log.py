@@ -19,7 +19,7 @@ from casadi_ik.logs.read.info import LogInfo
 from casadi_ik.logs.read.joining import joined, raised
 from casadi_ik.logs.read.shard import Shard
 from casadi_ik.logs.read.sources import Sources, offsets_of, overlapping, sources_of
-from casadi_ik.logs.read.table import Part, Table
+from casadi_ik.logs.read.table import MethodRows, Table
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class Log:
         self.methods = tuple(dict.fromkeys(m for shard in shards for m in shard.methods))
         self.metadata = first.metadata
         self.left_out = tuple(left_out)
-        self._own: dict[tuple[int, str], Part] = {}
+        self._own: dict[tuple[int, str], MethodRows] = {}
         for shard in shards:
             if not shard.contents.complete:
                 lost = shard.contents.size - shard.contents.readable
@@ -224,10 +224,10 @@ class Log:
         return Table(kind, tuple(parts))
 
     @cached_property
-    def _read(self) -> dict[str, Part]:
+    def _read(self) -> dict[str, MethodRows]:
         return {}
 
-    def _solves(self, method: str) -> Part:
+    def _solves(self, method: str) -> MethodRows:
         """All solves of a method; they are read once."""
         if method not in self._read:
             self._read[method] = self._joined(method, "solve", None, None)
@@ -239,7 +239,7 @@ class Log:
         kind: str,
         wanted: NDArray[np.int64] | None,
         fields: Sequence[str] | None,
-    ) -> Part:
+    ) -> MethodRows:
         """The rows of all shards as one."""
         holders = [i for i, shard in enumerate(self.shards) if method in shard.methods]
         sources, parts, origin = self.sources, [], []
@@ -303,7 +303,7 @@ class Log:
                 )
         return names
 
-    def _known(self, what: str, values: Names, parts: Sequence[Part], field: str) -> None:
+    def _known(self, what: str, values: Names, parts: Sequence[MethodRows], field: str) -> None:
         """See to it that at least one method knows the names.
 
         Raises:

@@ -21,7 +21,7 @@ from casadi_ik.errors import LogError
 from casadi_ik.kernels.rows import opaque
 from casadi_ik.logs.mcap.metadata import SHARDS, parsed_json, values_of
 from casadi_ik.logs.read.shard import Shard, naming
-from casadi_ik.logs.read.table import Part
+from casadi_ik.logs.read.table import MethodRows
 
 Numbers = NDArray[np.int64]
 
@@ -121,7 +121,7 @@ def _merged(text: str) -> list[_Merged]:
     return found
 
 
-def offsets_of(shards: Sequence[Shard], solves: Mapping[tuple[int, str], Part]) -> list[int]:
+def offsets_of(shards: Sequence[Shard], solves: Mapping[tuple[int, str], MethodRows]) -> list[int]:
     """What the numbers of each shard's solves are raised by: see above.
 
     Args:
@@ -149,7 +149,7 @@ def offsets_of(shards: Sequence[Shard], solves: Mapping[tuple[int, str], Part]) 
     return offsets
 
 
-def _refuse_same(method: str, parts: Sequence[tuple[Shard, Part]]) -> None:
+def _refuse_same(method: str, parts: Sequence[tuple[Shard, MethodRows]]) -> None:
     """See to it that no solve is in two shards, whatever its number.
 
     Raises:

@@ -10,13 +10,14 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.preference import preference
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
 from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated

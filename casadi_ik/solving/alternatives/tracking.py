@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.alternatives.finder import CLOSE, AlternativeFinder
 from casadi_ik.solving.trials import Bounds, Trials, refinement_rows
