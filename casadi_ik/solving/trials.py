@@ -170,7 +170,7 @@ class Descent:
 
 def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:
     """States and parameters of the loop that begin with the refinement of the whole arm-hand."""
-    count, hand = len(problems), len(trials.method.step.layouts.hand)
+    count, hand = len(problems), len(trials.robot.description.hand_actuators)
     home = np.tile(trials.robot.home, (count, 1))
     states, parameters = trials.posture_rows(problems, home, np.zeros((count, hand)))
     for name, value in ({"phase": Phase.REFINEMENT} | fresh_fit()).items():

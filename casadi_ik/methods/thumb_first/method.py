@@ -65,7 +65,11 @@ class ThumbFirstMethod(LoopedMethod):
         """The hand postures that targets are compared with."""
         robot, options = ArmHand(self.robot), self.options
         return PostureTable(
-            robot, robot.hand_actuators, options.table, pull=options.pull, compiled=self._compiled
+            robot,
+            self.robot.hand_actuators,
+            options.table,
+            pull=options.pull,
+            compiled=self._compiled,
         )
 
     def for_kinds(self, kinds: Kinds) -> ThumbFirstMethod:

@@ -82,7 +82,7 @@ class AlternativeFinder:
         self._trials = Trials(robot, method)
         self._compiled = compiled
         self._arm = list(robot.description.arm_actuators)
-        self._hand = list(method.step.layouts.hand)
+        self._hand = list(robot.description.hand_actuators)
 
     @cached_property
     def _branches(self) -> ArmBranches | None:

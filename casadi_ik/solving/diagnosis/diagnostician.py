@@ -203,7 +203,7 @@ class Diagnostician:
         random = self.robot.random(np.random.default_rng(count), count)
         starts = np.tile(random, (len(problems), 1, 1))
         if self.robot.description.arm_actuators:
-            hand = list(self.method.step.layouts.hand)
+            hand = list(self.robot.description.hand_actuators)
             starts[:, ::2, hand] = best.fair[:, None, hand]
             starts[:, 1::2, hand] = best.q[:, None, hand]
             starts[:, ::ALIKE, hand] = self._alike(problems, -(-count // ALIKE))
