@@ -128,7 +128,7 @@ class Tracker:
 
     def _starts(self, problems: Problems, q0: Array, prefer: str, seed: int) -> list[Array]:
         first = problems.rows(slice(0, 1))
-        found = self._finder.find(first, q0, seed, STARTS, prefer)
+        found = self._finder.find(first, q0, seed, STARTS, prefer, apart=0)
         if found:
             return [alternative.q for alternative in found]
         # Not to be solved: the nearest there is.
