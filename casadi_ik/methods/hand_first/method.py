@@ -155,6 +155,8 @@ class HandFirstMethod(LoopedMethod):
         hand = len(self.step.layouts.hand)
         tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
         vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
+        # A kernel's column is a vector: of a hand with one motor there is no second dimension.
+        tried = tried.reshape(len(problems), *self._beginning.input_shapes[-1])
         asked = *vectors, q0, self._terms(problems), tried
         states, parameters = self._beginning(*asked)
         if begun:
