@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.robots.description import Array
+from casadi_ik.arrays import Array
 from casadi_ik.robots.part import PREFIX
 from casadi_ik.robots.robot_files.mjcf_file import joint_name, mujoco_model
 from casadi_ik.robots.robot_files.read import read_tree, robot_element

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.robots.checks import check_couplings
 from casadi_ik.robots.couplings import Coupling, Linear
-from casadi_ik.robots.description import Actuator, Array, Joint, frozen
+from casadi_ik.robots.description import Actuator, Joint, frozen
 from casadi_ik.robots.part import HandPart, Part
 from casadi_ik.robots.robot_files.read import read_tree
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, turned

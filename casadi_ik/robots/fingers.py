@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, Vector, frame_matrix
 from casadi_ik.robots.checks import known_link, unique
-from casadi_ik.robots.description import Array, Finger, frozen
+from casadi_ik.robots.description import Finger, frozen
 from casadi_ik.robots.flat import FlatJoints
 from casadi_ik.robots.part import HandPart
 

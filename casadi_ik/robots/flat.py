@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from casadi_ik.robots.description import Array, Joint, frozen
+from casadi_ik.arrays import Array
+from casadi_ik.robots.description import Joint, frozen
 
 
 @dataclass(frozen=True, eq=False)

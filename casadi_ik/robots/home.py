@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.robots.description import Actuator, Array, Joint, frozen
+from casadi_ik.robots.description import Actuator, Joint, frozen
 from casadi_ik.robots.motor_ranges import motor_ranges
 
 

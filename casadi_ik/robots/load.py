@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, UnknownNameError
 from casadi_ik.files.reading import (
     Frame,
@@ -20,7 +21,7 @@ from casadi_ik.files.reading import (
 from casadi_ik.files.shipped import resolve, resolve_robot
 from casadi_ik.robots.checks import unique, usable
 from casadi_ik.robots.described_parts import arm_part, hand_part
-from casadi_ik.robots.description import Array, Joint, RobotDescription, frozen
+from casadi_ik.robots.description import Joint, RobotDescription, frozen
 from casadi_ik.robots.file_parts import arm_from_file, hand_from_file
 from casadi_ik.robots.fingers import the_fingers
 from casadi_ik.robots.flat import flattened

@@ -6,12 +6,10 @@ from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.robots.description import Actuator, Joint
 from casadi_ik.robots.schema import ContactEntry, PadEntry
-
-Array = NDArray[np.float64]
 
 PREFIX = "hand_"
 """Put before a name of the hand that the arm has as well."""

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, MissingExtraError
 from casadi_ik.robots.couplings import Coupling, Linear, Polynomial
-from casadi_ik.robots.robot_files.tree import Array, RobotTree, TreeJoint, fixed, turned
+from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, fixed, turned
 
 WORLD = "world"
 """MuJoCo's name of what does not move."""

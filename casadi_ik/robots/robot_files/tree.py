@@ -9,12 +9,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.robots.couplings import Coupling
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, MissingExtraError
 from casadi_ik.robots.couplings import Coupling, Linear
-from casadi_ik.robots.robot_files.tree import Array, RobotTree, TreeJoint, parents_first
+from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, parents_first
 from casadi_ik.robots.robot_files.xml_text import (
     Element,
     attribute,
