@@ -35,8 +35,8 @@ STEADY = 0.95
 """A step that leaves more than this part of the sum ends a power."""
 
 HOPELESS = 1.05
-"""Were all parts at most so large, the sum would be at most their number times this to the power: if
-it is steady above that, the contacts cannot be met near here."""
+"""Were all parts at most so large, the sum would be at most their number times this to the power:
+one that is steady above that says that the contacts cannot be met near here."""
 
 CLOSER = 0.99
 """A balance that leaves no less than this part of the least that others left is one of them."""
