@@ -18,7 +18,10 @@ from casadi_ik.kernels.rows import opaque
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
 SLOTS = 32
-"""Solves under way at once, of which four have the lanes."""
+"""Solves under way at once, of which four or eight have the lanes."""
+
+FIRST_MARK = 16
+"""Iteration, a power of two, of the first state that later ones are compared with."""
 
 
 class Job(ctypes.Structure):

@@ -5,15 +5,6 @@
  * (their sum).
  */
 
-EXPORT int casadi_ik_has_lanes(void) {
-#if defined(__x86_64__)
-  __builtin_cpu_init();
-  return __builtin_cpu_supports("avx2") != 0;
-#else
-  return 1;
-#endif
-}
-
 EXPORT LANES_TARGET int casadi_ik_map_lanes(map_job *job) {
   static const int sizes_in[] = SIZES_IN, sizes_out[] = SIZES_OUT;
   workspace space;
