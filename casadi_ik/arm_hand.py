@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.arrays import real_array
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
-
-Array = NDArray[np.float64]
 
 
 class ArmHand:

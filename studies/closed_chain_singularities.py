@@ -15,6 +15,7 @@ from closed_chain.report import OURS, PAPER, field, figure, options, title, writ
 from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.symbolic.active_joints import mobility, pivoted
 from casadi_ik.symbolic.closed_chain import VIRTUAL, split
 
@@ -23,8 +24,8 @@ NEAR = 100.0
 
 
 def conditions(
-    robot: ik.ArmHand, q: NDArray[np.float64]
-) -> tuple[dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]], NDArray[np.int64]]:
+    robot: ik.ArmHand, q: Array
+) -> tuple[dict[str, Array], dict[str, Array], NDArray[np.int64]]:
     """Condition of H_p and largest |passive / active| rate by active set, and pivoted columns."""
     parts = split(robot.description)
     columns = list(parts.columns)
@@ -82,7 +83,7 @@ def main() -> None:
     grid[1, 2].invert_yaxis()
     title(grid[1, 2], "active by pivoting (orange: paper)", "% of cases", "")
 
-    def percentiles(values: NDArray[np.float64]) -> str:
+    def percentiles(values: Array) -> str:
         return " | ".join(f"{v:.3g}" for v in np.percentile(values, [50, 90, 99]))
 
     near = {name: 100 * np.mean(values > NEAR) for name, values in condition.items()}

@@ -15,6 +15,7 @@ from closed_chain.report import FAINT, OURS, PAPER, field, figure, options, titl
 from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
 PALMS = 300
 """Palms tried for each contact."""
@@ -25,7 +26,7 @@ GRASP = "cup"
 
 def random_palms(
     robot: ik.ArmHand, held: HeldThumb, contact: tuple, count: int, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array, Array, Array]:
     """Palms on a contact: rotations, origins, virtual joint and thumb joints, all uniform."""
     q = np.tile(robot.home, (count, 1))
     thumb = list(robot.description.finger_actuators(robot.thumb))
@@ -131,9 +132,7 @@ at the border of the arm's reach, while well inside it most of what the thumb al
     write(given.out, "closed_chain_workspace", drawn, text)
 
 
-def _smoothed(
-    x: NDArray[np.float64], y: NDArray[np.float64], hit: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def _smoothed(x: Array, y: Array, hit: NDArray[np.bool_]) -> Array:
     """Share of hits in the cell of each sample, 36 by 36 cells."""
     i, j = (np.clip(((v - v.min()) / np.ptp(v) * 36).astype(int), 0, 35) for v in (x, y))
     cell = i * 36 + j
@@ -141,7 +140,7 @@ def _smoothed(
     return (hits / np.maximum(all_, 1))[cell]
 
 
-def _quantiles(values: NDArray[np.float64]) -> str:
+def _quantiles(values: Array) -> str:
     return " | ".join(f"{v:.0f}" for v in np.percentile(values, [5, 25, 50, 75, 95]))
 
 

@@ -14,13 +14,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from runner import markdown_table, write_page
 
 import casadi_ik as ik
-
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 STEP = 0.25e-3
 """Largest motion of a contact from one target of a path to the next [m], about."""

@@ -18,17 +18,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from bench_report import Section
-from numpy.typing import NDArray
 from peer_qp import Mink, Pink, Placo
 from peer_steps import Peer, Scipy
 from targets import random_arm_targets
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 
-Array = NDArray[np.float64]
 Targets = tuple[Array, Array]
 
 STARTS = 400

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 from closed_chain.report import OURS, PAPER, figure, options, title, write
-from numpy.typing import NDArray
 from targets import random_arm_targets
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
-Targets = tuple[NDArray[np.float64], NDArray[np.float64]]
+Targets = tuple[Array, Array]
 
 VARIANTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("one start, freeze", "thumb-first", {"options": {"starts": 1}}),

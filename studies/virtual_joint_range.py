@@ -15,12 +15,13 @@ from closed_chain.report import OURS, field, figure, options, title, write
 from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
 STEPS = 72
 """Turns tried in a full circle."""
 
 
-def usable(robot: ik.ArmHand, held: HeldThumb, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+def usable(robot: ik.ArmHand, held: HeldThumb, q: Array) -> NDArray[np.bool_]:
     """Which turns the arm follows, (k, STEPS), from -pi on."""
     turns = 2 * np.pi * (np.arange(STEPS) / STEPS - 0.5)
     points, normals = (part[:, held.thumb] for part in robot.contacts(q))
@@ -31,7 +32,7 @@ def usable(robot: ik.ArmHand, held: HeldThumb, q: NDArray[np.float64]) -> NDArra
     return follows
 
 
-def connected(follows: NDArray[np.bool_]) -> NDArray[np.float64]:
+def connected(follows: NDArray[np.bool_]) -> Array:
     """Width [deg] of the usable turns in one piece with turn zero, (k,)."""
     zero = STEPS // 2
     onwards = np.roll(follows, -zero, axis=1)
@@ -89,7 +90,7 @@ def main() -> None:
     )
     drawn.colorbar(mesh, ax=grid[1, 1])
 
-    def quartiles(values: NDArray[np.float64]) -> str:
+    def quartiles(values: Array) -> str:
         return " | ".join(f"{v:.0f}" for v in np.percentile(values, [5, 25, 50, 75, 95]))
 
     far = r > np.quantile(r, 0.75)

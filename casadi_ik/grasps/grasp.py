@@ -8,14 +8,13 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.arrays import real_array, unit_vectors
 from casadi_ik.grasps.tolerance import Tolerance
 from casadi_ik.grasps.vectors import MORE, fault, squared
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 MORE: Mapping[str, str] = {
     "tangent": "where the contact frame's second axis must point, across the normal",

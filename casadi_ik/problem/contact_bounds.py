@@ -6,14 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.problem.joint_bounds import joint_bounds
 from casadi_ik.problem.joint_frames import link_frames, placed
-from casadi_ik.problem.problems import Array
 from casadi_ik.robots.description import RobotDescription
-
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +31,7 @@ class Balls:
     radius: Array
     angle: Array
     effect: Array
-    empty: Flags
+    empty: Bools
 
 
 def balls(

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.grasps.arrays import real_array, unit_vectors
 from casadi_ik.robots.description import RobotDescription
-
-Array = NDArray[np.float64]
 
 LIMITS = ("enforce", "ignore")
 """How joint limits are taken: as part of being solved, or not at all (the paper's reading)."""

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.problem.arm_span import arm_span
-from casadi_ik.problem.contact_bounds import Balls, Flags, balls
+from casadi_ik.problem.contact_bounds import Balls, balls
 from casadi_ik.problem.hand_motors import (
     OUTWARDS,
     endless_fingers,
@@ -20,7 +21,7 @@ from casadi_ik.problem.hand_motors import (
     motor_box,
     motor_ends,
 )
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import reach, srs_arm
 
@@ -114,7 +115,7 @@ class _Search:
             waiting += [halves[i : i + TOGETHER] for i in range(0, len(halves), TOGETHER)]
         return True
 
-    def _refuted(self, found: Balls) -> Flags:
+    def _refuted(self, found: Balls) -> Bools:
         radius, angle = found.radius + self.loose, found.angle + self.turned
         if not self.in_palm:
             apart = np.linalg.norm(self.points - found.points, axis=2) > radius
@@ -126,7 +127,7 @@ class _Search:
             refuted |= self._reach(found, radius)
         return refuted
 
-    def _pairs(self, found: Balls, radius: Array, angle: Array) -> Flags:
+    def _pairs(self, found: Balls, radius: Array, angle: Array) -> Bools:
         """Distances of points, angles of normals, angles of normals and lines."""
         refuted = np.zeros(len(radius), dtype=bool)
         for i, j in combinations(range(len(self.fingers)), 2):
@@ -146,7 +147,7 @@ class _Search:
                     refuted |= np.abs(now - _angle(self.normals[n], asked)) > angle[:, n] + tilt
         return refuted
 
-    def _rigid(self, found: Balls, radius: Array, angle: Array, rows: Flags) -> Flags:
+    def _rigid(self, found: Balls, radius: Array, angle: Array, rows: Bools) -> Bools:
         """The best weighted rigid fit (Kabsch) against what the balls would allow."""
         w = 1 / radius[rows] ** 2
         chord = 2 * np.sin(np.minimum(angle[rows], np.pi) / 2)
@@ -164,7 +165,7 @@ class _Search:
         allowed = len(self.fingers) + known.sum()
         return size * (1 - 1e-9) - 2 * trace > allowed
 
-    def _reach(self, found: Balls, radius: Array) -> Flags:
+    def _reach(self, found: Balls, radius: Array) -> Bools:
         """Where the wrist can be, from each contact and from all, against the arm's span."""
         shoulder, wrist, near, far = self._arm
         away = np.linalg.norm(self.points - shoulder, axis=1)

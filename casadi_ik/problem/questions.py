@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp, Tolerance
 from casadi_ik.problem.contacts.arrays import more_arrays
-from casadi_ik.problem.problems import Array, Problems, fixed_array, target_arrays
+from casadi_ik.problem.problems import Problems, fixed_array, target_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +54,9 @@ class Questions:
         """
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row)
         tolerances = tuple(self.tolerances.values())
-        besides = more_arrays(more, p, n, first_row) if more else {}
+        others = more_arrays(more, p, n, first_row) if more else {}
         return Problems(
-            p, n, tolerances, self.enforce_limits, first_row, fixed, besides, prefer=prefer
+            p, n, tolerances, self.enforce_limits, first_row, fixed, others, prefer=prefer
         )
 
     def of_grasps(

@@ -12,12 +12,10 @@ from typing import ClassVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.units import AnyValue, Length, Pure, Turn
-
-Array = NDArray[np.float64]
 
 FLAT = 1e-16
 """A triangle's two slacks are kept above FLAT b c [m^2]."""

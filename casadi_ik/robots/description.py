@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.robots.couplings import Coupling
 from casadi_ik.robots.motor_ranges import motor_ranges
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +236,11 @@ class RobotDescription:
     def arm_actuators(self) -> tuple[int, ...]:
         """Positions in q of the arm's actuators (empty for a hand alone)."""
         return tuple(i for i, a in enumerate(self.actuators) if a.part == "arm")
+
+    @cached_property
+    def hand_actuators(self) -> tuple[int, ...]:
+        """Positions in q of the hand's actuators: all but the arm's."""
+        return tuple(i for i, a in enumerate(self.actuators) if a.part != "arm")
 
     def finger_actuators(self, name: str) -> tuple[int, ...]:
         """Positions in q of the actuators that move a finger relative to the palm.

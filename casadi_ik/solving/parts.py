@@ -13,7 +13,7 @@ FIRST_PART = 64
 """Solves of the first parts of a traced batch, from which the others' size is learned."""
 
 
-class Parts:
+class BatchParts:
     """The parts of a batch in order; iterating may go on while finished parts are learned from."""
 
     def __init__(self, count: int, jobs: int, trace: bool) -> None:

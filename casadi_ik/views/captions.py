@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.grasps import Grasp
 from casadi_ik.problem.solution import Solution
 from casadi_ik.views.picture import FAINT, INK
@@ -18,9 +18,7 @@ TARGET_COLOR = "#f0b400"
 MET_COLOR, MISSED_COLOR = "#1f9d55", "#d62f3c"
 
 
-def label_fingers(
-    axes: Axes, places: dict[str, NDArray[np.float64]], solution: Solution, grasp: Grasp
-) -> None:
+def label_fingers(axes: Axes, places: dict[str, Array], solution: Solution, grasp: Grasp) -> None:
     """Name and errors of every finger, at the edge of the picture with a line to its contact.
 
     Args:

@@ -11,9 +11,10 @@ import numpy as np
 import pyvista as pv
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Grasp, load_object
 from casadi_ik.problem.solution import Solution
@@ -32,8 +33,6 @@ from casadi_ik.views.robot_body import robot_body
 from casadi_ik.views.shapes import Solid, arrow, capsule, with_edges
 from casadi_ik.views.stage import Image, Stage, over
 from casadi_ik.views.viewpoint import View, close_view, whole_view
-
-Array = NDArray[np.float64]
 
 SIZE = (12.0, 6.6)
 """Of the picture [inch]."""

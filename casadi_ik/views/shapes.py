@@ -6,9 +6,8 @@ from typing import cast
 
 import numpy as np
 import pyvista as pv
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 Solid = tuple[pv.PolyData, str]
 """A surface and its colour."""

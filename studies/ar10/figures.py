@@ -5,12 +5,10 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.symbolic import dual_quaternion as dq
-
-Array = NDArray[np.float64]
 
 SLIDERS = "sliders in steps of 0.1 mm"
 

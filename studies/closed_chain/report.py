@@ -9,11 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.views.picture import FAINT, INK, new_figure
-
-Array = NDArray[np.float64]
 
 RESULTS = Path(__file__).parents[1] / "results"
 PAPER, OURS = "#e08a2e", "#2f6db3"

@@ -17,7 +17,7 @@ from matplotlib.image import imread
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, PictureError
-from casadi_ik.logs import EventKind, Part, Table
+from casadi_ik.logs import EventKind, MethodRows, Table
 from casadi_ik.views import draw_alternatives, draw_convergence, draw_solution
 from casadi_ik.views.captions import MET_COLOR, MISSED_COLOR, OBJECT_COLOR, TARGET_COLOR
 from casadi_ik.views.picture import new_figure, save_picture
@@ -272,7 +272,7 @@ def test_the_strip_of_events_has_a_row_per_kind_and_jacobian() -> None:
         "phase": ("",),
     }
     numbers = np.arange(4)
-    part = Part("made-up", rows, numbers * 0, numbers * 10, labels, {})
+    part = MethodRows("made-up", rows, numbers * 0, numbers * 10, labels, {})
     strip = events_strip(Table("event", (part,)))
     assert {name: spans for name, (spans, _) in strip.rows.items()} == {
         "near singular closed chain": [(-0.5, 1.0)],

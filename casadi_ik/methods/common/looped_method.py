@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array, Counts
 from casadi_ik.errors import RowError, UnsupportedError
 from casadi_ik.kernels import LoopKernel, StepGraph
 from casadi_ik.kernels.rows import opaque
@@ -19,13 +20,10 @@ from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Method, Outcome
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat, trace_format
 from casadi_ik.robots.description import RobotDescription
-
-Counts = NDArray[np.int64]
-"""(k,) numbers of something, one per solve."""
 
 Start = tuple[Array, Array]
 """First states (k, ns) and parameters (k, np) of a step graph."""

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.kernels import LookupKernel
 from casadi_ik.methods.common.contact_shape import contact_shape
 from casadi_ik.methods.common.even_spread import evenly
-from casadi_ik.problem.problems import Array
 
 CHUNK = 256
 """Targets whose postures are compared with each other at once."""

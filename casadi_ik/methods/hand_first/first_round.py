@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel, LoopKernel
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.state import STAGE_LABELS, HandFirstLayouts
 from casadi_ik.problem.method import Quick
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Status
 
 

@@ -7,11 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
+from casadi_ik.arrays import Array, Counts
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
-from casadi_ik.methods.common.looped_method import Counts, LoopedMethod, Start
+from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
@@ -21,7 +22,7 @@ from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Quick
 from casadi_ik.problem.preference import PREFERENCES
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
@@ -79,7 +80,7 @@ class HandFirstMethod(LoopedMethod):
     @cached_property
     def hands(self) -> Restarts:
         """The hand postures that rounds begin from."""
-        return Restarts(self.robot, self.step.layouts.hand, self.options, self._compiled)
+        return Restarts(self.robot, self.robot.hand_actuators, self.options, self._compiled)
 
     def for_kinds(self, kinds: Kinds) -> HandFirstMethod:
         """The same for contacts of other kinds."""
@@ -152,7 +153,7 @@ class HandFirstMethod(LoopedMethod):
         Returns:
             (k, ...) states and parameters.
         """
-        hand = len(self.step.layouts.hand)
+        hand = len(self.robot.hand_actuators)
         tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
         vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
         asked = *vectors, q0, self._terms(problems), tried
@@ -188,7 +189,8 @@ class HandFirstMethod(LoopedMethod):
             best = last[:, layouts.state.slice("best_q")]
             return self.rows(problems, q0, self.hands.along_valley(problems, best, later), True)
         anywhere = self.hands.anywhere(problems, later - VALLEYS)
-        states, parameters = self.rows(problems, q0, anywhere[None][:, :, list(layouts.hand)], True)
+        hands = anywhere[None][:, :, list(self.robot.hand_actuators)]
+        states, parameters = self.rows(problems, q0, hands, True)
         # The first of them begins as a whole: what stands in the way may be arm and hand together.
         lower, upper = (parameters[:, layouts.parameters.slice(end)] for end in ("lower", "upper"))
         states[:, layouts.state.slice("q")] = np.clip(anywhere[0], lower, upper)
@@ -206,7 +208,7 @@ class HandFirstMethod(LoopedMethod):
             postures: The postures.
             own: Whether its own posture comes first, instead of the last of them.
         """
-        hand = list(self.step.layouts.hand)
+        hand = list(self.robot.hand_actuators)
         here = np.clip(q0, *problems.bounds(self.robot, UNBOUNDED))[:, None, hand]
         if own:
             postures = postures[:, : max(postures.shape[1] - 1, 1)]

@@ -129,15 +129,15 @@ class HandFirstStep:
         layouts, count = self.layouts, self.layouts.candidates
         hand = sum(
             (ca.if_else(s["candidate"] == i, p["postures"][i, :].T, 0.0) for i in range(count)),
-            ca.SX.zeros(len(layouts.hand), 1),
+            ca.SX.zeros(len(self.robot.hand_actuators), 1),
         )
         exhausted = s["candidate"] >= count
         q = self._with_hand(p["start"], hand)
-        contacts = hand_contacts(self.robot, hand, layouts.hand)
+        contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
         rotation, origin = best_palm(contacts, layouts.contacts, p)
         # The hand as it is is only worth a fit if its contacts are shaped a little like these.
         own = ca.logic_and(p["nearest"], s["candidate"] == 0)
-        own = ca.logic_and(own, ca.sumsqr(hand - p["start"][list(layouts.hand)]) <= 0)
+        own = ca.logic_and(own, ca.sumsqr(hand - p["start"][list(self.robot.hand_actuators)]) <= 0)
         fitted = PalmAndHand(rotation, origin, hand)
         misfit = ca.sumsqr(fit_residual(contacts, layouts.contacts, fitted, p))
         skipped = ca.logic_and(own, misfit > OWN_HAND)
@@ -166,7 +166,7 @@ class HandFirstStep:
 
     def _hand_fit(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
-        columns = list(self.layouts.hand)
+        columns = list(self.robot.hand_actuators)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
         judged = judge_contacts(s, p, tried, self.layouts.contacts)
@@ -303,7 +303,7 @@ class HandFirstStep:
         return left[: self.layouts.contacts.size]
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
-        return with_rows(q, self.layouts.hand, hand)
+        return with_rows(q, self.robot.hand_actuators, hand)
 
     def _with_arm(self, q: Expr, arm: Expr) -> Expr:
         return with_rows(q, self.robot.arm_actuators, arm)

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.grasps.vectors import MORE, fault, squared
 from casadi_ik.problem.contacts.kinds import Kinds, kind_of, usual
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 
 NAMES = tuple(f"{name}s" for name in MORE)
 """Names of the arrays."""

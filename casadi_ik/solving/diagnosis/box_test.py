@@ -12,9 +12,9 @@ from itertools import combinations
 
 import casadi as ca
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.recipe import recipe
-from casadi_ik.problem.problems import Array
 from casadi_ik.solving.diagnosis.box_contacts import BoxContact, box_contacts
 from casadi_ik.solving.diagnosis.hand_space import HandSpace
 from casadi_ik.solving.diagnosis.pair_rows import pair_rows
