@@ -1,6 +1,6 @@
-"""The library of a function for four solves side by side.
+"""The library of a function for four or eight solves side by side.
 
-The generated code is there twice: as CasADi wrote it, and once more for vectors of four doubles
+The generated code is there twice: as CasADi wrote it, and once more for vectors of doubles
 (`lanes_lines.py`), `casadi_f3` as `lanes_f3`. An inner function with a line that has no form for
 vectors is called as it is, once for each lane that counts; the outermost must have one. What nobody
 calls the compiler leaves out.

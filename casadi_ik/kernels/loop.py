@@ -40,7 +40,8 @@ class LoopKernel:
     Attributes:
         step: The step.
         compiled: Whether the loop runs in compiled code. Otherwise the same graph runs in
-            CasADi's virtual machine, with the same iterates and records.
+            CasADi's virtual machine, with the same iterates and records up to the last places of
+            sines and arcs.
     """
 
     def __init__(self, step: StepGraph, compiled: bool = True) -> None:

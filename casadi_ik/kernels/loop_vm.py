@@ -1,4 +1,4 @@
-"""A step run to its end in CasADi's virtual machine: the same iterates and records, in Python."""
+"""A step run to its end in CasADi's virtual machine: the same iterates up to rounding."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
  * The C library takes one number at a time: of four or eight solves side by side a quarter of the
  * time went there. These are arithmetic only, and the same arithmetic in both forms: a solve's
  * iterates are bit for bit the same alone and among others, and do not depend on whose C library a
- * machine has. Within 2 units in the last place; angles beyond 5e8 rad go to the C library.
+ * machine has. Within 2 units in the last place of normal numbers; angles beyond 5e8 rad go to the C library.
  * Reductions and coefficients are those of Moshier's Cephes library (sin.c, atan.c).
  *
  * Expects the macros NAME(f), QUALIFIERS, REAL and INTEGER, BITS(real) and REAL_OF(integer) for the

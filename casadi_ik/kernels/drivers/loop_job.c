@@ -1,4 +1,4 @@
-/* What a loop works on, one solve by one (loop.c) or four side by side (loop_lanes.c). */
+/* What a loop works on, one solve by one (loop.c) or some side by side (loop_lanes.c). */
 typedef struct {
   double *states;              /* (count, N_STATE), start in, end out */
   const double *parameters;

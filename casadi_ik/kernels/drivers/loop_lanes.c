@@ -1,11 +1,11 @@
-/* loop.c for four solves side by side, each as it would be alone: see there.
+/* loop.c for LANES solves side by side, each as it would be alone: see there.
  *
- * A step costs least when the four take the same branches, so some more solves than four are under
+ * A step costs least when all lanes take the same branches, so some more solves than lanes are under
  * way: a lane whose solve ends or changes its stage takes another one of the stage the lanes are
  * in, and when more wait for another stage than lanes are left at work, all turn to that. The rows
  * come as they are made; `places` says whose they are.
  *
- * Expects besides what loop.c does N_PARAMETERS, SLOTS and STAGE, the place in the state of the
+ * Expects what loop.c does, and N_PARAMETERS, SLOTS and STAGE, the place in the state of the
  * number that tells the stages apart, -1 if there is none.
  */
 

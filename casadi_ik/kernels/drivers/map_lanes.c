@@ -1,4 +1,4 @@
-/* map.c for four samples side by side: see there. Where the last turn has less than four, its last
+/* map.c for LANES samples side by side: see there. Where the last turn has less, its last
  * sample is there several times.
  *
  * Expects the macros N_IN, N_OUT, SIZES_IN and SIZES_OUT (doubles of each, as initialisers), TOTAL
