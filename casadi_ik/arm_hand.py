@@ -181,7 +181,9 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        position, angle, _ = self._kernels.deviations(self.configuration(q), points, normals)
+        position, angle, _ = self.deviations(
+            self.configuration(q), np.asarray(points), np.asarray(normals)
+        )
         return position, angle
 
     def deviations(self, q: Array, points: Array, normals: Array) -> tuple[Array, Array, Array]:
@@ -197,7 +199,9 @@ class ArmHand:
             worst actuator or joint is beyond its limits [rad or m].
         """
         position, angle, beyond = self._kernels.deviations(q, points, normals)
-        return position, angle, beyond
+        # A kernel's single number has no dimension of its own, even that of a single finger.
+        by_finger = (*beyond.shape, len(self.fingers))
+        return position.reshape(by_finger), angle.reshape(by_finger), beyond
 
     def beyond_limits(self, q: ArrayLike) -> Array:
         """By how much the worst actuator or joint is beyond its limits [rad or m], () or (k,).

@@ -114,6 +114,25 @@ def test_the_largest_part_falls_until_all_are_met(robot):
     assert seen > 5
 
 
+def test_fits_that_come_back_to_a_minimum_that_misses_end_the_solve(robot):
+    """It took 88 hand postures, and up to 60 steps of balance each, to give one of these up."""
+    points, normals = noisy(robot, np.random.default_rng(11), 1000)
+    solver = ik.Solver(robot)
+    batch = solver.solve_batch(points, normals)
+    missed = ~batch.success
+    assert missed.sum() >= 10
+    assert np.median(batch.restarts[missed]) == 15
+    assert np.median(batch.phases["balance"][missed]) < 40
+    whole = HandFirstMethod(robot.description, HandFirstParameters())
+    whole.hopeful = lambda states, number: np.ones(len(states), dtype=bool)
+    asked = Problems(points[missed], normals[missed], TOLERANCE, True)
+    home = np.tile(robot.home, (len(asked), 1))
+    assert not (whole.run(asked, home, 0, False).status == Status.SOLVED).any()
+    first = np.flatnonzero(batch.restarts[missed] == 15)[0]
+    stepper = solver._engine.method.stepper(asked.rows(slice(first, first + 1)), robot.home)
+    assert max(record["restart"] for record in stepper) <= 16
+
+
 def test_what_is_missed_by_far_is_not_balanced(robot):
     points, normals = noisy(robot, np.random.default_rng(7), 20)
     points[:, 0] += 0.5

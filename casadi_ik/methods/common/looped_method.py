@@ -95,6 +95,16 @@ class LoopedMethod(ABC):
             last: (k, ns) states in which the round before ended; None in the first.
         """
 
+    def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
+        """(k,) whether to begin failed solves again.
+
+        Args:
+            states: (k, ns) in which they ended.
+            number: Of the next round.
+        """
+        del number
+        return np.ones(len(states), dtype=bool)
+
     @abstractmethod
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """Iterations by phase.
@@ -160,6 +170,8 @@ class LoopedMethod(ABC):
             number = next(rounds, None)
             if status == Status.SOLVED or number is None:
                 return None
+            if not self.hopeful(state[None], number)[0]:
+                return None
             states, parameters = self.begin(problems, q0[None], number, state[None])
             return states[0], parameters[0]
 
@@ -192,7 +204,8 @@ class LoopedMethod(ABC):
             seconds[left] += result.time + max(outside, 0.0) / max(len(left), 1)
             if result.rows is not None:
                 records.add(left, result.iterations, result.rows)
-            missed = np.flatnonzero(ended != Status.SOLVED)
+            again = self.hopeful(result.states, number + 1)
+            missed = np.flatnonzero((ended != Status.SOLVED) & again)
             if not len(missed):
                 break
             left, here, last = left[missed], here[missed], result.states[missed]

@@ -98,6 +98,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "q": start,
             "best_q": here,
             "best_cost": sys.float_info.max,
+            "least": sys.float_info.max,
             "phase": ca.if_else(t["nearest"], float(Phase.REFINEMENT), float(Phase.CANDIDATE)),
             "candidate": -t["nearest"],
         }

@@ -61,6 +61,7 @@ class FirstRound:
             max_iterations: Of the loop.
         """
         points, normals, *more, here, common, postures = self._begin.inputs
+        postures = postures.reshape(-1, self._postures.shape[1])  # a view
         points[...], normals[...], here[...], common[...] = (
             problems.points[0],
             problems.normals[0],

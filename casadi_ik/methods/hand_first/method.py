@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.errors import UnsupportedError
@@ -37,9 +38,22 @@ NEAREST = "q0"
 TINY = 1e-9
 """Smallest range [rad or m] a motion is measured by."""
 
-CARRIED = ("passed", "near", "balanced", "best_cost", "best_q", "counts")
+CARRIED = (
+    *("passed", "near", "balanced", "least", "returns"),
+    *("best_cost", "best_q", "counts"),
+)
 """What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
 were balanced in vain, and what was found."""
+
+
+RETURNS = 8
+"""A solve ends unsolved when so many fits and balances have ended where one had before."""
+
+SURE = 1e-8
+"""Cost (0.01 mm, 0.1 mrad) above which this is a minimum, and not a long flat valley."""
+
+VARIED = 2
+"""Rounds in any case: the second takes hands that differ from each other."""
 
 
 class HandFirstMethod(LoopedMethod):
@@ -109,6 +123,12 @@ class HandFirstMethod(LoopedMethod):
             states[:, layout.slice("earlier")] = number * self.options.candidates
         return states, parameters
 
+    def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
+        """Not if the fits come back to a minimum that just misses the contacts, again and again."""
+        layout = self.step.layouts.state
+        returns, cost = (states[:, layout.slice(name).start] for name in ("returns", "best_cost"))
+        return (number < VARIED) | (returns < RETURNS) | (cost < SURE)
+
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """The step counts them."""
         del iterations
@@ -156,6 +176,8 @@ class HandFirstMethod(LoopedMethod):
         hand = len(self.robot.hand_actuators)
         tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
         vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
+        # A kernel's column is a vector: of a hand with one motor there is no second dimension.
+        tried = tried.reshape(len(problems), *self._beginning.input_shapes[-1])
         asked = *vectors, q0, self._terms(problems), tried
         states, parameters = self._beginning(*asked)
         if begun:
@@ -210,6 +232,8 @@ class HandFirstMethod(LoopedMethod):
         """
         hand = list(self.robot.hand_actuators)
         here = np.clip(q0, *problems.bounds(self.robot, UNBOUNDED))[:, None, hand]
+        # A hand without an arm has begun there already.
+        own = own and bool(self.robot.arm_actuators)
         if own:
             postures = postures[:, : max(postures.shape[1] - 1, 1)]
         ranges = np.maximum((self.robot.upper - self.robot.lower)[hand], TINY)

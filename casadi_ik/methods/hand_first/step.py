@@ -22,7 +22,7 @@ import casadi as ca
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, NO_MARGIN, place_arm
-from casadi_ik.methods.common.balance import differs, worth_balancing
+from casadi_ik.methods.common.balance import differs, near_tolerance
 from casadi_ik.methods.common.contact_fit import (
     Judged,
     Tried,
@@ -32,7 +32,7 @@ from casadi_ik.methods.common.contact_fit import (
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.balance_stage import balance_stage
 from casadi_ik.methods.hand_first.choice_stage import choice_stage
-from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_residual, fit_step
+from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_rows
 from casadi_ik.methods.hand_first.whole_fit import whole_step
@@ -135,20 +135,13 @@ class HandFirstStep:
         q = self._with_hand(p["start"], hand)
         contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
         rotation, origin = best_palm(contacts, layouts.contacts, p)
-        # The hand as it is is only worth a fit if its contacts are shaped a little like these.
-        own = ca.logic_and(p["nearest"], s["candidate"] == 0)
-        own = ca.logic_and(own, ca.sumsqr(hand - p["start"][list(self.robot.hand_actuators)]) <= 0)
-        fitted = PalmAndHand(rotation, origin, hand)
-        misfit = ca.sumsqr(fit_residual(contacts, layouts.contacts, fitted, p))
-        skipped = ca.logic_and(own, misfit > OWN_HAND)
         after = layouts.state.pack(
             self.layouts.counted(s, Phase.CANDIDATE)
             | {
                 "q": ca.if_else(exhausted, s["best_q"], q),
                 "palm_rotation": rotation,
                 "palm_origin": origin,
-                "phase": ca.if_else(skipped, float(Phase.CANDIDATE), float(self._after_candidate)),
-                "candidate": s["candidate"] + skipped,
+                "phase": float(self._after_candidate),
                 "cost": 0.0,
                 "margin": NO_MARGIN,
                 "starts": 0.0,
@@ -169,20 +162,24 @@ class HandFirstStep:
         columns = list(self.robot.hand_actuators)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
-        judged = judge_contacts(s, p, tried, self.layouts.contacts)
+        contacts = self.layouts.contacts
+        judged = judge_contacts(s, p, tried, contacts)
         keep, reached = judged.accepted, tried.reached
         # The last candidate goes on to the arm even if it does not fit: its arm and hand are the
         # nearest there is, and refinement starts from them.
         last = s["candidate"] + 1 >= self.layouts.candidates
         onwards = ca.logic_or(judged.within, last)
-        # Nor does one that fits nearly have to fit: it is balanced with the arm.
-        near = ca.logic_and(
-            worth_balancing(self._left(judged, tried), self.layouts.contacts, p),
-            ca.logic_and(differs(judged.cost, s["near"]), ca.logic_not(p["alone"])),
-        )
-        near = ca.logic_and(near, judged.settled)
         ended = ca.logic_and(judged.settled, ca.logic_and(onwards, p["alone"] > 0))
+        # Nor does one that fits nearly have to fit: it is balanced with the arm.
+        missed = ca.logic_and(judged.settled, ca.logic_not(judged.within))
+        near = ca.logic_and(missed, near_tolerance(self._left(judged, tried), contacts, p))
+        other = differs(judged.cost, s["near"])
+        returned = ca.logic_and(near, ca.logic_not(other))
+        near = ca.logic_and(ca.logic_and(near, other), ca.logic_not(p["alone"]))
         onwards = ca.logic_or(onwards, near)
+        # The hand as it is is only worth a fit if its contacts are shaped a little like these.
+        skipped = ca.logic_and(self._is_own(s, p), ca.sumsqr(tried.before) > OWN_HAND)
+        leave = ca.logic_or(skipped, ca.logic_and(judged.settled, ca.logic_not(onwards)))
         after = self.layouts.state.pack(
             self.layouts.counted(s, Phase.HAND_FIT)
             | {
@@ -190,14 +187,14 @@ class HandFirstStep:
                 "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
                 "palm_origin": ca.if_else(keep, reached.origin, x.origin),
                 "phase": ca.if_else(
-                    judged.settled,
-                    ca.if_else(onwards, self._arm_stage(p), float(Phase.CANDIDATE)),
-                    float(Phase.HAND_FIT),
+                    leave,
+                    float(Phase.CANDIDATE),
+                    ca.if_else(judged.settled, self._arm_stage(p), float(Phase.HAND_FIT)),
                 ),
-                "candidate": s["candidate"]
-                + ca.if_else(ca.logic_and(judged.settled, ca.logic_not(onwards)), 1.0, 0.0),
+                "candidate": s["candidate"] + leave,
                 "fits": judged.within,
                 "near": ca.if_else(near, judged.cost, s["near"]),
+                "returns": s["returns"] + returned,
             }
             | judged.fit
         )
@@ -205,6 +202,13 @@ class HandFirstStep:
         status = ca.if_else(ended, fitted, float(Status.RUNNING))
         record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged.accepted)
         return ca.Function("hand_fit", [state, parameters], shared(after, record, status))
+
+    def _is_own(self, s: dict[str, Expr], p: dict[str, Expr]) -> Expr:
+        """Whether a fit begins with the hand as it is, the first of the first round."""
+        if self.layouts.candidates == 1:
+            return ca.SX(0)
+        first = ca.logic_and(s["candidate"] + s["earlier"] <= 0, s["spent"] < 1)
+        return ca.logic_and(first, p["nearest"])
 
     def _arm_stage(self, p: dict[str, Expr]) -> Expr:
         if self.arm is None:
@@ -265,9 +269,10 @@ class HandFirstStep:
         q = ca.if_else(moved, tried.reached, s["q"])
         solved = ca.logic_or(met, ca.logic_and(judged.settled, judged.within))
         unsolved = ca.logic_and(judged.settled, ca.logic_not(judged.within))
-        near = worth_balancing(self._left(judged, tried), self.layouts.contacts, p)
-        near = ca.logic_and(near, differs(judged.cost, s["balanced"]))
-        near = ca.logic_and(near, unsolved)
+        near = ca.logic_and(unsolved, near_tolerance(self._left(judged, tried), contacts, p))
+        other = differs(judged.cost, s["balanced"])
+        returned = ca.logic_and(near, ca.logic_not(other))
+        near = ca.logic_and(near, other)
         failed = ca.logic_or(far, ca.logic_and(unsolved, ca.logic_not(near)))
         near = ca.logic_and(near, ca.logic_not(far))
         better = judged.cost < s["best_cost"]
@@ -282,6 +287,7 @@ class HandFirstStep:
                 ),
                 "candidate": s["candidate"] + ca.if_else(failed, 1.0, 0.0),
                 "balanced": ca.if_else(near, judged.cost, s["balanced"]),
+                "returns": s["returns"] + returned,
                 "best_cost": ca.if_else(better, judged.cost, s["best_cost"]),
                 "best_q": ca.if_else(better, q, s["best_q"]),
             }
