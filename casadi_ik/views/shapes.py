@@ -73,6 +73,18 @@ def arrow(start: Array, direction: Array, length: float, width: float) -> pv.Pol
     return with_edges(mesh)
 
 
+def ring(center: Array, axis: Array, radius: float, width: float) -> pv.PolyData:
+    """A thin ring about an axis through its centre."""
+    mesh = pv.ParametricTorus(ringradius=radius, crosssectionradius=width / 2).triangulate()
+    z = axis / np.linalg.norm(axis)
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3] = np.column_stack([x, np.cross(z, x), z, center])
+    mesh.transform(pose, inplace=True)
+    return mesh
+
+
 def with_edges(mesh: pv.PolyData) -> pv.PolyData:
     """The given surface, now smooth but where its faces meet at a sharp angle."""
     mesh.compute_normals(split_vertices=True, feature_angle=35.0, inplace=True)
