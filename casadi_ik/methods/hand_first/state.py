@@ -90,6 +90,7 @@ class HandFirstLayouts:
                 Field("swivel", unit="rad", doc="swivel of the arm nearest to the start"),
                 Field("elbow", doc="its sign of the elbow"),
                 Field("starts", doc="starts of the numeric arm stage so far"),
+                Field("turned", doc="joints of this start that were sent to the other side"),
                 Field("passed", doc="how far the palm of the last start was from the one wanted"),
                 Field("best_cost", doc="smallest cost of a whole configuration so far"),
                 Field("best_q", (n,), doc="the configuration it belongs to"),
