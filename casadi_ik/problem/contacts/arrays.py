@@ -12,7 +12,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.grasps.vectors import MORE, fault, squared
 from casadi_ik.problem.contacts.kinds import Kinds, kind_of, usual
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.problems import DIRECTIONS, Problems
 
 NAMES = tuple(f"{name}s" for name in MORE)
 """Names of the arrays."""
@@ -41,7 +41,9 @@ def more_arrays(
     found: dict[str, Array] = {}
     for name, value in more.items():
         if name not in NAMES:
-            raise UnknownNameError(f"{name!r} does not exist; expected one of {', '.join(NAMES)}")
+            raise UnknownNameError(
+                f"{name!r} does not exist; expected one of {', '.join((*NAMES, DIRECTIONS))}"
+            )
         if value is None:
             continue
         try:
