@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays_of
 
 import casadi_ik as ik
 from casadi_ik.errors import DescriptionError, InputError, RowError
-from casadi_ik.grasps.vectors import MORE
+from casadi_ik.grasps.vectors import MORE, fault, faulty
 from casadi_ik.logs import one_solve
 from casadi_ik.problem.contacts.arrays import NAMES, by_kinds, more_arrays
 from casadi_ik.problem.contacts.conditions import CONDITIONS
@@ -347,6 +347,26 @@ def test_bad_arrays(robot):
         assert caught.value.row == 4
     with pytest.raises(InputError, match=r"tangents: found shape \(1, 3\), expected \(1, 3, 3\)"):
         more_arrays({"tangents": tangents[..., 0]}, points, normals)
+
+
+def test_all_contacts_at_once_are_judged_like_each():
+    """With vectors left out at random, tangents across their normals or not."""
+    rng = np.random.default_rng(5)
+    whole = {name: rng.normal(size=(400, 3)) for name in ("point", "normal", *MORE)}
+    across = rng.random(400) < 0.7
+    whole["tangent"][across] = np.cross(whole["normal"], whole["line"])[across]
+    for name, array in whole.items():
+        if name != "point":
+            array /= np.linalg.norm(array, axis=1)[:, None]
+        array[rng.random(400) < 0.3] = np.nan
+    single = [
+        fault({name: array[i] for name, array in whole.items() if not np.isnan(array[i, 0])})
+        for i in range(400)
+    ]
+    expected = [problem is not None for problem in single]
+    assert 50 < sum(expected) < 350
+    assert len(set(single)) > 20
+    np.testing.assert_array_equal(faulty(whole), expected)
 
 
 @given(
