@@ -61,7 +61,8 @@ class Solver:
                 "closed-form", the same answer, much faster. Methods without a finger step take no
                 notice.
             options: Fields of the method's parameter record (`QiuParameters`), by name.
-            compiled: False keeps to CasADi's virtual machine: the same iterates, slower.
+            compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
+                slower.
 
         Raises:
             UnknownNameError: No such method or option.

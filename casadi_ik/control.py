@@ -74,7 +74,8 @@ class ScrewControl:
             speed: Fastest motion of an actuator, () or (n,) [unit/s]; None is unlimited.
             resolution: Steps in which an actuator can be commanded, () or (n,) [rad or m], counted
                 from its lower limit; None or 0 is continuous.
-            compiled: False keeps to CasADi's virtual machine: the same iterates, slower.
+            compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
+                slower.
 
         Raises:
             UnknownNameError: The task names a finger that the robot does not have.

@@ -84,7 +84,7 @@ class FunctionKernel:
     Attributes:
         name: The function's name.
         compiled: Whether calls run in compiled code (otherwise in CasADi's virtual machine, with
-            the same results).
+            the same results up to the last places of sines and arcs).
         input_shapes: Shape of one sample of each input.
         output_shapes: Shape of one sample of each output.
     """

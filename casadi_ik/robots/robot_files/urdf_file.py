@@ -158,7 +158,7 @@ def _model(element: Element, links: list[str], joints: dict[str, Element], path:
     text = ElementTree.tostring(bare(element), encoding="unicode")
     if not joints:
         raise DescriptionError(f"{path}: has no joints ({len(links)} links)")
-    with _silent() as said:
+    with silent() as said:
         try:
             return module.buildModelFromXML(text)
         except (ValueError, RuntimeError) as error:
@@ -229,7 +229,7 @@ def _mimic(element: Element, where: str) -> Coupling | None:
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[Any]:
+def silent() -> Iterator[Any]:
     """Keep what the parsers print on stderr, whose lines are ours; gives the first error."""
     with tempfile.TemporaryFile() as kept:
         sys.stderr.flush() if sys.stderr is not None else None
