@@ -125,7 +125,7 @@ def test_fits_that_come_back_to_a_minimum_that_misses_end_the_rounds_of_tables(r
     # Two rounds of tables instead of six.
     given_up = 8 * (2 + LATER) - 1
     assert np.median(batch.restarts[missed]) == given_up
-    assert np.median(batch.phases["balance"][missed]) < 100
+    assert np.median(batch.phases["balance"][missed]) < 15
     whole = HandFirstMethod(robot.description, HandFirstParameters())
     whole.hopeful = lambda states, number: np.ones(len(states), dtype=bool)
     asked = Problems(points[missed], normals[missed], TOLERANCE, True)
