@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 from ar10.free_tasks import null_space, offsets
-from ar10.tip_poses import index_pose, relative_pose
+from ar10.hand import RESOLUTION
+from ar10.tip_poses import INDEX_GAINS, RELATIVE_GAINS, index_pose, relative_pose
 from runner import command, program
 
 import casadi_ik as ik
@@ -28,6 +29,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--robot", default="ar10")
     parser.add_argument("--goals", type=int, default=200, help="random goals per table row")
     parser.add_argument("--seed", type=int, default=0)
+    for name, gains in (("index", INDEX_GAINS), ("relative", RELATIVE_GAINS)):
+        parser.add_argument(
+            f"--{name}-gains", type=float, nargs="+", default=gains, help=f"of the {name} pose"
+        )
+    parser.add_argument(
+        "--resolution", type=float, default=RESOLUTION, help="steps of a slider [m]"
+    )
     parser.add_argument("--offset-gain", type=float, default=0.6, help="of the section on offsets")
     parser.add_argument(
         "--centring", type=float, nargs="+", default=CENTRING, help="gains in the null space"
@@ -41,8 +49,15 @@ def main(arguments: list[str] | None = None) -> None:
     rng = np.random.default_rng(options.seed)
     parts = [
         INTRODUCTION.format(command=command(__file__, arguments)),
-        index_pose(robot, options.out, options.goals, rng),
-        relative_pose(robot, options.out),
+        index_pose(
+            robot,
+            options.out,
+            options.goals,
+            rng,
+            options.index_gains,
+            options.resolution,
+        ),
+        relative_pose(robot, options.out, options.relative_gains, options.resolution),
         offsets(robot, options.out, options.goals, rng, options.offset_gain),
         null_space(robot, options.goals, rng, options.centring),
     ]

@@ -151,9 +151,13 @@ class LookupKernel:
             self._run_numpy(arrays, found)
         return found
 
-    def single(self, count: int) -> SingleLookup:
-        """One lookup with memory of its own, to be made again and again; of compiled ones only."""
-        inputs = [np.zeros(shape) for shape in self.key.input_shapes]
+    def single(self, count: int, inputs: Sequence[NDArray[np.float64]]) -> SingleLookup:
+        """One lookup to be made again and again; of compiled ones only.
+
+        Args:
+            count: How many rows.
+            inputs: Contiguous arrays to read from, of one sample's shapes.
+        """
         found = np.zeros((1, count), dtype=np.int64)
         return SingleLookup(self.key.name, self._lookup, inputs, found, *self._job(inputs, found))
 

@@ -81,15 +81,15 @@ class Questions:
             if not isinstance(grasp, Grasp):
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
         # Contacts are checked when they are made.
-        points, normals = zip(*(grasp.arrays(fingers) for grasp in grasps), strict=True)
+        arrays = [grasp.arrays(fingers) for grasp in grasps]
         own, usual = grasps[0].contacts, self.tolerances
         tolerances = tuple(
             (own[name].tolerance if name in own else None) or usual[name] for name in fingers
         )
         held = self.held(fixed)
         return Problems(
-            np.array(points),
-            np.array(normals),
+            np.concatenate([points[None] for points, _ in arrays]),
+            np.concatenate([normals[None] for _, normals in arrays]),
             tolerances,
             self.enforce_limits,
             fixed=held,

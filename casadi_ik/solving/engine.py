@@ -99,9 +99,15 @@ class Engine:
         method.prepare()
         return method
 
+    # Whether a method follows a protocol takes 20 us to ask, a fifth of a solve from Python.
     @cached_property
     def _quick(self) -> QuickMethod | None:
         return self.method if isinstance(self.method, QuickMethod) else None
+
+    @cached_property
+    def _preferences(self) -> tuple[str, ...]:
+        method = self.method
+        return method.preferences if isinstance(method, PreferringMethod) else ()
 
     def kinds_of(self, problems: Problems) -> Engine:
         """The engine for targets that are all of the same kinds.
@@ -140,10 +146,10 @@ class Engine:
             UnsupportedError: The method does not know it.
         """
         asked, method = preference(prefer, started), self.method
-        if isinstance(method, PreferringMethod):
-            if asked in method.preferences:
+        if self._preferences:
+            if asked in self._preferences:
                 return asked
-            known = ", ".join(method.preferences)
+            known = ", ".join(self._preferences)
             raise UnsupportedError(f"prefer: method {method.name!r} knows {known}, found {asked!r}")
         if prefer is None:
             return NO_PREFERENCE

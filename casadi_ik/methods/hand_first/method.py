@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,7 @@ class HandFirstMethod(LoopedMethod):
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(robot, _closed_form(robot), options.candidates, self._kinds)
         self._singles: list[FirstRound] = []
+        self._kept: tuple[Any, Array] | None = None
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""
@@ -247,7 +249,16 @@ class HandFirstMethod(LoopedMethod):
         return np.concatenate([here, ordered], axis=1)
 
     def _terms(self, problems: Problems) -> Array:
-        """What `beginning` calls terms."""
+        """What `beginning` calls terms; kept, since making them costs as much as a solve."""
+        if problems.fixed is not None:
+            return self._terms_of(problems)
+        asked = problems.tolerances, problems.enforce_limits, problems.prefer
+        kept = self._kept
+        if kept is None or kept[0] != asked:
+            self._kept = kept = asked, self._terms_of(problems)
+        return kept[1]
+
+    def _terms_of(self, problems: Problems) -> Array:
         bounds = problems.bounds(self.robot, UNBOUNDED)
         nearest = [float(problems.prefer == NEAREST)]
         tolerances = problems.position_tolerance, problems.angle_tolerance
