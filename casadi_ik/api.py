@@ -24,7 +24,7 @@ from casadi_ik.solving.alternatives.finder import APART, Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
-from casadi_ik.solving.stream import REQUIRED, SolvedBlock, Stream
+from casadi_ik.solving.stream import SolvedBlock, Stream
 
 
 class Solver:
@@ -175,7 +175,8 @@ class Solver:
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
             prefer: As for `solve`.
             more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
-                `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point).
+                `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point),
+                "directions" (a fingertip without a point faces this way).
 
         Returns:
             The same fields as a `Solution`, as arrays.
@@ -233,9 +234,7 @@ class Solver:
         preferred = self._engine.preference(prefer, q0 is not None)
 
         def ask(block: Mapping[str, ArrayLike], first_row: int) -> Problems:
-            more = {name: array for name, array in block.items() if name not in REQUIRED}
-            points, normals = (block[name] for name in REQUIRED)
-            return self._questions.of_arrays(points, normals, held, first_row, more, preferred)
+            return self._questions.of_named(block, held, first_row, preferred)
 
         with self._recorder(log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())

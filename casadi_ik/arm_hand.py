@@ -261,7 +261,8 @@ def load_robot(name_or_path: str | Path) -> ArmHand:
     """Load a robot.
 
     Args:
-        name_or_path: A shipped name (`casadi-ik robots` lists them) or the path of your own YAML.
+        name_or_path: A shipped name (`casadi-ik robots` lists them), a shipped arm with a shipped
+            hand ("panda+allegro_right"), or the path of your own YAML.
 
     Raises:
         UnknownNameError: No shipped robot has that name.

@@ -61,6 +61,7 @@ and if wanted, NaN where not:
   tangents (k, f, 3) second axes of the contact frames, orthogonal to the normals: whole poses
   lines    (k, f, 3) a contact may be anywhere on the line through its point in this direction
   planes   (k, f, 3) a contact may be anywhere in the plane through its point with this normal
+  directions (k, f, 3) a fingertip faces this way wherever it is; it has no point then
 OUT.npz then holds:
   q (k, n), success (k,), status (k,), position_error (k, f) [m], angle_error (k, f) [rad],
   iterations, restarts (k,), time (k,) [s]

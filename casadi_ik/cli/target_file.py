@@ -17,11 +17,12 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.problem.contacts.arrays import NAMES
+from casadi_ik.problem.problems import DIRECTIONS
 
 KEYS = ("points", "normals")
 """What has to be there; the others may be."""
 
-OPTIONAL = NAMES
+OPTIONAL = (*NAMES, DIRECTIONS)
 
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,

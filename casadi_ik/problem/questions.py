@@ -13,7 +13,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp, Tolerance
 from casadi_ik.problem.contacts.arrays import more_arrays
-from casadi_ik.problem.problems import Problems, fixed_array, target_arrays
+from casadi_ik.problem.problems import DIRECTIONS, Problems, fixed_array, target_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,18 +46,36 @@ class Questions:
             normals: (k, f, 3).
             fixed: See `Problems`.
             first_row: Number of the first target.
-            more: (k, f, 3) what contacts have beside, see `more_arrays`.
+            more: (k, f, 3) what contacts have beside, see `more_arrays`; and directions.
             prefer: See `Problems`.
 
         Raises:
             InputError: See `target_arrays` and `more_arrays`.
         """
-        p, n = target_arrays(points, normals, len(self.robot.fingers), first_row)
+        named = dict(more or {})
+        directions = named.pop(DIRECTIONS, None)
+        p, n = target_arrays(points, normals, len(self.robot.fingers), first_row, directions)
         tolerances = tuple(self.tolerances.values())
-        others = more_arrays(more, p, n, first_row) if more else {}
+        others = more_arrays(named, p, n, first_row) if named else {}
         return Problems(
             p, n, tolerances, self.enforce_limits, first_row, fixed, others, prefer=prefer
         )
+
+    def of_named(
+        self,
+        arrays: Mapping[str, ArrayLike],
+        fixed: Array | None,
+        first_row: int = 0,
+        prefer: str = "limits",
+    ) -> Problems:
+        """Targets as arrays by name, see `of_arrays`: points, normals, and what else there is.
+
+        Raises:
+            InputError: See `of_arrays`.
+        """
+        more = dict(arrays)
+        points, normals = more.pop("points"), more.pop("normals")
+        return self.of_arrays(points, normals, fixed, first_row, more, prefer)
 
     def of_grasps(
         self,

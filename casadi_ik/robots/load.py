@@ -147,7 +147,7 @@ def _joined(
     unique((joint.name for joint in joints), f"{where}: joints")
     unique((root, *(joint.child for joint in joints)), f"{where}: links")
     flat = flattened(joints, root, hand.tip_link)
-    home = (arm.home if arm else {}) | hand.home | home
+    home = home or (arm.home if arm else {}) | hand.home
     if thumb is None and hand.thumb in fingers:
         thumb = hand.thumb
     return RobotDescription(
