@@ -125,7 +125,7 @@ class LookupKernel:
             "STEPS": STEPS,
             "LARGEST": LARGEST,
         }
-        driver = define(constants) + driver_text("lookup")
+        driver = define(constants) + driver_text("registers") + driver_text("lookup")
         return load_library(
             graph.name, lambda: row_major(graph.function), driver, SYMBOL, graph.recipe
         )

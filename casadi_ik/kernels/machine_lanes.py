@@ -19,7 +19,7 @@ def machine_lanes() -> int:
     library = load_library(
         "machine_lanes",
         lambda: ca.Function("machine_lanes", [x], [x]),
-        driver_text("machine_lanes"),
+        driver_text("registers") + driver_text("machine_lanes"),
         SYMBOL,
         "machine_lanes",
     )

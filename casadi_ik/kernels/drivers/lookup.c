@@ -161,9 +161,9 @@ __attribute__((target("avx512f,avx512bw"))) FORM void with_avx512(
 
 static look_up *best_form(void) {
 #if defined(__x86_64__)
-  __builtin_cpu_init();
-  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw")) return with_avx512;
-  if (__builtin_cpu_supports("avx2")) return with_avx2;
+  const int bits = register_bits();
+  if (bits == 512) return with_avx512;
+  if (bits == 256) return with_avx2;
 #endif
   return anywhere;
 }

@@ -3,12 +3,8 @@ EXPORT int casadi_ik_machine_lanes(void) {
 #if defined(_WIN32) && !defined(__clang__)
   return 0; /* gcc does not align vectors on the stack there */
 #elif defined(__x86_64__)
-  __builtin_cpu_init();
-  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq")
-      && __builtin_cpu_supports("avx512vl")) {
-    return 8;
-  }
-  return __builtin_cpu_supports("avx2") ? 4 : 0;
+  const int bits = register_bits();
+  return bits == 512 ? 8 : bits == 256 ? 4 : 0;
 #else
   return 4;
 #endif
