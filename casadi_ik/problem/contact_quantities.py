@@ -91,11 +91,10 @@ class Quantity:
         """Whether both say the same, rounding aside."""
         if (self.name, self.unit, self.reach) != (other.name, other.unit, other.reach):
             return False
-        pairs = ((getattr(q, part) for part in NUMBERS) for q in (self, other))
-        return all(abs(a - b) <= SAME for a, b in zip(*pairs, strict=True))
-
-
-NUMBERS = "asked", "give", "lower", "upper"
+        return all(
+            abs(getattr(self, part) - getattr(other, part)) <= SAME
+            for part in ("asked", "give", "lower", "upper")
+        )
 
 
 def kept_quantities(robot: RobotDescription, problems: Problems) -> tuple[Kept, ...]:
