@@ -8,8 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError
@@ -21,13 +20,11 @@ from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
 from casadi_ik.problem.solution import BatchSolution, Solution
-from casadi_ik.solving.alternatives.finder import Alternative
+from casadi_ik.solving.alternatives.finder import APART, Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
-from casadi_ik.solving.stream import REQUIRED, SolvedBlock, Stream
-
-Array = NDArray[np.float64]
+from casadi_ik.solving.stream import SolvedBlock, Stream
 
 
 class Solver:
@@ -64,7 +61,8 @@ class Solver:
                 "closed-form", the same answer, much faster. Methods without a finger step take no
                 notice.
             options: Fields of the method's parameter record (`QiuParameters`), by name.
-            compiled: False keeps to CasADi's virtual machine: the same iterates, slower.
+            compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
+                slower.
 
         Raises:
             UnknownNameError: No such method or option.
@@ -177,7 +175,8 @@ class Solver:
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
             prefer: As for `solve`.
             more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
-                `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point).
+                `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point),
+                "directions" (a fingertip without a point faces this way).
 
         Returns:
             The same fields as a `Solution`, as arrays.
@@ -235,9 +234,7 @@ class Solver:
         preferred = self._engine.preference(prefer, q0 is not None)
 
         def ask(block: Mapping[str, ArrayLike], first_row: int) -> Problems:
-            more = {name: array for name, array in block.items() if name not in REQUIRED}
-            points, normals = (block[name] for name in REQUIRED)
-            return self._questions.of_arrays(points, normals, held, first_row, more, preferred)
+            return self._questions.of_named(block, held, first_row, preferred)
 
         with self._recorder(log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
@@ -252,12 +249,13 @@ class Solver:
         q0: ArrayLike | None = None,
         seed: int = 0,
         fixed: Mapping[str, float] | None = None,
+        apart: float = APART,
     ) -> tuple[Alternative, ...]:
         """Find different solutions of one grasp, best first.
 
         For every hand posture that meets the contacts: of an S-R-S arm every branch (signs of
         shoulder, elbow and wrist) with its intervals of swivels, and the preferred swivel of each;
-        of another arm the different configurations that many starts lead to.
+        of another arm the different configurations that many starts lead to. Of two alike, one.
 
         Args:
             grasp: A contact per finger; its fingers must be the robot's.
@@ -267,17 +265,19 @@ class Solver:
             q0: (n,) where the robot is [rad or m]; None is `robot.home`.
             seed: Of all random numbers, an integer >= 0.
             fixed: Positions of actuators that are not to move, by name [rad or m].
+            apart: How different they are: of any two, at least one actuator differs by this part
+                of its range, 0 to 1. 0: all that are found.
 
         Returns:
             The solutions; none if the grasp cannot be solved (`solve` says why).
 
         Raises:
-            InputError: Bad limit, preference or q0, or a grasp the robot cannot take.
+            InputError: Bad limit, preference, distance or q0, or a grasp the robot cannot take.
             UnsupportedError: The method is not hand-first.
         """
         problems = self._questions.of_grasps([grasp], fixed)
         finder = self._engine.kinds_of(problems).finder
-        return finder.find(problems, self._questions.start(q0), seed, limit, prefer)
+        return finder.find(problems, self._questions.start(q0), seed, limit, prefer, apart)
 
     def track(
         self,

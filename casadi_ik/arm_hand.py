@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.arrays import real_array
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
-
-Array = NDArray[np.float64]
 
 
 class ArmHand:
@@ -182,7 +181,9 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        position, angle, _ = self._kernels.deviations(self.configuration(q), points, normals)
+        position, angle, _ = self.deviations(
+            self.configuration(q), np.asarray(points), np.asarray(normals)
+        )
         return position, angle
 
     def deviations(self, q: Array, points: Array, normals: Array) -> tuple[Array, Array, Array]:
@@ -198,7 +199,9 @@ class ArmHand:
             worst actuator or joint is beyond its limits [rad or m].
         """
         position, angle, beyond = self._kernels.deviations(q, points, normals)
-        return position, angle, beyond
+        # A kernel's single number has no dimension of its own, even that of a single finger.
+        by_finger = (*beyond.shape, len(self.fingers))
+        return position.reshape(by_finger), angle.reshape(by_finger), beyond
 
     def beyond_limits(self, q: ArrayLike) -> Array:
         """By how much the worst actuator or joint is beyond its limits [rad or m], () or (k,).
@@ -258,7 +261,8 @@ def load_robot(name_or_path: str | Path) -> ArmHand:
     """Load a robot.
 
     Args:
-        name_or_path: A shipped name (`casadi-ik robots` lists them) or the path of your own YAML.
+        name_or_path: A shipped name (`casadi-ik robots` lists them), a shipped arm with a shipped
+            hand ("panda+allegro_right"), or the path of your own YAML.
 
     Raises:
         UnknownNameError: No shipped robot has that name.

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.kernels import FunctionKernel, LoopKernel
 from casadi_ik.kernels.stepper import Stepper
@@ -29,8 +30,6 @@ from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.problem.trajectory import Trajectory
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
-
-Array = NDArray[np.float64]
 
 UNLIMITED = 1e9
 """A step that no actuator reaches [rad or m]."""
@@ -75,7 +74,8 @@ class ScrewControl:
             speed: Fastest motion of an actuator, () or (n,) [unit/s]; None is unlimited.
             resolution: Steps in which an actuator can be commanded, () or (n,) [rad or m], counted
                 from its lower limit; None or 0 is continuous.
-            compiled: False keeps to CasADi's virtual machine: the same iterates, slower.
+            compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
+                slower.
 
         Raises:
             UnknownNameError: The task names a finger that the robot does not have.

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hard_targets import Array, contact_slopes, corners
+from hard_targets import contact_slopes, corners
 from missed import ROBOTS, TOLERANCES, load
 from rich.console import Console
 from runner import markdown_table, provenance, write_metrics, write_page
@@ -32,6 +32,7 @@ from runner.metric import rate_metric
 from runner.results import code_version
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
 CLIMBERS = 512
 PATIENCE = 25

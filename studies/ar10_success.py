@@ -14,13 +14,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
-Array = NDArray[np.float64]
 # (robot, rng, count) -> (count, n) configurations within limits.
 Configurations = Callable[[ik.ArmHand, np.random.Generator, int], Array]
 FINGERS = ("thumb", "index", "middle")

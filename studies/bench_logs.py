@@ -18,10 +18,10 @@ from typing import Any, Self, get_args
 
 import numpy as np
 from bench_report import Section
-from numpy.typing import NDArray
 from targets import random_arm_targets
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.problem.recorder import SolveBlock
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -33,7 +33,7 @@ METHODS: dict[str, dict[str, Any]] = {
 FEWER = 25
 """The slow methods get so many times fewer targets."""
 
-Targets = tuple[NDArray[np.float64], NDArray[np.float64]]
+Targets = tuple[Array, Array]
 
 
 class Dropped:
@@ -146,9 +146,7 @@ def _measured(
     ]
 
 
-def _ratios(
-    plain: Callable[[], object], logged: Callable[[], object], repeats: int
-) -> NDArray[np.float64]:
+def _ratios(plain: Callable[[], object], logged: Callable[[], object], repeats: int) -> Array:
     """CPU and wall time of one call over those of another, which take turns."""
     times = np.zeros((repeats, 2, 2))
     for i, j in np.ndindex(repeats, 2):

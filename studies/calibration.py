@@ -11,95 +11,21 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from runner.page import markdown_table
+from calibrated_hands.figures import draw_bars, draw_spectrum
+from calibrated_hands.trials import FINGER, NOISE, POSES, Trials, trials
+from runner import command, markdown_table, program
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.calibration import (
     LOSSES,
     Calibration,
     HandModel,
-    Measurements,
-    calibrate,
     hand_parameters,
-    simulate,
-    true_values,
 )
-
-Array = NDArray[np.float64]
-
-FINGER = "index"
-NOISE = (2e-4, math.radians(0.5))
-"""Of a measured coordinate [m] and angle [rad]: an assumption, of the size of marker tracking."""
-
-POSES = 60
-EXACT = (1e-9, 1e-9)
-LEVELS = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99])
-NORMAL = np.array([0.6745, 0.8416, 1.0364, 1.2816, 1.6449, 1.96, 2.5758])
-"""Half widths in standard deviations that hold so much of a normal variable."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trials:
-    """Estimates for many hands: h hands, k parameters.
-
-    Attributes:
-        deviations: (h, k) estimate minus truth, over the estimated standard deviation.
-        misses: (h,) root mean square distance of the estimated tip from the true one [mm].
-        described: (h,) the same of the description.
-        noise: (h,) estimated noise of a coordinate over the true one.
-        converged: (h,) whether the estimate converged.
-        last: One of the estimates.
-    """
-
-    deviations: Array
-    misses: Array
-    described: Array
-    noise: Array
-    converged: NDArray[np.bool_]
-    last: Calibration
-
-    def coverage(self, level: float = 1.959964) -> float:
-        """Part of the true numbers within so many standard deviations [%]."""
-        return 100 * float(np.mean(np.abs(self.deviations) <= level))
-
-
-def trials(
-    model: HandModel, hands: int, seed: int, loss: str, outliers: float, poses: int = POSES
-) -> Trials:
-    """Calibrate hands drawn from the priors, each with its own data and random numbers."""
-    rows = []
-    for hand in range(hands):
-        rng = np.random.default_rng([seed, hand])
-        truth = true_values(model, rng)
-        data = simulate(model, truth, FINGER, poses, rng, noise=NOISE, outliers=outliers)
-        found = calibrate(model, data, loss=loss)
-        fresh = simulate(model, truth, FINGER, 100, rng, noise=EXACT)
-        miss, described = (
-            tip_miss(model, values, fresh) for values in (found.values, model.nominal)
-        )
-        scaled = (found.values - truth) / found.deviation
-        rows.append((scaled, miss, described, found.noise[0] / NOISE[0], found.converged, found))
-    scaled, misses, described, noise, converged, found = zip(*rows, strict=True)
-    return Trials(
-        np.array(scaled),
-        np.array(misses),
-        np.array(described),
-        np.array(noise),
-        np.array(converged),
-        found[-1],
-    )
-
-
-def tip_miss(model: HandModel, values: Array, exact: Measurements) -> float:
-    """Root mean square distance of a model's tip from exact measurements [mm]."""
-    error, _ = model.misfit(FINGER, exact.q, values, exact.poses)
-    return 1e3 * float(np.sqrt((error[:, :3] ** 2).sum(axis=1).mean()))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -108,6 +34,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--robot", default="ar10")
     parser.add_argument("--hands", type=int, default=150, help="hands per table row")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--poses", type=int, default=POSES, help="measured of a hand")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        nargs=2,
+        default=NOISE,
+        metavar=("METRES", "RADIANS"),
+        help="standard deviation of a measured coordinate and angle",
+    )
     parser.add_argument(
         "--out", type=Path, default=Path(__file__).parent / "results" / "calibration"
     )
@@ -115,22 +50,25 @@ def main(arguments: list[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     robot = ik.load_robot(options.robot).description
     model = HandModel(robot, hand_parameters(robot, [FINGER]))
-    hands, seed = options.hands, options.seed
+    hands, seed, poses, noise = options.hands, options.seed, options.poses, tuple(options.noise)
     results = {
-        (loss, outliers): trials(model, hands, seed, loss, outliers)
+        (loss, outliers): trials(model, hands, seed, loss, outliers, poses, noise)
         for outliers in (0.0, 0.1, 0.25)
         for loss in LOSSES
     }
-    sizes = {count: trials(model, hands, seed, "cauchy", 0.1, count) for count in (15, 30, 120)}
-    sizes[POSES] = results["cauchy", 0.1]
+    sizes = {
+        part: trials(model, hands, seed, "cauchy", 0.1, part, noise)
+        for part in (poses // 4, poses // 2, 2 * poses)
+    }
+    sizes[poses] = results["cauchy", 0.1]
     sizes = dict(sorted(sizes.items()))
     text = REPORT.format(
-        command=f"python studies/calibration.py --hands {hands} --seed {seed}",
+        command=command(__file__, arguments),
         numbers=len(model.parameters),
         hands=hands,
-        poses=POSES,
-        position=1e3 * NOISE[0],
-        angle=math.degrees(NOISE[1]),
+        poses=poses,
+        position=1e3 * noise[0],
+        angle=math.degrees(noise[1]),
         described=np.median(results["cauchy", 0.1].described),
         losses=loss_table(results),
         sizes=size_table(sizes),
@@ -245,68 +183,10 @@ def direction_table(found: Calibration) -> str:
     return markdown_table(("singular value", "direction"), rows)
 
 
-def draw_bars(results: dict[tuple[str, float], Trials], path: Path) -> None:
-    """How far the coverage is from its level, and the errors over their standard deviations."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    levels, errors = figure.subplots(1, 2)
-    colors = dict(zip(LOSSES, ("#2f6db3", "#1f9d55", "#e08a2e"), strict=True))
-    for (loss, outliers), result in results.items():
-        if outliers == 0.25:
-            continue
-        off = [result.coverage(width) for width in NORMAL] - 100 * LEVELS
-        style, fill = ("-", colors[loss]) if outliers else ("--", "white")
-        label = f"{loss}, {100 * outliers:.0f} % outliers"
-        levels.plot(100 * LEVELS, off, style, color=colors[loss], marker="o", ms=5, mfc=fill,
-                    label=label)  # fmt: skip
-    levels.axhline(0, color="black", lw=0.8)
-    levels.set_title("Intervals that hold too often (above 0) or too rarely", size=10, loc="left")
-    levels.set(xlabel="level of the interval [%]", ylabel="true values within, minus level [%]")
-    low, high = levels.get_ylim()
-    levels.set_ylim(low, high + 0.55 * (high - low))  # room for the legend
-    levels.legend(frameon=False, fontsize=8, ncols=2, loc="upper left")
-    grid = np.linspace(-4, 4, 81)
-    pooled = results["cauchy", 0.1].deviations.ravel()
-    errors.hist(pooled, bins=grid, density=True, color="#9fc3e6", label="all hands and numbers")
-    normal = np.exp(-0.5 * grid**2) / math.sqrt(2 * math.pi)
-    errors.plot(grid, normal, color="black", lw=1, label="what the intervals assume: normal")
-    errors.set_title("Errors, Cauchy loss, 10 % outliers", size=10, loc="left")
-    errors.set(xlabel="error / its estimated standard deviation", ylabel="density", ylim=(0, 0.55))
-    errors.legend(frameon=False, fontsize=8, loc="upper left")
-    figure.savefig(path, dpi=110)
-
-
-NONE = 1e-6
-"""Singular values below this are zero to rounding."""
-
-
-def draw_spectrum(found: Calibration, path: Path) -> None:
-    """Singular values, with the level of the priors."""
-    figure = Figure(figsize=(7, 3.4), layout="constrained")
-    axes = figure.subplots()
-    values, order = found.singular_values, np.arange(1, len(found.singular_values) + 1)
-    for chosen, color, label in (
-        (values >= 1, "#2f6db3", "known from the measurements"),
-        ((values < 1) & (values > NONE), "#9fc3e6", "known from the priors for the most part"),
-    ):
-        axes.semilogy(order[chosen], values[chosen], "o", color=color, ms=5, label=label)
-    zero = order[values <= NONE]
-    axes.semilogy(zero, np.full(len(zero), NONE), "v", color="#e08a2e", ms=6,
-                  label="zero: no measurement of the tip tells")  # fmt: skip
-    axes.axhline(1, color="black", lw=0.8, ls="--")
-    axes.annotate(
-        "1: measurements say as much as priors", (0.99, 1.25), fontsize=8, ha="right",
-        xycoords=("axes fraction", "data"),
-    )  # fmt: skip
-    axes.set(xlabel="direction in the space of dimensions, best known first")
-    axes.set(ylabel="singular value, priors = 1", ylim=(3e-7, None))
-    axes.legend(frameon=False, fontsize=8, loc="lower left")
-    figure.savefig(path, dpi=110)
-
-
 def spread(values: Array) -> str:
     """Median and 90th percentile."""
     return f"{np.median(values):.3f} / {np.percentile(values, 90):.3f}"
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

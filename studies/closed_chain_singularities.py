@@ -13,18 +13,17 @@ import numpy as np
 from closed_chain.chain import LENGTH, constraints, cylinder
 from closed_chain.report import OURS, PAPER, field, figure, options, title, write
 from numpy.typing import NDArray
+from runner import command, program
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.symbolic.active_joints import mobility, pivoted
 from casadi_ik.symbolic.closed_chain import VIRTUAL, split
 
-NEAR = 100.0
-"""Condition from which a configuration counts as near singular."""
-
 
 def conditions(
-    robot: ik.ArmHand, q: NDArray[np.float64]
-) -> tuple[dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]], NDArray[np.int64]]:
+    robot: ik.ArmHand, q: Array
+) -> tuple[dict[str, Array], dict[str, Array], NDArray[np.int64]]:
     """Condition of H_p and largest |passive / active| rate by active set, and pivoted columns."""
     parts = split(robot.description)
     columns = list(parts.columns)
@@ -44,9 +43,14 @@ def conditions(
     return condition, ratio, chosen
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Run the study and write its page."""
-    given = options("Singularities of the closed chain.", 30_000)
+    given = options(
+        "Singularities of the closed chain.",
+        30_000,
+        arguments,
+        near=(100.0, "condition from which a configuration counts as near singular"),
+    )
     robot = ik.load_robot("kuka_lwr_barrett")
     q = robot.random(np.random.default_rng(given.seed), given.count)
     condition, ratio, chosen = conditions(robot, q)
@@ -72,7 +76,7 @@ def main() -> None:
     share = np.linspace(0, 100, len(q))
     for (name, values), color in zip(condition.items(), (PAPER, OURS), strict=True):
         grid[0, 2].semilogx(np.sort(values), share, color=color, lw=2, label=name)
-    grid[0, 2].axvline(NEAR, color="0.6", lw=1, ls="--")
+    grid[0, 2].axvline(given.near, color="0.6", lw=1, ls="--")
     grid[0, 2].set_xlim(1, 1e5)
     grid[0, 2].legend(frameon=False, fontsize=9)
     title(grid[0, 2], "how often", "cond(H_p)", "configurations below [%]")
@@ -82,17 +86,17 @@ def main() -> None:
     grid[1, 2].invert_yaxis()
     title(grid[1, 2], "active by pivoting (orange: paper)", "% of cases", "")
 
-    def percentiles(values: NDArray[np.float64]) -> str:
+    def percentiles(values: Array) -> str:
         return " | ".join(f"{v:.3g}" for v in np.percentile(values, [50, 90, 99]))
 
-    near = {name: 100 * np.mean(values > NEAR) for name, values in condition.items()}
+    near = {name: 100 * np.mean(values > given.near) for name, values in condition.items()}
     straight = np.abs(elbow) < 10
-    bad = condition["paper"] > NEAR
+    bad = condition["paper"] > given.near
     moves = mobility(constraints(robot, q[:1])[0])
     text = f"""
 # Where the closed chain comes near singular
 
-`python studies/closed_chain_singularities.py --count {given.count} --seed {given.seed}`:
+`{command(__file__, arguments)}`:
 {given.count} configurations of `{robot.name}` uniform within limits; lengths in units of
 {LENGTH} m. The chain of arm, thumb and virtual joint has {len(names)} coordinates and mobility
 {moves}.
@@ -105,8 +109,8 @@ def main() -> None:
 | largest passive / active rate, by pivoting | {percentiles(ratio["pivoted"])} |
 
 With the paper's active joints (virtual joint, thumb 2, arm 7 and 6) {near["paper"]:.1f} % of the
-configurations are near singular (condition above {NEAR:g}). Worst is the straight elbow, at the
-border of the reach, whatever the wrist does: the elbow is passive there. But
+configurations are near singular (condition above {given.near:g}). Worst is the straight elbow, at
+the border of the reach, whatever the wrist does: the elbow is passive there. But
 {100 * np.mean(bad & ~straight) / max(np.mean(bad), 1e-12):.0f} % of the near singular ones have it
 more than 10 deg from straight. They are singularities of the choice, not of the
 mechanism: with the active joints chosen anew by QR with column pivoting {near["pivoted"]:.2f} %
@@ -118,4 +122,4 @@ null space of the thumb's rows need no H_p.
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

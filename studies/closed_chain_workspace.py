@@ -13,19 +13,15 @@ import numpy as np
 from closed_chain.chain import HeldThumb, cylinder
 from closed_chain.report import FAINT, OURS, PAPER, field, figure, options, title, write
 from numpy.typing import NDArray
+from runner import command, program
 
 import casadi_ik as ik
-
-PALMS = 300
-"""Palms tried for each contact."""
-
-GRASP = "cup"
-"""The grasp whose thumb contact is shown by itself."""
+from casadi_ik.arrays import Array
 
 
 def random_palms(
     robot: ik.ArmHand, held: HeldThumb, contact: tuple, count: int, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array, Array, Array]:
     """Palms on a contact: rotations, origins, virtual joint and thumb joints, all uniform."""
     q = np.tile(robot.home, (count, 1))
     thumb = list(robot.description.finger_actuators(robot.thumb))
@@ -35,9 +31,15 @@ def random_palms(
     return rotation, origin, turn, q[:, thumb]
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Run the study and write its page."""
-    given = options("Palm poses with the thumb held.", 2000)
+    given = options(
+        "Palm poses with the thumb held.",
+        2000,
+        arguments,
+        palms=(300, "tried for each contact"),
+        grasp=("cup", "whose thumb contact is shown by itself"),
+    )
     rng = np.random.default_rng(given.seed)
     robot = ik.load_robot("kuka_lwr_barrett")
     held = HeldThumb(robot)
@@ -46,14 +48,16 @@ def main() -> None:
     )
     share, spread, blocked = (np.empty(given.count) for _ in range(3))
     for i in range(given.count):
-        rotation, origin, _, _ = random_palms(robot, held, (points[i], normals[i]), PALMS, rng)
+        rotation, origin, _, _ = random_palms(
+            robot, held, (points[i], normals[i]), given.palms, rng
+        )
         follows = held.followed(rotation, origin)
         share[i] = 100 * follows.mean()
         reached = origin[follows]
         blocked[i] = 100 * np.mean(held.in_reach(rotation, origin) & ~follows)
         spread[i] = 1e3 * np.linalg.norm(np.ptp(reached, axis=0)) if len(reached) else 0.0
 
-    contact = ik.load_grasp(GRASP).contacts[robot.thumb]
+    contact = ik.load_grasp(given.grasp).contacts[robot.thumb]
     one = (np.asarray(contact.point), np.asarray(contact.normal))
     rotation, origin, turn, joints = random_palms(robot, held, one, 20_000, rng)
     follows = held.followed(rotation, origin)
@@ -82,7 +86,7 @@ def main() -> None:
     grid[1, 0].legend(frameon=False, fontsize=8, markerscale=2, labelcolor=FAINT)
     title(
         grid[1, 0],
-        f"{GRASP}: where the palm can be",
+        f"{given.grasp}: where the palm can be",
         "across the normal [mm]",
         "along the contact's normal [mm]",
     )
@@ -98,7 +102,7 @@ def main() -> None:
     )
     title(
         grid[1, 1],
-        f"{GRASP}: palms the arm follows [%]",
+        f"{given.grasp}: palms the arm follows [%]",
         "virtual joint [deg]",
         "thumb joints, summed [deg]",
     )
@@ -108,10 +112,10 @@ def main() -> None:
     text = f"""
 # Palm poses with the thumb held
 
-`python studies/closed_chain_workspace.py --count {given.count} --seed {given.seed}`:
+`{command(__file__, arguments)}`:
 {given.count} thumb contacts of `{robot.name}` (from configurations uniform within limits), for each
-{PALMS} palms uniform in virtual joint and thumb joints, the arm in closed form within limits; and
-20,000 palms on the thumb contact of the grasp `{GRASP}`.
+{given.palms} palms uniform in virtual joint and thumb joints, the arm in closed form within limits;
+and 20,000 palms on the thumb contact of the grasp `{given.grasp}`.
 
 | | 5 % | 25 % | median | 75 % | 95 % |
 |---|---|---|---|---|---|
@@ -121,7 +125,7 @@ def main() -> None:
 Half of the contacts let the arm follow at least {np.median(share):.0f} % of the palms;
 {100 * low.mean():.0f} % let it follow less than a tenth (they lie {np.median(r[low]):.2f} m from
 the base's axis and {np.median(z[low]):.2f} m high in the median) and {100 * high.mean():.0f} %
-more than nine tenths. For the `{GRASP}` it is
+more than nine tenths. For the `{given.grasp}` it is
 {100 * follows.mean():.0f} %: the palm moves on a shell about the contact, as thick as the thumb's
 joints allow, and the arm cuts a piece out of it. Of all palms the arm cannot follow,
 {100 * blocked.mean() / (100 - share.mean()):.0f} % are within reach of the wrist and fail at joint
@@ -131,9 +135,7 @@ at the border of the arm's reach, while well inside it most of what the thumb al
     write(given.out, "closed_chain_workspace", drawn, text)
 
 
-def _smoothed(
-    x: NDArray[np.float64], y: NDArray[np.float64], hit: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def _smoothed(x: Array, y: Array, hit: NDArray[np.bool_]) -> Array:
     """Share of hits in the cell of each sample, 36 by 36 cells."""
     i, j = (np.clip(((v - v.min()) / np.ptp(v) * 36).astype(int), 0, 35) for v in (x, y))
     cell = i * 36 + j
@@ -141,9 +143,9 @@ def _smoothed(
     return (hits / np.maximum(all_, 1))[cell]
 
 
-def _quantiles(values: NDArray[np.float64]) -> str:
+def _quantiles(values: Array) -> str:
     return " | ".join(f"{v:.0f}" for v in np.percentile(values, [5, 25, 50, 75, 95]))
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

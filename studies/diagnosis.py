@@ -21,11 +21,10 @@ from typing import Any
 
 import numpy as np
 from bench_report import Section, write_report
-from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
-Array = NDArray[np.float64]
 Targets = tuple[Array, Array]
 # (robot, rng, count) -> (count, n) configurations within limits.
 Configurations = Callable[[ik.ArmHand, np.random.Generator, int], Array]

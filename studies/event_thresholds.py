@@ -4,7 +4,7 @@ Solves are made once and logged several times, each log with one threshold chang
 kind of event as it is; what is counted is read from the logs::
 
     python studies/event_thresholds.py
-    python studies/event_thresholds.py --count 30 --report out/thresholds
+    python studies/event_thresholds.py --count 30 --factors 0.5 1 2 --report out/thresholds
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 from bench_logs import Kept
-from runner.page import markdown_table, write_page
+from runner import command, markdown_table, program, write_page
 from targets import any_configuration, random_arm_targets
 
 import casadi_ik as ik
@@ -28,7 +28,7 @@ from casadi_ik.logs.write.measured import measured_format
 from casadi_ik.problem.recorder import SolveBlock
 
 FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Thresholds are tried at these multiples of what is the rule."""
+"""Thresholds are tried at these multiples of what is the rule, unless said otherwise."""
 
 REPORT = Path(__file__).parent / "results" / "event_thresholds"
 
@@ -78,27 +78,27 @@ class Caught:
     rate: float
 
 
-def trials(block: SolveBlock) -> Iterator[Trial]:
+def trials(block: SolveBlock, factors: Sequence[float] = FACTORS) -> Iterator[Trial]:
     """Rules for every Jacobian of a method, for stalls and for oscillations."""
     known = measured_format(block.format).jacobians
     silent = dict.fromkeys(known, 0.0), dict.fromkeys(known, math.inf)
     for name, jacobian in known.items():
-        for factor in FACTORS:
+        for factor in factors:
             if jacobian.singular > 0:
                 value = factor * jacobian.singular
                 rules = EventRules(singular=silent[0] | {name: value}, condition=silent[1])
                 yield Trial(EventKind.NEAR_SINGULAR, name, value, factor == 1, rules)
-        for factor in FACTORS:
+        for factor in factors:
             if jacobian.condition < math.inf:
                 value = factor * jacobian.condition
                 rules = EventRules(singular=silent[0], condition=silent[1] | {name: value})
                 yield Trial(EventKind.ILL_CONDITIONED, name, value, factor == 1, rules)
     usual = EventRules()
-    for factor in FACTORS:
+    for factor in factors:
         value = factor * usual.stall_change
         rules = EventRules(stall_change=value)
         yield Trial(EventKind.STALL, "relative spread", value, factor == 1, rules)
-    for factor in FACTORS:
+    for factor in factors:
         value = factor * usual.oscillation_step
         rules = EventRules(oscillation_step=value)
         yield Trial(EventKind.OSCILLATION, "shortest step", value, factor == 1, rules)
@@ -130,12 +130,12 @@ def targets_of(robot: ik.ArmHand, count: int, seed: int) -> tuple[np.ndarray, np
     return points, normals
 
 
-def section(solver: ik.Solver, count: int, seed: int) -> str:
+def section(solver: ik.Solver, count: int, seed: int, factors: Sequence[float]) -> str:
     """The table of one method on one robot, as Markdown."""
     kept, targets = Kept(), targets_of(solver.robot, count, seed)
     batch = solver.solve_batch(*targets, seed=seed, log=kept)
     rows = []
-    for trial in trials(kept.blocks[0]):
+    for trial in trials(kept.blocks[0], factors):
         found = caught(kept.blocks, trial)
         number = f"{trial.threshold:.2g}"
         rows.append(
@@ -165,6 +165,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="What the thresholds of events catch.")
     parser.add_argument("--count", type=int, default=480, help="targets of each method")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--factors", type=float, nargs="+", default=FACTORS, help="thresholds over the rule's"
+    )
     parser.add_argument("--report", type=Path, default=REPORT, help="folder of the report")
     options = parser.parse_args(arguments)
     barrett, ar10 = ik.load_robot("kuka_lwr_barrett"), ik.load_robot("baxter_ar10")
@@ -175,9 +178,9 @@ def main(arguments: list[str] | None = None) -> None:
         ik.Solver(barrett, "thumb-first"),
         ik.Solver(ar10, "hand-first"),
     )
-    parts = [section(solver, options.count, options.seed) for solver in solvers]
+    parts = [section(solver, options.count, options.seed, options.factors) for solver in solvers]
     text = f"""
-`python studies/event_thresholds.py --count {options.count} --seed {options.seed}`: half of the
+`{command(__file__, arguments)}`: half of the
 targets are shipped grasps on random arms, half are random hands on random arms, all reachable; one
 start from `robot.home`, within limits. A row is a threshold, the rule in bold, and the share of the
 solves that failed and of those that were solved in which the event happened at all.
@@ -186,4 +189,4 @@ solves that failed and of those that were solved in which the event happened at 
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

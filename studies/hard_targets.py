@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 import casadi_ik as ik
-
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 DRAWS = 32
 """Arms of which the one nearest to a singularity is taken."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from diagnosis import Targets, moved
-from hard_targets import Array
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
 CLASSES = (
     "too far",

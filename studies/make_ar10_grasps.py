@@ -22,13 +22,12 @@ import numpy as np
 from grasp_synthesis.fingertip_pinch import TipPinch, TipPinchProblem
 from grasp_synthesis.holding import Scene, hold
 from grasp_synthesis.writing import grasp_text, made_by, placed_at
-from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.files.shipped import models_folder
 from casadi_ik.grasps import GraspObject, load_object
 
-Array = NDArray[np.float64]
 ROBOT, ROOT = "baxter_ar10", "hand_base"
 ALL, TWO = {"thumb": 1, "index": -1, "middle": -1}, {"thumb": 1, "index": -1}
 PHALANX_GAP = 0.005  # [m] from a phalanx's axis to the object, but for the last, which touches

@@ -14,13 +14,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from runner import markdown_table, write_page
 
 import casadi_ik as ik
-
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 STEP = 0.25e-3
 """Largest motion of a contact from one target of a path to the next [m], about."""
@@ -36,19 +34,19 @@ NEAREST = 1.01
 INTRODUCTION = """
 Robot kuka_lwr_barrett. *Motion:* of the motor that moves most, from q0 to the answer. *Distance:*
 Euclidean, every motor as a part of its range. *Paths:* straight lines in the space of the motors
-from the inner 40 % of their ranges, contacts 0.25 mm apart; every solve starts at the last answer.
-*Anywhere:* random targets from random configurations. *CPU time* of a solve in a batch.
+from the inner 40 % of their ranges, contacts {step:g} mm apart; every solve starts at the last
+answer. *Anywhere:* random targets from random configurations. *CPU time* of a solve in a batch.
 """
 
 
-def path(robot: ik.ArmHand, rng: np.random.Generator, steps: int) -> Array:
-    """Configurations (steps, n) whose contacts move by about `STEP` from one to the next."""
+def path(robot: ik.ArmHand, rng: np.random.Generator, steps: int, step: float) -> Array:
+    """Configurations (steps, n) whose contacts move by about `step` [m] from one to the next."""
     ranges = robot.upper - robot.lower
     start = robot.lower + ranges * rng.uniform(0.3, 0.7, len(ranges))
     direction = rng.normal(size=len(ranges)) * ranges
     points = [robot.contacts(start + scale * direction)[0] for scale in (0.0, 1e-6)]
     speed = np.linalg.norm(points[1] - points[0], axis=-1).max() / 1e-6
-    q = start + np.arange(steps)[:, None] * direction * STEP / speed
+    q = start + np.arange(steps)[:, None] * direction * step / speed
     return np.clip(q, robot.lower, robot.upper)
 
 
@@ -98,6 +96,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="How far solves move from q0.")
     parser.add_argument("--paths", type=int, default=40)
     parser.add_argument("--steps", type=int, default=100, help="of a path")
+    parser.add_argument("--step", type=float, default=STEP, help="of the contacts [m], about")
     parser.add_argument("--count", type=int, default=4000, help="targets anywhere")
     parser.add_argument("--compared", type=int, default=300, help="of them, with solve_all")
     parser.add_argument("--seed", type=int, default=7)
@@ -105,7 +104,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     robot = ik.load_robot("kuka_lwr_barrett")
     rng = np.random.default_rng(options.seed)
-    paths = [path(robot, rng, options.steps) for _ in range(options.paths)]
+    paths = [path(robot, rng, options.steps, options.step) for _ in range(options.paths)]
     q, q0 = robot.random(rng, options.count), robot.random(rng, options.count)
     steps, jumps = [], []
     for name, tolerance in TOLERANCES.items():
@@ -127,7 +126,8 @@ def main(arguments: list[str] | None = None) -> None:
     heads = ["tolerance", "prefer", "median distance", "median motion [deg]"]
     heads += ["nearest of solve_all %", "within 10 % of it", "CPU time [us]"]
     tables.append(markdown_table(heads, jumps))
-    parts = [INTRODUCTION, f"Seed {options.seed}.", "## Paths", tables[0], "## Anywhere", tables[1]]
+    introduction = INTRODUCTION.format(step=1e3 * options.step)
+    parts = [introduction, f"Seed {options.seed}.", "## Paths", tables[0], "## Anywhere", tables[1]]
     write_page("From q0 to the nearest solution", parts, options.report)
 
 

@@ -21,13 +21,11 @@ from pathlib import Path
 
 import numpy as np
 from minimax.program import MinimaxProgram
-from numpy.typing import NDArray
 from rich.console import Console
 from runner import markdown_table, write_page
 
 import casadi_ik as ik
-
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 LEVELS = ((1.0, 0.5), (2.0, 1.0), (3.0, 1.5), (4.0, 2.0), (5.0, 2.5))
 """Standard deviations of a coordinate of a point [mm], and of a normal [deg]."""

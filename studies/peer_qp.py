@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from peer_steps import LENGTH, Array, Joints, PinContacts, cross, normal_axes, residual
+from peer_steps import LENGTH, Joints, PinContacts, cross, normal_axes, residual
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
 
 class Pink:

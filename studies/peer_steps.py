@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import casadi_ik as ik
-
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 LENGTH = 0.1
 """Position errors are divided by this [m], so that they weigh like those of the normals."""

@@ -18,21 +18,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from bench_report import Section
-from numpy.typing import NDArray
 from peer_qp import Mink, Pink, Placo
 from peer_steps import Peer, Scipy
 from targets import random_arm_targets
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 
-Array = NDArray[np.float64]
 Targets = tuple[Array, Array]
 
 STARTS = 400
-"""Restarts before a target is given up."""
+"""Restarts before a target is given up, unless said otherwise."""
 
 STALL = 0.9
 """A start is left when its cost has not fallen below this part of what it was some steps ago."""
@@ -86,11 +85,17 @@ def installed() -> list[str]:
     return [name for name, s in SETTINGS.items() if importlib.util.find_spec(s.package)]
 
 
-def run_peer(name: str, robot: ik.ArmHand, targets: Targets, tolerance: ik.Tolerance) -> Run:
+def run_peer(
+    name: str,
+    robot: ik.ArmHand,
+    targets: Targets,
+    tolerance: ik.Tolerance,
+    restarts: int,
+) -> Run:
     """Solve targets with restarts, then judge."""
     setting = SETTINGS[name]
     peer = setting.make(robot, tolerance.position < 1e-4)
-    spread = evenly(STARTS, len(robot.actuators))
+    spread = evenly(restarts, len(robot.actuators))
     starts = np.vstack([robot.home, robot.lower + spread * (robot.upper - robot.lower)])
     count = len(targets[0])
     q, used, times = np.empty((count, len(robot.home))), np.empty(count), np.empty(count)
@@ -165,7 +170,7 @@ def _grasp(robot: ik.ArmHand, targets: Targets, row: int) -> ik.Grasp:
     return ik.Grasp({name: ik.Contact(point, normal) for name, point, normal in pairs})
 
 
-def measured(count: int, seed: int, names: Sequence[str]) -> Section:
+def measured(count: int, seed: int, names: Sequence[str], restarts: int = STARTS) -> Section:
     """The table of all kinds of targets and tolerances."""
     robot = ik.load_robot("kuka_lwr_barrett")
     rows = []
@@ -174,7 +179,7 @@ def measured(count: int, seed: int, names: Sequence[str]) -> Section:
         runs = {"hand-first, in a batch": ours}
         for method in ("hand-first", "ipopt"):
             runs[method] = run_ours(method, robot, targets, tolerance)
-        runs |= {name: run_peer(name, robot, targets, tolerance) for name in names}
+        runs |= {name: run_peer(name, robot, targets, tolerance, restarts) for name in names}
         for name, run in runs.items():
             cells = (
                 f"{100 * run.solved:.1f}",
@@ -212,9 +217,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Other solvers on the same targets.")
     parser.add_argument("--count", type=int, default=120, help="targets of each kind")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--restarts", type=int, default=STARTS, help="of a peer for a target")
     parser.add_argument("--peers", nargs="+", default=installed(), choices=SETTINGS)
     options = parser.parse_args(arguments)
-    measured(options.count, options.seed, options.peers).show()
+    measured(options.count, options.seed, options.peers, options.restarts).show()
 
 
 if __name__ == "__main__":

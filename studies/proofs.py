@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 from diagnosis import moved
-from hard_targets import Array, close_to_limits, corners, random_hands, singular_arms
+from hard_targets import close_to_limits, corners, random_hands, singular_arms
 from impossible_targets import CLASSES, impossible
 from missed import ROBOTS, load
 from rich.console import Console
@@ -42,6 +42,7 @@ from runner import (
 from runner.results import code_version
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.problem.problems import Problems
 from casadi_ik.solving.diagnosis.prover import Prover
 

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 from closed_chain.report import OURS, PAPER, figure, options, title, write
-from numpy.typing import NDArray
+from runner import command, program
 from targets import random_arm_targets
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
-Targets = tuple[NDArray[np.float64], NDArray[np.float64]]
+Targets = tuple[Array, Array]
 
 VARIANTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("one start, freeze", "thumb-first", {"options": {"starts": 1}}),
@@ -54,9 +55,9 @@ def bent_targets(robot: ik.ArmHand, count: int, rng: np.random.Generator) -> Tar
     return robot.contacts(q)
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Run the study and write its page."""
-    given = options("Success, iterations and time of thumb-first.", 250)
+    given = options("Success, iterations and time of thumb-first.", 250, arguments)
     rng = np.random.default_rng(given.seed)
     robot = ik.load_robot("kuka_lwr_barrett")
     grasps = ik.shipped_grasps(robot.name)
@@ -100,7 +101,7 @@ def main() -> None:
     text = f"""
 # thumb-first: one start, all starts, and two ways to keep to limits
 
-`python studies/thumb_first.py --count {given.count} --seed {given.seed}`: {total} targets a set on
+`{command(__file__, arguments)}`: {total} targets a set on
 `{robot.name}`, 5 mm / 3 deg, limits enforced, start at home. *grasps*: hands of the {len(grasps)}
 shipped grasps; *bent*: the same with distal joints from 25 to 45 deg; arms uniform within limits.
 The time is that of an iteration as a ratio to hand-first's on the same targets in the same run, the
@@ -120,4 +121,4 @@ default, and ProxQP remains as `options={{"step": "proxqp"}}`.
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

@@ -13,44 +13,52 @@ import numpy as np
 from closed_chain.chain import HeldThumb, cylinder
 from closed_chain.report import OURS, field, figure, options, title, write
 from numpy.typing import NDArray
+from runner import command, program
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
 
-STEPS = 72
-"""Turns tried in a full circle."""
 
-
-def usable(robot: ik.ArmHand, held: HeldThumb, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which turns the arm follows, (k, STEPS), from -pi on."""
-    turns = 2 * np.pi * (np.arange(STEPS) / STEPS - 0.5)
+def usable(robot: ik.ArmHand, held: HeldThumb, q: Array, steps: int) -> NDArray[np.bool_]:
+    """Which turns the arm follows, (k, steps), from -pi on."""
+    turns = 2 * np.pi * (np.arange(steps) / steps - 0.5)
     points, normals = (part[:, held.thumb] for part in robot.contacts(q))
-    follows = np.empty((len(q), STEPS), dtype=bool)
+    follows = np.empty((len(q), steps), dtype=bool)
     for i, turn in enumerate(turns):
         palms = held.palms(q, (points, normals), np.full(len(q), turn))
         follows[:, i] = held.followed(*palms)
     return follows
 
 
-def connected(follows: NDArray[np.bool_]) -> NDArray[np.float64]:
+def connected(follows: NDArray[np.bool_]) -> Array:
     """Width [deg] of the usable turns in one piece with turn zero, (k,)."""
-    zero = STEPS // 2
+    steps = follows.shape[1]
+    zero = steps // 2
     onwards = np.roll(follows, -zero, axis=1)
     up = np.cumprod(onwards, axis=1).sum(axis=1)
     down = np.cumprod(onwards[:, ::-1], axis=1).sum(axis=1)
-    width = np.where(follows.all(axis=1), STEPS, up + down)
-    return np.where(follows[:, zero], width, 0) * 360.0 / STEPS
+    width = np.where(follows.all(axis=1), steps, up + down)
+    return np.where(follows[:, zero], width, 0) * 360.0 / steps
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Run the study and write its page."""
-    given = options("Usable range of the virtual joint.", 3000)
+    given = options(
+        "Usable range of the virtual joint.",
+        3000,
+        arguments,
+        steps=(72, "turns tried in a full circle"),
+    )
+    if given.steps < 2 or given.steps % 2:
+        raise InputError(f"--steps: found {given.steps}, expected an even number")
     robot = ik.load_robot("kuka_lwr_barrett")
     held = HeldThumb(robot)
     q = robot.random(np.random.default_rng(given.seed), given.count)
-    hand = [i for i in range(len(robot.actuators)) if i not in held.arm]
+    hand = list(robot.description.hand_actuators)
     q[:, hand] = robot.home[hand]
-    follows = usable(robot, held, q)
-    at_rest = follows[:, STEPS // 2].mean()
+    follows = usable(robot, held, q, given.steps)
+    at_rest = follows[:, given.steps // 2].mean()
     width, whole = connected(follows), 360.0 * follows.mean(axis=1)
 
     drawn, grid = figure(2, 2, 5.4, 4.0)
@@ -89,18 +97,18 @@ def main() -> None:
     )
     drawn.colorbar(mesh, ax=grid[1, 1])
 
-    def quartiles(values: NDArray[np.float64]) -> str:
+    def quartiles(values: Array) -> str:
         return " | ".join(f"{v:.0f}" for v in np.percentile(values, [5, 25, 50, 75, 95]))
 
     far = r > np.quantile(r, 0.75)
     text = f"""
 # How far the virtual joint can be turned
 
-`python studies/virtual_joint_range.py --count {given.count} --seed {given.seed}`:
+`{command(__file__, arguments)}`:
 {given.count} arms of `{robot.name}` uniform within limits, the hand at home; the palm is turned
-about the thumb's contact normal in steps of {360 // STEPS} deg, the arm follows in closed form over
-all its swivels, within limits. (At turn zero an arm is found for {100 * at_rest:.2f} %: the one
-that was drawn, or another.)
+about the thumb's contact normal in steps of {360 / given.steps:g} deg, the arm follows in closed
+form over all its swivels, within limits. (At turn zero an arm is found for {100 * at_rest:.2f} %:
+the one that was drawn, or another.)
 
 | usable range [deg] | 5 % | 25 % | median | 75 % | 95 % |
 |---|---|---|---|---|---|
@@ -119,4 +127,4 @@ though the arm may have to change its branch within it.
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

@@ -45,8 +45,8 @@ def derived_robot(
 def thumb_of(folder: Path, joints: int) -> ik.ArmHand:
     """The shipped arm-hand with a thumb of one to four joints.
 
-    The distal joint is fixed for one; a turning base comes first for three, a rolling link
-    besides for four.
+    The distal joint is fixed for one; a turning base comes first for three, and a
+    rolling link too for four.
     """
     path = copy_shipped_robot(folder)
     hand = yaml.safe_load((folder / "hand.yaml").read_text())

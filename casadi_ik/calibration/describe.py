@@ -11,6 +11,7 @@ import yaml
 
 from casadi_ik.calibration.model import tilted
 from casadi_ik.calibration.result import Calibration
+from casadi_ik.errors import InputError
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.shipped import resolve
 from casadi_ik.robots.load import load_description
@@ -42,10 +43,16 @@ def write_description(
         origin: Where the data are from, for the list of sources.
 
     Raises:
+        InputError: The robot's joints are not described in our own files.
         OSError: The file cannot be written.
     """
     top_path = resolve(robot, "arm_hands")
     top = read_yaml(top_path)
+    if any(isinstance(part, dict) and "file" in part for part in top.values()):
+        raise InputError(
+            f"{top_path}: a calibrated robot is written joint by joint, but this one's joints are "
+            "in files of others"
+        )
     if isinstance(top["hand"], str):
         top["hand"] = read_yaml(resolve(top["hand"], "hands", beside=top_path))
     if top.get("arm") is not None and Path(top["arm"]).suffix:

@@ -16,13 +16,12 @@ import numpy as np
 import proxsuite
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.calibration.losses import LOSSES, Loss
 from casadi_ik.calibration.measurements import Measurements
 from casadi_ik.calibration.model import HandModel
 from casadi_ik.calibration.result import UNKNOWN, Calibration
 from casadi_ik.errors import InputError, UnknownNameError
-
-Array = NDArray[np.float64]
 
 CHI_SQUARE_MEDIAN = 2.366
 """Median of the chi-square distribution of 3 degrees of freedom."""

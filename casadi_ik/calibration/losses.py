@@ -10,9 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 CAUCHY, HUBER = 2.385, 1.345
 """Tuning constants for 95 % efficiency on one normal component (Holland & Welsch 1977)."""

@@ -12,12 +12,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
 from casadi_ik.symbolic.tip_motion import finger_chain
-
-Array = NDArray[np.float64]
 
 POINT = ("x", "y", "z")
 TURN = ("qw", "qx", "qy", "qz")

@@ -13,8 +13,8 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.calibration.parameters import Parameter
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.robots.description import Joint, RobotDescription
@@ -24,8 +24,6 @@ from casadi_ik.symbolic.directions import perpendicular
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.so3 import exp_so3
 from casadi_ik.symbolic.subexpressions import shared
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.calibration.parameters import Parameter
-
-Array = NDArray[np.float64]
 
 NORMAL_95 = 1.959964
 """95 % of a normal variable lie within so many standard deviations."""

@@ -6,15 +6,13 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.calibration.measurements import Measurements
 from casadi_ik.calibration.model import HandModel
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.symbolic import dual_quaternion as dq
 from casadi_ik.symbolic.tip_motion import finger_chain
-
-Array = NDArray[np.float64]
 
 
 def true_values(model: HandModel, rng: np.random.Generator) -> Array:

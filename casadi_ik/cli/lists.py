@@ -13,7 +13,7 @@ from casadi_ik.files.shipped import resolve, shipped_names
 from casadi_ik.grasps.load import GraspFile
 from casadi_ik.methods.registry import METHODS, method_summary
 from casadi_ik.robots import load_description
-from casadi_ik.robots.schema import ArmHandFile
+from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile
 
 
 def robots() -> Answer:
@@ -26,14 +26,40 @@ def robots() -> Answer:
     for name in shipped_names("arm_hands"):
         path = resolve(name, "arm_hands")
         robot = load_description(path)
-        fingers = (f"{f} (placed first)" if f == robot.thumb else f for f in robot.finger_names)
+        thumb = robot.named_thumb
+        fingers = (f"{f} (placed first)" if f == thumb else f for f in robot.finger_names)
         pairs = {
             "fingers": f"{len(robot.fingers)}: {', '.join(fingers)}",
             "actuators": f"{len(robot.actuators)}: {', '.join(robot.actuator_names)}",
         }
         description = convert(read_yaml(path), ArmHandFile, path).description
         parts += [Text(name, "bold"), Text(f"  {description}"), fields(pairs)]
-    return Answer(Group(*parts))
+    return Answer(Group(*parts, *_catalogue()))
+
+
+def _catalogue() -> list[RenderableType]:
+    """The arms and hands that are put together by their names."""
+    arms = table("arm", "joints", "what it is", right=("joints",))
+    for name in shipped_names("arms"):
+        path = resolve(name, "arms")
+        arm = convert(read_yaml(path), ArmFile, path)
+        count = sum(joint.type != "fixed" for joint in arm.joints)
+        arms.add_row(name, str(count), _short(arm.description))
+    hands = table("hand", "motors", "fingers", "what it is", right=("motors", "fingers"))
+    for name in shipped_names("hands"):
+        path = resolve(name, "hands")
+        hand = convert(read_yaml(path), HandFile, path)
+        motors = hand.actuators or [
+            joint for joint in hand.joints if joint.type != "fixed" and joint.coupling is None
+        ]
+        hands.add_row(name, str(len(motors)), str(len(hand.fingers)), _short(hand.description))
+    example = 'any arm with any hand: load_robot("ARM+HAND"), --robot ARM+HAND, such as'
+    return [Text(f"{example} panda+allegro_right", "bold"), arms, hands]
+
+
+def _short(description: str) -> str:
+    """The first sentence of a description."""
+    return description.split(". ")[0].rstrip(".\n")
 
 
 def methods() -> Answer:

@@ -84,7 +84,7 @@ def filters(arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _solve_rows(part: logs.Part, records: Iterable[Mapping[str, Any]]) -> Table:
+def _solve_rows(part: logs.MethodRows, records: Iterable[Mapping[str, Any]]) -> Table:
     """A row per solve of one method; restarts only if there are any."""
     restarts = ["restarts"] if part.rows["restarts"].any() else []
     heads = ["solve", "status", "iterations", *restarts, "mm off", "deg off", "time", "events"]

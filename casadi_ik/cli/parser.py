@@ -8,6 +8,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from casadi_ik.cli.calibrate_parser import add_calibrate
+from casadi_ik.cli.import_parser import add_import
 from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.say import PROGRAM
 from casadi_ik.cli.values import assignment, file_name, numbers, one_of, positive, whole
@@ -60,6 +61,7 @@ and if wanted, NaN where not:
   tangents (k, f, 3) second axes of the contact frames, orthogonal to the normals: whole poses
   lines    (k, f, 3) a contact may be anywhere on the line through its point in this direction
   planes   (k, f, 3) a contact may be anywhere in the plane through its point with this normal
+  directions (k, f, 3) a fingertip faces this way wherever it is; it has no point then
 OUT.npz then holds:
   q (k, n), success (k,), status (k,), position_error (k, f) [m], angle_error (k, f) [rad],
   iterations, restarts (k,), time (k,) [s]
@@ -102,6 +104,7 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True, title="commands")
     _add_solve(commands)
     _add_batch(commands)
+    add_import(commands)
     add_calibrate(commands)
     for name, run, text in (
         ("robots", _robots, "list the shipped robots: fingers and actuators"),

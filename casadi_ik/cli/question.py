@@ -17,7 +17,7 @@ from casadi_ik.errors import (
     UnknownNameError,
     UnsupportedError,
 )
-from casadi_ik.files.shipped import resolve
+from casadi_ik.files.shipped import resolve, resolve_robot
 from casadi_ik.grasps import Grasp, load_grasp
 from casadi_ik.methods.registry import METHODS
 from casadi_ik.problem.problems import Tolerance, fixed_array
@@ -65,8 +65,8 @@ def the_robot(name: str | None, path: Path | None = None, grasp: Grasp | None = 
     if path is None or grasp is None or not grasp.robot:
         raise InputError(f"{path}: robot: missing, expected it in the file or --robot")
     with located(f"{path}: robot", (UnknownNameError, DescriptionError)):
-        description = resolve(grasp.robot, "arm_hands", beside=path)
-    return load_robot(description)
+        found = resolve_robot(grasp.robot, beside=path)
+    return load_robot(grasp.robot if isinstance(found, tuple) else found)
 
 
 def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:

@@ -13,15 +13,16 @@ from pathlib import Path
 from typing import IO, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.problem.contacts.arrays import NAMES
+from casadi_ik.problem.problems import DIRECTIONS
 
 KEYS = ("points", "normals")
 """What has to be there; the others may be."""
 
-OPTIONAL = NAMES
+OPTIONAL = (*NAMES, DIRECTIONS)
 
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -74,7 +75,7 @@ class TargetFile:
         """
         return sum(len(block["points"]) for block in self.blocks(lambda: size))
 
-    def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, NDArray[np.float64]]]:
+    def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, Array]]:
         """Arrays (up to size, f, 3) by name, one block after the other.
 
         Args:
@@ -184,7 +185,7 @@ class _Member:
         self._whole = self._rows(count, "F") if column_major else None
         self._read = 0
 
-    def read(self, rows: int, last: bool) -> NDArray[np.float64]:
+    def read(self, rows: int, last: bool) -> Array:
         """The next rows; at the last, the member has to end and its checksum to be right."""
         if self._whole is not None:
             block = self._whole[self._read : self._read + rows]
@@ -195,7 +196,7 @@ class _Member:
             raise InputError(f"{self._where}: damaged: more bytes than its shape says")
         return block
 
-    def _rows(self, rows: int, order: Literal["C", "F"]) -> NDArray[np.float64]:
+    def _rows(self, rows: int, order: Literal["C", "F"]) -> Array:
         size = rows * self._fingers * 3
         data = self._bytes(size * self._dtype.itemsize)
         if len(data) < size * self._dtype.itemsize:

@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.units import (
     QUANTITY,
@@ -43,7 +43,7 @@ class Frame(Struct, frozen=True):
     rpy: Angles = (0.0, 0.0, 0.0)
 
 
-def frame_matrix(frame: Frame) -> NDArray[np.float64]:
+def frame_matrix(frame: Frame) -> Array:
     """(4, 4) pose of a frame: translation xyz after rotation rpy about the fixed axes (URDF)."""
     roll, pitch, yaw = frame.rpy
     cr, sr = math.cos(roll), math.sin(roll)

@@ -55,3 +55,22 @@ def resolve(name_or_path: str | Path, kind: str, beside: Path | None = None) -> 
             "(or give the path of a YAML file)"
         )
     return path
+
+
+def resolve_robot(name_or_path: str | Path, beside: Path | None = None) -> Path | tuple[Path, Path]:
+    """The file of a robot, or those of an arm and a hand that a plus sign joins.
+
+    Args:
+        name_or_path: A shipped arm-hand, the path of a YAML file, or "ARM+HAND" of shipped names.
+        beside: See `resolve`.
+
+    Raises:
+        UnknownNameError: No shipped description has that name.
+        DescriptionError: The path does not exist.
+    """
+    text = str(name_or_path)
+    path_like = isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml"))
+    arm, plus, hand = text.partition("+")
+    if path_like or not plus:
+        return resolve(name_or_path, "arm_hands", beside)
+    return resolve(arm, "arms"), resolve(hand, "hands")

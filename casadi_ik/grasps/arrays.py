@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
+
 UNIT = 1e-15
 """A vector whose length is so near to 1 has been normalised before."""
 
@@ -14,7 +16,7 @@ SMALL, LARGE = 1e-100, 1e100
 """Between these the squares of a length are neither rounded to zero nor infinite."""
 
 
-def real_array(value: Any) -> NDArray[np.float64]:
+def real_array(value: Any) -> Array:
     """A new array of real numbers.
 
     Raises:
@@ -30,7 +32,7 @@ def real_array(value: Any) -> NDArray[np.float64]:
     return array if array.dtype == np.float64 else np.array(value, dtype=np.float64)
 
 
-def unit_vectors(vectors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def unit_vectors(vectors: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Directions of any length, from the smallest number to the largest.
 
     Args:

@@ -8,14 +8,15 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.arrays import real_array, unit_vectors
 from casadi_ik.grasps.tolerance import Tolerance
 from casadi_ik.grasps.vectors import MORE, fault, squared
 
-Array = NDArray[np.float64]
+FREE = np.full(3, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,13 +141,13 @@ class Grasp:
                 raise InputError(
                     f"contacts.{name}: no such finger; the robot's fingers: {', '.join(fingers)}"
                 )
-        points, normals = np.empty((len(fingers), 3)), np.empty((len(fingers), 3))
-        for row, finger in enumerate(fingers):
-            contact = self.contacts.get(finger)
-            known = contact is not None
-            points[row] = contact.point if known else np.nan
-            normals[row] = contact.normal if known and contact.normal is not None else np.nan
-        return points, normals
+        contacts = [self.contacts.get(finger) for finger in fingers]
+        points = [FREE if contact is None else contact.point for contact in contacts]
+        normals = [
+            FREE if contact is None or contact.normal is None else contact.normal
+            for contact in contacts
+        ]
+        return np.array(points), np.array(normals)
 
     def more(self, fingers: Sequence[str]) -> dict[str, Array]:
         """What the contacts have beside point and normal.
@@ -158,13 +159,12 @@ class Grasp:
             (f, 3) by name ("tangents", "lines", "planes"), NaN where free; only what any has.
         """
         found: dict[str, Array] = {}
-        for name in MORE:
-            rows = np.full((len(fingers), 3), np.nan)
-            for row, finger in enumerate(fingers):
-                vector = getattr(self.contacts.get(finger), name, None)
+        for finger, contact in self.contacts.items():
+            for name in MORE:
+                vector = getattr(contact, name)
                 if vector is not None:
-                    rows[row] = vector
-                    found[f"{name}s"] = rows
+                    rows = found.setdefault(f"{name}s", np.full((len(fingers), 3), np.nan))
+                    rows[fingers.index(finger)] = vector
         return found
 
 

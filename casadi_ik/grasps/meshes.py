@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
+
 Mesh = tuple[Array, NDArray[np.int64]]
 """Vertices (v, 3) [m] and triangles (t, 3) of vertex indices, outward by the right-hand rule."""
 

@@ -6,16 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Struct, read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import Mass
 from casadi_ik.grasps.meshes import Mesh
 from casadi_ik.grasps.shapes import Shape
-
-Array = NDArray[np.float64]
 
 
 class MassEntry(Struct, frozen=True):

@@ -12,13 +12,12 @@ from typing import Protocol
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from casadi_ik.arrays import Array
 from casadi_ik.files.units import Length
 from casadi_ik.grasps import meshes
 from casadi_ik.grasps.meshes import Mesh
-
-Array = NDArray[np.float64]
 
 
 class Surface(Protocol):

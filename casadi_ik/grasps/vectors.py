@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array, Bools
 
 MORE: Mapping[str, str] = {
     "tangent": "where the contact frame's second axis must point, across the normal",
@@ -45,7 +44,26 @@ def fault(vectors: Mapping[str, Array]) -> str | None:
     return None
 
 
+def faulty(vectors: Mapping[str, Array]) -> Bools:
+    """Which contacts `fault` has something to say about, all at once.
+
+    Args:
+        vectors: (..., 3) by name, as there, of all contacts; NaN where free.
+    """
+    given = {name: ~np.isnan(array[..., 0]) for name, array in vectors.items()}
+    bad = np.zeros_like(given["point"])
+    for name in MORE:
+        if name in given:
+            bad |= given[name] & ~given["point"]
+    if "line" in given and "plane" in given:
+        bad |= given["line"] & given["plane"]
+    if "tangent" in given:
+        cosine = np.einsum("...i,...i->...", vectors["tangent"], vectors["normal"])
+        bad |= given["tangent"] & ~(np.abs(cosine) <= ACROSS)
+    return bad
+
+
 def squared(tangent: Array, normal: Array) -> Array:
-    """A tangent without what rounding left of it along the normal, unit."""
-    across = tangent - normal * (normal @ tangent)
-    return across / np.linalg.norm(across)
+    """Tangents (..., 3) without what rounding left of them along the normals, unit."""
+    across = tangent - normal * np.einsum("...i,...i->...", normal, tangent)[..., None]
+    return across / np.sqrt(np.einsum("...i,...i->...", across, across))[..., None]

@@ -82,6 +82,23 @@ def function_source(function: ca.Function) -> str:
     return text
 
 
+OWN = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")
+"""Functions of the C library that generated code does not call (drivers/elementary.c)."""
+
+
+def with_own_functions(text: str) -> str:
+    """Generated code that calls the elementary functions of the drivers."""
+    return "\n".join(
+        (
+            driver_text("elementary_alone"),
+            driver_text("elementary"),
+            *(f"#define {name} own_{name}" for name in OWN),
+            text,
+            *(f"#undef {name}" for name in OWN),
+        )
+    )
+
+
 def step_names(name: str) -> str:
     """The macros by which drivers name a function's symbols."""
     suffixes = ("", "_work", "_checkout", "_release", "_incref")
@@ -95,7 +112,7 @@ def library_source(function: ca.Function, driver: str) -> str:
     return "\n".join(
         (
             header,
-            function_source(function),
+            with_own_functions(function_source(function)),
             step_names(function.name()),
             driver_text("common"),
             driver,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import importlib.util
 import os
 import shlex
 import shutil
@@ -28,6 +29,9 @@ from casadi_ik.kernels.folders import NO_ROOM
 FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden")
 
 CANDIDATES = ("cc", "gcc", "clang")
+
+ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=all")
+"""The compiler of the Python package ziglang: for any machine of the kind, as gcc compiles."""
 
 SHOWN_ERROR_LINES, SHOWN_CHARACTERS = 3, 200
 """How much of a compiler's complaint is shown."""
@@ -188,8 +192,9 @@ def find_compiler() -> Compiler | None:
     """The compiler of the environment, or None.
 
     The environment variable `CC` (command and arguments) counts alone if it is set; otherwise the
-    first of cc, gcc, clang on the path. A `CC` that does not exist (`CC=none`) is a way to ask for
-    the virtual machine. `CASADI_IK_CFLAGS` is appended to the flags.
+    first of cc, gcc, clang on the path, then the Python package ziglang (extra `compiler`). A `CC`
+    that does not exist (`CC=none`) is a way to ask for the virtual machine. `CASADI_IK_CFLAGS` is
+    appended to the flags.
     """
     return _find(
         os.environ.get("CC", ""),
@@ -206,7 +211,7 @@ def _find(cc: str, path: str, flags: str) -> Compiler | None:
     except ValueError as error:
         raise KernelError(f"CASADI_IK_CFLAGS={flags[:SHOWN_CHARACTERS]!r}: {error}") from error
     try:
-        wanted = [shlex.split(cc)] if cc.strip() else [[name] for name in CANDIDATES]
+        wanted = [shlex.split(cc)] if cc.strip() else [[name] for name in CANDIDATES] + _zig()
     except ValueError:  # a quotation without an end
         return None
     for words in wanted:
@@ -217,6 +222,12 @@ def _find(cc: str, path: str, flags: str) -> Compiler | None:
         if version is not None:
             return Compiler((program, *words[1:]), version, flags=(*FLAGS, *further))
     return None
+
+
+def _zig() -> list[list[str]]:
+    """Its command, where it is installed."""
+    known = importlib.util.find_spec("ziglang") is not None and bool(sys.executable)
+    return [[sys.executable, *ZIG]] if known else []
 
 
 def _version(command: tuple[str, ...]) -> str | None:
@@ -248,7 +259,10 @@ def warn_no_compiler(problem: str = "") -> None:
     found = problem or (
         f"CC={os.environ['CC'][:SHOWN_CHARACTERS]!r} does not run"
         if os.environ.get("CC", "").strip()
-        else (f"none of {', '.join(CANDIDATES)} is on the path")
+        else (
+            f"none of {', '.join(CANDIDATES)} is on the path; "
+            "pip install 'casadi-ik[compiler]' brings one"
+        )
     )
     warnings.warn(
         f"no C compiler ({found}): casadi_ik runs in CasADi's virtual machine, with the same "

@@ -1,6 +1,6 @@
-"""The library of a function for four solves side by side.
+"""The library of a function for four or eight solves side by side.
 
-The generated code is there twice: as CasADi wrote it, and once more for vectors of four doubles
+The generated code is there twice: as CasADi wrote it, and once more for vectors of doubles
 (`lanes_lines.py`), `casadi_f3` as `lanes_f3`. An inner function with a line that has no form for
 vectors is called as it is, once for each lane that counts; the outermost must have one. What nobody
 calls the compiler leaves out.
@@ -14,11 +14,14 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from casadi_ik.kernels.codegen import driver_text, function_source, step_names
+from casadi_ik.kernels.codegen import (
+    define,
+    driver_text,
+    function_source,
+    step_names,
+    with_own_functions,
+)
 from casadi_ik.kernels.lanes_lines import UnsuitedError, rewritten
-
-LANES = 4
-"""Solves side by side; as in drivers/lanes.c."""
 
 SIGNATURE = re.compile(r"/\* \w+:\((.*)\)->\((.*)\) \*/")
 HEAD = re.compile(r"(?:static|CASADI_SYMBOL_EXPORT) int (\w+)\(const casadi_real\*\* arg, .*\) ?\{")
@@ -59,13 +62,13 @@ class _Function:
         return f"LANES_TARGET static int {name}({given}) {{"
 
 
-def lanes_source(function: ca.Function, driver: str, quick: bool = False) -> str:
-    """The text of a library of the function for four solves side by side.
+def lanes_source(function: ca.Function, driver: str, lanes: int) -> str:
+    """The text of a library of the function for some solves side by side.
 
     Args:
         function: Dense and row-major.
         driver: C text of the driver, with its constants.
-        quick: Whether sines and cosines may differ from the C library's in the last place.
+        lanes: How many, 4 or 8.
 
     Raises:
         UnsuitedError: The outermost function has no form for vectors, or one needs memory or can
@@ -82,9 +85,11 @@ def lanes_source(function: ca.Function, driver: str, quick: bool = False) -> str
     return "\n".join(
         (
             "#define CASADI_SYMBOL_EXPORT static",
-            text,
+            with_own_functions(text),
+            define({"LANES": lanes}),
             driver_text("lanes"),
-            driver_text("lanes_trigonometry") if quick else "",
+            driver_text("elementary_lanes"),
+            driver_text("elementary"),
             *(f"#undef casadi_{own}\n#define casadi_{own} lanes_{own}" for own in RENAMED),
             f"static const lanes lanes_zeros[{zeros[1] if zeros else 1}];",
             *(line for each in inner for line in _side_by_side(each, room)),

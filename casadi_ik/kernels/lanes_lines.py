@@ -1,4 +1,4 @@
-"""One line of generated C code, rewritten for vectors of four doubles.
+"""One line of generated C code, rewritten for vectors of doubles.
 
 CasADi writes one operation a line: `a3=(a1*a2);`. Where `casadi_real` is a vector, arithmetic means
 the same four times over; what does not (comparisons, choices, calls of the C library, plain

@@ -21,8 +21,8 @@ from casadi_ik.kernels.function_kernel import FunctionKernel
 SYMBOL = "casadi_ik_lookup"
 
 STEPS = 64
-"""Keys are compared in steps of 1 / STEPS. Squares and their sums then have no rounding errors in
-single precision: compiled code and numpy find the same rows, alone and in a batch."""
+"""Keys are compared in steps of 1 / STEPS: whole numbers of 16 bits in compiled code, without
+rounding errors in single precision in numpy. Both find the same rows, alone and in a batch."""
 
 LARGEST = 8 * STEPS
 """Entries of a key beyond this many steps count as this many."""
@@ -108,10 +108,11 @@ class LookupKernel:
         self.key = FunctionKernel(graph, compiled)
         (keys,) = self.key(*rows)
         self._keys = _rounded(np.nan_to_num(keys).reshape(len(keys), -1))
-        # An entry of neighbouring rows side by side, tile by tile in the order of reading: whole
+        # Two entries of neighbouring rows side by side, tile by tile in the order of reading: whole
         # columns a power of two apart would fall on each other in the cache.
-        padded = np.pad(self._keys, ((0, -len(keys) % TILE), (0, 0)))
-        self._tiles = padded.reshape(-1, TILE, self._keys.shape[1]).transpose(0, 2, 1).copy()
+        width = self._keys.shape[1]
+        padded = np.pad(self._keys, ((0, -len(keys) % TILE), (0, width % 2))).astype(np.int16)
+        self._tiles = padded.reshape(-1, TILE, (width + 1) // 2, 2).transpose(0, 2, 1, 3).copy()
         library = self._load(graph) if compiled else None
         self.compiled = library is not None
         self._lookup: Any = None if library is None else library[SYMBOL]
@@ -124,7 +125,7 @@ class LookupKernel:
             "STEPS": STEPS,
             "LARGEST": LARGEST,
         }
-        driver = define(constants) + driver_text("lookup")
+        driver = define(constants) + driver_text("registers") + driver_text("lookup")
         return load_library(
             graph.name, lambda: row_major(graph.function), driver, SYMBOL, graph.recipe
         )
@@ -150,9 +151,13 @@ class LookupKernel:
             self._run_numpy(arrays, found)
         return found
 
-    def single(self, count: int) -> SingleLookup:
-        """One lookup with memory of its own, to be made again and again; of compiled ones only."""
-        inputs = [np.zeros(shape) for shape in self.key.input_shapes]
+    def single(self, count: int, inputs: Sequence[NDArray[np.float64]]) -> SingleLookup:
+        """One lookup to be made again and again; of compiled ones only.
+
+        Args:
+            count: How many rows.
+            inputs: Contiguous arrays to read from, of one sample's shapes.
+        """
         found = np.zeros((1, count), dtype=np.int64)
         return SingleLookup(self.key.name, self._lookup, inputs, found, *self._job(inputs, found))
 

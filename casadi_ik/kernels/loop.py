@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import warnings
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import casadi as ca
@@ -16,11 +16,12 @@ from casadi_ik.kernels.buffered import doubles
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, row_major
-from casadi_ik.kernels.lanes import LANES, lanes_source
+from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
-from casadi_ik.kernels.loop_job import SLOTS, CompiledBatch, SingleSolve
+from casadi_ik.kernels.loop_job import FIRST_MARK, SLOTS, CompiledBatch, SingleSolve
 from casadi_ik.kernels.loop_result import CODE_LIMIT, FAILED, NON_FINITE, REPEATED, LoopResult
 from casadi_ik.kernels.loop_vm import run_vm
+from casadi_ik.kernels.machine_lanes import machine_lanes
 from casadi_ik.kernels.rows import row_driver
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
@@ -29,6 +30,9 @@ logger = logging.getLogger(__name__)
 SYMBOL = "casadi_ik_loop"
 SYMBOL_LANES = "casadi_ik_loop_lanes"
 
+FEWEST = 4
+"""Solves from which on they are made side by side."""
+
 
 class LoopKernel:
     """Runs a step until it ends, for each solve of a batch; several threads may run it at once.
@@ -36,7 +40,8 @@ class LoopKernel:
     Attributes:
         step: The step.
         compiled: Whether the loop runs in compiled code. Otherwise the same graph runs in
-            CasADi's virtual machine, with the same iterates and records.
+            CasADi's virtual machine, with the same iterates and records up to the last places of
+            sines and arcs.
     """
 
     def __init__(self, step: StepGraph, compiled: bool = True) -> None:
@@ -63,21 +68,22 @@ class LoopKernel:
     @property
     def lanes(self) -> int:
         """How many solves of a batch are made side by side; 1 where that is not possible."""
-        return 1 if self._side_by_side is None else LANES
+        return 1 if self._side_by_side is None else machine_lanes()
 
     @cached_property
     def _side_by_side(self) -> Any:
-        """The loop that makes four solves at a time; None where there is none."""
-        if not self.compiled:
+        """The loop that makes some solves at a time; None where there is none."""
+        lanes = machine_lanes() if self.compiled else 0
+        if not lanes:
             return None
         try:
             library = load_library(
-                f"{self.step.name}_lanes",
+                f"{self.step.name}_lanes{lanes}",
                 lambda: self._function,
                 self._driver("loop_lanes"),
                 SYMBOL_LANES,
-                self.step.recipe,
-                lanes_source,
+                f"{self.step.recipe} lanes {lanes}" if self.step.recipe else "",
+                partial(lanes_source, lanes=lanes),
             )
         except UnsuitedError as error:
             logger.info("%s: one solve at a time: %s", self.step.name, error)
@@ -85,9 +91,7 @@ class LoopKernel:
         except KernelError as error:
             warnings.warn(f"one solve at a time: {error}", RuntimeWarning, stacklevel=2)
             return None
-        return (
-            None if library is None or not library.casadi_ik_has_lanes() else library[SYMBOL_LANES]
-        )
+        return None if library is None else library[SYMBOL_LANES]
 
     def _driver(self, name: str) -> str:
         """C text of one of the two drivers, with its constants."""
@@ -100,6 +104,7 @@ class LoopKernel:
             "REPEATED": REPEATED,
             "CODE_LIMIT": CODE_LIMIT,
             "SLOTS": SLOTS,
+            "FIRST_MARK": FIRST_MARK,
             "STAGE": self.step.stage_place,
         }
         job = driver_text("loop_job")
@@ -158,7 +163,7 @@ class LoopKernel:
             run_vm(self.step, self._function, result, given, max_iterations)
             return result
         batch = CompiledBatch(self.step, result, given, max_iterations)
-        if count >= LANES and max_iterations > 0 and self._side_by_side is not None:
+        if count >= FEWEST and max_iterations > 0 and self._side_by_side is not None:
             batch.run_side_by_side(self._side_by_side)
         else:
             batch.run(self._loop)

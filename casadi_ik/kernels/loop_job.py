@@ -1,6 +1,6 @@
 """The compiled loops: what they work on, and how they are called.
 
-`drivers/loop.c` makes one solve after the other, `drivers/loop_lanes.c` four side by side.
+`drivers/loop.c` makes one solve after the other, `drivers/loop_lanes.c` four or eight side by side.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from casadi_ik.kernels.rows import opaque
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
 SLOTS = 32
-"""Solves under way at once, of which four have the lanes."""
+"""Solves under way at once, of which four or eight have the lanes."""
+
+FIRST_MARK = 16
+"""Iteration, a power of two, of the first state that later ones are compared with."""
 
 
 class Job(ctypes.Structure):
@@ -88,7 +91,7 @@ class CompiledBatch:
         self._run(loop)
 
     def run_side_by_side(self, loop: Any) -> None:
-        """Four solves at a time.
+        """As many solves at a time as there are lanes.
 
         Args:
             loop: `casadi_ik_loop_lanes` of a library.

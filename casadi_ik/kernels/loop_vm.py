@@ -1,4 +1,4 @@
-"""A step run to its end in CasADi's virtual machine: the same iterates and records, in Python."""
+"""A step run to its end in CasADi's virtual machine: the same iterates up to rounding."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.buffered import BufferedFunction
 from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.kernels.loop_job import FIRST_MARK
 from casadi_ik.kernels.loop_result import (
     CODE_LIMIT,
     FAILED,
@@ -64,7 +65,7 @@ def run_vm(
                 now = state.tobytes()
                 if status == RUNNING and now == mark:
                     status = REPEATED
-                if iteration & (iteration - 1) == 0:
+                if iteration >= FIRST_MARK and iteration & (iteration - 1) == 0:
                     mark = now
         result.states[i] = state
         result.iterations[i] = iteration

@@ -1,8 +1,4 @@
-"""A function of many samples, four at a time: for what is measured, not for what is solved.
-
-The values are those of the compiled function up to the last places of its sines and cosines, which
-nothing that is iterated may depend on.
-"""
+"""A function of many samples, some at a time: for what is measured, not for what is solved."""
 
 from __future__ import annotations
 
@@ -23,6 +19,7 @@ from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel, MapJob
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
+from casadi_ik.kernels.machine_lanes import machine_lanes
 
 logger = logging.getLogger(__name__)
 
@@ -51,24 +48,25 @@ class MeasureKernel:
 
     @cached_property
     def _one_by_one(self) -> FunctionKernel:
-        """For machines without vectors of four doubles."""
+        """For machines without such vectors."""
         return FunctionKernel(self._graph, self._compiled)
 
     @cached_property
     def _map(self) -> Any:
-        if not self._compiled:
+        lanes = machine_lanes() if self._compiled else 0
+        if not lanes:
             return None
         constants = {"N_IN": 1, "N_OUT": 1, "TOTAL": self._n_in + self._n_out}
         sizes = f"#define SIZES_IN {{{self._n_in}}}\n#define SIZES_OUT {{{self._n_out}}}\n"
         driver = define(constants) + sizes + driver_text("map_job") + driver_text("map_lanes")
         try:
             library = load_library(
-                f"{self._graph.name}_lanes",
+                f"{self._graph.name}_lanes{lanes}",
                 lambda: row_major(self._graph.function),
                 driver,
                 SYMBOL,
-                self._graph.recipe,
-                partial(lanes_source, quick=True),
+                f"{self._graph.recipe} lanes {lanes}" if self._graph.recipe else "",
+                partial(lanes_source, lanes=lanes),
             )
         except UnsuitedError as error:
             logger.info("%s: one sample at a time: %s", self._graph.name, error)
@@ -76,7 +74,7 @@ class MeasureKernel:
         except KernelError as error:
             logger.warning("%s: one sample at a time: %s", self._graph.name, error)
             return None
-        return None if library is None or not library.casadi_ik_has_lanes() else library[SYMBOL]
+        return None if library is None else library[SYMBOL]
 
     def __call__(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (k, m) for samples (k, n).

@@ -11,7 +11,7 @@ from casadi_ik.logs.read.info import LogInfo
 from casadi_ik.logs.read.log import Log
 from casadi_ik.logs.read.log import open_log as open  # noqa: A004 - read as `ik.logs.open`
 from casadi_ik.logs.read.one_solve import OneSolve, one_solve
-from casadi_ik.logs.read.table import Part, Table
+from casadi_ik.logs.read.table import MethodRows, Table
 from casadi_ik.logs.repair.finish import finish_log
 from casadi_ik.logs.repair.merge import merge_logs
 from casadi_ik.logs.write.keep import Keep
@@ -28,8 +28,8 @@ __all__ = [
     "LogClock",
     "LogInfo",
     "McapRecorder",
+    "MethodRows",
     "OneSolve",
-    "Part",
     "Table",
     "detect_events",
     "explain",

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.problem.hand_motors import OUTWARDS, motor_ends
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import Spherical, srs_arm
 

@@ -7,9 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.problem.hand_motors import OUTWARDS, motor_ends
 from casadi_ik.problem.joint_frames import link_frames, placed
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import Joint, RobotDescription
 
 MEETING = 1e-9

@@ -6,15 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array, Bools, Rows
 from casadi_ik.problem.hand_motors import finger_joints
 from casadi_ik.problem.joint_bounds import joint_bounds
 from casadi_ik.problem.joint_frames import link_frames, placed
-from casadi_ik.problem.problems import Array
 from casadi_ik.robots.description import RobotDescription
-
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +34,9 @@ class Balls:
     angle: Array
     moved: Array
     swung: Array
-    empty: Flags
+    empty: Bools
 
-    def rows(self, rows: NDArray[np.intp]) -> Balls:
+    def rows(self, rows: Rows) -> Balls:
         """Some of the boxes."""
         return Balls(*(getattr(self, item.name)[rows] for item in fields(self)))
 

@@ -14,10 +14,11 @@ from itertools import combinations
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.problem.arm_span import arm_span
 from casadi_ik.problem.contact_bounds import Balls, balls
 from casadi_ik.problem.hand_motors import endless_fingers, hand_motors, joint_limits, motor_box
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
 
 GAP = {"m": 0.01, "rad": 0.1}

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 
+from casadi_ik.arrays import Array
 from casadi_ik.problem.contact_verdict import ContactVerdict
-from casadi_ik.problem.problems import Array, Tolerance
+from casadi_ik.problem.problems import Tolerance
 from casadi_ik.problem.proof import Proof
 
 Point = tuple[float, float, float]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.arrays import Array
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import LIMIT_SLACK
 from casadi_ik.robots.description import Joint, RobotDescription
 

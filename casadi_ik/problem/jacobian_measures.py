@@ -90,8 +90,7 @@ class JacobianMeasures:
         self._robot = robot
         self._without_arm = tuple(map(int, without_arm))
         self._compiled = compiled
-        arm = robot.arm_actuators
-        hand = tuple(i for i in range(len(robot.actuators)) if i not in arm)
+        arm, hand = robot.arm_actuators, robot.hand_actuators
         thumb = robot.finger_actuators(robot.thumb)
         parts = []
         if arm:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.problem.problems import Array
 from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear
 from casadi_ik.robots.description import RobotDescription
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from casadi_ik.problem.problems import Array
+from casadi_ik.arrays import Array
 from casadi_ik.robots.description import Joint, RobotDescription
 
 

@@ -9,10 +9,11 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels.rows import split_rows
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.problem.contacts.kinds import Kinds
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.trace import TraceFormat
 
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.grasps.arrays import real_array, unit_vectors
 from casadi_ik.robots.description import RobotDescription
-
-Array = NDArray[np.float64]
 
 LIMITS = ("enforce", "ignore")
 """How joint limits are taken: as part of being solved, or not at all (the paper's reading)."""
@@ -153,8 +152,16 @@ def fixed_array(
     return values
 
 
+DIRECTIONS = "directions"
+"""Name of the array of contacts that are a direction alone."""
+
+
 def target_arrays(
-    points: ArrayLike, normals: ArrayLike, f: int, first_row: int = 0
+    points: ArrayLike,
+    normals: ArrayLike,
+    f: int,
+    first_row: int = 0,
+    directions: ArrayLike | None = None,
 ) -> tuple[Array, Array]:
     """Checked batch targets.
 
@@ -163,17 +170,23 @@ def target_arrays(
         normals: (k, f, 3), any length but zero.
         f: Number of the robot's fingers.
         first_row: Number of the first row, for messages.
+        directions: (k, f, 3) which way fingertips face that may be anywhere, any length but zero;
+            NaN, or None for all, where there is none.
 
     Returns:
-        Points and unit normals, (k, f, 3).
+        Points and unit normals, (k, f, 3); a direction is a normal without a point.
 
     Raises:
-        RowError: Infinite numbers, partly NaN vectors, a zero normal, a normal without a point, a
-            row with no contact. The message names row and finger.
+        RowError: Infinite numbers, partly NaN vectors, a zero normal or direction, a normal
+            without a point, a direction with one, a row with no contact. The message names row
+            and finger.
         InputError: Wrong shape, no numbers.
     """
     arrays = []
-    for name, value in (("points", points), ("normals", normals)):
+    given = {"points": points, "normals": normals}
+    if directions is not None:
+        given[DIRECTIONS] = directions
+    for name, value in given.items():
         try:
             array = real_array(value)
         except (TypeError, ValueError) as error:
@@ -189,15 +202,24 @@ def target_arrays(
         _refuse(partly, first_row, name, "is partly NaN, expected three numbers or three NaN")
         _refuse(infinite, first_row, name, "is infinite, expected finite numbers")
         arrays.append(array)
-    p, n = arrays
-    if len(p) != len(n):
-        raise InputError(f"points and normals: found {len(p)} and {len(n)} rows, expected as many")
+    p, n, *lone = arrays
+    for name, array in zip(list(given)[1:], arrays[1:], strict=True):
+        if len(p) != len(array):
+            found = f"{len(p)} and {len(array)} rows"
+            raise InputError(f"points and {name}: found {found}, expected as many")
     # What is a unit normal stays as it is: a contact gives the same target here and in a `Grasp`.
     unit, zero = unit_vectors(n)
     _refuse(zero, first_row, "normals", "is zero, expected a direction")
     free_point = np.isnan(p[..., 0])
-    lone = free_point & ~np.isnan(n[..., 0])
-    _refuse(lone, first_row, "normals", "is given for a finger without a point")
+    placeless = free_point & ~np.isnan(n[..., 0])
+    _refuse(placeless, first_row, "normals", "is given for a finger without a point")
+    if lone:
+        ways, zero = unit_vectors(lone[0])
+        _refuse(zero, first_row, DIRECTIONS, "is zero, expected a direction")
+        faces = ~np.isnan(ways[..., 0])
+        _refuse(faces & ~free_point, first_row, DIRECTIONS, "has a point too, expected it alone")
+        unit = np.where(faces[..., None], ways, unit)
+        free_point = free_point & ~faces
     empty = np.flatnonzero(free_point.all(axis=1))
     if len(empty):
         row = first_row + int(empty[0])

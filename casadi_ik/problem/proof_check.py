@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.problem.arm_cones import NONE, ArmCones, arm_cones
 from casadi_ik.problem.arm_span import arm_span
-from casadi_ik.problem.contact_bounds import Balls, Flags, balls
+from casadi_ik.problem.contact_bounds import Balls, balls
 from casadi_ik.problem.contact_quantities import (
     Quantity,
     asked_quantities,
@@ -27,7 +28,7 @@ from casadi_ik.problem.hand_motors import (
     motor_box,
     motor_ends,
 )
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import reach, srs_arm
 
@@ -141,7 +142,7 @@ class _Search:
             waiting += [halves[i : i + TOGETHER] for i in range(0, len(halves), TOGETHER)]
         return True
 
-    def _refuted(self, found: Balls) -> tuple[Flags, Array]:
+    def _refuted(self, found: Balls) -> tuple[Bools, Array]:
         """Which boxes are impossible, and what each motor leaves open (k, h)."""
         radius, angle = found.radius + self.loose, found.angle + self.turned
         if not self.in_palm:
@@ -156,7 +157,7 @@ class _Search:
             refuted[rows] = self._beyond_cones(found.rows(rows), radius[rows])
         return refuted, scores
 
-    def _pairs(self, found: Balls, radius: Array, angle: Array) -> tuple[Flags, Array]:
+    def _pairs(self, found: Balls, radius: Array, angle: Array) -> tuple[Bools, Array]:
         """Distances of points, angles of normals, angles of normals and lines.
 
         What is nearly broken counts most for where boxes are divided.
@@ -186,7 +187,7 @@ class _Search:
                     scores += np.nan_to_num(ratio[:, None] ** 4 * shares / width[:, None])
         return refuted, scores
 
-    def _rigid(self, found: Balls, radius: Array, angle: Array, rows: Flags) -> Flags:
+    def _rigid(self, found: Balls, radius: Array, angle: Array, rows: Bools) -> Bools:
         """The best weighted rigid fit (Kabsch) against what the balls would allow."""
         w = 1 / radius[rows] ** 2
         chord = 2 * np.sin(np.minimum(angle[rows], np.pi) / 2)
@@ -204,7 +205,7 @@ class _Search:
         allowed = len(self.fingers) + known.sum()
         return size * (1 - 1e-9) - 2 * trace > allowed
 
-    def _reach(self, found: Balls, radius: Array) -> Flags:
+    def _reach(self, found: Balls, radius: Array) -> Bools:
         """Where the wrist can be, from each contact and from all, against the arm's span."""
         shoulder, wrist, near, far = self._arm
         away = np.linalg.norm(self.points - shoulder, axis=1)
@@ -241,7 +242,7 @@ class _Search:
         give += (np.abs(share[:, n:]) * chord[:, known]).sum(axis=1)
         return whole * origin + share @ goals, give
 
-    def _beyond_cones(self, found: Balls, radius: Array) -> Flags:
+    def _beyond_cones(self, found: Balls, radius: Array) -> Bools:
         """Whether at every swivel of the elbow a limit of shoulder or wrist is passed."""
         beyond = np.zeros(len(radius), dtype=bool)
         if self._cones is None or not len(radius):

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp, Tolerance
 from casadi_ik.problem.contacts.arrays import more_arrays
-from casadi_ik.problem.problems import Array, Problems, fixed_array, target_arrays
+from casadi_ik.problem.problems import DIRECTIONS, Problems, fixed_array, target_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,18 +46,36 @@ class Questions:
             normals: (k, f, 3).
             fixed: See `Problems`.
             first_row: Number of the first target.
-            more: (k, f, 3) what contacts have beside, see `more_arrays`.
+            more: (k, f, 3) what contacts have beside, see `more_arrays`; and directions.
             prefer: See `Problems`.
 
         Raises:
             InputError: See `target_arrays` and `more_arrays`.
         """
-        p, n = target_arrays(points, normals, len(self.robot.fingers), first_row)
+        named = dict(more or {})
+        directions = named.pop(DIRECTIONS, None)
+        p, n = target_arrays(points, normals, len(self.robot.fingers), first_row, directions)
         tolerances = tuple(self.tolerances.values())
-        besides = more_arrays(more, p, n, first_row) if more else {}
+        others = more_arrays(named, p, n, first_row) if named else {}
         return Problems(
-            p, n, tolerances, self.enforce_limits, first_row, fixed, besides, prefer=prefer
+            p, n, tolerances, self.enforce_limits, first_row, fixed, others, prefer=prefer
         )
+
+    def of_named(
+        self,
+        arrays: Mapping[str, ArrayLike],
+        fixed: Array | None,
+        first_row: int = 0,
+        prefer: str = "limits",
+    ) -> Problems:
+        """Targets as arrays by name, see `of_arrays`: points, normals, and what else there is.
+
+        Raises:
+            InputError: See `of_arrays`.
+        """
+        more = dict(arrays)
+        points, normals = more.pop("points"), more.pop("normals")
+        return self.of_arrays(points, normals, fixed, first_row, more, prefer)
 
     def of_grasps(
         self,
@@ -80,15 +99,15 @@ class Questions:
             if not isinstance(grasp, Grasp):
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
         # Contacts are checked when they are made.
-        points, normals = zip(*(grasp.arrays(fingers) for grasp in grasps), strict=True)
+        arrays = [grasp.arrays(fingers) for grasp in grasps]
         own, usual = grasps[0].contacts, self.tolerances
         tolerances = tuple(
             (own[name].tolerance if name in own else None) or usual[name] for name in fingers
         )
         held = self.held(fixed)
         return Problems(
-            np.array(points),
-            np.array(normals),
+            np.concatenate([points[None] for points, _ in arrays]),
+            np.concatenate([normals[None] for _, normals in arrays]),
             tolerances,
             self.enforce_limits,
             fixed=held,

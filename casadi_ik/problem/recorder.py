@@ -12,6 +12,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.problem.trace import TraceFormat
@@ -36,7 +37,7 @@ class SolveBlock:
     format: TraceFormat
     first: int
     problems: Problems
-    starts: NDArray[np.float64]
+    starts: Array
     seed: int
     batch: BatchSolution
     rows: NDArray[Any]

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.diagnosis import Diagnosis
-from casadi_ik.problem.problems import Array
 from casadi_ik.problem.status import Status
 
 

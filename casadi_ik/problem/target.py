@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels.layout import Field
 from casadi_ik.problem.contacts.conditions import Vectors
 from casadi_ik.problem.contacts.kinds import USUAL
 from casadi_ik.problem.contacts.rows import tip_vectors
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Kinematics
 from casadi_ik.symbolic.smooth import Expr

@@ -6,11 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.problem.status import Status
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

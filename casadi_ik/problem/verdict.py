@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.problem.contact_verdict import ContactVerdict
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 
 LIMIT_SLACK = 1e-9
 """Rounding allowed at a limit [rad or m]: a coupling's arithmetic may end a hair beyond it."""

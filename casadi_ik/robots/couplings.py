@@ -12,12 +12,10 @@ from typing import ClassVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.units import AnyValue, Length, Pure, Turn
-
-Array = NDArray[np.float64]
 
 FLAT = 1e-16
 """A triangle's two slacks are kept above FLAT b c [m^2]."""
@@ -231,5 +229,29 @@ class FourBar(CouplingKind, frozen=True, tag="four-bar"):
         return self.theta_3_0 + np.arctan2(y * ct - x * st, x * ct + y * st)
 
 
-Coupling = Linear | LeadScrew | FourBar
+class Polynomial(CouplingKind, frozen=True, tag="polynomial"):
+    """A joint bent by a cam or a cable: ``theta = sum of coefficients[i] * source^i``.
+
+    Attributes:
+        coefficients: The constant first [rad or m per power of the source's unit].
+    """
+
+    coefficients: tuple[Pure, ...]
+
+    monotone: ClassVar[bool] = False
+
+    def check(self, where: str) -> None:
+        """Whether the joint moves at all."""
+        if not any(self.coefficients[1:]):
+            raise DescriptionError(
+                f"{where}.coefficients: all but the first are zero, so the joint would not move"
+            )
+
+    def followed(self, source: Array) -> Array:
+        """Positions (k,) of the joint."""
+        value: Array = np.polynomial.polynomial.polyval(source, self.coefficients)
+        return value
+
+
+Coupling = Linear | LeadScrew | FourBar | Polynomial
 """What a joint may follow."""

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from casadi_ik.errors import UnknownNameError
+from casadi_ik.arrays import Array
+from casadi_ik.errors import UnknownNameError, UnsupportedError
 from casadi_ik.robots.couplings import Coupling
 from casadi_ik.robots.motor_ranges import motor_ranges
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +99,7 @@ class RobotDescription:
         joints: All joints, parents before children, fixed ones included.
         actuators: The motors in the fixed order of q.
         fingers: The fingers, in the order of `contacts`.
-        thumb: Name of the finger placed first.
+        named_thumb: Name of the finger placed first; None if the description names none.
         palm_link: Link the palm frame sits on.
         palm_placement: (4, 4) pose of the palm frame in that link.
         home: (n,) home position of the actuators.
@@ -113,11 +111,25 @@ class RobotDescription:
     joints: tuple[Joint, ...]
     actuators: tuple[Actuator, ...]
     fingers: tuple[Finger, ...]
-    thumb: str
+    named_thumb: str | None
     palm_link: str
     palm_placement: Array
     home: Array
     sources: dict[str, str]
+
+    @property
+    def thumb(self) -> str:
+        """Name of the finger placed first.
+
+        Raises:
+            UnsupportedError: The description names none.
+        """
+        if self.named_thumb is None:
+            raise UnsupportedError(
+                f"robot {self.name!r} names no thumb, which is needed here; write 'thumb: FINGER' "
+                f"in its description, one of {', '.join(self.finger_names)}"
+            )
+        return self.named_thumb
 
     @cached_property
     def movable(self) -> tuple[Joint, ...]:
@@ -152,13 +164,13 @@ class RobotDescription:
     @cached_property
     def _ranges(self) -> tuple[Array, Array]:
         found = motor_ranges(self.movable, self.actuators, self.home, f"robot {self.name!r}")
-        return _frozen(found[0]), _frozen(found[1])
+        return frozen(found[0]), frozen(found[1])
 
     @cached_property
     def strokes(self) -> tuple[Array, Array]:
         """(n,) what the actuators could do by themselves, whatever their joints' limits say."""
         lower = [actuator.lower for actuator in self.actuators]
-        return _frozen(lower), _frozen([actuator.upper for actuator in self.actuators])
+        return frozen(lower), frozen([actuator.upper for actuator in self.actuators])
 
     @cached_property
     def mechanical(self) -> tuple[Array, Array]:
@@ -174,17 +186,17 @@ class RobotDescription:
                 least, most = coupling.stroke
                 lower[coupling.of] = max(lower[coupling.of], least)
                 upper[coupling.of] = min(upper[coupling.of], most)
-        return _frozen(list(lower.values())), _frozen(list(upper.values()))
+        return frozen(list(lower.values())), frozen(list(upper.values()))
 
     @cached_property
     def joint_lower(self) -> Array:
         """(m,) lower limits of the movable joints."""
-        return _frozen([joint.lower for joint in self.movable])
+        return frozen([joint.lower for joint in self.movable])
 
     @cached_property
     def joint_upper(self) -> Array:
         """(m,) upper limits of the movable joints."""
-        return _frozen([joint.upper for joint in self.movable])
+        return frozen([joint.upper for joint in self.movable])
 
     @cached_property
     def links(self) -> tuple[str, ...]:
@@ -239,6 +251,11 @@ class RobotDescription:
         """Positions in q of the arm's actuators (empty for a hand alone)."""
         return tuple(i for i, a in enumerate(self.actuators) if a.part == "arm")
 
+    @cached_property
+    def hand_actuators(self) -> tuple[int, ...]:
+        """Positions in q of the hand's actuators: all but the arm's."""
+        return tuple(i for i, a in enumerate(self.actuators) if a.part != "arm")
+
     def finger_actuators(self, name: str) -> tuple[int, ...]:
         """Positions in q of the actuators that move a finger relative to the palm.
 
@@ -256,7 +273,8 @@ class RobotDescription:
         return tuple(sorted(found))
 
 
-def _frozen(values: Sequence[float] | Array) -> Array:
+def frozen(values: Sequence[float] | Array) -> Array:
+    """An array that cannot be changed."""
     array = np.asarray(values, dtype=float)
     array.flags.writeable = False
     return array

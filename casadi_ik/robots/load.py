@@ -1,102 +1,108 @@
-"""Arm, hand and arm-hand files become one `RobotDescription`."""
+"""Arms and hands, described or imported, become one `RobotDescription`."""
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, UnknownNameError
 from casadi_ik.files.reading import (
     Frame,
     T,
-    Vector,
     frame_matrix,
     read,
     read_yaml,
     refuse_non_finite,
 )
-from casadi_ik.files.shipped import resolve
-from casadi_ik.robots.checks import (
-    check_couplings,
-    known_link,
-    known_source,
-    positive,
-    unique,
-    usable,
-)
-from casadi_ik.robots.description import Actuator, Array, Finger, Joint, RobotDescription
-from casadi_ik.robots.motor_ranges import motor_ranges
-from casadi_ik.robots.schema import (
-    ActuatorEntry,
-    ArmFile,
-    ArmHandFile,
-    ContactEntry,
-    HandFile,
-    JointEntry,
-    LinkFrame,
-)
-
-ALONG = 0.995
-"""Cosine with the normal above which the contact frame's x axis is no tangent."""
-
-JOINT_TYPES = ("revolute", "prismatic", "fixed")
+from casadi_ik.files.shipped import resolve, resolve_robot
+from casadi_ik.robots.checks import unique, usable
+from casadi_ik.robots.described_parts import arm_part, hand_part
+from casadi_ik.robots.description import Joint, RobotDescription, frozen
+from casadi_ik.robots.file_parts import arm_from_file, hand_from_file
+from casadi_ik.robots.fingers import the_fingers
+from casadi_ik.robots.flat import flattened
+from casadi_ik.robots.home import the_home
+from casadi_ik.robots.part import HandPart, Part, told_apart
+from casadi_ik.robots.schema import ArmFile, ArmFromFile, ArmHandFile, HandFile, ImportedFile
 
 
 def load_description(name_or_path: str | Path) -> RobotDescription:
     """Load an arm-hand description.
 
     Args:
-        name_or_path: A shipped name (`shipped_names("arm_hands")`) or the path of a YAML file,
-            whose ``arm`` and ``hand`` may be shipped names or paths relative to it.
+        name_or_path: A shipped name (`shipped_names("arm_hands")`), a shipped arm and a shipped
+            hand joined by a plus sign ("panda+allegro_right"), or the path of a YAML file, whose
+            ``arm`` and ``hand`` may be shipped names or paths relative to it, or may stand in
+            somebody's URDF or MJCF.
 
     Raises:
         UnknownNameError: No shipped description has that name.
         DescriptionError: A file is missing or malformed; the message names file and key.
+        MissingExtraError: What reads a file's format is not installed.
     """
-    path = resolve(name_or_path, "arm_hands")
-    top, units = _read(path, ArmHandFile)
+    found = resolve_robot(name_or_path)
+    return _pair(*found) if isinstance(found, tuple) else _robot(found)
+
+
+def _pair(arm_path: Path, hand_path: Path) -> RobotDescription:
+    """A shipped arm with a shipped hand, as their files say that they are put together."""
+    arm = arm_part(_read(arm_path, ArmFile)[0], arm_path)
+    hand = hand_part(_read(hand_path, HandFile)[0], hand_path)
+    name = f"{arm_path.stem}+{hand_path.stem}"
+    return _joined(name, arm, hand.mount, hand, list(hand.pads), hand.thumb, {}, name, {}, {})
+
+
+def _robot(path: Path) -> RobotDescription:
+    raw = read_yaml(path)
+    refuse_non_finite(raw, path)
+    top, units = read(path, ImportedFile if _imports(raw) else ArmHandFile)
     usable(top.name, f"{path}: name")
-    hand_path, hand = _part(top.hand, "hand", HandFile, path)
-    joints: list[Joint] = []
-    actuators: list[Actuator] = []
-    sources: dict[str, str] = dict(top.sources)
-    root = hand.root
-    if top.arm is not None:
-        arm_path, arm = _part(top.arm, "arm", ArmFile, path)
-        joints += _joints(arm.joints, arm.root, arm.sources, "arm", arm_path)
-        actuators += _actuators(None, joints, arm.sources, "arm", arm_path)
-        tip = known_link(arm.tip.link, arm.root, joints, f"{arm_path}: tip.link")
-        known_source(arm.tip.source, arm.sources, f"{arm_path}: tip.source")
-        mount = _pose(arm.tip) @ frame_matrix(top.mount)
-        joints.append(_fixed("mount", tip, hand.root, mount))
-        sources |= _told_apart(arm.sources, sources, arm.name)
-        root = arm.root
-    elif top.mount != Frame():
-        joints.append(_fixed("mount", "base", hand.root, frame_matrix(top.mount)))
-        root = "base"
-    hand_joints = _joints(hand.joints, hand.root, hand.sources, "hand", hand_path)
-    joints += hand_joints
-    actuators += _actuators(hand.actuators, hand_joints, hand.sources, "hand", hand_path)
-    sources |= _told_apart(hand.sources, sources, hand.name)
-    unique((a.name for a in actuators), f"{path}: actuators")
-    unique((j.name for j in joints), f"{path}: joints")
-    unique((root, *(j.child for j in joints)), f"{path}: links")
-    palm_link = known_link(hand.palm.link, hand.root, hand_joints, f"{hand_path}: palm.link")
-    known_source(hand.palm.source, hand.sources, f"{hand_path}: palm.source")
-    return RobotDescription(
-        name=top.name,
-        root=root,
-        joints=tuple(joints),
-        actuators=tuple(actuators),
-        fingers=_fingers(top, hand, hand_joints, path, hand_path),
-        thumb=top.thumb,
-        palm_link=palm_link,
-        palm_placement=_freeze(_pose(hand.palm)),
-        home=_home(top.home, units, actuators, joints, path),
-        sources=sources,
+    arm = None if top.arm is None else _arm(top.arm, path)
+    mount = frame_matrix(top.mount)
+    moved = top.mount != Frame()
+    if isinstance(top, ArmHandFile):
+        hand, fingers = _hand(top.hand, path), top.fingers
+    else:
+        entry, key = top.hand or top.robot, "hand" if top.hand else "robot"
+        if entry is None or (top.hand and top.robot):
+            raise DescriptionError(f"{path}: expected either 'hand' or 'robot'")
+        if arm is not None and top.robot is not None:
+            raise DescriptionError(f"{path}: arm: found beside 'robot', which has its own")
+        hand, fingers = hand_from_file(entry, dict(top.fingers), key, path), list(top.fingers)
+    if arm is None and moved:
+        base = Part("base", str(path), "base", [], [], {}, "base", np.eye(4), {})
+        return _joined(
+            top.name, base, mount, hand, fingers, top.thumb, top.home, str(path), units, top.sources
+        )
+    return _joined(
+        top.name, arm, mount, hand, fingers, top.thumb, top.home, str(path), units, top.sources
     )
+
+
+def _imports(raw: Any) -> bool:
+    """Whether a description's hand stands in somebody's file."""
+    if not isinstance(raw, dict):
+        return False
+    hand = raw.get("hand")
+    return "robot" in raw or (isinstance(hand, dict) and "file" in hand)
+
+
+def _arm(arm: str | ArmFromFile, beside: Path) -> Part:
+    if not isinstance(arm, str):
+        return arm_from_file(arm, "arm", beside)
+    path = _file_of(arm, "arm", beside)
+    return arm_part(_read(path, ArmFile)[0], path)
+
+
+def _hand(hand: str | HandFile, beside: Path) -> HandPart:
+    if not isinstance(hand, str):
+        return hand_part(hand, beside)
+    path = _file_of(hand, "hand", beside)
+    return hand_part(_read(path, HandFile)[0], path)
 
 
 def _read(path: Path, type_: type[T]) -> tuple[T, dict[str, str]]:
@@ -104,15 +110,93 @@ def _read(path: Path, type_: type[T]) -> tuple[T, dict[str, str]]:
     return read(path, type_)
 
 
-def _part(name_or_path: str | T, key: str, type_: type[T], beside: Path) -> tuple[Path, T]:
-    """The arm or hand file that an arm-hand file names, or what stands there in full."""
-    if not isinstance(name_or_path, str):
-        return beside, name_or_path
+def _file_of(name_or_path: str, key: str, beside: Path) -> Path:
+    """The arm or hand file that an arm-hand file names."""
     try:
-        path = resolve(name_or_path, f"{key}s", beside=beside)
+        return resolve(name_or_path, f"{key}s", beside=beside)
     except (UnknownNameError, DescriptionError) as error:
         raise DescriptionError(f"{beside}: {key}: {error}") from error
-    return path, _read(path, type_)[0]
+
+
+def _joined(
+    name: str,
+    arm: Part | None,
+    mount: Array,
+    hand: HandPart,
+    fingers: list[str],
+    thumb: str | None,
+    home: dict[str, float],
+    where: str,
+    units: dict[str, str],
+    sources: dict[str, str],
+) -> RobotDescription:
+    """The robot of an arm (if there is one) and a hand on it."""
+    joints: list[Joint] = []
+    root = hand.root
+    sources = dict(sources)
+    if arm is not None:
+        hand = told_apart(hand, arm)
+        joints += [*arm.joints, _fixed("mount", arm.tip_link, hand.root, arm.tip @ mount)]
+        sources |= _told_apart(arm.sources, sources, arm.name)
+        root = arm.root
+    hand = _with_wrist(hand)
+    joints += hand.joints
+    actuators = [*(arm.actuators if arm else ()), *hand.actuators]
+    sources |= _told_apart(hand.sources, sources, hand.name)
+    unique((one.name for one in actuators), f"{where}: actuators")
+    unique((joint.name for joint in joints), f"{where}: joints")
+    unique((root, *(joint.child for joint in joints)), f"{where}: links")
+    flat = flattened(joints, root, hand.tip_link)
+    home = home or (arm.home if arm else {}) | hand.home
+    if thumb is None and hand.thumb in fingers:
+        thumb = hand.thumb
+    return RobotDescription(
+        name=name,
+        root=root,
+        joints=flat.joints,
+        actuators=tuple(actuators),
+        fingers=the_fingers(fingers, thumb, hand, flat, where),
+        named_thumb=thumb,
+        palm_link=hand.tip_link,
+        palm_placement=frozen(hand.tip),
+        home=the_home(home, units, actuators, joints, where),
+        sources=sources,
+    )
+
+
+def _with_wrist(hand: HandPart) -> HandPart:
+    """The hand, of which what moves the palm itself counts as arm, if all fingers are beyond it."""
+    by_child = {joint.child: joint for joint in hand.joints}
+
+    def above(link: str) -> list[Joint]:
+        chain = []
+        while link in by_child:
+            chain.append(by_child[link])
+            link = by_child[link].parent
+        return chain
+
+    wrist = {joint.name for joint in above(hand.tip_link)}
+    beyond = all(
+        hand.tip_link == hand.root or hand.tip_link in {joint.child for joint in above(pad.link)}
+        for pad in hand.pads.values()
+    )
+    if not wrist or not beyond:
+        return hand
+    motors = set(wrist)
+    while (
+        more := {
+            joint.coupling.of for joint in hand.joints if joint.name in motors and joint.coupling
+        }
+        - motors
+    ):
+        motors |= more
+    return replace(
+        hand,
+        joints=[replace(one, part="arm") if one.name in wrist else one for one in hand.joints],
+        actuators=[
+            replace(one, part="arm") if one.name in motors else one for one in hand.actuators
+        ],
+    )
 
 
 def _told_apart(new: dict[str, str], known: dict[str, str], owner: str) -> dict[str, str]:
@@ -120,216 +204,6 @@ def _told_apart(new: dict[str, str], known: dict[str, str], owner: str) -> dict[
     return {f"{owner}.{tag}" if tag in known else tag: text for tag, text in new.items()}
 
 
-def _joints(
-    entries: list[JointEntry], root: str, sources: dict[str, str], part: str, path: Path
-) -> list[Joint]:
-    """Checked joints, parents before children."""
-    names = [entry.name for entry in entries]
-    unique(names, f"{path}: joints")
-    unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
-    for entry in entries:
-        where = f"{path}: joint {entry.name!r}"
-        if entry.type not in JOINT_TYPES:
-            raise DescriptionError(
-                f"{where}: type: found {entry.type!r}, expected one of {', '.join(JOINT_TYPES)}"
-            )
-        low, high = entry.limits
-        if not low <= high:
-            raise DescriptionError(f"{where}: limits: lower {low:.6g} is above upper {high:.6g}")
-        if not np.linalg.norm(entry.axis) > 1e-9:
-            raise DescriptionError(f"{where}: axis: is zero, expected a direction")
-        if entry.velocity is not None:
-            positive(entry.velocity, f"{where}: velocity")
-        known_source(entry.source, sources, f"{where}: source")
-        if entry.coupling is not None:
-            entry.coupling.check(f"{where}: coupling")
-    by_parent: dict[str, list[JointEntry]] = {}
-    for entry in entries:
-        by_parent.setdefault(entry.parent, []).append(entry)
-    ordered: list[JointEntry] = []
-    frontier = [root]
-    while frontier:
-        children = by_parent.pop(frontier.pop(0), [])
-        ordered += children
-        frontier += [entry.child for entry in children]
-    if by_parent:
-        stray = next(iter(by_parent.values()))[0]
-        links = {entry.child for entry in entries}
-        problem = "is part of a frame cycle" if stray.parent in links else "is no link"
-        raise DescriptionError(
-            f"{path}: joint {stray.name!r}: parent: {stray.parent!r} {problem}; "
-            f"expected a chain of joints down to the root {root!r}"
-        )
-    ordered.sort(key=lambda entry: names.index(entry.name))
-    return [_joint(entry, part) for entry in _parents_first(ordered, root)]
-
-
-def _parents_first(entries: list[JointEntry], root: str) -> list[JointEntry]:
-    """The file's own order, moved only where a child stands before its parent."""
-    placed, known = [], {root}
-    waiting = list(entries)
-    while waiting:
-        entry = next(item for item in waiting if item.parent in known)
-        waiting.remove(entry)
-        placed.append(entry)
-        known.add(entry.child)
-    return placed
-
-
-def _joint(entry: JointEntry, part: str) -> Joint:
-    axis = np.asarray(entry.axis, dtype=float)
-    return Joint(
-        name=entry.name,
-        parent=entry.parent,
-        child=entry.child,
-        type=entry.type,
-        placement=_freeze(frame_matrix(entry.origin)),
-        axis=_freeze(axis / np.linalg.norm(axis)),
-        lower=entry.limits[0],
-        upper=entry.limits[1],
-        velocity=math.inf if entry.velocity is None else entry.velocity,
-        coupling=entry.coupling,
-        part=part,
-    )
-
-
 def _fixed(name: str, parent: str, child: str, pose: Array) -> Joint:
-    axis = _freeze(np.array([0.0, 0.0, 1.0]))
-    return Joint(
-        name, parent, child, "fixed", _freeze(pose), axis, 0.0, 0.0, math.inf, None, "mount"
-    )
-
-
-def _actuators(
-    entries: dict[str, ActuatorEntry] | None,
-    joints: list[Joint],
-    sources: dict[str, str],
-    part: str,
-    path: Path,
-) -> list[Actuator]:
-    """The part's actuators, after checking that every coupling ends at one of them."""
-    by_name = {joint.name: joint for joint in joints if joint.type != "fixed"}
-    if entries is None:
-        entries = {name: ActuatorEntry() for name, j in by_name.items() if j.coupling is None}
-    actuators = []
-    for name, entry in entries.items():
-        where = f"{path}: actuators.{name}"
-        joint = by_name.get(name)
-        if joint is not None and joint.coupling is not None:
-            raise DescriptionError(f"{where}: joint {name!r} follows {joint.coupling.of!r} already")
-        if entry.limits is None and joint is None:
-            raise DescriptionError(f"{where}: limits: missing (no joint has this name)")
-        if entry.unit not in ("rad", "m"):
-            raise DescriptionError(f"{where}: unit: found {entry.unit!r}, expected 'rad' or 'm'")
-        low, high = entry.limits or ((joint.lower, joint.upper) if joint else (0.0, 0.0))
-        if not low < high:
-            raise DescriptionError(
-                f"{where}: limits: lower {low:.6g} is not below upper {high:.6g}"
-            )
-        velocity = joint.velocity if joint else math.inf
-        if entry.velocity is not None:
-            velocity = positive(entry.velocity, f"{where}: velocity")
-        if entry.source or joint is None:
-            known_source(entry.source, sources, f"{where}: source")
-        unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit
-        actuators.append(Actuator(name, unit, low, high, velocity, part))
-    check_couplings(by_name, actuators, path)
-    return actuators
-
-
-def _fingers(
-    top: ArmHandFile, hand: HandFile, joints: list[Joint], path: Path, hand_path: Path
-) -> tuple[Finger, ...]:
-    unique(top.fingers, f"{path}: fingers")
-    for key, name in (*(("fingers", name) for name in top.fingers), ("thumb", top.thumb)):
-        if name not in hand.fingers:
-            raise DescriptionError(
-                f"{path}: {key}: {hand_path.name} has no finger {name!r}; it has "
-                + ", ".join(hand.fingers)
-            )
-    if top.thumb not in top.fingers:
-        raise DescriptionError(f"{path}: thumb: {top.thumb!r} is not among the fingers")
-    by_child = {joint.child: joint for joint in joints}
-    fingers = []
-    for name in top.fingers:
-        entry = hand.fingers[name]
-        where = f"{hand_path}: fingers.{name}"
-        link = known_link(entry.link, hand.root, joints, f"{where}.link")
-        known_source(entry.source, hand.sources, f"{where}.source")
-        length = float(np.linalg.norm(entry.normal))
-        if not length > 1e-9:
-            raise DescriptionError(f"{where}.normal: is zero, expected a direction")
-        chain: list[str] = []
-        while link not in (hand.root, hand.palm.link):
-            if by_child[link].type != "fixed":
-                chain.append(by_child[link].name)
-            link = by_child[link].parent
-        normal = np.asarray(entry.normal, dtype=float) / length
-        fingers.append(
-            Finger(
-                name,
-                entry.link,
-                _freeze(_pose(entry)),
-                _freeze(normal),
-                tuple(chain[::-1]),
-                _freeze(_tangent(entry.tangent, normal, where)),
-            )
-        )
-    return tuple(fingers)
-
-
-def _tangent(given: Vector | None, normal: Array, where: str) -> Array:
-    """The pad's second axis (3,): what is given, else x (y if the normal is along x)."""
-    along = given
-    if given is None:
-        along = (1.0, 0.0, 0.0) if abs(normal[0]) < ALONG else (0.0, 1.0, 0.0)
-    across = np.asarray(along, dtype=float)
-    across = across - normal * (normal @ across)
-    length = float(np.linalg.norm(across))
-    if not length > 1e-3 * float(np.linalg.norm(np.asarray(along))):
-        raise DescriptionError(
-            f"{where}.tangent: found {list(along or ())}, expected a direction across the normal"
-        )
-    return across / length
-
-
-def _home(
-    home: dict[str, float],
-    units: dict[str, str],
-    actuators: list[Actuator],
-    joints: list[Joint],
-    path: Path,
-) -> Array:
-    """The home position; where the file gives none, the position nearest to zero."""
-    names = [actuator.name for actuator in actuators]
-    for name in home:
-        if name not in names:
-            raise DescriptionError(
-                f"{path}: home.{name}: no such actuator; known: {', '.join(names)}"
-            )
-    for actuator in actuators:
-        unit = units.get(f"home.{actuator.name}", actuator.unit)
-        if unit != actuator.unit:
-            raise DescriptionError(
-                f"{path}: home.{actuator.name}: found a number in {unit}, expected {actuator.unit}"
-            )
-    asked = np.array([home.get(name, 0.0) for name in names])
-    movable = [joint for joint in joints if joint.type != "fixed"]
-    lower, upper = motor_ranges(movable, actuators, asked, str(path))
-    values = np.clip(asked, lower, upper)
-    for name, value, low, high in zip(names, asked, lower, upper, strict=True):
-        if name in home and not low <= value <= high:
-            raise DescriptionError(
-                f"{path}: home.{name}: {value:.6g} is outside the limits [{low:.6g}, {high:.6g}] "
-                "of the actuator and its joints"
-            )
-    return _freeze(values)
-
-
-def _pose(entry: LinkFrame | ContactEntry) -> Array:
-    return frame_matrix(Frame(entry.xyz, entry.rpy))
-
-
-def _freeze(array: Array) -> Array:
-    array.flags.writeable = False
-    return array
+    axis = frozen(np.array([0.0, 0.0, 1.0]))
+    return Joint(name, parent, child, "fixed", frozen(pose), axis, 0.0, 0.0, np.inf, None, "mount")

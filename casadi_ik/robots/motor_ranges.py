@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.robots.couplings import Array
 
 if TYPE_CHECKING:
     from casadi_ik.robots.description import Actuator, Joint

@@ -58,7 +58,7 @@ class ContactEntry(Struct, frozen=True):
 
 
 class ArmFile(Struct, frozen=True):
-    """``models/arms/*.yaml``."""
+    """``models/arms/*.yaml``; ``home`` is where an arm stands whose robot does not say."""
 
     name: str
     root: str
@@ -66,10 +66,15 @@ class ArmFile(Struct, frozen=True):
     joints: list[JointEntry]
     sources: dict[str, str]
     description: str = ""
+    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
 
 
 class HandFile(Struct, frozen=True):
-    """``models/hands/*.yaml``."""
+    """``models/hands/*.yaml``.
+
+    ``thumb``, ``mount`` (the hand's root on the arm's tip) and ``home`` hold for a robot that is
+    put together by name; others say them themselves.
+    """
 
     name: str
     root: str
@@ -79,6 +84,42 @@ class HandFile(Struct, frozen=True):
     sources: dict[str, str]
     actuators: dict[str, ActuatorEntry] | None = None
     description: str = ""
+    thumb: str | None = None
+    mount: Frame = Frame()
+    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+
+
+class ArmFromFile(Struct, frozen=True):
+    """An arm in somebody's file: the chain from ``root`` to ``tip``.
+
+    ``locked`` joints stand still at a value; ``limits`` go before the file's.
+    """
+
+    file: str
+    tip: str | None = None
+    root: str | None = None
+    locked: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    limits: dict[str, tuple[AnyValue, AnyValue]] = msgspec.field(default_factory=dict)
+
+
+class HandFromFile(Struct, frozen=True):
+    """A hand in somebody's file, or a whole robot: what is above ``palm`` moves the hand."""
+
+    file: str
+    palm: str | LinkFrame | None = None
+    root: str | None = None
+    locked: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    limits: dict[str, tuple[AnyValue, AnyValue]] = msgspec.field(default_factory=dict)
+
+
+class PadEntry(Struct, frozen=True):
+    """The contact frame of a finger of a `HandFromFile`; see `ContactEntry`."""
+
+    link: str
+    normal: Vector
+    xyz: Point = (0.0, 0.0, 0.0)
+    rpy: Angles = (0.0, 0.0, 0.0)
+    tangent: Vector | None = None
 
 
 class ArmHandFile(Struct, frozen=True):
@@ -89,9 +130,27 @@ class ArmHandFile(Struct, frozen=True):
 
     name: str
     hand: str | HandFile
-    thumb: str
     fingers: list[str]
-    arm: str | None = None
+    thumb: str | None = None
+    arm: str | ArmFromFile | None = None
+    mount: Frame = Frame()
+    home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    sources: dict[str, str] = msgspec.field(default_factory=dict)
+    description: str = ""
+
+
+class ImportedFile(Struct, frozen=True):
+    """An arm-hand whose hand is in somebody's file: either ``hand`` or ``robot``, which has an arm.
+
+    The fingers are described here, since no file says where a pad is.
+    """
+
+    name: str
+    fingers: dict[str, PadEntry]
+    hand: HandFromFile | None = None
+    robot: HandFromFile | None = None
+    arm: str | ArmFromFile | None = None
+    thumb: str | None = None
     mount: Frame = Frame()
     home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     sources: dict[str, str] = msgspec.field(default_factory=dict)

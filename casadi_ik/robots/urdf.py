@@ -7,7 +7,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from casadi_ik.robots.description import Array, RobotDescription
+from casadi_ik.arrays import Array
+from casadi_ik.robots.description import RobotDescription
 
 LINK_RADIUS = {"arm": 0.055, "mount": 0.03, "hand": 0.009}
 """Radius of the drawn cylinders [m] by part; for looks only."""

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from threading import Lock
 from typing import Generic, TypeVar
 
+from casadi_ik.arrays import Array
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.method import Method, Outcome
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 
 T = TypeVar("T")
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
-from casadi_ik.problem.problems import Array
 from casadi_ik.problem.recorder import Recorder
 
 

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array, Rows
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.method import UNBOUNDED, HandFirstMethod
 from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.verdict import deviations, judge
 
@@ -22,9 +23,6 @@ NEVER = 1e-12
 
 ALIKE = 1.001
 """Two values of a row that differ by less than this factor count as the same."""
-
-Rows = NDArray[np.intp]
-"""Numbers of targets, one per row of something."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +170,7 @@ class Descent:
 
 def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:
     """States and parameters of the loop that begin with the refinement of the whole arm-hand."""
-    count, hand = len(problems), len(trials.method.step.layouts.hand)
+    count, hand = len(problems), len(trials.robot.description.hand_actuators)
     home = np.tile(trials.robot.home, (count, 1))
     states, parameters = trials.posture_rows(problems, home, np.zeros((count, hand)))
     for name, value in ({"phase": Phase.REFINEMENT} | fresh_fit()).items():

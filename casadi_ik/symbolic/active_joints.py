@@ -10,9 +10,8 @@ another.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 DEPENDENT = 1e-9
 """A column counts as dependent if less than this part of the largest is left of it."""

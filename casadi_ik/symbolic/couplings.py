@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
 
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear
+from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear, Polynomial
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic import four_bar, lead_screw
 from casadi_ik.symbolic.smooth import Expr
@@ -46,6 +46,19 @@ def _bent(numbers: Any, source: Expr, known: FourBar) -> Expr:
     return four_bar.theta3(phi, bar, known.theta_3_0) - numbers.theta_3_0
 
 
+def _horner(coefficients: Sequence[float], source: Expr) -> Expr:
+    """A polynomial, its constant first."""
+    value: Expr = ca.DM(coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        value = value * source + coefficient
+    return value
+
+
+def _slopes(coefficients: Sequence[float]) -> list[float]:
+    """The coefficients of a polynomial's derivative."""
+    return [power * value for power, value in enumerate(coefficients)][1:]
+
+
 ROWS: dict[type[Any], CouplingRow] = {
     Linear: CouplingRow(
         follow=lambda c, source, _: c.ratio * source + c.offset,
@@ -55,6 +68,10 @@ ROWS: dict[type[Any], CouplingRow] = {
         follow=lambda c, s, _: lead_screw.angle_from_slider(s, c.b, c.c) - c.theta_0,
         rate=lambda c, s, _: lead_screw.angle_rate(s, c.b, c.c),
         toggle=lambda c, s, _: lead_screw.toggle(s, c.b, c.c),
+    ),
+    Polynomial: CouplingRow(
+        follow=lambda c, x, _: _horner(c.coefficients, x),
+        rate=lambda c, x, _: _horner(_slopes(c.coefficients), x),
     ),
     FourBar: CouplingRow(
         follow=_bent,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.robots.description import Joint, RobotDescription
 
 ROUNDING = 1e-15
@@ -22,12 +22,12 @@ class Pose:
     rotation: ca.SX
     origin: ca.SX
 
-    def at(self, placement: NDArray[np.float64]) -> Pose:
+    def at(self, placement: Array) -> Pose:
         """The frame that has the constant (4, 4) pose `placement` in this one."""
         rotation, origin = _constants(placement)
         return Pose(self.rotation @ rotation, self.origin + self.rotation @ origin)
 
-    def rotate(self, vector: NDArray[np.float64]) -> ca.SX:
+    def rotate(self, vector: Array) -> ca.SX:
         """A constant (3,) direction of this frame in the base frame, (3, 1)."""
         return self.rotation @ _sparse(np.asarray(vector, dtype=float).reshape(3, 1))
 
@@ -127,7 +127,7 @@ def _moved(frame: Pose, joint: Joint, value: ca.SX) -> Pose:
     return Pose(frame.rotation @ axis_rotation(joint.axis, value), frame.origin)
 
 
-def axis_rotation(axis: NDArray[np.float64], angle: ca.SX) -> ca.SX:
+def axis_rotation(axis: Array, angle: ca.SX) -> ca.SX:
     """Rotation about a constant unit axis, (3, 3), with as few operations as the axis allows."""
     a = np.asarray(axis, dtype=float)
     outer = np.outer(a, a)
@@ -137,16 +137,16 @@ def axis_rotation(axis: NDArray[np.float64], angle: ca.SX) -> ca.SX:
     return ca.SX(_sparse(outer)) + ca.SX(_sparse(np.eye(3) - outer)) * c + ca.SX(_sparse(cross)) * s
 
 
-def number(value: ca.SX) -> NDArray[np.float64]:
+def number(value: ca.SX) -> Array:
     """The entries of a constant graph, row by row (rows * columns,)."""
     return np.array(ca.evalf(ca.densify(value))).ravel()
 
 
-def _constants(placement: NDArray[np.float64]) -> tuple[ca.DM, ca.DM]:
+def _constants(placement: Array) -> tuple[ca.DM, ca.DM]:
     return _sparse(placement[:3, :3]), _sparse(placement[:3, 3:])
 
 
-def _sparse(array: NDArray[np.float64]) -> ca.DM:
+def _sparse(array: Array) -> ca.DM:
     exact = np.where(np.abs(array) < ROUNDING, 0.0, array)
     # Rotations by quarter turns come out of cosines as 1 - 1e-16; make them exact as well.
     near = np.round(exact)

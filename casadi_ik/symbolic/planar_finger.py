@@ -13,13 +13,12 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic.kinematics import forward, number
 
-Array = NDArray[np.float64]
 ALIGNED = 1e-9
 
 

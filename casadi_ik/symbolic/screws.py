@@ -17,14 +17,12 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
 from casadi_ik.symbolic.kinematics import Pose, forward, number
 from casadi_ik.symbolic.smooth import Expr
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

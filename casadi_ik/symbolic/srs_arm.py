@@ -17,8 +17,8 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.directions import rotation_between
@@ -26,7 +26,6 @@ from casadi_ik.symbolic.kinematics import Pose, axis_rotation, forward
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 from casadi_ik.symbolic.so3 import skew
 
-Array = NDArray[np.float64]
 MEETING = 1e-9
 """How far apart axes may pass and still count as meeting [m], or be off perpendicular [rad]."""
 

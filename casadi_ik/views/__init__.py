@@ -11,6 +11,7 @@ except ImportError as error:
     ) from error
 
 from casadi_ik.views.convergence import draw_convergence
+from casadi_ik.views.pads import draw_pads
 from casadi_ik.views.scene import draw_alternatives, draw_solution, show
 
-__all__ = ["draw_alternatives", "draw_convergence", "draw_solution", "show"]
+__all__ = ["draw_alternatives", "draw_convergence", "draw_pads", "draw_solution", "show"]

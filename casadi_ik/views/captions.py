@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.grasps import Grasp
 from casadi_ik.problem.solution import Solution
 from casadi_ik.views.picture import FAINT, INK
@@ -18,9 +18,7 @@ TARGET_COLOR = "#f0b400"
 MET_COLOR, MISSED_COLOR = "#1f9d55", "#d62f3c"
 
 
-def label_fingers(
-    axes: Axes, places: dict[str, NDArray[np.float64]], solution: Solution, grasp: Grasp
-) -> None:
+def label_fingers(axes: Axes, places: dict[str, Array], solution: Solution, grasp: Grasp) -> None:
     """Name and errors of every finger, at the edge of the picture with a line to its contact.
 
     Args:
@@ -70,10 +68,10 @@ def add_title(figure: Figure, solution: Solution, grasp: Grasp) -> None:
     figure.text(0.02, 0.90, how, size=11, color=FAINT, va="center")
 
 
-def add_legend(figure: Figure, solution: Solution, has_object: bool) -> None:
+def add_legend(figure: Figure, solution: Solution, grasp: Grasp, has_object: bool) -> None:
     """What the arrows mean."""
     states = {verdict.ok for verdict in solution.contacts.values()}
-    handles: list[Line2D | Patch] = [_mark(TARGET_COLOR, "contact asked for, pad normal", 4.5)]
+    handles: list[Line2D | Patch] = [_mark(TARGET_COLOR, _asked(grasp), 4.5)]
     if True in states:
         handles.append(_mark(MET_COLOR, "reached, within tolerance", 2.0))
     if False in states:
@@ -82,6 +80,20 @@ def add_legend(figure: Figure, solution: Solution, has_object: bool) -> None:
         handles.append(Patch(color=OBJECT_COLOR, label="object"))
     style = {"frameon": False, "fontsize": 10, "labelcolor": INK}
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), **style)
+
+
+def _asked(grasp: Grasp) -> str:
+    """What the marks of a target are."""
+    contacts = grasp.contacts.values()
+    placed = [contact for contact in contacts if not np.isnan(contact.point[0])]
+    marks = {
+        "contact": any(c.line is None and c.plane is None for c in placed),
+        "line (rod)": any(c.line is not None for c in placed),
+        "plane (ring)": any(c.plane is not None for c in placed),
+        "pad normal": any(c.normal is not None for c in contacts),
+        "second axis (shorter)": any(c.tangent is not None for c in contacts),
+    }
+    return "asked for: " + ", ".join(name for name, there in marks.items() if there)
 
 
 def _mark(color: str, label: str, width: float) -> Line2D:

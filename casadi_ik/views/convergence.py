@@ -10,15 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullFormatter
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.logs import Table
 from casadi_ik.problem.problems import Tolerance
 from casadi_ik.views.picture import DPI, FAINT, INK, new_figure, save_picture
 from casadi_ik.views.strips import draw_strip, events_strip, limits_strip, mark_events, runs
-
-Array = NDArray[np.float64]
 
 COLORS = ("#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6", "#c2334d", "#0f8b8d")
 """Of the lines of a panel; where there are more of them, dashes tell the rounds apart."""

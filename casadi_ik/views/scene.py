@@ -11,9 +11,10 @@ import numpy as np
 import pyvista as pv
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Grasp, load_object
 from casadi_ik.problem.solution import Solution
@@ -22,18 +23,16 @@ from casadi_ik.views.captions import (
     MET_COLOR,
     MISSED_COLOR,
     OBJECT_COLOR,
-    TARGET_COLOR,
     add_legend,
     add_title,
     label_fingers,
 )
+from casadi_ik.views.marks import contact_marks, target_place
 from casadi_ik.views.picture import DPI, INK, new_figure, save_picture
 from casadi_ik.views.robot_body import robot_body
-from casadi_ik.views.shapes import Solid, arrow, capsule, with_edges
+from casadi_ik.views.shapes import Solid, with_edges
 from casadi_ik.views.stage import Image, Stage, over
 from casadi_ik.views.viewpoint import View, close_view, whole_view
-
-Array = NDArray[np.float64]
 
 SIZE = (12.0, 6.6)
 """Of the picture [inch]."""
@@ -96,7 +95,7 @@ def draw_solution(
     with _one_at_a_time, closing(Stage()) as stage:
         solids = _fill(stage, robot, solution.q, grasp, colors)
         view = view or close_view(robot, solution.q)
-        target = np.nanmean(grasp.arrays(robot.fingers)[0], axis=0)
+        target = _middle(robot, solution.q, grasp)
         pixels = _pixels(figure, WHOLE)
         stage.aim(whole_view(target, view), _points(*solids.values()), pixels, (0.03, 0.10))
         image = over(1.0, stage.shoot("floor"), _inwards(pixels))
@@ -115,7 +114,7 @@ def draw_solution(
         seen = stage.project(robot.contacts(solution.q)[0])
     label_fingers(axes, dict(zip(robot.fingers, seen, strict=True)), solution, grasp)
     add_title(figure, solution, grasp)
-    add_legend(figure, solution, bool(solids["object"]))
+    add_legend(figure, solution, grasp, bool(solids["object"]))
     if path is not None:
         save_picture(figure, path)
     return figure
@@ -226,7 +225,7 @@ def _fill(
         stage.add(group, members)
     stage.add_floor(float(robot.links(q)[robot.description.root][2, 3]), arm + hand)
     solids["object"] = _object(grasp) if grasp else []
-    solids["marks"] = _marks(robot, q, grasp, colors) if grasp else []
+    solids["marks"] = contact_marks(robot, q, grasp, colors) if grasp else []
     stage.add("object", solids["object"], OBJECT)
     stage.add("marks", solids["marks"])
     return solids
@@ -245,24 +244,12 @@ def _object(grasp: Grasp) -> list[Solid]:
     return [(with_edges(mesh), OBJECT_COLOR)]
 
 
-def _marks(robot: ArmHand, q: ArrayLike, grasp: Grasp, colors: Mapping[str, str]) -> list[Solid]:
-    """Arrows of the contacts: asked for thick and short, reached thin and long."""
-    marks: list[Solid] = []
-    contacts = zip(*grasp.arrays(robot.fingers), *robot.contacts(q), strict=True)
-    for finger, (asked, asked_normal, point, normal) in zip(robot.fingers, contacts, strict=True):
-        if np.isnan(asked[0]):
-            continue
-        color = colors[finger]
-        marks += [
-            (pv.Sphere(radius=0.0036, center=asked), TARGET_COLOR),
-            (pv.Sphere(radius=0.0042, center=point), color),
-            (arrow(point, normal, 0.046, 0.0022), color),
-        ]
-        if color == MISSED_COLOR:
-            marks.append((capsule(point, asked, 0.0006), color))
-        if not np.isnan(asked_normal[0]):
-            marks.append((arrow(asked, asked_normal, 0.030, 0.0048), TARGET_COLOR))
-    return marks
+def _middle(robot: ArmHand, q: ArrayLike, grasp: Grasp) -> Array:
+    """(3,) amid the contacts asked for [m]."""
+    grasp.arrays(robot.fingers)
+    tips = dict(zip(robot.fingers, robot.contacts(q)[0], strict=True))
+    places = [target_place(contact, tips[name]) for name, contact in grasp.contacts.items()]
+    return np.mean(places, axis=0)
 
 
 def _points(*groups: list[Solid]) -> Array:

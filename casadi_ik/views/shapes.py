@@ -6,9 +6,8 @@ from typing import cast
 
 import numpy as np
 import pyvista as pv
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 Solid = tuple[pv.PolyData, str]
 """A surface and its colour."""
@@ -72,6 +71,18 @@ def arrow(start: Array, direction: Array, length: float, width: float) -> pv.Pol
         scale=length,
     )
     return with_edges(mesh)
+
+
+def ring(center: Array, axis: Array, radius: float, width: float) -> pv.PolyData:
+    """A thin ring about an axis through its centre."""
+    mesh = pv.ParametricTorus(ringradius=radius, crosssectionradius=width / 2).triangulate()
+    z = axis / np.linalg.norm(axis)
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3] = np.column_stack([x, np.cross(z, x), z, center])
+    mesh.transform(pose, inplace=True)
+    return mesh
 
 
 def with_edges(mesh: pv.PolyData) -> pv.PolyData:

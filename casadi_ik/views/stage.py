@@ -10,11 +10,11 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import PictureError
 from casadi_ik.views.shapes import Solid
 from casadi_ik.views.viewpoint import View, axes_of
 
-Array = NDArray[np.float64]
 Image = NDArray[np.floating]
 """(h, w, channels) of values in 0..1."""
 

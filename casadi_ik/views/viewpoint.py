@@ -5,11 +5,10 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
-
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 View = tuple[float, float]
 """Azimuth about z from x, and elevation above the horizon, of the viewer [rad]."""

@@ -5,14 +5,10 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.symbolic import dual_quaternion as dq
-
-Array = NDArray[np.float64]
-
-SLIDERS = "sliders in steps of 0.1 mm"
 
 
 def translation(target: dict[str, Array]) -> Array:
@@ -39,11 +35,12 @@ def finish(
     path: Axes,
     norms: Axes,
     pose: Array,
+    resolution: float,
     axes: tuple[int, int] = (1, 2),
     names: str = "yz",
     frame: str = "hand base",
 ) -> None:
-    """Goal, titles, labels and legend of a figure."""
+    """Goal, titles, labels and legend of a figure; dotted are sliders in steps [m]."""
     goal = 1e3 * translation({"pose": pose})
     path.plot(*goal[list(axes)], "k+", ms=12, label="goal")
     path.set(xlabel=f"{names[0]} [mm], {frame}", ylabel=f"{names[1]} [mm]", aspect="equal")
@@ -52,6 +49,7 @@ def finish(
     path.legend(frameon=False, fontsize=8)
     norms.set_title("How the error falls", size=10, loc="left")
     norms.set(xlabel="step", ylabel="screw error norm, eq. (17)", ylim=(1e-9, 5))
-    for style, label in (("-", "exact sliders"), (":", SLIDERS)):
+    coarse = f"sliders in steps of {1e3 * resolution:g} mm"
+    for style, label in (("-", "exact sliders"), (":", coarse)):
         norms.plot([], [], style, color="black", label=label)
     norms.legend(frameon=False, fontsize=8)

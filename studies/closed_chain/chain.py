@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, place_arm
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.closed_chain import closed_chain, split
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.srs_arm import reach, srs_arm
-
-Array = NDArray[np.float64]
 
 LENGTH = 0.1
 """Unit of the constraint's linear rows [m]: about the size of a hand."""

@@ -9,23 +9,28 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.views.picture import FAINT, INK, new_figure
-
-Array = NDArray[np.float64]
 
 RESULTS = Path(__file__).parents[1] / "results"
 PAPER, OURS = "#e08a2e", "#2f6db3"
 
 
-def options(description: str, count: int) -> argparse.Namespace:
-    """Size, seed and place of a study."""
+def options(
+    description: str,
+    count: int,
+    arguments: list[str] | None,
+    **parameters: tuple[int | float | str, str],
+) -> argparse.Namespace:
+    """Size, seed and place of a study, and its own parameters: default and meaning by name."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--count", type=int, default=count, help="configurations")
     parser.add_argument("--seed", type=int, default=0)
+    for name, (default, meaning) in parameters.items():
+        parser.add_argument(f"--{name}", type=type(default), default=default, help=meaning)
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the results")
-    return parser.parse_args()
+    return parser.parse_args(arguments)
 
 
 def figure(rows: int, columns: int, width: float = 4.2, height: float = 3.7) -> tuple:

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.grasps import GraspObject
 
-Array = NDArray[np.float64]
 PHALANX_RADIUS = 0.009  # [m]
 PALM_SURFACE = 0.080  # [m] z in frame W (robots.md, section 2)
 

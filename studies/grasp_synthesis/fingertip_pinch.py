@@ -18,8 +18,8 @@ from itertools import combinations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.grasps import GraspObject, Sphere
 from casadi_ik.robots import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
@@ -27,7 +27,6 @@ from casadi_ik.symbolic.so3 import exp_so3
 from grasp_synthesis.patches import Patch
 from grasp_synthesis.programme import Programme
 
-Array = NDArray[np.float64]
 LENGTH = 0.1  # [m] unit of positions in the programme
 RANGE = 0.97  # part of a motor's range that may be used
 TURN = 0.8  # [rad] by how much the object may turn from the recipe's orientation

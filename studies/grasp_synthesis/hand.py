@@ -6,12 +6,11 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.robots import RobotDescription, load_description
 from casadi_ik.symbolic.kinematics import Kinematics, Pose, forward
 
-Array = NDArray[np.float64]
 ROBOT = "kuka_lwr_barrett"
 FRAME_W = "bh_base"  # on the mounting face; the palm surface is 80 mm above it
 FINGERS = ("thumb", "finger_2", "finger_3")

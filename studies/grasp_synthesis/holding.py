@@ -10,14 +10,13 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.robots import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
 from grasp_synthesis.fingertip_pinch import TipPinch
 from grasp_synthesis.programme import OPTIONS
 
-Array = NDArray[np.float64]
 LIMIT_MARGIN = np.deg2rad(10.0)
 STARTS = 12
 

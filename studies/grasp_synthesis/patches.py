@@ -11,11 +11,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.grasps import BentCapsule, Box, Cylinder, EllipticCylinder, Shape, Sphere
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

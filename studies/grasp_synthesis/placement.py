@@ -12,15 +12,14 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.grasps import GraspObject
 from grasp_synthesis.hand import FRAME_W, ArmHand
 from grasp_synthesis.posture import Pinch
 from grasp_synthesis.programme import OPTIONS
 from grasp_synthesis.recipes import Recipe
 
-Array = NDArray[np.float64]
 LIMIT_MARGIN = np.deg2rad(10.0)
 ELBOW = np.deg2rad([-105.0, -35.0])  # bent towards the object, never straight
 WRIST_BEND = np.deg2rad(15.0)  # joint 6 keeps away from zero, where joints 5 and 7 align

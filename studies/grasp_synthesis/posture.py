@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.grasps import BentCapsule, Cylinder, GraspObject, Sphere
 from casadi_ik.symbolic.kinematics import Pose
 from grasp_synthesis.hand import ArmHand, full_posture
@@ -25,7 +25,6 @@ from grasp_synthesis.patches import Patch
 from grasp_synthesis.programme import Programme
 from grasp_synthesis.recipes import Recipe
 
-Array = NDArray[np.float64]
 LIMIT_MARGIN = np.deg2rad(3.0)
 UNIT_MARGIN = np.deg2rad(5.0)
 MAX_DISTAL = np.deg2rad(45.0)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
+
 OPTIONS = {
     "print_time": False,
     "ipopt.print_level": 0,

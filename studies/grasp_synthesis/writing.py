@@ -6,15 +6,13 @@ import textwrap
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from grasp_synthesis.clearance import Clearance
 from grasp_synthesis.hand import FINGERS, ROBOT, ArmHand
 from grasp_synthesis.placement import Placement
 from grasp_synthesis.posture import Pinch
 from grasp_synthesis.recipes import Recipe
-
-Array = NDArray[np.float64]
 
 
 def barrett_text(

@@ -18,13 +18,11 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.couplings import joint_positions
-
-Array = NDArray[np.float64]
 
 ITERATIONS = 300
 """Of Ipopt, from one start."""

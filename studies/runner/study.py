@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import casadi_ik as ik
-
-Array = NDArray[np.float64]
+from casadi_ik.arrays import Array
 
 FIRST_USE = 8
 """Targets that a solver's first use is tried on: so many are also solved side by side."""

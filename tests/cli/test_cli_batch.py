@@ -41,6 +41,27 @@ def test_all_solved(
     assert len(list(tmp_path.iterdir())) == 3
 
 
+def test_a_file_of_directions(
+    run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
+) -> None:
+    with np.load(target_file()) as data:
+        points, normals = data["points"].copy(), data["normals"].copy()
+    directions = np.full_like(normals, np.nan)
+    directions[1:] = normals[1:]
+    points[1:] = normals[1:] = np.nan
+    file, out = tmp_path / "ways.npz", tmp_path / "solved.npz"
+    directions[2, 0, 1] = np.nan
+    np.savez(file, points=points, normals=normals, directions=directions)
+    done = run("batch", file, *ROBOT, "--out", out)
+    assert done.exit == 1
+    assert "directions: row 2, finger 0 is partly NaN" in done.err
+    with np.load(out) as data:
+        assert data["status"].tolist() == ["SOLVED", "SOLVED", "INVALID"]
+        assert np.isnan(data["position_error"][1]).all()
+        _, reached = robot.contacts(data["q"][1])
+    assert (np.sum(reached * directions[1], axis=1) > np.cos(ik.Tolerance().angle)).all()
+
+
 def test_not_all_solved_names_rows(
     run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:

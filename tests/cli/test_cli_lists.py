@@ -16,6 +16,7 @@ from casadi_ik.cli.parser import build_parser
 WORDS = {
     "solve": "--picture",
     "batch": "OUT.npz",
+    "import": "--palm",
     "robots": "robots",
     "methods": "methods",
     "grasps": "grasps",

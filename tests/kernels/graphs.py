@@ -21,21 +21,28 @@ RECORD = Layout.record(
 )
 
 
-def random_expression(inputs: ca.SX, size: int, operations: int, seed: int) -> ca.SX:
-    """A bounded random function of the inputs, in the operations kinematics is made of."""
+def random_expression(
+    inputs: ca.SX, size: int, operations: int, seed: int, turning: bool = True
+) -> ca.SX:
+    """A bounded random function of the inputs, in the operations kinematics is made of.
+
+    Without the turning ones compiled code and the virtual machine agree to the last bit.
+    """
     rng = np.random.default_rng(seed)
+    sin, cos = (ca.sin, ca.cos) if turning else (lambda v: v / (1 + v * v), ca.tanh)
+    atan2 = ca.atan2 if turning else ca.hypot
     pool = ca.vertsplit(inputs)
     for _ in range(operations):
         a, b, c = (pool[i] for i in rng.integers(len(pool), size=3))
         kind = rng.integers(6)
         if kind == 0:
-            pool.append(ca.sin(a) * ca.cos(b) + 0.1 * c)
+            pool.append(sin(a) * cos(b) + 0.1 * c)
         elif kind == 1:
             pool.append(ca.sqrt(1 + a * a) - 1)
         elif kind == 2:
-            pool.append(ca.if_else(a > b, ca.sin(c), ca.cos(a)))
+            pool.append(ca.if_else(a > b, sin(c), cos(a)))
         elif kind == 3:
-            pool.append(ca.atan2(a, 1 + b * b))
+            pool.append(atan2(a, 1 + b * b))
         elif kind == 4:
             pool.append(ca.fmin(ca.fmax(a - b, -1), 1))
         else:
@@ -65,14 +72,18 @@ def step_of(name: str, function: ca.Function, record: Layout = RECORD) -> StepGr
     )
 
 
-def random_step(seed: int = 0) -> StepGraph:
+def random_step(seed: int = 0, turning: bool = True) -> StepGraph:
     """A chaotic step on four numbers; ends by chance, at different iterations."""
     x, p = ca.SX.sym("x", 4), ca.SX.sym("p", 2)
-    noise = random_expression(ca.vertcat(x, p), 4, 120, seed)
-    new = 2 * ca.sin(3 * noise + 4 * x)
+    noise = random_expression(ca.vertcat(x, p), 4, 120, seed, turning)
+    mixed = 3 * noise + 4 * x
+    # A parabola of the rest folds as a sine does.
+    rest = mixed - 2 * ca.floor(mixed / 2 + 0.5)
+    new = 2 * ca.sin(mixed) if turning else 2 - 4 * rest * rest
     status = ca.if_else(ca.fabs(new[0] - p[1]) < 0.01, DONE, RUNNING)
-    function = ca.Function("random_step", [x, p], [new, record_of(new, p), status])
-    return step_of("random_step", function)
+    name = "random_step" if turning else "random_parabola"
+    function = ca.Function(name, [x, p], [new, record_of(new, p), status])
+    return step_of(name, function)
 
 
 def branching_step() -> StepGraph:

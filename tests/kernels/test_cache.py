@@ -173,6 +173,7 @@ def test_without_compiler_one_warning(
     monkeypatch.setenv("CC", cc)
     if not cc:
         monkeypatch.setenv("PATH", str(tmp_path))
+        monkeypatch.setattr(compiler, "_zig", list)
     with pytest.warns(NoCompilerWarning, match="no C compiler") as caught:
         kernel = FunctionKernel(function())
     assert len(caught) == 1

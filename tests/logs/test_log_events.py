@@ -15,7 +15,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs import EventKind, EventRules, detect_events
 from casadi_ik.logs.events.kinds import event_format
-from casadi_ik.logs.read.table import Part, Table
+from casadi_ik.logs.read.table import MethodRows, Table
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 
 STORAGE = {"phase": "u1", "restart": "u4", "limit_mask": "u4", "active_mask": "u4"}
@@ -60,7 +60,7 @@ def found_in(
     form = TraceFormat(layout, labels or {}, jacobians or {})
     count = np.array([len(trace)] if counts is None else counts)
     rows = detect_events(form, trace, count, rules)
-    part = Part("m", rows, rows["solve_id"], rows["iteration"], event_format(form).labels, {})
+    part = MethodRows("m", rows, rows["solve_id"], rows["iteration"], event_format(form).labels, {})
     return tuple(
         Event(
             record["iteration"],

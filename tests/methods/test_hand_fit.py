@@ -84,11 +84,11 @@ def test_hand_jacobian(robot, layouts, problem):
 
     def residual(x):
         at = moved(x)
-        contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.hand)
+        contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.robot.hand_actuators)
         return number(fit_residual(contacts, ROWS, at, p)).ravel()
 
     at = moved(np.zeros(6 + HAND))
-    contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.hand)
+    contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.robot.hand_actuators)
     expected = differences(residual, np.zeros(6 + HAND))
     np.testing.assert_allclose(number(fit_jacobian(contacts, ROWS, at, p)), expected, atol=1e-7)
     assert np.linalg.matrix_rank(expected) > 8
@@ -119,14 +119,14 @@ def test_residual_vanishes_at_the_generating_configuration(robot, layouts, probl
     q, _ = problem
     p, palm = parameters(robot, *robot.contacts(q)), robot.palm(q)
     at = PalmAndHand(ca.DM(palm[:3, :3]), ca.DM(palm[:3, 3]), ca.DM(q[ARM:]))
-    contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.hand)
+    contacts = hand_contacts(robot.description, ca.SX(at.hand), layouts.robot.hand_actuators)
     assert np.abs(number(fit_residual(contacts, ROWS, at, p))).max() < 1e-13
     assert np.abs(number(whole_residual(robot.description, ROWS, ca.SX(q), p))).max() < 1e-13
 
 
 def test_best_palm_finds_the_palm_of_the_right_posture(robot, layouts, rng):
     for q in robot.random(rng, 10):
-        contacts = hand_contacts(robot.description, ca.SX(q[ARM:]), layouts.hand)
+        contacts = hand_contacts(robot.description, ca.SX(q[ARM:]), layouts.robot.hand_actuators)
         rotation, origin = best_palm(contacts, ROWS, parameters(robot, *robot.contacts(q)))
         palm = robot.palm(q)
         np.testing.assert_allclose(number(rotation), palm[:3, :3], atol=1e-3)

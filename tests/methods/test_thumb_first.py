@@ -151,7 +151,7 @@ def test_the_start_chooses_between_hands(robot, once, rng):
     q = robot.random(rng, 200)
     asked = problems(robot, q)
     batches = [Engine(robot, once).solve(asked, Run(q0)) for q0 in (robot.home, q)]
-    hand = list(once.step.hand)
+    hand = list(once.step.robot.hand_actuators)
     from_home, from_truth = (np.abs(batch.q - q)[:, hand].max(axis=1) for batch in batches)
     assert np.median(from_truth) < np.median(from_home)
 

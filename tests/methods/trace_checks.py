@@ -30,8 +30,6 @@ from casadi_ik.problem.trace import (
     Q,
 )
 
-Array = NDArray[np.float64]
-
 LENGTH = 0.1
 """Position errors weigh in a cost by this [m]."""
 

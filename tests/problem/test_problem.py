@@ -65,6 +65,36 @@ def test_malformed_targets(points, normals, says):
     assert "\n" not in str(caught.value)
 
 
+def test_a_direction_is_a_normal_without_a_point():
+    points, normals = arrays()
+    directions = np.full_like(normals, np.nan)
+    directions[0, 1] = 3 * normals[0, 1]
+    points[0, 1] = normals[0, 1] = np.nan
+    p, n = target_arrays(points, normals, 3, directions=directions)
+    np.testing.assert_allclose(n, target_arrays(*arrays(), 3)[1], atol=1e-15)
+    assert np.isnan(p[0, 1]).all()
+    assert np.isnan(p).sum() == 3
+    only, _ = target_arrays(*np.full((2, 1, 3, 3), np.nan), 3, directions=arrays(k=1)[1])
+    assert np.isnan(only).all()
+
+
+@pytest.mark.parametrize(
+    ("directions", "says"),
+    [
+        (arrays()[1], "directions: row 4, finger 0 has a point too, expected it alone"),
+        (np.zeros((2, 3, 3)), "directions: row 4, finger 0 is zero, expected a direction"),
+        (np.full((2, 3, 3), np.inf), "directions: row 4, finger 0 is infinite"),
+        (arrays(k=3)[1], "points and directions: found 2 and 3 rows, expected as many"),
+        (arrays(f=2)[1], "directions: found shape (2, 2, 3), expected (k, 3, 3)"),
+        ("up", "directions: expected an array of numbers"),
+    ],
+)
+def test_malformed_directions(directions, says):
+    with pytest.raises(InputError) as caught:
+        target_arrays(*arrays(), 3, 4, directions)
+    assert says in str(caught.value)
+
+
 @pytest.mark.parametrize("value", [0, -1e-3, float("nan"), float("inf"), "5 mm", None])
 def test_tolerance_is_a_positive_number(value):
     with pytest.raises(InputError, match=r"tolerance\.position: found .*, expected a number > 0"):

@@ -85,7 +85,7 @@ def package_with_the_page(folder: Path) -> None:
     union = "Coupling = Linear | LeadScrew | FourBar"
     replace(described, union, f"{data}\n\n{union} | Quadratic")
     graphs = folder / "casadi_ik" / "symbolic" / "couplings.py"
-    replace(graphs, "FourBar, LeadScrew, Linear\n", "FourBar, LeadScrew, Linear, Quadratic\n")
+    replace(graphs, "Linear, Polynomial\n", "Linear, Polynomial, Quadratic\n")
     replace(graphs, '}\n"""The kinds of couplings."""', f'{row}}}\n"""The kinds of couplings."""')
 
 

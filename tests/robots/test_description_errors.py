@@ -141,13 +141,6 @@ SHIPPED = {
         "joints: child links",
         "'bh_thumb_link_2' appears twice",
     ),
-    "joint of arm and hand": (
-        "arm",
-        "name: lwr_joint_1",
-        "name: bh_thumb_distal",
-        "actuators",
-        "'bh_thumb_distal' appears twice",
-    ),
     "link of arm and hand": (
         "arm",
         "child: lwr_link_1",
@@ -279,8 +272,6 @@ def test_broken_shipped_robot(own_robot, case):
     file, old, new, key, says = SHIPPED[case]
     path = own_robot.with_name(f"{file}.yaml")
     replace(path, old, new)
-    if case == "joint of arm and hand":
-        path = own_robot
     with pytest.raises(DescriptionError) as caught:
         load_description(own_robot)
     message = str(caught.value)

@@ -9,7 +9,7 @@ from robot_variants import derived_robot
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.solving.alternatives.branches import ArmBranches
-from casadi_ik.solving.alternatives.finder import DISTINCT
+from casadi_ik.solving.alternatives.finder import APART, DISTINCT
 from casadi_ik.symbolic.srs_arm import srs_arm
 
 ARM = slice(0, 7)
@@ -83,7 +83,7 @@ def test_an_interval_ends_where_a_joint_meets_its_limit(robot, branches, seed):
 def test_they_are_solutions_and_they_differ(robot, solver):
     points_asked = robot.random(np.random.default_rng(11), 5)
     for q in points_asked:
-        found = solver.solve_all(grasp(robot, q), limit=100)
+        found = solver.solve_all(grasp(robot, q), limit=100, apart=0)
         assert len(found) > 3
         configurations = np.stack([one.q for one in found])
         points, normals = robot.contacts(q)
@@ -102,6 +102,51 @@ def test_they_are_solutions_and_they_differ(robot, solver):
         for a in hands:
             for b in hands:
                 assert a == b or np.abs((hands[a] - hands[b]) / span).max() > DISTINCT
+
+
+def differences(robot, first, second):
+    """(k, l) the largest motion of a motor from one solution to another, in ranges."""
+    one, other = (np.stack([each.q for each in found]) for found in (first, second))
+    return np.abs((one[:, None] - other) / (robot.upper - robot.lower)).max(axis=2)
+
+
+def least(robot, found):
+    return differences(robot, found, found)[np.triu_indices(len(found), 1)].min(initial=np.inf)
+
+
+@pytest.mark.parametrize("prefer", ["limits", "manipulability", "q0"])
+def test_the_answers_for_the_cup_are_different_ones(robot, solver, prefer):
+    """Its hand has a valley of postures; without a least distance they fill the list."""
+    cup = ik.load_grasp("cup")
+    every = solver.solve_all(cup, limit=1000, prefer=prefer, apart=0)
+    assert least(robot, every) < 0.1
+    few = solver.solve_all(cup, limit=4, prefer=prefer)
+    assert len(few) == 4
+    assert least(robot, few) >= APART
+    # Each that is left out is like one before it.
+    kept = solver.solve_all(cup, limit=1000, prefer=prefer)
+    assert [one.branch for one in kept[:4]] == [one.branch for one in few]
+    same = differences(robot, every, kept)
+    places = same.argmin(axis=0)
+    assert (np.diff(places) > 0).all()
+    assert (same.min(axis=0) == 0).all()
+    for place, row in enumerate(same):
+        assert row[places <= place].min() < APART
+
+
+def test_how_different_they_are_is_a_parameter():
+    """On a robot whose arm has no closed form."""
+    robot = ik.load_robot("baxter_ar10")
+    asked = grasp(robot, robot.random(np.random.default_rng(1), 1)[0])
+    solver = ik.Solver(robot)
+    counts = []
+    for apart in (0.0, 0.25, 0.6, 1.0):
+        found = solver.solve_all(asked, limit=100, apart=apart)
+        assert least(robot, found) >= apart
+        counts.append(len(found))
+    assert counts[1] > 1
+    assert counts == sorted(counts, reverse=True)
+    assert counts[-1] == 1
 
 
 @pytest.mark.parametrize(
@@ -180,6 +225,9 @@ def test_what_is_refused(robot, solver):
     asked = grasp(robot, robot.home)
     with pytest.raises(InputError, match="limit: found 0, expected an integer >= 1"):
         solver.solve_all(asked, limit=0)
+    for apart in (-0.1, 1.5, float("nan"), "far", True):
+        with pytest.raises(InputError, match=r"apart: found .*, expected a number from 0 to 1"):
+            solver.solve_all(asked, apart=apart)
     with pytest.raises(InputError, match="prefer: found 'speed', expected one of limits, manip"):
         solver.solve_all(asked, prefer="speed")
     with pytest.raises(InputError, match=r"q0: found shape \(2, 14\), expected \(14,\)"):

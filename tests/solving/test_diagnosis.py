@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.problem.solution import BatchSolution
 
-Array = NDArray[np.float64]
 STARTS = 2
 
 

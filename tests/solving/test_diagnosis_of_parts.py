@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from robot_variants import derived_robot
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.solution import BatchSolution
-
-Array = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")

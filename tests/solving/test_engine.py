@@ -11,7 +11,13 @@ from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.parts import FIRST_PART, PART_BYTES, Parts
+from casadi_ik.solving.parts import (
+    CACHED_BYTES,
+    ENOUGH,
+    FIRST_PART,
+    PART_BYTES,
+    BatchParts,
+)
 from casadi_ik.solving.run import Run
 
 LAYOUT = Layout.record(Field("row", (), "f8"))
@@ -131,10 +137,17 @@ def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
 
 
 @pytest.mark.parametrize(
-    ("bytes_per_solve", "size"), [(PART_BYTES // 2**10, 2**10), (2**30, 1), (1, 10**6)]
+    ("bytes_per_solve", "size"),
+    [
+        (CACHED_BYTES // 2**10, 2**10),
+        (PART_BYTES // ENOUGH, ENOUGH),
+        (PART_BYTES // 100, 100),
+        (2**30, 1),
+        (1, 10**6),
+    ],
 )
 def test_parts_are_as_large_as_their_iterations_allow(bytes_per_solve, size):
-    parts = Parts(10**6, 1, trace=True)
+    parts = BatchParts(10**6, 1, trace=True)
     found = []
     for part in parts:
         found.append(part)
@@ -147,5 +160,5 @@ def test_parts_are_as_large_as_their_iterations_allow(bytes_per_solve, size):
 
 @pytest.mark.parametrize(("count", "jobs", "sizes"), [(0, 2, [0]), (5, 2, [3, 2]), (1, 4, [1])])
 def test_without_a_trace_there_is_a_part_for_each_thread(count, jobs, sizes):
-    parts = list(Parts(count, jobs, trace=False))
+    parts = list(BatchParts(count, jobs, trace=False))
     assert [part.stop - part.start for part in parts] == sizes

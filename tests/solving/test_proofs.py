@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from robot_variants import derived_robot
 from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.problem.arm_cones import arm_cones
 from casadi_ik.problem.contact_quantities import asked_quantities, kept_quantities
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.proof import Proof, ProofKind
 from casadi_ik.solving.diagnosis.prover import Prover
 
-Array = NDArray[np.float64]
 BLIND = [[0, 100, 48, 78, 48, 48, 48], [0, 90, 48, 78, 46, 60, 31], [4, 94, 48, 78, 48, 47, 48]]
 """Hands (spread, thumb, finger 2, finger 3) [deg] that a lookup of postures tells badly apart."""
 

@@ -48,9 +48,8 @@ def test_what_a_threshold_catches(kept: Kept) -> None:
 
 
 def test_the_report_marks_the_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(event_thresholds, "FACTORS", (1.0, 10.0))
     monkeypatch.setattr(event_thresholds.ik, "Solver", lambda robot, *_, **__: ik.api.Solver(robot))
-    event_thresholds.main(["--count", "24", "--report", str(tmp_path)])
+    event_thresholds.main(["--count", "24", "--factors", "1", "10", "--report", str(tmp_path)])
     text = (tmp_path / "report.md").read_text()
     sections = len(re.findall(r"^## \S+ on \S+$", text, re.MULTILINE))
     assert sections == 5

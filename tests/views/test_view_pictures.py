@@ -17,9 +17,10 @@ from matplotlib.image import imread
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, PictureError
-from casadi_ik.logs import EventKind, Part, Table
+from casadi_ik.logs import EventKind, MethodRows, Table
 from casadi_ik.views import draw_alternatives, draw_convergence, draw_solution
 from casadi_ik.views.captions import MET_COLOR, MISSED_COLOR, OBJECT_COLOR, TARGET_COLOR
+from casadi_ik.views.marks import contact_marks, target_place
 from casadi_ik.views.picture import new_figure, save_picture
 from casadi_ik.views.strips import events_strip
 
@@ -103,6 +104,63 @@ def test_free_fingers_and_normals_are_left_out(robot, solution, grasp) -> None:
     assert "1.00 mm" in text
     assert "nan" not in text
     assert "finger_2" not in text
+
+
+@pytest.mark.parametrize(
+    ("changed", "legend", "solids"),
+    [
+        ({}, "contact, pad normal", 2),
+        ({"normal": None}, "contact", 1),
+        ({"tangent": 1}, "contact, pad normal, second axis (shorter)", 3),
+        ({"line": 2}, "line (rod), pad normal", 2),
+        ({"plane": 0}, "plane (ring), pad normal", 2),
+    ],
+)
+def test_every_kind_of_contact_has_its_marks(robot, solution, changed, legend, solids) -> None:
+    frames = robot.contact_frames(solution.q)
+    contacts = {}
+    for frame, finger in zip(frames, robot.fingers, strict=True):
+        vectors = {"normal": frame[:3, 0]}
+        for name, axis in changed.items():
+            vectors[name] = None if axis is None else frame[:3, axis]
+        contacts[finger] = ik.Contact(frame[:3, 3] + 0.01 * frame[:3, 1], **vectors)
+    asked = ik.Grasp(contacts)
+    marks = contact_marks(robot, solution.q, asked, dict.fromkeys(robot.fingers, MET_COLOR))
+    assert sum(color == TARGET_COLOR for _, color in marks) == solids * len(robot.fingers)
+    assert sum(color == MET_COLOR for _, color in marks) == len(robot.fingers) * (
+        3 if "tangent" in changed else 2
+    )
+    text = words(draw_solution(robot, solution, asked, dpi=COARSE))
+    assert f"asked for: {legend}\n" in text
+
+
+def test_a_direction_alone_is_drawn_where_the_fingertip_is(robot, solution) -> None:
+    points, normals = robot.contacts(solution.q)
+    asked = ik.Grasp(
+        {name: ik.Contact(direction=normals[i]) for i, name in enumerate(robot.fingers)}
+    )
+    colors = dict.fromkeys(robot.fingers, MISSED_COLOR)
+    arrows = [m for m, color in contact_marks(robot, solution.q, asked, colors)
+              if color == TARGET_COLOR]  # fmt: skip
+    for mesh, point, normal in zip(arrows, points, normals, strict=True):
+        along = (mesh.points - point) @ normal
+        assert along.min() > -1e-6
+        assert along.max() == pytest.approx(0.03, abs=1e-4)
+    figure = draw_solution(robot, solution, asked, dpi=COARSE)
+    assert "asked for: pad normal\n" in words(figure)
+    assert count(figure, TARGET_COLOR) > 20
+
+
+def test_the_place_asked_for_is_the_nearest_that_a_contact_allows() -> None:
+    point, tip = np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.7, 0.9])
+    assert (target_place(ik.Contact(point), tip) == point).all()
+    np.testing.assert_allclose(
+        target_place(ik.Contact(point, line=[0, 0, 2]), tip), [0.1, 0.2, 0.9]
+    )
+    np.testing.assert_allclose(
+        target_place(ik.Contact(point, plane=[0, 0, 2]), tip), [0.5, 0.7, 0.3]
+    )
+    assert (target_place(ik.Contact(direction=[1, 0, 0]), tip) == tip).all()
 
 
 def test_a_target_far_away_does_not_shrink_the_close_up(robot, solution, grasp) -> None:
@@ -272,7 +330,7 @@ def test_the_strip_of_events_has_a_row_per_kind_and_jacobian() -> None:
         "phase": ("",),
     }
     numbers = np.arange(4)
-    part = Part("made-up", rows, numbers * 0, numbers * 10, labels, {})
+    part = MethodRows("made-up", rows, numbers * 0, numbers * 10, labels, {})
     strip = events_strip(Table("event", (part,)))
     assert {name: spans for name, (spans, _) in strip.rows.items()} == {
         "near singular closed chain": [(-0.5, 1.0)],

@@ -1,4 +1,4 @@
-/* The step's arithmetic on vectors whose entries belong to four solves.
+/* The step's arithmetic on vectors whose entries belong to LANES solves, four or eight.
  *
  * Stands between the code as CasADi generated it and the same rewritten to call what is here
  * (`lanes.py`).
@@ -12,21 +12,26 @@
 #include <immintrin.h>
 #endif
 
-#define LANES 4
 typedef double lanes __attribute__((vector_size(LANES * sizeof(double))));
 typedef int64_t lane_mask __attribute__((vector_size(LANES * sizeof(double))));
 
-#if defined(__x86_64__)
-#define LANES_TARGET __attribute__((target("avx2")))
-#else
+#if !defined(__x86_64__)
 #define LANES_TARGET
+#elif LANES == 8
+#define LANES_TARGET __attribute__((target("avx512f,avx512dq,avx512vl")))
+#else
+#define LANES_TARGET __attribute__((target("avx2")))
 #endif
 #define LANES_INLINE static inline __attribute__((always_inline)) LANES_TARGET
 
 #undef casadi_real
 #define casadi_real lanes
 
+#if LANES == 8
+#define SPREAD(x) ((lanes) {(x), (x), (x), (x), (x), (x), (x), (x)})
+#else
 #define SPREAD(x) ((lanes) {(x), (x), (x), (x)})
+#endif
 #define TRUTH(mask) ((lanes) ((lane_mask) (mask) & (lane_mask) SPREAD(1.0)))
 #define IS(x) ((lane_mask) ((x) != SPREAD(0.0)))
 
@@ -41,6 +46,19 @@ LANES_INLINE lanes lanes_if_else_zero(lanes condition, lanes value) {
 LANES_INLINE lanes lanes_sq(lanes x) { return x * x; }
 
 LANES_INLINE lanes lanes_fabs(lanes x) { return (lanes) ((lane_mask) x & INT64_MAX); }
+
+/* One lane after the other, each as it would be alone. */
+#define LANES_ALONE(NAME)                                       \
+  static __attribute__((noinline)) LANES_TARGET                 \
+  lanes lanes_alone_##NAME(lanes x) {                           \
+    lanes value;                                                \
+    int i;                                                      \
+    for (i = 0; i < LANES; ++i) value[i] = own_##NAME(x[i]);    \
+    return value;                                               \
+  }
+
+LANES_ALONE(sin)
+LANES_ALONE(cos)
 
 #define LANES_OF_ONE(NAME)                               \
   LANES_INLINE lanes lanes_##NAME(lanes x) {             \
@@ -58,25 +76,30 @@ LANES_INLINE lanes lanes_fabs(lanes x) { return (lanes) ((lane_mask) x & INT64_M
     return value;                                              \
   }
 
-#if defined(__x86_64__)
+#if defined(__x86_64__) && LANES == 8
+LANES_INLINE lanes lanes_sqrt(lanes x) { return _mm512_sqrt_pd(x); }
+LANES_INLINE lanes lanes_floor(lanes x) { return _mm512_floor_pd(x); }
+LANES_INLINE lanes lanes_ceil(lanes x) { return _mm512_ceil_pd(x); }
+LANES_INLINE int lanes_all(lane_mask mask) { return _mm512_movepi64_mask((__m512i) mask) == 255; }
+#elif defined(__x86_64__)
 LANES_INLINE lanes lanes_sqrt(lanes x) { return _mm256_sqrt_pd(x); }
 LANES_INLINE lanes lanes_floor(lanes x) { return _mm256_floor_pd(x); }
 LANES_INLINE lanes lanes_ceil(lanes x) { return _mm256_ceil_pd(x); }
+LANES_INLINE int lanes_all(lane_mask mask) { return _mm256_movemask_pd((__m256d) mask) == 15; }
 #else
 LANES_OF_ONE(sqrt)
 LANES_OF_ONE(floor)
 LANES_OF_ONE(ceil)
+
+LANES_INLINE int lanes_all(lane_mask mask) {
+  int i, all = 1;
+  for (i = 0; i < LANES; ++i) all &= mask[i] != 0;
+  return all;
+}
 #endif
-LANES_OF_ONE(sin)
-LANES_OF_ONE(cos)
-LANES_OF_ONE(tan)
-LANES_OF_ONE(asin)
-LANES_OF_ONE(acos)
-LANES_OF_ONE(atan)
 LANES_OF_ONE(exp)
 LANES_OF_ONE(log)
 LANES_OF_ONE(tanh)
-LANES_OF_TWO(atan2)
 LANES_OF_TWO(fmod)
 LANES_OF_TWO(hypot)
 LANES_OF_TWO(pow)

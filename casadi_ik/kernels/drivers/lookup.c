@@ -7,7 +7,7 @@
 typedef struct {
   const double **inputs;       /* first sample of each input */
   const int64_t *input_steps;  /* doubles from one sample to the next, 0 = the same for all */
-  const float *tiles;          /* (tiles, N_KEY, TILE) rounded keys of the table */
+  const int16_t *tiles;        /* (tiles, pairs of entries, TILE, 2) keys of the table in steps */
   int64_t *found;              /* (count, wanted) */
   int64_t rows;                /* of the table */
   int64_t wanted;
@@ -16,69 +16,156 @@ typedef struct {
   double slice;                /* [s] after which Python gets a look at its signals */
 } lookup_job;
 
-/* Rows side by side: a vector of gcc and clang, which they cut to what the machine has. */
-#define LANES 8
-typedef float lanes __attribute__((vector_size(LANES * sizeof(float))));
+/* Twice a key of whole steps, for two entries of all rows of a tile. Entries that are not known
+ * count nothing: `kept` is zero there, else all its bits are set. */
+typedef struct {
+  int16_t twice[2], kept[2];
+} asked;
 
-static inline float least(const float *values) {
-  float found = values[0];
-  int j;
-  for (j = 1; j < TILE; ++j) found = values[j] < found ? values[j] : found;
-  return found;
+#define PAIRS ((N_KEY + 1) / 2)
+#define FAR INT32_MAX
+
+/* Only gcc needs to be told that loops over a tile are one instruction. */
+#if defined(__clang__)
+#define UNROLLED static inline __attribute__((always_inline))
+#else
+#define UNROLLED static inline __attribute__((always_inline, optimize("O3")))
+#endif
+
+static void ask(const double *key, asked *pairs) {
+  int i;
+  memset(pairs, 0, PAIRS * sizeof *pairs);
+  for (i = 0; i < N_KEY; ++i) {
+    if (key[i] != key[i]) continue;
+    pairs[i / 2].twice[i % 2] = (int16_t) (2 * fmax(fmin(rint(key[i] * STEPS), LARGEST), -LARGEST));
+    pairs[i / 2].kept[i % 2] = -1;
+  }
 }
 
 /* |row - key|^2 over the known entries, without the part that all rows share. */
-static inline __attribute__((always_inline)) void measure(
-    const lookup_job *job, const double *key, float *distance) {
-  float twice[N_KEY];
-  int known[N_KEY], count = 0, i;
-  int64_t start;
-  for (i = 0; i < N_KEY; ++i) {
-    if (key[i] != key[i]) continue;
-    twice[count] = 2 * (float) fmax(fmin(rint(key[i] * STEPS), LARGEST), -LARGEST);
-    known[count++] = i * TILE;
-  }
-  for (start = 0; start < job->rows; start += TILE) {
-    const float *tile = job->tiles + start * N_KEY;
-    lanes low = {0}, high = {0}, a, b;
-    for (i = 0; i < count; ++i) {
-      memcpy(&a, tile + known[i], sizeof a);
-      memcpy(&b, tile + known[i] + LANES, sizeof b);
-      low += a * (a - twice[i]);
-      high += b * (b - twice[i]);
+UNROLLED void measure(const lookup_job *job, const asked *pairs, int32_t *distance) {
+  int64_t tile, tiles = (job->rows + TILE - 1) / TILE;
+  int i, j;
+  for (tile = 0; tile < tiles; ++tile, distance += TILE) {
+    const int16_t *row = job->tiles + tile * PAIRS * TILE * 2;
+    for (j = 0; j < TILE; ++j) distance[j] = 0;
+    for (i = 0; i < PAIRS; ++i, row += TILE * 2) {
+      for (j = 0; j < TILE; ++j) {
+        distance[j] += row[2 * j] * ((row[2 * j] - pairs[i].twice[0]) & pairs[i].kept[0])
+                     + row[2 * j + 1] * ((row[2 * j + 1] - pairs[i].twice[1]) & pairs[i].kept[1]);
+      }
     }
-    memcpy(distance + start, &low, sizeof low);
-    memcpy(distance + start + LANES, &high, sizeof high);
   }
 }
 
-static void measure_anywhere(const lookup_job *job, const double *key, float *distance) {
-  measure(job, key, distance);
+UNROLLED int32_t least(const int32_t *values, int64_t count) {
+  int32_t found = FAR;
+  int64_t j;
+  for (j = 0; j < count; ++j) found = values[j] < found ? values[j] : found;
+  return found;
+}
+
+/* The nearest one after the other, of equals the first: the tile it is in, then the row. */
+UNROLLED void choose(const lookup_job *job, int32_t *distance, int32_t *nearest, int64_t *found) {
+  const int64_t tiles = (job->rows + TILE - 1) / TILE;
+  int64_t i, j, place;
+  for (j = job->rows; j < tiles * TILE; ++j) distance[j] = FAR;
+  for (i = 0; i < tiles; ++i) nearest[i] = least(distance + i * TILE, TILE);
+  for (place = 0; place < job->wanted; ++place) {
+    const int32_t best = least(nearest, tiles);
+    int32_t *tile;
+    for (i = 0; nearest[i] != best; ++i) {}
+    tile = distance + i * TILE;
+    for (j = 0; tile[j] != best; ++j) {}
+    found[place] = i * TILE + j;
+    tile[j] = FAR;
+    nearest[i] = least(tile, TILE);
+  }
+}
+
+typedef void look_up(const lookup_job *, const asked *, int32_t *, int32_t *, int64_t *);
+
+#if defined(__clang__)
+#define FORM static
+#else
+#define FORM static __attribute__((optimize("O3")))
+#endif
+
+FORM void anywhere(
+    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
+  measure(job, pairs, distance);
+  choose(job, distance, nearest, found);
 }
 
 #if defined(__x86_64__)
+#include <immintrin.h>
+
+#define PAIR_OF(numbers) \
+  ((int32_t) ((uint32_t) (uint16_t) (numbers)[0] | (uint32_t) (uint16_t) (numbers)[1] << 16))
+
 __attribute__((target("avx2")))
-static void measure_avx2(const lookup_job *job, const double *key, float *distance) {
-  measure(job, key, distance);
+static void measure_avx2(const lookup_job *job, const asked *pairs, int32_t *distance) {
+  __m256i twice[PAIRS], kept[PAIRS];
+  const __m256i *row = (const __m256i *) job->tiles;
+  int64_t half, halves = (job->rows + TILE - 1) / TILE * 2;
+  int i;
+  for (i = 0; i < PAIRS; ++i) {
+    twice[i] = _mm256_set1_epi32(PAIR_OF(pairs[i].twice));
+    kept[i] = _mm256_set1_epi32(PAIR_OF(pairs[i].kept));
+  }
+  for (half = 0; half < halves; ++half) {
+    const __m256i *from = row + half / 2 * PAIRS * 2 + half % 2;
+    __m256i sum = _mm256_setzero_si256();
+    for (i = 0; i < PAIRS; ++i) {
+      const __m256i a = _mm256_loadu_si256(from + 2 * i);
+      const __m256i rest = _mm256_and_si256(_mm256_sub_epi16(a, twice[i]), kept[i]);
+      sum = _mm256_add_epi32(sum, _mm256_madd_epi16(a, rest));
+    }
+    _mm256_storeu_si256((__m256i *) (distance + half * TILE / 2), sum);
+  }
+}
+
+__attribute__((target("avx2"))) FORM void with_avx2(
+    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
+  measure_avx2(job, pairs, distance);
+  choose(job, distance, nearest, found);
+}
+
+__attribute__((target("avx512f,avx512bw")))
+static void measure_avx512(const lookup_job *job, const asked *pairs, int32_t *distance) {
+  __m512i twice[PAIRS], kept[PAIRS];
+  const __m512i *row = (const __m512i *) job->tiles;
+  int64_t tile, tiles = (job->rows + TILE - 1) / TILE;
+  int i;
+  for (i = 0; i < PAIRS; ++i) {
+    twice[i] = _mm512_set1_epi32(PAIR_OF(pairs[i].twice));
+    kept[i] = _mm512_set1_epi32(PAIR_OF(pairs[i].kept));
+  }
+  for (tile = 0; tile < tiles; ++tile) {
+    __m512i sum = _mm512_setzero_si512();
+    for (i = 0; i < PAIRS; ++i) {
+      const __m512i a = _mm512_loadu_si512(row++);
+      const __m512i rest = _mm512_and_si512(_mm512_sub_epi16(a, twice[i]), kept[i]);
+      sum = _mm512_add_epi32(sum, _mm512_madd_epi16(a, rest));
+    }
+    _mm512_storeu_si512(distance + tile * TILE, sum);
+  }
+}
+
+__attribute__((target("avx512f,avx512bw"))) FORM void with_avx512(
+    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
+  measure_avx512(job, pairs, distance);
+  choose(job, distance, nearest, found);
 }
 #endif
 
-/* The nearest one after the other, of equals the first: the tile it is in, then the row. */
-static void choose(const lookup_job *job, float *distance, float *nearest, int64_t *found) {
-  const int64_t tiles = (job->rows + TILE - 1) / TILE;
-  int64_t i, j, place;
-  for (j = job->rows; j < tiles * TILE; ++j) distance[j] = INFINITY;
-  for (i = 0; i < tiles; ++i) nearest[i] = least(distance + i * TILE);
-  for (place = 0; place < job->wanted; ++place) {
-    int64_t best = 0;
-    float *tile;
-    for (i = 1; i < tiles; ++i) best = nearest[i] < nearest[best] ? i : best;
-    tile = distance + best * TILE;
-    for (j = 0; tile[j] > nearest[best]; ++j) {}
-    found[place] = best * TILE + j;
-    tile[j] = INFINITY;
-    nearest[best] = least(tile);
-  }
+static look_up *best_form(void) {
+#if defined(__x86_64__)
+  const int bits = register_bits();
+  if (bits == 512) return with_avx512;
+  if (bits == 256) return with_avx2;
+#endif
+  return anywhere;
 }
 
 EXPORT int casadi_ik_lookup(lookup_job *job) {
@@ -87,15 +174,12 @@ EXPORT int casadi_ik_lookup(lookup_job *job) {
   int64_t ticks = 0;
   double limit = 0;
   int i;
-  float *distance, *nearest;
-  void (*measured)(const lookup_job *, const double *, float *) = measure_anywhere;
+  asked pairs[PAIRS];
+  int32_t *distance, *nearest;
+  look_up *find = best_form();
   if (outcome != DONE) return outcome;
-  distance = (float *) (space.extra + N_KEY);
+  distance = (int32_t *) (space.extra + N_KEY);
   nearest = distance + job->rows + TILE;
-#if defined(__x86_64__)
-  __builtin_cpu_init();
-  if (__builtin_cpu_supports("avx2")) measured = measure_avx2;
-#endif
   if (job->count - job->next > CLOCK_INTERVAL) limit = monotonic() + job->slice;
   for (; job->next < job->count; ++job->next) {
     if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {
@@ -108,8 +192,8 @@ EXPORT int casadi_ik_lookup(lookup_job *job) {
       outcome = STEP_FAILED;
       break;
     }
-    measured(job, space.extra, distance);
-    choose(job, distance, nearest, job->found + job->next * job->wanted);
+    ask(space.extra, pairs);
+    find(job, pairs, distance, nearest, job->found + job->next * job->wanted);
   }
   give_back(&space);
   return outcome;

@@ -4,7 +4,8 @@
  * back for ever, and so does everything between: such a solve would run to its budget and ends as
  * REPEATED instead. Noticed as by Brent (1980): every state is compared with that of the last
  * iteration whose number is a power of two, so a cycle is found within its length after the first
- * such iteration in it that is no smaller than its length.
+ * such iteration in it that is no smaller than its length. It begins at FIRST_MARK: most solves end
+ * before, and keeping states for a comparison costs.
  *
  * Expects the macros N_STATE, N_RECORD, ROW_BYTES, RUNNING, NON_FINITE, FAILED, REPEATED, CODE_LIMIT
  * and the function store_row(record, row). Everything that must survive a pause lives in the
@@ -65,9 +66,9 @@ EXPORT int casadi_ik_loop(loop_job *job) {
         now = next;
         next = last;
         status = (int32_t) code;
-        if (status == RUNNING && iteration > 1
+        if (status == RUNNING && iteration > FIRST_MARK
             && !memcmp(now, job->mark, N_STATE * sizeof(double))) status = REPEATED;
-        if (!(iteration & (iteration - 1))) memcpy(job->mark, now, N_STATE * sizeof(double));
+        if (is_marked(iteration)) memcpy(job->mark, now, N_STATE * sizeof(double));
       }
     }
     memcpy(job->states + i * N_STATE, now, N_STATE * sizeof(double));

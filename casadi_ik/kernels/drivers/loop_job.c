@@ -1,4 +1,4 @@
-/* What a loop works on, one solve by one (loop.c) or four side by side (loop_lanes.c). */
+/* What a loop works on, one solve by one (loop.c) or some side by side (loop_lanes.c). */
 typedef struct {
   double *states;              /* (count, N_STATE), start in, end out */
   const double *parameters;
@@ -19,3 +19,8 @@ typedef struct {
   int64_t *places;             /* (capacity, 2) solve and iteration of each row */
   int64_t *slots;              /* (SLOTS) the solves under way, -1 = none */
 } loop_job;
+
+/* Whether later states are compared with that of this iteration. */
+static int is_marked(int64_t iteration) {
+  return iteration >= FIRST_MARK && !(iteration & (iteration - 1));
+}

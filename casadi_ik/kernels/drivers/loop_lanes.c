@@ -1,11 +1,11 @@
-/* loop.c for four solves side by side, each as it would be alone: see there.
+/* loop.c for LANES solves side by side, each as it would be alone: see there.
  *
- * A step costs least when the four take the same branches, so some more solves than four are under
+ * A step costs least when all lanes take the same branches, so some more solves than lanes are under
  * way: a lane whose solve ends or changes its stage takes another one of the stage the lanes are
  * in, and when more wait for another stage than lanes are left at work, all turn to that. The rows
  * come as they are made; `places` says whose they are.
  *
- * Expects besides what loop.c does N_PARAMETERS, SLOTS and STAGE, the place in the state of the
+ * Expects what loop.c does, and N_PARAMETERS, SLOTS and STAGE, the place in the state of the
  * number that tells the stages apart, -1 if there is none.
  */
 
@@ -24,7 +24,7 @@ typedef struct {
 typedef struct {
   int slot[LANES];             /* whose state, or NOBODY */
   int queue;                   /* where its like wait */
-  lanes *now, *next, *mark, *parameters, *record;
+  lanes *now, *next, *parameters, *record;
 } bench;
 
 #define LANE(pack, k, lane) (((double *) (pack))[(k) * LANES + (lane)])
@@ -55,21 +55,18 @@ static void admit(queues *all, loop_job *job, int slot) {
 
 static void sit_down(bench *b, const loop_job *job, int lane, int slot) {
   const int64_t solve = job->slots[slot];
-  const double *state = job->states + solve * N_STATE, *mark = job->mark + slot * N_STATE;
+  const double *state = job->states + solve * N_STATE;
   const double *given = job->parameters + solve * job->parameter_step;
   int k;
   for (k = 0; k < N_STATE; ++k) LANE(b->now, k, lane) = state[k];
-  for (k = 0; k < N_STATE; ++k) LANE(b->mark, k, lane) = mark[k];
   for (k = 0; k < N_PARAMETERS; ++k) LANE(b->parameters, k, lane) = given[k];
   b->slot[lane] = slot;
 }
 
 static void stand_up(bench *b, loop_job *job, int lane, const lanes *state) {
   double *to = job->states + job->slots[b->slot[lane]] * N_STATE;
-  double *mark = job->mark + b->slot[lane] * N_STATE;
   int k;
   for (k = 0; k < N_STATE; ++k) to[k] = LANE(state, k, lane);
-  for (k = 0; k < N_STATE; ++k) mark[k] = LANE(b->mark, k, lane);
   b->slot[lane] = NOBODY;
 }
 
@@ -109,24 +106,29 @@ static void write_row(const bench *b, loop_job *job, int lane, int64_t solve) {
   store_row(own, job->rows + ROW_BYTES * job->used++);
 }
 
-/* Which lanes have a finite state, and which the one they were marked at. */
-LANES_TARGET static void examine(const bench *b, lane_mask *finite, lane_mask *repeated) {
+/* Which lanes have a finite state. */
+LANES_TARGET static void examine(const bench *b, lane_mask *finite) {
   lanes sum = {0};
-  lane_mask apart = {0};
+  int k;
+  for (k = 0; k < N_STATE; ++k) sum += b->next[k] * SPREAD(0.0);
+  *finite = (lane_mask) (sum == SPREAD(0.0));
+}
+
+/* Whether the state is once more the one marked; nearly always its first numbers tell. */
+static int is_repeated(const bench *b, const double *mark, int lane) {
   int k;
   for (k = 0; k < N_STATE; ++k) {
-    sum += b->next[k] * SPREAD(0.0);
-    apart |= (lane_mask) b->next[k] ^ (lane_mask) b->mark[k];
+    if (memcmp(&LANE(b->now, k, lane), mark + k, sizeof(double))) return 0;
   }
-  *finite = (lane_mask) (sum == SPREAD(0.0));
-  *repeated = (lane_mask) (apart == (lane_mask) {0});
+  return 1;
 }
 
 /* What comes of a lane's solve after a step; the state is in `now`, the one before in `next`. */
 static int settle(
-    bench *b, queues *all, loop_job *job, int lane, double code, int finite, int repeated) {
+    bench *b, queues *all, loop_job *job, int lane, double code, int finite) {
   const int slot = b->slot[lane];
   const int64_t solve = job->slots[slot], iteration = job->iterations[solve];
+  double *mark = job->mark + slot * N_STATE;
   int32_t status;
   int k;
   /* Written so that a NaN code fails the test too. */
@@ -134,10 +136,12 @@ static int settle(
     status = NON_FINITE;
   } else {
     status = (int32_t) code;
-    if (status == RUNNING && iteration > 1 && repeated) status = REPEATED;
+    if (status == RUNNING && iteration > FIRST_MARK && is_repeated(b, mark, lane)) {
+      status = REPEATED;
+    }
   }
-  if (!(iteration & (iteration - 1))) {
-    for (k = 0; k < N_STATE; ++k) LANE(b->mark, k, lane) = LANE(b->now, k, lane);
+  if (is_marked(iteration)) {
+    for (k = 0; k < N_STATE; ++k) mark[k] = LANE(b->now, k, lane);
   }
   job->status[solve] = status;
   if (status != RUNNING || iteration == job->max_iterations) {
@@ -169,8 +173,7 @@ static void begin(bench *b, queues *all, loop_job *job, lanes *memory) {
   int slot, lane;
   b->now = memory;
   b->next = b->now + N_STATE;
-  b->mark = b->next + N_STATE;
-  b->parameters = b->mark + N_STATE;
+  b->parameters = b->next + N_STATE;
   b->record = b->parameters + N_PARAMETERS;
   b->queue = 0;
   memset(all, 0, sizeof *all);
@@ -181,28 +184,16 @@ static void begin(bench *b, queues *all, loop_job *job, lanes *memory) {
   }
 }
 
-/* Whether this machine can run what LANES_TARGET asks for. */
-EXPORT int casadi_ik_has_lanes(void) {
-#if defined(_WIN32) && !defined(__clang__)
-  return 0; /* gcc does not align vectors on the stack there */
-#elif defined(__x86_64__)
-  __builtin_cpu_init();
-  return __builtin_cpu_supports("avx2") != 0;
-#else
-  return 1;
-#endif
-}
-
 EXPORT LANES_TARGET int casadi_ik_loop_lanes(loop_job *job) {
   workspace space;
   queues all;
   bench b;
   lanes code, *last;
-  lane_mask finite, repeated;
+  lane_mask finite;
   int64_t ticks = 0;
   double limit, since;
   int64_t solves[LANES];
-  int lane, busy, outcome = set_up(&space, 3 * N_STATE + N_PARAMETERS + N_RECORD);
+  int lane, busy, outcome = set_up(&space, 2 * N_STATE + N_PARAMETERS + N_RECORD);
   if (outcome != DONE) return outcome;
   begin(&b, &all, job, space.extra);
   since = monotonic();
@@ -227,7 +218,7 @@ EXPORT LANES_TARGET int casadi_ik_loop_lanes(loop_job *job) {
         outcome = STEP_FAILED;
         break;
       }
-      examine(&b, &finite, &repeated);
+      examine(&b, &finite);
       last = b.now;
       b.now = b.next;
       b.next = last;
@@ -235,7 +226,7 @@ EXPORT LANES_TARGET int casadi_ik_loop_lanes(loop_job *job) {
         if (solves[lane] == NOBODY) continue;
         ++job->iterations[solves[lane]];
         if (job->rows) write_row(&b, job, lane, solves[lane]);
-        changed |= settle(&b, &all, job, lane, code[lane], finite[lane] != 0, repeated[lane] != 0);
+        changed |= settle(&b, &all, job, lane, code[lane], finite[lane] != 0);
       }
     }
     share(solves, busy, job, &since);

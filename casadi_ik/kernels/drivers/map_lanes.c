@@ -1,18 +1,9 @@
-/* map.c for four samples side by side: see there. Where the last turn has less than four, its last
+/* map.c for LANES samples side by side: see there. Where the last turn has less, its last
  * sample is there several times.
  *
  * Expects the macros N_IN, N_OUT, SIZES_IN and SIZES_OUT (doubles of each, as initialisers), TOTAL
  * (their sum).
  */
-
-EXPORT int casadi_ik_has_lanes(void) {
-#if defined(__x86_64__)
-  __builtin_cpu_init();
-  return __builtin_cpu_supports("avx2") != 0;
-#else
-  return 1;
-#endif
-}
 
 EXPORT LANES_TARGET int casadi_ik_map_lanes(map_job *job) {
   static const int sizes_in[] = SIZES_IN, sizes_out[] = SIZES_OUT;

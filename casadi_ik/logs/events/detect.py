@@ -26,12 +26,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.arrays import Bools
 from casadi_ik.logs.events.kinds import EventKind, event_format, mask_words
 from casadi_ik.logs.events.limits import limit_changes
 from casadi_ik.logs.events.rules import EventRules
 from casadi_ik.logs.events.singular import jacobians, near_singular, nearest_singular
 from casadi_ik.logs.events.standstill import oscillations, stalls
-from casadi_ik.logs.events.traces import Bools, Rows, Traces, Words, bits_of, words_of
+from casadi_ik.logs.events.traces import Rows, Traces, Words, bits_of, words_of
 from casadi_ik.problem.trace import ACTIVE_MASK, LIMIT_MASK, PHASE, RESTART, TraceFormat
 
 

@@ -9,8 +9,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.logs.events.kinds import EventKind
-from casadi_ik.logs.events.traces import Bools, Rows, Traces, places_of
+from casadi_ik.logs.events.traces import Rows, Traces, places_of
 from casadi_ik.problem.trace import LIMIT_MASK, Q
 
 
@@ -27,8 +28,8 @@ class LimitChanges:
 
     row: Rows
     bit: Rows
-    value: NDArray[np.float64]
-    limit: NDArray[np.float64]
+    value: Array
+    limit: Array
 
     @classmethod
     def at(cls, traces: Traces, row: Rows, bit: Rows, last: Rows) -> Self:
@@ -98,7 +99,7 @@ def _follow(
     )
 
 
-def _q(traces: Traces, row: Rows, bit: Rows) -> NDArray[np.float64]:
+def _q(traces: Traces, row: Rows, bit: Rows) -> Array:
     """Coordinates (e,); NaN where the trace has none."""
     if Q.name not in traces.names:
         return np.full(len(row), np.nan)

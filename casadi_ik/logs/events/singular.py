@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.logs.events.kinds import EventKind, jacobian_names
 from casadi_ik.logs.events.rules import EventRules
 from casadi_ik.logs.events.traces import Rows, Traces, entries
@@ -59,7 +60,7 @@ def jacobians(form: TraceFormat, rules: EventRules) -> list[Measured]:
 
 def near_singular(
     traces: Traces, jacobian: Measured, rules: EventRules
-) -> Iterator[tuple[EventKind, Rows, NDArray[np.float64], float]]:
+) -> Iterator[tuple[EventKind, Rows, Array, float]]:
     """Where a Jacobian comes to be singular; the entry only.
 
     It may enter again once it was better than its threshold by the factor `EventRules.release`,

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.logs.events.rules import EventRules
-from casadi_ik.logs.events.traces import Bools, Rows, Traces, over_window
+from casadi_ik.logs.events.traces import Rows, Traces, over_window
 from casadi_ik.problem.trace import ANGLE_ERROR, COST, POSITION_ERROR, Q
 
 
-def stalls(traces: Traces, rules: EventRules) -> tuple[Rows, NDArray[np.float64]]:
+def stalls(traces: Traces, rules: EventRules) -> tuple[Rows, Array]:
     """Where the error has stood still over the window; the entry only.
 
     Standing still: over the last `EventRules.stall_window` iterations, none of them in another
@@ -39,7 +40,7 @@ def stalls(traces: Traces, rules: EventRules) -> tuple[Rows, NDArray[np.float64]
     return number[found + window], spread[found].astype(float)
 
 
-def oscillations(traces: Traces, rules: EventRules) -> tuple[Rows, NDArray[np.float64], Bools]:
+def oscillations(traces: Traces, rules: EventRules) -> tuple[Rows, Array, Bools]:
     """Where coordinates go to and fro without progress; the entry only.
 
     To and fro: every step of the coordinate in the last `EventRules.oscillation_window`

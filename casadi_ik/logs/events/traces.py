@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Bools, Rows
 from casadi_ik.problem.trace import PHASE, RESTART, TraceFormat
 
-Bools = NDArray[np.bool_]
-Rows = NDArray[np.intp]
 Words = NDArray[np.uint32]
 
 

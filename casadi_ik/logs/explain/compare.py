@@ -46,8 +46,8 @@ def target_key(
         more: (f, 3) what they have beside; NaN where free.
     """
     free = np.full_like(points, np.nan)
-    besides = [free if more is None else more.get(name, free) for name in NAMES]
-    rounded = np.round(np.concatenate([points, normals, *besides]).astype(float) / SAME)
+    others = [free if more is None else more.get(name, free) for name in NAMES]
+    rounded = np.round(np.concatenate([points, normals, *others]).astype(float) / SAME)
     rounded[np.isnan(rounded)] = np.inf
     return (rounded + 0.0).tobytes()
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.logs.read.one_solve import OneSolve
-
-Array = NDArray[np.float64]
 
 
 def within(solve: OneSolve) -> NDArray[np.bool_]:

@@ -24,6 +24,7 @@ from mcap.records import (
     DataEnd,
     Footer,
     Header,
+    McapRecord,
     Metadata,
     MetadataIndex,
     Schema,
@@ -43,23 +44,9 @@ RECORD_LIMIT = 2**28
 """No record is larger, nor what a chunk unpacks to: 256 MiB. A chunk of ours holds 2 MiB and the
 rest of one solve; a file that announces more is refused before memory is taken for it [bytes]."""
 
-Kind = TypeVar(
-    "Kind",
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
+Kind = TypeVar("Kind", bound=McapRecord)
 
-_OPCODES: dict[type, Opcode] = {
+_OPCODES: dict[type[McapRecord], Opcode] = {
     Attachment: Opcode.ATTACHMENT,
     AttachmentIndex: Opcode.ATTACHMENT_INDEX,
     Channel: Opcode.CHANNEL,

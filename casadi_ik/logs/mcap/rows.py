@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError
 from casadi_ik.logs.mcap import unpacking
-from casadi_ik.logs.mcap.message import CDR_NUMBER, HEAD
+from casadi_ik.logs.mcap.message_bytes import CDR_NUMBER, HEAD
 
 TimeFilter = Callable[[np.ndarray], NDArray[np.bool_]]
 """Which of log times (k,) are wanted."""

@@ -20,7 +20,7 @@ from mcap.records import ChunkIndex
 
 from casadi_ik.errors import LogError
 from casadi_ik.logs.mcap.chunk import Run
-from casadi_ik.logs.mcap.message import PREFIX
+from casadi_ik.logs.mcap.message_bytes import PREFIX
 from casadi_ik.logs.mcap.records import HEAD, Record, check_size, record_at
 
 _CHUNK_HEAD = struct.Struct("<QQQII")

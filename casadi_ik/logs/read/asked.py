@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError
 from casadi_ik.logs.events.traces import bits_of
-from casadi_ik.logs.read.table import Part, element_name
+from casadi_ik.logs.read.table import MethodRows, element_name
 from casadi_ik.problem.preference import NO_PREFERENCE
 from casadi_ik.problem.problems import Tolerance
 
@@ -41,12 +41,12 @@ class Asked:
     tolerances: tuple[Tolerance, ...]
     limits: str = "enforce"
     seed: int = 0
-    start: NDArray[np.float64] | None = None
+    start: Array | None = None
     fixed: Mapping[str, float] = field(default_factory=dict)
     prefer: str | None = None
 
 
-def asked_of(part: Part, metadata: Mapping[str, Any]) -> Asked:
+def asked_of(part: MethodRows, metadata: Mapping[str, Any]) -> Asked:
     """What the only solve of a part was asked.
 
     Args:

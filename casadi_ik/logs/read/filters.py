@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.logs.events.kinds import EventKind
-from casadi_ik.logs.read.table import Part
+from casadi_ik.logs.read.table import MethodRows
 
 Names = str | EventKind | Iterable[str | EventKind] | None
 Solves = int | Iterable[int] | None
@@ -23,7 +23,7 @@ def numbers(solve: Solves) -> NDArray[np.int64] | None:
     return np.unique(np.array(numbers, dtype=np.int64))
 
 
-def codes(part: Part, field: str, values: Names) -> list[int]:
+def codes(part: MethodRows, field: str, values: Names) -> list[int]:
     """The codes of names; of those the method does not know none."""
     labels = part.labels.get(field, ())
     return [labels.index(name) for name in names(values) if name in labels]
@@ -35,7 +35,7 @@ def names(values: Names) -> list[str]:
     return [value.name if isinstance(value, EventKind) else value for value in several]
 
 
-def chosen(part: Part, keep: NDArray[np.bool_]) -> Part:
+def chosen(part: MethodRows, keep: NDArray[np.bool_]) -> MethodRows:
     """Some of the rows (k,) of a part."""
     if keep.all():
         return part

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError
-from casadi_ik.logs.read.table import Part
+from casadi_ik.logs.read.table import MethodRows
 
 _ROOM = 2**24
 """More than the iterations that a solve can have: makes solve and iteration one number."""
 
 
-def raised(part: Part, offset: int) -> Part:
+def raised(part: MethodRows, offset: int) -> MethodRows:
     """The rows of a part, the numbers of the solves raised."""
     rows = part.rows.copy()
     if "solve_id" in (rows.dtype.names or ()):
@@ -26,10 +26,10 @@ def raised(part: Part, offset: int) -> Part:
 def joined(
     where: str,
     kind: str,
-    parts: Sequence[Part],
+    parts: Sequence[MethodRows],
     shard: NDArray[np.int64],
     shards: tuple[str, ...],
-) -> Part:
+) -> MethodRows:
     """Parts of one method as one, by solve and iteration.
 
     Args:

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Counts
 from casadi_ik.errors import LogError, UnknownNameError, printable
 from casadi_ik.logs.read import filters
 from casadi_ik.logs.read.files import Paths, open_shards
 from casadi_ik.logs.read.filters import Names, Solves
 from casadi_ik.logs.read.info import LogInfo
-from casadi_ik.logs.read.joining import joined, raised
+from casadi_ik.logs.read.joined_shards import JoinedShards
 from casadi_ik.logs.read.shard import Shard
-from casadi_ik.logs.read.sources import Sources, offsets_of, overlapping, sources_of
-from casadi_ik.logs.read.table import Part, Table
+from casadi_ik.logs.read.sources import Sources
+from casadi_ik.logs.read.table import MethodRows, Table
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +68,7 @@ class Log:
         self.methods = tuple(dict.fromkeys(m for shard in shards for m in shard.methods))
         self.metadata = first.metadata
         self.left_out = tuple(left_out)
-        self._own: dict[tuple[int, str], Part] = {}
+        self._joined = JoinedShards(self.shards)
         for shard in shards:
             if not shard.contents.complete:
                 lost = shard.contents.size - shard.contents.readable
@@ -104,7 +102,7 @@ class Log:
             attachments={item.name: item.data_size for item in contents[0].attachments},
             unfinished=tuple(each.path for each in contents if not each.complete),
             left_out=self.left_out,
-            differs=self._differs(),
+            differs=self.sources.differences(),
         )
 
     def attachment(self, name: str) -> bytes:
@@ -132,7 +130,7 @@ class Log:
             LogError: The log is damaged, or a solve is in it twice.
         """
         wanted = filters.numbers(solve)
-        parts = [self._solves(name) for name in self._methods(method)]
+        parts = [self._joined.solves(name) for name in self._methods(method)]
         self._known("status", status, parts, "status")
         self._known("event", event, parts, "events")
         self._known("phase", phase, parts, "phase_iterations")
@@ -202,7 +200,7 @@ class Log:
         phase: Names,
         fields: Sequence[str] | None,
     ) -> Table:
-        numbers: dict[str, NDArray[np.int64] | None] = {}
+        numbers: dict[str, Counts | None] = {}
         if status is None and event is None and phase is None:
             chosen = filters.numbers(solve)
             numbers = dict.fromkeys(self._methods(method), chosen)
@@ -214,7 +212,7 @@ class Log:
             asked = fields
             if fields is not None and phase is not None:
                 asked = [*fields, *(["phase"] if "phase" not in fields else [])]
-            part = self._joined(name, kind, wanted, asked)
+            part = self._joined.read(name, kind, wanted, asked)
             keep = np.ones(len(part), dtype=bool)
             if phase is not None and "phase" in (part.rows.dtype.names or ()):
                 keep &= np.isin(part.rows["phase"], filters.codes(part, "phase", phase))
@@ -223,73 +221,14 @@ class Log:
             parts.append(filters.chosen(part, keep))
         return Table(kind, tuple(parts))
 
-    @cached_property
-    def _read(self) -> dict[str, Part]:
-        return {}
-
-    def _solves(self, method: str) -> Part:
-        """All solves of a method; they are read once."""
-        if method not in self._read:
-            self._read[method] = self._joined(method, "solve", None, None)
-        return self._read[method]
-
-    def _joined(
-        self,
-        method: str,
-        kind: str,
-        wanted: NDArray[np.int64] | None,
-        fields: Sequence[str] | None,
-    ) -> Part:
-        """The rows of all shards as one."""
-        holders = [i for i, shard in enumerate(self.shards) if method in shard.methods]
-        sources, parts, origin = self.sources, [], []
-        for i in holders:
-            offset = sources.offsets[i]
-            own = None if wanted is None else wanted[wanted >= offset] - offset
-            part = self._own.pop((i, method), None) if kind == "solve" and own is None else None
-            part = part or self.shards[i].read(method, kind, own, fields)
-            first = parts[0] if parts else part
-            if part.rows.dtype != first.rows.dtype or part.labels != first.labels:
-                raise LogError(
-                    f"{self.shards[i].path}: method {method!r} has other fields or names than in "
-                    f"{self.shards[holders[0]].path}"
-                )
-            if offset:
-                part = raised(part, offset)
-            parts.append(part)
-            origin.append(sources.of(i, method, part.solve_id))
-        where = str(self.shards[holders[0]].path)
-        return joined(where, kind, parts, np.concatenate(origin), sources.names)
-
-    @cached_property
+    @property
     def sources(self) -> Sources:
         """Where the solves come from, and how they are numbered.
 
         Raises:
             LogError: A solve is in two files, or what a merged log says of its shards is wrong.
         """
-        offsets = [0] * len(self.shards)
-        if overlapping(self.shards):
-            self._own = {
-                (i, method): shard.read(method, "solve")
-                for i, shard in enumerate(self.shards)
-                for method in shard.methods
-            }
-            offsets = offsets_of(self.shards, self._own)
-        return sources_of(self.shards, offsets)
-
-    def _differs(self) -> dict[str, tuple[Any, ...]]:
-        """Entries of the metadata in which sources differ."""
-        all_of = [source.metadata for source in self.sources.sources]
-        found: dict[str, tuple[Any, ...]] = {}
-        for key in dict.fromkeys(key for each in all_of for key in each):
-            values: list[Any] = []
-            for each in all_of:
-                if each.get(key) not in values:
-                    values.append(each.get(key))
-            if len(values) > 1:
-                found[key] = tuple(values)
-        return found
+        return self._joined.sources
 
     def _methods(self, method: Names) -> tuple[str, ...]:
         if method is None:
@@ -303,7 +242,7 @@ class Log:
                 )
         return names
 
-    def _known(self, what: str, values: Names, parts: Sequence[Part], field: str) -> None:
+    def _known(self, what: str, values: Names, parts: Sequence[MethodRows], field: str) -> None:
         """See to it that at least one method knows the names.
 
         Raises:

@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.events.kinds import SINGULAR
 from casadi_ik.logs.events.traces import bits_of
 from casadi_ik.logs.read.asked import Asked, asked_of
 from casadi_ik.logs.read.log import Log
-from casadi_ik.logs.read.table import Part, Table, label_of
+from casadi_ik.logs.read.table import MethodRows, Table, label_of
 from casadi_ik.problem.contacts.arrays import NAMES
 from casadi_ik.problem.problems import Tolerance
-
-Array = NDArray[np.float64]
 
 SINGULAR_KINDS = tuple(kind.name for kind in SINGULAR)
 
@@ -242,7 +241,7 @@ def _range(numbers: NDArray[np.int64]) -> str:
     return f"solve {first}" if first == last else f"solves {first} to {last}"
 
 
-def _layout(part: Part) -> Layout:
+def _layout(part: MethodRows) -> Layout:
     """The layout of the rows, which must be numbers only."""
     described = part.rows.dtype
     return Layout(

@@ -20,7 +20,7 @@ from casadi_ik.logs.mcap.data_section import NothingWrittenError
 from casadi_ik.logs.mcap.metadata import clock_of, own_record, values_of
 from casadi_ik.logs.mcap.schema import KINDS, topic
 from casadi_ik.logs.read.fields import NAME_LIMIT, Labels, described
-from casadi_ik.logs.read.table import Part
+from casadi_ik.logs.read.table import MethodRows
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class Shard:
         kind: str,
         solves: NDArray[np.int64] | None = None,
         fields: Sequence[str] | None = None,
-    ) -> Part:
+    ) -> MethodRows:
         """Rows in the order of the file.
 
         Args:
@@ -131,7 +131,7 @@ class Shard:
             if "solve_id" in (rows.dtype.names or ()) and np.any(rows["solve_id"] != solve_id):
                 raise LogError(f"{topic(method, kind)!r}: a solve's number is not that of its time")
         units = {item.name: item.unit for item in found.layout}
-        return Part(method, rows, solve_id, iteration, found.labels, units)
+        return MethodRows(method, rows, solve_id, iteration, found.labels, units)
 
     def _described(self) -> dict[tuple[str, str], Topic]:
         """The topics by method and kind.

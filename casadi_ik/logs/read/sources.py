@@ -15,15 +15,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Counts
 from casadi_ik.errors import LogError
 from casadi_ik.kernels.rows import opaque
 from casadi_ik.logs.mcap.metadata import SHARDS, parsed_json, values_of
 from casadi_ik.logs.read.shard import Shard, naming
-from casadi_ik.logs.read.table import Part
-
-Numbers = NDArray[np.int64]
+from casadi_ik.logs.read.table import MethodRows
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +38,7 @@ class Source:
     name: str
     first: int
     metadata: Mapping[str, Any]
-    ranges: Mapping[str, Numbers] | None = None
+    ranges: Mapping[str, Counts] | None = None
 
 
 class _Merged(msgspec.Struct):
@@ -71,7 +69,19 @@ class Sources:
         """What each is called."""
         return tuple(source.name for source in self.sources)
 
-    def of(self, shard: int, method: str, numbers: Numbers) -> Numbers:
+    def differences(self) -> dict[str, tuple[Any, ...]]:
+        """Entries of the metadata in which they differ, and all that is said there."""
+        found: dict[str, tuple[Any, ...]] = {}
+        for key in dict.fromkeys(key for each in self.sources for key in each.metadata):
+            values: list[Any] = []
+            for each in self.sources:
+                if each.metadata.get(key) not in values:
+                    values.append(each.metadata.get(key))
+            if len(values) > 1:
+                found[key] = tuple(values)
+        return found
+
+    def of(self, shard: int, method: str, numbers: Counts) -> Counts:
         """Which source the solves (k,) of a file come from, by their numbers here."""
         first = self.first[shard]
         last = self.first[shard + 1] if shard + 1 < len(self.first) else len(self.sources)
@@ -121,7 +131,7 @@ def _merged(text: str) -> list[_Merged]:
     return found
 
 
-def offsets_of(shards: Sequence[Shard], solves: Mapping[tuple[int, str], Part]) -> list[int]:
+def offsets_of(shards: Sequence[Shard], solves: Mapping[tuple[int, str], MethodRows]) -> list[int]:
     """What the numbers of each shard's solves are raised by: see above.
 
     Args:
@@ -149,7 +159,7 @@ def offsets_of(shards: Sequence[Shard], solves: Mapping[tuple[int, str], Part]) 
     return offsets
 
 
-def _refuse_same(method: str, parts: Sequence[tuple[Shard, Part]]) -> None:
+def _refuse_same(method: str, parts: Sequence[tuple[Shard, MethodRows]]) -> None:
     """See to it that no solve is in two shards, whatever its number.
 
     Raises:
@@ -183,7 +193,7 @@ def overlapping(shards: Sequence[Shard]) -> bool:
     return any(after[0] <= before[1] for before, after in pairwise(spans))
 
 
-def ranges_of(numbers: Numbers) -> list[list[int]]:
+def ranges_of(numbers: Counts) -> list[list[int]]:
     """Sorted numbers as first and last of every run."""
     ends = np.flatnonzero(np.diff(numbers) != 1)
     firsts = numbers[np.concatenate([[0], ends + 1]).astype(int)] if len(numbers) else numbers

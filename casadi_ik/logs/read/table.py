@@ -25,7 +25,7 @@ _AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class MethodRows:
     """Rows of one method.
 
     Attributes:
@@ -71,13 +71,13 @@ class Table:
     """
 
     kind: str
-    parts: tuple[Part, ...]
+    parts: tuple[MethodRows, ...]
 
     def __len__(self) -> int:
         return sum(map(len, self.parts))
 
     @property
-    def part(self) -> Part:
+    def part(self) -> MethodRows:
         """The rows of the only method.
 
         Raises:
@@ -177,7 +177,7 @@ class Table:
         return ("solve_id",) if self.kind == "solve" else ("solve_id", "iteration")
 
 
-def _series(pl: Any, part: Part, keys: Sequence[str]) -> dict[str, Any]:
+def _series(pl: Any, part: MethodRows, keys: Sequence[str]) -> dict[str, Any]:
     """The columns of a part by name."""
     columns: dict[str, Any] = {"method": pl.repeat(part.method, len(part), eager=True)}
     columns |= {name: getattr(part, name).astype(np.uint32) for name in keys}
@@ -209,7 +209,7 @@ def _element_names(shape: tuple[int, ...], labels: Sequence[str]) -> list[str]:
     return names
 
 
-def _readable(part: Part, name: str) -> list[Any]:
+def _readable(part: MethodRows, name: str) -> list[Any]:
     """A field as a person would have it: names for codes and bits."""
     values, labels = part.rows[name], part.labels.get(name, ())
     if name.endswith("_mask") and values.dtype.kind == "u":
@@ -237,7 +237,7 @@ def _code_of(labels: Sequence[str], value: float) -> str:
     return label_of(labels, int(value)) if np.isfinite(value) else str(value)
 
 
-def _subjects(part: Part) -> list[str]:
+def _subjects(part: MethodRows) -> list[str]:
     """What each event is about: the Jacobian, the joints, the phases."""
     kinds = _readable(part, "kind")
     joints = [", ".join(names) for names in _readable(part, "joint_mask")]

@@ -11,7 +11,7 @@ from mcap.records import Channel, ChunkIndex, Schema
 
 from casadi_ik.errors import LogError
 from casadi_ik.logs.mcap.chunk import COMPRESSORS, Run, chunk_bytes
-from casadi_ik.logs.mcap.message import HEAD, PREFIX
+from casadi_ik.logs.mcap.message_bytes import HEAD, PREFIX
 from casadi_ik.logs.mcap.schema import KINDS
 from casadi_ik.logs.mcap.unpacking import Unpacked, read_chunk
 from casadi_ik.logs.read.shard import Shard

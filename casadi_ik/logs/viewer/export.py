@@ -25,16 +25,16 @@ import numpy as np
 from mcap.writer import Writer
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs.explain.phrases import SERIOUS, errors, told
 from casadi_ik.logs.mcap import schema
-from casadi_ik.logs.mcap.message import CDR_HEADER
+from casadi_ik.logs.mcap.message_bytes import CDR_HEADER
 from casadi_ik.logs.read.one_solve import OneSolve
-from casadi_ik.logs.viewer.messages import (
+from casadi_ik.logs.viewer.viewer_messages import (
     JOINT_STATE,
     STRING,
-    Array,
     Color,
     Schema,
     along,

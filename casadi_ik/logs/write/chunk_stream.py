@@ -11,9 +11,9 @@ from mcap.records import Channel, Schema
 from casadi_ik.errors import LogError
 from casadi_ik.logs.mcap.chunk import Run, chunk_bytes, definitions
 from casadi_ik.logs.mcap.file import McapFile
-from casadi_ik.logs.mcap.message import fill
+from casadi_ik.logs.mcap.message_bytes import fill
 from casadi_ik.logs.mcap.summary import Summary
-from casadi_ik.logs.write.messages import Messages
+from casadi_ik.logs.write.topic_messages import Messages
 
 CHUNK_SIZE = 2**21
 """A chunk is closed at the end of the first solve with which it is no smaller [bytes]."""

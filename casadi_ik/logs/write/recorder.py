@@ -33,9 +33,9 @@ from casadi_ik.logs.mcap.summary import Summary
 from casadi_ik.logs.write.chunk_stream import ChunkStream
 from casadi_ik.logs.write.keep import Keep
 from casadi_ik.logs.write.measured import measured_format, measured_rows
-from casadi_ik.logs.write.messages import block_messages
 from casadi_ik.logs.write.provenance import log_metadata
 from casadi_ik.logs.write.solve_rows import solve_format, solve_rows
+from casadi_ik.logs.write.topic_messages import block_messages
 from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.trace import TraceFormat
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.rows import opaque
 from casadi_ik.logs.events.kinds import EventKind, jacobian_names
 from casadi_ik.logs.events.traces import as_matrix, words_of
 from casadi_ik.problem.contacts.arrays import NAMES
@@ -83,23 +84,21 @@ def solve_rows(block: SolveBlock, events: NDArray[np.int64], layout: Layout) -> 
         layout: Of `solve_format`.
     """
     batch, problems = block.batch, block.problems
-    rows = np.zeros(len(block), layout.dtype)
+    rows = _alike(block, layout)
     rows["started"] = block.started * 1e-9
     rows["solve_id"] = block.first + np.arange(len(block))
     rows["status"] = batch.status % len(STATUSES)
     rows["phase_iterations"] = np.stack(list(batch.phases.values()), axis=1)
     rows["events"] = events
     rows["target_points"], rows["target_normals"] = problems.points, problems.normals
-    for name in NAMES:
-        rows[f"target_{name}"] = problems.vectors(name)
-    rows["start"], rows["seed"] = block.starts, block.seed
+    for name, vectors in problems.more.items():
+        rows[f"target_{name}"] = vectors
+    rows["start"] = block.starts
     if problems.fixed is not None:
         held = ~np.isnan(problems.fixed)
         rows["start"] = np.where(held, problems.fixed, block.starts)
         padded = np.pad(held, (0, -len(held) % 32))
         rows["fixed_mask"] = words_of(padded[None]).reshape(rows["fixed_mask"].shape[1:])
-    rows["limits_enforced"] = problems.enforce_limits
-    rows["prefer"] = (NO_PREFERENCE, *PREFERENCES).index(problems.prefer)
     for name in ("position_tolerance", "angle_tolerance"):
         rows[name] = getattr(problems, name)
     for name in (
@@ -109,6 +108,19 @@ def solve_rows(block: SolveBlock, events: NDArray[np.int64], layout: Layout) -> 
         rows[name] = getattr(batch, name)
     if "lowest_sigma" in layout.names:
         rows["lowest_sigma"] = _lowest(block)
+    return rows
+
+
+def _alike(block: SolveBlock, layout: Layout) -> NDArray[Any]:
+    """Rows (k,) with what all solves of a block have in common; numpy copies whole rows at once."""
+    one = np.zeros(1, layout.dtype)
+    for name in NAMES:
+        one[f"target_{name}"] = np.nan
+    one["seed"] = block.seed
+    one["limits_enforced"] = block.problems.enforce_limits
+    one["prefer"] = (NO_PREFERENCE, *PREFERENCES).index(block.problems.prefer)
+    rows = np.empty(len(block), layout.dtype)
+    rows.view(opaque(one).dtype)[:] = opaque(one)
     return rows
 
 

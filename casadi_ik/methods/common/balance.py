@@ -19,7 +19,7 @@ import casadi as ca
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
 from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.contacts.rows import ContactRows, chord
+from casadi_ik.problem.contacts.rows import ContactRows, chord, within_tolerance
 from casadi_ik.symbolic.smooth import Expr
 
 POWERS = (4.0, 10.0, 24.0, 60.0, 150.0, 400.0)
@@ -33,6 +33,13 @@ SAME = 1e-2
 
 STEADY = 0.95
 """A step that leaves more than this part of the sum ends a power."""
+
+HOPELESS = 1.05
+"""Were all parts at most so large, the sum would be at most their number times this to the power:
+one that is steady above that says that the contacts cannot be met near here."""
+
+CLOSER = 0.99
+"""A balance that leaves no less than this part of the least that others left is one of them."""
 
 BUDGET = 60
 """Steps in all."""
@@ -65,6 +72,7 @@ class Balanced:
         accepted: Whether it gained.
         within: Whether every contact is met at q.
         over: Whether nothing more is to be hoped for.
+        largest: Largest part at q.
         fit: Damping, power and steps spent, for the state.
     """
 
@@ -73,13 +81,15 @@ class Balanced:
     accepted: Expr
     within: Expr
     over: Expr
+    largest: Expr
     fit: dict[str, Expr]
 
 
-def worth_balancing(residual: Expr, rows: ContactRows, p: dict[str, Expr]) -> Expr:
-    """Whether the contacts of a residual are missed, but by little."""
-    largest = ca.mmax(_lengths(_scaled(residual, rows, p), rows))
-    return ca.logic_and(largest > 1, largest < NEAR)
+def near_tolerance(residual: Expr, rows: ContactRows, p: dict[str, Expr]) -> Expr:
+    """Whether the contacts of a residual are met, or missed by little."""
+    positions, chords = rows.errors(residual)
+    tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
+    return within_tolerance(positions / NEAR, chords / NEAR, *tolerances)
 
 
 def differs(cost: Expr, before: Expr) -> Expr:
@@ -139,6 +149,9 @@ def balance_step(
     done = s["power"] + steady
     spent = s["spent"] + 1
     over = ca.logic_or(done >= len(POWERS), spent >= BUDGET)
+    powers = ca.if_else(accepted, total_there, total) * largest ** (power - 2)
+    hopeless = powers > len(contacts.slices) * HOPELESS**power
+    over = ca.logic_or(over, ca.logic_and(steady, hopeless))
     eased = ca.if_else(accepted, EASED, TIGHTENED)
     fit = {
         "damping": ca.fmax(s["damping"] * eased, DAMPING_FLOOR),
@@ -152,6 +165,7 @@ def balance_step(
         accepted=accepted,
         within=ca.mmax(left) <= 1,
         over=over,
+        largest=ca.mmax(left),
         fit=fit,
     )
 

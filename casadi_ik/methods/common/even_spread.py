@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array
 
 
-def evenly(count: int, dimensions: int) -> NDArray[np.float64]:
+def evenly(count: int, dimensions: int) -> Array:
     """(count, dimensions) points of an additive recurrence, evenly spread over the unit cube.
 
     Roberts' generalised golden ratio: the root of x^(d+1) = x + 1 gives the increments.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.arrays import Array
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.trace import WORD
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array, Counts
 from casadi_ik.errors import RowError, UnsupportedError
 from casadi_ik.kernels import LoopKernel, StepGraph
 from casadi_ik.kernels.rows import opaque
@@ -19,13 +20,10 @@ from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Method, Outcome
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat, trace_format
 from casadi_ik.robots.description import RobotDescription
-
-Counts = NDArray[np.int64]
-"""(k,) numbers of something, one per solve."""
 
 Start = tuple[Array, Array]
 """First states (k, ns) and parameters (k, np) of a step graph."""
@@ -97,6 +95,16 @@ class LoopedMethod(ABC):
             last: (k, ns) states in which the round before ended; None in the first.
         """
 
+    def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
+        """(k,) whether failed solves take part in a round after the first.
+
+        Args:
+            states: (k, ns) in which they ended.
+            number: Of the round.
+        """
+        del number
+        return np.ones(len(states), dtype=bool)
+
     @abstractmethod
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """Iterations by phase.
@@ -159,8 +167,10 @@ class LoopedMethod(ABC):
         rounds = iter(range(1, self.rounds))
 
         def next_round(status: int, state: Array) -> Start | None:
-            number = next(rounds, None)
-            if status == Status.SOLVED or number is None:
+            if status == Status.SOLVED:
+                return None
+            number = next((n for n in rounds if self.hopeful(state[None], n)[0]), None)
+            if number is None:
                 return None
             states, parameters = self.begin(problems, q0[None], number, state[None])
             return states[0], parameters[0]
@@ -177,10 +187,15 @@ class LoopedMethod(ABC):
         records = _Records()
         states = np.empty((count, self.graph.state.size))
         status = np.empty(count, dtype=np.int64)
-        left, here, last = np.arange(count), q0, None
+        left, some, here, last = np.arange(count), problems, q0, None
         for number in range(self.rounds):
+            if number:
+                left = np.flatnonzero(status != Status.SOLVED)
+                left = left[self.hopeful(states[left], number)]
+                if not len(left):
+                    continue
+                some, here, last = problems.rows(left), q0[left], states[left]
             begun = time.perf_counter()
-            some = problems if last is None else problems.rows(left)
             first, parameters = self.begin(some, here, number, last)
             result = self.kernel.run(first, parameters, self.max_iterations, trace)
             ended = Status.from_loop(result.status)
@@ -194,10 +209,6 @@ class LoopedMethod(ABC):
             seconds[left] += result.time + max(outside, 0.0) / max(len(left), 1)
             if result.rows is not None:
                 records.add(left, result.iterations, result.rows)
-            missed = np.flatnonzero(ended != Status.SOLVED)
-            if not len(missed):
-                break
-            left, here, last = left[missed], here[missed], result.states[missed]
         counts = self.phase_counts(states, iterations)
         return Outcome(
             # A copy: the states are much larger and need not stay.

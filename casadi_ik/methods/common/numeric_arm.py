@@ -25,6 +25,13 @@ TABLE = 1024
 STARTS = 22
 """Of these, how many are tried for a palm pose; all rounds of a solve together try them all."""
 
+GAP = 1.0
+"""A joint that can turn all around but for so much [rad] may rest at the wrong end of its range:
+what is beyond one end is nearly what is beyond the other."""
+
+AT_END = 1e-6
+"""How near to a limit [rad] counts as at it."""
+
 FAR = 1e30
 """Farther than any palm."""
 
@@ -65,6 +72,33 @@ def _next_nearest(distances: Expr, passed: Expr) -> tuple[Expr, Expr]:
     masked = ca.if_else(ca.logic_or(beyond, ca.repmat(over, TABLE, 1)), distances, FAR)
     nearest = ca.mmin(masked)
     return ca.find(masked <= nearest), nearest
+
+
+def other_side(robot: RobotDescription, arm: Expr, turned: Expr, p: dict[str, Expr]) -> Expr:
+    """The next joint at an end of its range sent to the other end.
+
+    Args:
+        robot: The description.
+        arm: (a, 1) where the arm came to rest.
+        turned: How many joints were seen to.
+        p: Parameters.
+
+    Returns:
+        (a + 1, 1): the arm, and how many joints are seen to now; 0 if none is left.
+    """
+    columns = list(robot.arm_actuators)
+    lower, upper = p["lower"][columns], p["upper"][columns]
+    found, sent = ca.SX(0), list(ca.vertsplit(arm))
+    for i, column in enumerate(columns):
+        if robot.actuators[column].unit != "rad":
+            continue
+        gap = 2 * np.pi - (upper[i] - lower[i])
+        ends = ca.logic_or(arm[i] - lower[i] <= AT_END, upper[i] - arm[i] <= AT_END)
+        due = ca.logic_and(ca.logic_and(ends, ca.fabs(gap) < GAP), turned <= i)
+        due = ca.logic_and(due, found <= 0)
+        sent[i] = ca.if_else(due, lower[i] + upper[i] - arm[i], arm[i])
+        found = ca.if_else(due, i + 1, found)
+    return ca.vertcat(*sent, found)
 
 
 def pose_step(

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.kernels import LookupKernel
 from casadi_ik.methods.common.contact_shape import contact_shape
 from casadi_ik.methods.common.even_spread import evenly
-from casadi_ik.problem.problems import Array
 
 CHUNK = 256
 """Targets whose postures are compared with each other at once."""
@@ -113,15 +113,18 @@ class PostureTable:
     def _chosen(self, rows: NDArray[np.int64], count: int, similar: float) -> Array:
         """Of rows (k, pool) in order of nearness those that differ, (k, count, hand)."""
         places = self.postures[rows] / np.where(self._ranges > 0, self._ranges, 1.0)
+        squares = (places * places).sum(axis=2)
+        products = places @ places.transpose(0, 2, 1)
+        alike = similar * similar * places.shape[2]
         every = np.arange(len(rows))
         closest = np.full(rows.shape, np.inf)
         taken = np.zeros(rows.shape, dtype=bool)
         chosen = np.empty((len(rows), count), dtype=np.intp)
         for place in range(count):
             # The first that differs; where none is left, the first that is not taken.
-            rank = taken * 2 + (closest < similar)
+            rank = taken * 2 + (closest < alike)
             chosen[:, place] = pick = rank.argmin(axis=1)
             taken[every, pick] = True
-            apart = places - places[every, pick][:, None]
-            np.minimum(closest, np.sqrt(np.mean(apart * apart, axis=2)), out=closest)
+            apart = squares + squares[every, pick][:, None] - 2 * products[every, pick]
+            np.minimum(closest, apart, out=closest)
         return self.postures[rows[every[:, None], chosen]]

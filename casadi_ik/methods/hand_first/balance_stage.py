@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from casadi_ik.methods.common.balance import Balanced, balance_step
+from casadi_ik.methods.common.balance import CLOSER, Balanced, balance_step
 from casadi_ik.methods.common.bounded_step import Bounded
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
@@ -33,6 +33,8 @@ def balance_stage(layouts: HandFirstLayouts) -> ca.Function:
             "q": balanced.q,
             "phase": ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.BALANCE)),
             "candidate": s["candidate"] + failed,
+            "returns": s["returns"] + ca.logic_and(failed, balanced.largest > CLOSER * s["least"]),
+            "least": ca.if_else(failed, ca.fmin(balanced.largest, s["least"]), s["least"]),
         }
         | fit
     )

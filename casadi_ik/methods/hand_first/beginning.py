@@ -53,7 +53,7 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
             **{f"{vector}s": (f, 3) for vector in layouts.contacts.data},
             "here": (n, 1),
             "terms": (terms(robot).size, 1),
-            "postures": (layouts.candidates, len(layouts.hand)),
+            "postures": (layouts.candidates, len(layouts.robot.hand_actuators)),
         },
         ((layouts.state.size, 1), (layouts.parameters.size, 1)),
         recipe(name, robot, layouts.candidates, layouts.kinds),
@@ -61,7 +61,7 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
 
 
 def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
-    robot, hand = layouts.robot, list(layouts.hand)
+    robot, hand = layouts.robot, list(layouts.robot.hand_actuators)
     f, n = len(robot.fingers), len(robot.actuators)
     vectors = {f"{vector}s": ca.SX.sym(f"{vector}s", f, 3) for vector in layouts.contacts.data}
     here = ca.SX.sym("q", n)
@@ -98,6 +98,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "q": start,
             "best_q": here,
             "best_cost": sys.float_info.max,
+            "least": sys.float_info.max,
             "phase": ca.if_else(t["nearest"], float(Phase.REFINEMENT), float(Phase.CANDIDATE)),
             "candidate": -t["nearest"],
         }

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel, LoopKernel
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.state import STAGE_LABELS, HandFirstLayouts
 from casadi_ik.problem.method import Quick
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Status
 
 
@@ -38,11 +39,11 @@ class FirstRound:
         """
         self._order = order
         self._postures = table.postures
-        self._lookup = table.lookup.single(layouts.candidates)
         self._solve = loop.single()
         self._state = self._solve.result.states[0]
         self._more = [f"{name}s" for name in layouts.contacts.data[2:]]
         self._begin = beginning.single(outputs=[self._state, self._solve.parameters])
+        self._lookup = table.lookup.single(layouts.candidates, self._begin.inputs[:2])
         fields = ("q", "candidate", "counts")
         self._q, self._candidate, self._counts = (
             self._state[layouts.state.slice(name)] for name in fields
@@ -60,6 +61,7 @@ class FirstRound:
             max_iterations: Of the loop.
         """
         points, normals, *more, here, common, postures = self._begin.inputs
+        postures = postures.reshape(-1, self._postures.shape[1])  # a view
         points[...], normals[...], here[...], common[...] = (
             problems.points[0],
             problems.normals[0],
@@ -68,10 +70,8 @@ class FirstRound:
         )
         for vectors, name in zip(more, self._more, strict=True):
             vectors[...] = problems.vectors(name)[0]
-        known = self._lookup.inputs
-        known[0][...], known[1][...] = points, normals
         self._lookup()
-        self._postures.take(self._lookup.found[0], axis=0, out=postures, mode="clip")
+        postures[...] = self._postures[self._lookup.found[0]]
         if problems.prefer == "q0":
             postures[...] = self._order(problems, q0[None], postures[None], True)[0]
         self._begin()

@@ -132,11 +132,11 @@ def _rows(
     layouts: HandFirstLayouts, arm: SrsArm | None, x: PalmAndHand, p: dict[str, Expr]
 ) -> tuple[Expr, Expr]:
     """Residual and Jacobian of contacts and reach."""
-    contacts = hand_contacts(layouts.robot, x.hand, layouts.hand)
+    contacts = hand_contacts(layouts.robot, x.hand, layouts.robot.hand_actuators)
     asked = contacts, layouts.contacts, x, p
     residual, jacobian = fit_residual(*asked), fit_jacobian(*asked)
     if arm is None:
         return residual, jacobian
     beyond, slope = reach_row(arm, layouts.robot.arm_actuators, x, p)
-    slope = ca.horzcat(slope, ca.SX(1, len(layouts.hand)))
+    slope = ca.horzcat(slope, ca.SX(1, len(layouts.robot.hand_actuators)))
     return ca.vertcat(residual, beyond), ca.vertcat(jacobian, slope)

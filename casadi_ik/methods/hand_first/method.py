@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array, Counts
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
-from casadi_ik.methods.common.looped_method import Counts, LoopedMethod, Start
+from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
@@ -21,7 +24,7 @@ from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Quick
 from casadi_ik.problem.preference import PREFERENCES
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
@@ -36,9 +39,22 @@ NEAREST = "q0"
 TINY = 1e-9
 """Smallest range [rad or m] a motion is measured by."""
 
-CARRIED = ("passed", "near", "balanced", "best_cost", "best_q", "counts")
+CARRIED = (
+    *("passed", "near", "balanced", "least", "returns"),
+    *("best_cost", "best_q", "counts"),
+)
 """What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
 were balanced in vain, and what was found."""
+
+
+RETURNS = 8
+"""When so many fits and balances have ended where one had before, no table holds another kind."""
+
+SURE = 1e-8
+"""Cost (0.01 mm, 0.1 mrad) above which this is a minimum, and not a long flat valley."""
+
+VARIED = 2
+"""Rounds of tables in any case: the second takes hands that differ from each other."""
 
 
 class HandFirstMethod(LoopedMethod):
@@ -71,6 +87,7 @@ class HandFirstMethod(LoopedMethod):
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(robot, _closed_form(robot), options.candidates, self._kinds)
         self._singles: list[FirstRound] = []
+        self._kept: tuple[Any, Array] | None = None
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""
@@ -79,7 +96,7 @@ class HandFirstMethod(LoopedMethod):
     @cached_property
     def hands(self) -> Restarts:
         """The hand postures that rounds begin from."""
-        return Restarts(self.robot, self.step.layouts.hand, self.options, self._compiled)
+        return Restarts(self.robot, self.robot.hand_actuators, self.options, self._compiled)
 
     def for_kinds(self, kinds: Kinds) -> HandFirstMethod:
         """The same for contacts of other kinds."""
@@ -105,8 +122,16 @@ class HandFirstMethod(LoopedMethod):
             layout = self.step.layouts.state
             for name in CARRIED:
                 states[:, layout.slice(name)] = last[:, layout.slice(name)]
-            states[:, layout.slice("earlier")] = number * self.options.candidates
+            earlier = layout.slice("earlier")
+            states[:, earlier] = last[:, earlier] + self.options.candidates
         return states, parameters
+
+    def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
+        """No more hands of tables if their fits come back to a minimum that just misses."""
+        tables = VARIED <= number < self.options.rounds
+        layout = self.step.layouts.state
+        returns, cost = (states[:, layout.slice(name).start] for name in ("returns", "best_cost"))
+        return (returns < RETURNS) | (cost < SURE) | (not tables)
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """The step counts them."""
@@ -152,9 +177,11 @@ class HandFirstMethod(LoopedMethod):
         Returns:
             (k, ...) states and parameters.
         """
-        hand = len(self.step.layouts.hand)
+        hand = len(self.robot.hand_actuators)
         tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
         vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
+        # A kernel's column is a vector: of a hand with one motor there is no second dimension.
+        tried = tried.reshape(len(problems), *self._beginning.input_shapes[-1])
         asked = *vectors, q0, self._terms(problems), tried
         states, parameters = self._beginning(*asked)
         if begun:
@@ -188,7 +215,8 @@ class HandFirstMethod(LoopedMethod):
             best = last[:, layouts.state.slice("best_q")]
             return self.rows(problems, q0, self.hands.along_valley(problems, best, later), True)
         anywhere = self.hands.anywhere(problems, later - VALLEYS)
-        states, parameters = self.rows(problems, q0, anywhere[None][:, :, list(layouts.hand)], True)
+        hands = anywhere[None][:, :, list(self.robot.hand_actuators)]
+        states, parameters = self.rows(problems, q0, hands, True)
         # The first of them begins as a whole: what stands in the way may be arm and hand together.
         lower, upper = (parameters[:, layouts.parameters.slice(end)] for end in ("lower", "upper"))
         states[:, layouts.state.slice("q")] = np.clip(anywhere[0], lower, upper)
@@ -206,8 +234,10 @@ class HandFirstMethod(LoopedMethod):
             postures: The postures.
             own: Whether its own posture comes first, instead of the last of them.
         """
-        hand = list(self.step.layouts.hand)
+        hand = list(self.robot.hand_actuators)
         here = np.clip(q0, *problems.bounds(self.robot, UNBOUNDED))[:, None, hand]
+        # A hand without an arm has begun there already.
+        own = own and bool(self.robot.arm_actuators)
         if own:
             postures = postures[:, : max(postures.shape[1] - 1, 1)]
         ranges = np.maximum((self.robot.upper - self.robot.lower)[hand], TINY)
@@ -219,7 +249,16 @@ class HandFirstMethod(LoopedMethod):
         return np.concatenate([here, ordered], axis=1)
 
     def _terms(self, problems: Problems) -> Array:
-        """What `beginning` calls terms."""
+        """What `beginning` calls terms; kept, since making them costs as much as a solve."""
+        if problems.fixed is not None:
+            return self._terms_of(problems)
+        asked = problems.tolerances, problems.enforce_limits, problems.prefer
+        kept = self._kept
+        if kept is None or kept[0] != asked:
+            self._kept = kept = asked, self._terms_of(problems)
+        return kept[1]
+
+    def _terms_of(self, problems: Problems) -> Array:
         bounds = problems.bounds(self.robot, UNBOUNDED)
         nearest = [float(problems.prefer == NEAREST)]
         tolerances = problems.position_tolerance, problems.angle_tolerance

@@ -5,7 +5,12 @@ from __future__ import annotations
 import casadi as ca
 
 from casadi_ik.methods.common.contact_fit import EXACT, judge
-from casadi_ik.methods.common.numeric_arm import STARTS, nearest_start, pose_step
+from casadi_ik.methods.common.numeric_arm import (
+    STARTS,
+    nearest_start,
+    other_side,
+    pose_step,
+)
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.kinematics import Pose
@@ -26,6 +31,7 @@ def numeric_stage(layouts: HandFirstLayouts) -> ca.Function:
     palm = (s["palm_rotation"], s["palm_origin"])
     # The first start is the arm as it is, if a solution near it is wanted.
     own = ca.logic_and(p["nearest"], s["starts"] < 1)
+    own = ca.logic_or(own, s["turned"] > 0)
     first = ca.logic_and(s["spent"] < 1, ca.logic_not(own))
     chosen = ca.Function.if_else("start", fresh, same)(first, *palm, s["passed"], now)
     outputs = _pose_step(layouts)(state, parameters, *chosen)
@@ -46,9 +52,13 @@ def _pose_step(layouts: HandFirstLayouts) -> ca.Function:
     better = margin > s["margin"]
     best, best_margin = ca.if_else(better, now, s["arm"]), ca.fmax(margin, s["margin"])
     exact = judged.cost < EXACT * EXACT
-    starts = s["starts"] + judged.settled
+    # What the first round missed may lie beyond the gap between two limits of a joint.
+    *sent, turned = ca.vertsplit(other_side(layouts.robot, now, s["turned"], p))
+    again = ca.logic_and(judged.settled, ca.logic_and(s["earlier"] > 0, turned > 0))
+    starts = s["starts"] + ca.logic_and(judged.settled, ca.logic_not(again))
+    turned = ca.if_else(judged.settled, ca.if_else(again, turned, 0), s["turned"])
     leave = ca.logic_or(exact, starts >= STARTS)
-    q = with_rows(s["q"], rows, ca.if_else(leave, best, now))
+    q = with_rows(s["q"], rows, ca.if_else(leave, best, ca.if_else(again, ca.vertcat(*sent), now)))
     after = layouts.state.pack(
         layouts.counted(s, Phase.ARM_PLACEMENT)
         | judged.fit
@@ -60,6 +70,7 @@ def _pose_step(layouts: HandFirstLayouts) -> ca.Function:
             "arm": best,
             "starts": starts,
             "passed": passed,
+            "turned": ca.if_else(leave, 0, turned),
         }
     )
     solved = ca.logic_and(exact, s["fits"] > 0)

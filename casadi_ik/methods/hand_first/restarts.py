@@ -15,11 +15,12 @@ from functools import cached_property
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
 
 AT_LIMITS = 0.5

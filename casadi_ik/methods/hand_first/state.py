@@ -51,7 +51,6 @@ class HandFirstLayouts:
         robot: The description.
         candidates: How many hand postures the stages may start from.
         kinds: Of the contacts, by finger.
-        hand: Positions in q of the hand's actuators.
     """
 
     robot: RobotDescription
@@ -62,12 +61,6 @@ class HandFirstLayouts:
     def contacts(self) -> ContactRows:
         """The contacts' rows."""
         return ContactRows(self.kinds)
-
-    @cached_property
-    def hand(self) -> tuple[int, ...]:
-        """Positions in q of the hand's actuators."""
-        arm = set(self.robot.arm_actuators)
-        return tuple(i for i in range(len(self.robot.actuators)) if i not in arm)
 
     @cached_property
     def state(self) -> Layout:
@@ -90,11 +83,14 @@ class HandFirstLayouts:
                 Field("power", doc="powers done while the contacts are balanced"),
                 Field("near", doc="cost of the near fit that last went on to the arm, 0: none"),
                 Field("balanced", doc="cost of the refinement last balanced, 0: none"),
+                Field("least", doc="smallest largest part of the tolerances balanced to so far"),
+                Field("returns", doc="how often a fit or a balance ended where one had before"),
                 Field("margin", doc="best margin of the arm so far, negative: a violation"),
                 Field("arm", (len(self.robot.arm_actuators),), doc="arm with the best margin"),
                 Field("swivel", unit="rad", doc="swivel of the arm nearest to the start"),
                 Field("elbow", doc="its sign of the elbow"),
                 Field("starts", doc="starts of the numeric arm stage so far"),
+                Field("turned", doc="joints of this start that were sent to the other side"),
                 Field("passed", doc="how far the palm of the last start was from the one wanted"),
                 Field("best_cost", doc="smallest cost of a whole configuration so far"),
                 Field("best_q", (n,), doc="the configuration it belongs to"),
@@ -106,6 +102,7 @@ class HandFirstLayouts:
     def parameters(self) -> Layout:
         """The problem and the numbers of the method."""
         n, f = len(self.robot.actuators), len(self.robot.fingers)
+        hand = len(self.robot.hand_actuators)
         return Layout(
             (
                 *self.contacts.fields,
@@ -117,7 +114,7 @@ class HandFirstLayouts:
                 Field("alone", doc="1 if a solve ends with the hand's fit, and the arm stays out"),
                 Field("start", (n,), doc="where the robot is, within bounds"),
                 Field("nearest", doc="1 if the solution nearest to the start is wanted"),
-                Field("postures", (self.candidates, len(self.hand)), doc="hand postures to try"),
+                Field("postures", (self.candidates, hand), doc="hand postures to try"),
             )
         )
 
@@ -143,7 +140,7 @@ class HandFirstLayouts:
 
     def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> Bounded:
         """Bounds of the hand's actuators."""
-        rows = list(self.hand)
+        rows = list(self.robot.hand_actuators)
         return Bounded(q[rows], p["lower"][rows], p["upper"][rows], first)
 
     def counted(self, s: dict[str, Expr], stage: Phase) -> dict[str, Expr]:

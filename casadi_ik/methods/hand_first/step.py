@@ -22,7 +22,7 @@ import casadi as ca
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, NO_MARGIN, place_arm
-from casadi_ik.methods.common.balance import differs, worth_balancing
+from casadi_ik.methods.common.balance import differs, near_tolerance
 from casadi_ik.methods.common.contact_fit import (
     Judged,
     Tried,
@@ -32,21 +32,18 @@ from casadi_ik.methods.common.contact_fit import (
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.balance_stage import balance_stage
 from casadi_ik.methods.hand_first.choice_stage import choice_stage
-from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_residual, fit_step
+from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
+from casadi_ik.methods.hand_first.start_stage import at_start, start_stage
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_rows
 from casadi_ik.methods.hand_first.whole_fit import whole_step
 from casadi_ik.problem.contacts.kinds import Kinds, suffix
-from casadi_ik.problem.contacts.rows import chord, within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
-
-WHOLE = 0.5
-"""Cost up to which a start is refined as a whole (three contacts off by 4 cm each)."""
 
 OWN_HAND = 0.5
 """Cost, with the best palm, up to which the hand as it is is fitted before other hands."""
@@ -96,7 +93,7 @@ class HandFirstStep:
         state = ca.MX.sym("state", layouts.state.size)
         parameters = ca.MX.sym("parameters", layouts.parameters.size)
         stages = {
-            Phase.REFINEMENT: self._refinement(),
+            Phase.REFINEMENT: self._start_or_refinement(),
             Phase.CANDIDATE: self._candidate(),
             Phase.BALANCE: balance_stage(layouts),
         }
@@ -129,26 +126,19 @@ class HandFirstStep:
         layouts, count = self.layouts, self.layouts.candidates
         hand = sum(
             (ca.if_else(s["candidate"] == i, p["postures"][i, :].T, 0.0) for i in range(count)),
-            ca.SX.zeros(len(layouts.hand), 1),
+            ca.SX.zeros(len(self.robot.hand_actuators), 1),
         )
         exhausted = s["candidate"] >= count
         q = self._with_hand(p["start"], hand)
-        contacts = hand_contacts(self.robot, hand, layouts.hand)
+        contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
         rotation, origin = best_palm(contacts, layouts.contacts, p)
-        # The hand as it is is only worth a fit if its contacts are shaped a little like these.
-        own = ca.logic_and(p["nearest"], s["candidate"] == 0)
-        own = ca.logic_and(own, ca.sumsqr(hand - p["start"][list(layouts.hand)]) <= 0)
-        fitted = PalmAndHand(rotation, origin, hand)
-        misfit = ca.sumsqr(fit_residual(contacts, layouts.contacts, fitted, p))
-        skipped = ca.logic_and(own, misfit > OWN_HAND)
         after = layouts.state.pack(
             self.layouts.counted(s, Phase.CANDIDATE)
             | {
                 "q": ca.if_else(exhausted, s["best_q"], q),
                 "palm_rotation": rotation,
                 "palm_origin": origin,
-                "phase": ca.if_else(skipped, float(Phase.CANDIDATE), float(self._after_candidate)),
-                "candidate": s["candidate"] + skipped,
+                "phase": float(self._after_candidate),
                 "cost": 0.0,
                 "margin": NO_MARGIN,
                 "starts": 0.0,
@@ -166,23 +156,27 @@ class HandFirstStep:
 
     def _hand_fit(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
-        columns = list(self.layouts.hand)
+        columns = list(self.robot.hand_actuators)
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
-        judged = judge_contacts(s, p, tried, self.layouts.contacts)
+        contacts = self.layouts.contacts
+        judged = judge_contacts(s, p, tried, contacts)
         keep, reached = judged.accepted, tried.reached
         # The last candidate goes on to the arm even if it does not fit: its arm and hand are the
         # nearest there is, and refinement starts from them.
         last = s["candidate"] + 1 >= self.layouts.candidates
         onwards = ca.logic_or(judged.within, last)
-        # Nor does one that fits nearly have to fit: it is balanced with the arm.
-        near = ca.logic_and(
-            worth_balancing(self._left(judged, tried), self.layouts.contacts, p),
-            ca.logic_and(differs(judged.cost, s["near"]), ca.logic_not(p["alone"])),
-        )
-        near = ca.logic_and(near, judged.settled)
         ended = ca.logic_and(judged.settled, ca.logic_and(onwards, p["alone"] > 0))
+        # Nor does one that fits nearly have to fit: it is balanced with the arm.
+        missed = ca.logic_and(judged.settled, ca.logic_not(judged.within))
+        near = ca.logic_and(missed, near_tolerance(self._left(judged, tried), contacts, p))
+        other = differs(judged.cost, s["near"])
+        returned = ca.logic_and(near, ca.logic_not(other))
+        near = ca.logic_and(ca.logic_and(near, other), ca.logic_not(p["alone"]))
         onwards = ca.logic_or(onwards, near)
+        # The hand as it is is only worth a fit if its contacts are shaped a little like these.
+        skipped = ca.logic_and(self._is_own(s, p), ca.sumsqr(tried.before) > OWN_HAND)
+        leave = ca.logic_or(skipped, ca.logic_and(judged.settled, ca.logic_not(onwards)))
         after = self.layouts.state.pack(
             self.layouts.counted(s, Phase.HAND_FIT)
             | {
@@ -190,14 +184,14 @@ class HandFirstStep:
                 "palm_rotation": ca.if_else(keep, reached.rotation, x.rotation),
                 "palm_origin": ca.if_else(keep, reached.origin, x.origin),
                 "phase": ca.if_else(
-                    judged.settled,
-                    ca.if_else(onwards, self._arm_stage(p), float(Phase.CANDIDATE)),
-                    float(Phase.HAND_FIT),
+                    leave,
+                    float(Phase.CANDIDATE),
+                    ca.if_else(judged.settled, self._arm_stage(p), float(Phase.HAND_FIT)),
                 ),
-                "candidate": s["candidate"]
-                + ca.if_else(ca.logic_and(judged.settled, ca.logic_not(onwards)), 1.0, 0.0),
+                "candidate": s["candidate"] + leave,
                 "fits": judged.within,
                 "near": ca.if_else(near, judged.cost, s["near"]),
+                "returns": s["returns"] + returned,
             }
             | judged.fit
         )
@@ -205,6 +199,13 @@ class HandFirstStep:
         status = ca.if_else(ended, fitted, float(Status.RUNNING))
         record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, status, tried, judged.accepted)
         return ca.Function("hand_fit", [state, parameters], shared(after, record, status))
+
+    def _is_own(self, s: dict[str, Expr], p: dict[str, Expr]) -> Expr:
+        """Whether a fit begins with the hand as it is, the first of the first round."""
+        if self.layouts.candidates == 1:
+            return ca.SX(0)
+        first = ca.logic_and(s["candidate"] + s["earlier"] <= 0, s["spent"] < 1)
+        return ca.logic_and(first, p["nearest"])
 
     def _arm_stage(self, p: dict[str, Expr]) -> Expr:
         if self.arm is None:
@@ -251,25 +252,28 @@ class HandFirstStep:
         record = self.layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
         return ca.Function("place", [state, parameters, arm, margin], shared(after, record, status))
 
+    def _start_or_refinement(self) -> ca.Function:
+        state = ca.MX.sym("state", self.layouts.state.size)
+        parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
+        stages = start_stage(self.layouts), self._refinement()
+        choose = ca.Function.if_else("whole", *stages)
+        begins = at_start(self.layouts.state.unpack(state))
+        outputs = choose(begins, state, parameters)
+        return ca.Function("start_or_refinement", [state, parameters], list(outputs))
+
     def _refinement(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
         contacts = self.layouts.contacts
         tried = whole_step(self.robot, contacts, s["q"], s["damping"], p)
         judged = judge_contacts(s, p, tried, contacts)
-        # Where the robot is: if that solves, nothing moves; if it is far off, this is no short way.
-        here = ca.logic_and(s["candidate"] < 0, s["spent"] < 1)
-        tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
-        met = ca.logic_and(here, within_tolerance(*contacts.errors(tried.before), *tolerances))
-        far = self._far(here, tried)
-        moved = ca.logic_and(judged.accepted, ca.logic_not(met))
-        q = ca.if_else(moved, tried.reached, s["q"])
-        solved = ca.logic_or(met, ca.logic_and(judged.settled, judged.within))
+        q = ca.if_else(judged.accepted, tried.reached, s["q"])
+        solved = ca.logic_and(judged.settled, judged.within)
         unsolved = ca.logic_and(judged.settled, ca.logic_not(judged.within))
-        near = worth_balancing(self._left(judged, tried), self.layouts.contacts, p)
-        near = ca.logic_and(near, differs(judged.cost, s["balanced"]))
-        near = ca.logic_and(near, unsolved)
-        failed = ca.logic_or(far, ca.logic_and(unsolved, ca.logic_not(near)))
-        near = ca.logic_and(near, ca.logic_not(far))
+        near = ca.logic_and(unsolved, near_tolerance(self._left(judged, tried), contacts, p))
+        other = differs(judged.cost, s["balanced"])
+        returned = ca.logic_and(near, ca.logic_not(other))
+        near = ca.logic_and(near, other)
+        failed = ca.logic_and(unsolved, ca.logic_not(near))
         better = judged.cost < s["best_cost"]
         after = self.layouts.state.pack(
             self.layouts.counted(s, Phase.REFINEMENT)
@@ -282,20 +286,15 @@ class HandFirstStep:
                 ),
                 "candidate": s["candidate"] + ca.if_else(failed, 1.0, 0.0),
                 "balanced": ca.if_else(near, judged.cost, s["balanced"]),
+                "returns": s["returns"] + returned,
                 "best_cost": ca.if_else(better, judged.cost, s["best_cost"]),
                 "best_q": ca.if_else(better, q, s["best_q"]),
             }
             | judged.fit
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, moved)
+        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged.accepted)
         return ca.Function("refinement", [state, parameters], shared(after, record, status))
-
-    def _far(self, here: Expr, tried: Tried) -> Expr:
-        """Whether a start is so far from the contacts that refining it is not worth it."""
-        if not self.robot.arm_actuators:
-            return ca.SX(0)
-        return ca.logic_and(here, ca.sumsqr(tried.before) > WHOLE)
 
     def _left(self, judged: Judged, tried: Tried) -> Expr:
         """Residual of the contacts after a step was judged."""
@@ -303,7 +302,7 @@ class HandFirstStep:
         return left[: self.layouts.contacts.size]
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
-        return with_rows(q, self.layouts.hand, hand)
+        return with_rows(q, self.robot.hand_actuators, hand)
 
     def _with_arm(self, q: Expr, arm: Expr) -> Expr:
         return with_rows(q, self.robot.arm_actuators, arm)

@@ -10,16 +10,14 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels.layout import Field
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.kinematics import Kinematics
-
-Array = NDArray[np.float64]
 
 LENGTH = 0.1
 """Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.stepper import Stepper
@@ -20,7 +21,7 @@ from casadi_ik.methods.ipopt.whole_nlp import NlpRun, WholeNlp
 from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import (
     ANGLE_ERROR,

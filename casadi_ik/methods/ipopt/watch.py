@@ -6,11 +6,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels.cancellation import is_cancelled
-
-Array = NDArray[np.float64]
 
 EXACT = 1e-8
 """Root of the cost at which the contacts count as met exactly: no iteration is spent beyond."""

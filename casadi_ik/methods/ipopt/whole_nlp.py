@@ -28,8 +28,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.forks import ForkSafeLock
 from casadi_ik.kernels.layout import Layout
@@ -41,8 +41,6 @@ from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.status import Status
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.couplings import joint_positions
-
-Array = NDArray[np.float64]
 
 NEAR = 0.1
 """Cost below which a start is taken for a solution nearly there, and Ipopt started warm."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.limits import limit_mask
 from casadi_ik.methods.qiu.finger_step import planar_fingers
@@ -22,7 +23,7 @@ from casadi_ik.problem.trace import (
     Q,
     RecordedJacobian,
 )
-from casadi_ik.robots.description import Array, RobotDescription
+from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.closed_chain import VIRTUAL, split
 from casadi_ik.symbolic.smooth import Expr
 

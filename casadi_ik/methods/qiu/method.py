@@ -4,33 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from casadi_ik.arrays import Array, Counts
 from casadi_ik.kernels import StepGraph
 from casadi_ik.methods.common.limits import starts_within
-from casadi_ik.methods.common.looped_method import Counts, LoopedMethod, Start
+from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.qiu.enhanced import EnhancedStep
 from casadi_ik.methods.qiu.original import OriginalStep
 from casadi_ik.methods.qiu.parameters import OriginalParameters, QiuParameters
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 
 
-class EnhancedMethod(LoopedMethod):
-    """`enhanced-*`: thumb reaching, then hand alignment along the arm-thumb closed chain.
+class _QiuMethod(LoopedMethod):
+    """What the methods of the paper share: one step graph, begun at q0, within the paper's budget.
 
     Attributes:
-        step: Its step for this robot; in the virtual machine if the finger step is Ipopt's.
+        step: Its step for this robot.
     """
 
-    def __init__(
-        self, robot: RobotDescription, options: QiuParameters, compiled: bool = True
-    ) -> None:
-        """Lay out the step; the budget is the paper's."""
-        super().__init__(robot, options, compiled)
-        self.name = f"enhanced-{options.steps}"
-        self.step = EnhancedStep(robot, options)
-        self.max_iterations = options.max_iterations
+    step: EnhancedStep | OriginalStep
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""
@@ -41,11 +35,28 @@ class EnhancedMethod(LoopedMethod):
     ) -> Start:
         """Start at q0, moved into limits that are enforced."""
         del number, last
-        count, starts = len(problems), starts_within(self.robot, problems, q0)
-        first, values = self.step.first_state(starts), self.step.parameter_values(problems)
-        return self.step.state.pack_rows(first, count), self.step.parameters.pack_rows(
-            values, count
-        )
+        step, count = self.step, len(problems)
+        first = step.first_state(starts_within(self.robot, problems, q0))
+        states = step.state.pack_rows(first, count)
+        return states, step.parameters.pack_rows(step.parameter_values(problems), count)
+
+
+class EnhancedMethod(_QiuMethod):
+    """`enhanced-*`: thumb reaching, then hand alignment along the arm-thumb closed chain.
+
+    Its step runs in the virtual machine if the finger step is Ipopt's.
+    """
+
+    step: EnhancedStep
+
+    def __init__(
+        self, robot: RobotDescription, options: QiuParameters, compiled: bool = True
+    ) -> None:
+        """Lay out the step; the budget is the paper's."""
+        super().__init__(robot, options, compiled)
+        self.name = f"enhanced-{options.steps}"
+        self.step = EnhancedStep(robot, options)
+        self.max_iterations = options.max_iterations
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """What is not thumb reaching is hand alignment."""
@@ -58,12 +69,10 @@ class EnhancedMethod(LoopedMethod):
         return self.step.jacobians
 
 
-class OriginalMethod(LoopedMethod):
-    """`original-*`: all contacts in one hierarchy, what the paper compares with.
+class OriginalMethod(_QiuMethod):
+    """`original-*`: all contacts in one hierarchy, what the paper compares with."""
 
-    Attributes:
-        step: Its step for this robot.
-    """
+    step: OriginalStep
 
     def __init__(
         self, robot: RobotDescription, options: OriginalParameters, compiled: bool = True
@@ -73,21 +82,6 @@ class OriginalMethod(LoopedMethod):
         self.name = f"original-{options.steps}"
         self.step = OriginalStep(robot, options)
         self.max_iterations = options.max_iterations
-
-    def step_graph(self) -> StepGraph:
-        """The whole iteration."""
-        return self.step.graph()
-
-    def begin(
-        self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
-    ) -> Start:
-        """Start at q0, moved into limits that are enforced."""
-        del number, last
-        count, first = len(problems), {"q": starts_within(self.robot, problems, q0)}
-        values = self.step.parameter_values(problems)
-        return self.step.state.pack_rows(first, count), self.step.parameters.pack_rows(
-            values, count
-        )
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """There is but one phase."""

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import casadi as ca
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
@@ -33,7 +34,7 @@ from casadi_ik.problem.trace import (
     STEP_SIZE,
     Q,
 )
-from casadi_ik.robots.description import Array, RobotDescription
+from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times
 from casadi_ik.symbolic.subexpressions import shared
@@ -114,6 +115,10 @@ class OriginalStep:
             step = self._combined()(*pairs, *steps)
         outputs = self._ending()(state, parameters, errors, step)
         return ca.Function(self._name, [state, parameters], list(outputs))
+
+    def first_state(self, starts: Array) -> dict[str, float | Array]:
+        """Values of all state fields for starts (k, n)."""
+        return {"q": starts}
 
     def parameter_values(self, problems: Problems) -> dict[str, float | Array]:
         """Values of all parameter fields for a batch."""

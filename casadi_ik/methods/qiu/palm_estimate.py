@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.problem.target import Target
 from casadi_ik.robots.description import RobotDescription
@@ -34,7 +33,7 @@ def axes_through(points: list[ca.SX]) -> ca.SX:
     return ca.horzcat(ca.cross(y, z), y, z)
 
 
-def base_axes(robot: RobotDescription) -> NDArray[np.float64]:
+def base_axes(robot: RobotDescription) -> Array:
     """The same frame through the fingers' base points, in the palm frame (3, 3).
 
     The paper's palm frame has it as the identity; another hand's palm frame may be turned.

@@ -15,9 +15,8 @@ from functools import cached_property
 from typing import Any
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels import Field, Layout, StepGraph
 from casadi_ik.methods.common.bounded_step import Bounded, damped_step
 from casadi_ik.methods.common.coupling_record import coupling_fields, coupling_values
@@ -153,8 +152,6 @@ class ScrewControlStep:
         function = ca.Function(name, [state, parameters], shared(after, record, status))
         return StepGraph(name, function, self.state, self.parameters, self.record)
 
-    def parameter_vector(
-        self, target: dict[str, Any], numbers: dict[str, Any]
-    ) -> NDArray[np.float64]:
+    def parameter_vector(self, target: dict[str, Any], numbers: dict[str, Any]) -> Array:
         """Parameters (np,) of a target and the law's numbers."""
         return self.parameters.pack({**target, **numbers})

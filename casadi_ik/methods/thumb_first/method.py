@@ -8,15 +8,16 @@ from functools import cached_property
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array, Counts
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import StepGraph
-from casadi_ik.methods.common.looped_method import Counts, LoopedMethod, Start
+from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.methods.thumb_first.state import STAGES
 from casadi_ik.methods.thumb_first.step import ThumbFirstStep
 from casadi_ik.problem.contacts.kinds import Kinds, usual
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.target import target_values
 from casadi_ik.robots.description import RobotDescription
@@ -64,7 +65,11 @@ class ThumbFirstMethod(LoopedMethod):
         """The hand postures that targets are compared with."""
         robot, options = ArmHand(self.robot), self.options
         return PostureTable(
-            robot, self.step.hand, options.table, pull=options.pull, compiled=self._compiled
+            robot,
+            self.robot.hand_actuators,
+            options.table,
+            pull=options.pull,
+            compiled=self._compiled,
         )
 
     def for_kinds(self, kinds: Kinds) -> ThumbFirstMethod:
@@ -84,7 +89,7 @@ class ThumbFirstMethod(LoopedMethod):
         starts = self.options.starts if number else 1
         count, step = len(problems), self.step
         lower, upper = problems.bounds(self.robot, UNBOUNDED)
-        hand = list(step.hand)
+        hand = list(self.robot.hand_actuators)
         found = self.table.nearest(problems.points, problems.normals, starts, q0[:, hand])
         postures = np.zeros((count, self.options.starts, len(hand)))
         postures[:, :starts] = found

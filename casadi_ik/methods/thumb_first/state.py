@@ -57,12 +57,6 @@ class ThumbFirstLayouts:
         return ContactRows(self.kinds)
 
     @cached_property
-    def hand(self) -> tuple[int, ...]:
-        """Positions in q of the hand's actuators."""
-        arm = set(self.robot.arm_actuators)
-        return tuple(i for i in range(len(self.robot.actuators)) if i not in arm)
-
-    @cached_property
     def state(self) -> Layout:
         """What an iteration hands to the next."""
         n = len(self.robot.actuators)
@@ -89,6 +83,7 @@ class ThumbFirstLayouts:
     def parameters(self) -> Layout:
         """The problem and the numbers of the method."""
         n, f = len(self.robot.actuators), len(self.robot.fingers)
+        hand = len(self.robot.hand_actuators)
         return Layout(
             (
                 *self.contacts.fields,
@@ -96,7 +91,7 @@ class ThumbFirstLayouts:
                 Field("angle_tolerance", (f,), unit="rad"),
                 Field("lower", (n,), doc="lower bounds of q"),
                 Field("upper", (n,), doc="upper bounds of q"),
-                Field("postures", (self.options.starts, len(self.hand)), doc="hands to begin with"),
+                Field("postures", (self.options.starts, hand), doc="hands to begin with"),
                 Field("given", doc="how many of them are there"),
                 Field("first_damping"),
                 Field("step_cap"),

@@ -128,21 +128,22 @@ class ThumbFirstStep(ThumbFirstLayouts):
                 ca.if_else(s["start"] == i, p["postures"][i, :].T, 0.0)
                 for i in range(self.options.starts)
             ),
-            ca.SX.zeros(len(self.hand), 1),
+            ca.SX.zeros(len(self.robot.hand_actuators), 1),
         )
-        rotation, origin = best_palm(hand_contacts(self.robot, hand, self.hand), self.contacts, p)
+        contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
+        rotation, origin = best_palm(contacts, self.contacts, p)
         return ca.Function("guess", [state, parameters], shared(hand, rotation, origin))
 
     def _begin(self) -> ca.Function:
         state, parameters, s, p = self._vectors(ca.SX)
         hand, arm = (
-            ca.SX.sym("hand", len(self.hand)),
+            ca.SX.sym("hand", len(self.robot.hand_actuators)),
             ca.SX.sym("arm", len(self.robot.arm_actuators)),
         )
         rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
         passed = ca.SX.sym("passed")
         started = ca.SX.zeros(s["q"].numel(), 1)
-        started[list(self.hand)] = hand
+        started[list(self.robot.hand_actuators)] = hand
         started[list(self.robot.arm_actuators)] = arm
         started = ca.fmin(ca.fmax(started, p["lower"]), p["upper"])
         exhausted = s["start"] >= p["given"]

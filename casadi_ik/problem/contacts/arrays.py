@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnknownNameError
-from casadi_ik.grasps.vectors import MORE, fault, squared
+from casadi_ik.grasps.arrays import unit_vectors
+from casadi_ik.grasps.vectors import MORE, fault, faulty, squared
 from casadi_ik.problem.contacts.kinds import Kinds, kind_of, usual
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import DIRECTIONS, Problems
 
 NAMES = tuple(f"{name}s" for name in MORE)
 """Names of the arrays."""
@@ -40,7 +42,9 @@ def more_arrays(
     found: dict[str, Array] = {}
     for name, value in more.items():
         if name not in NAMES:
-            raise UnknownNameError(f"{name!r} does not exist; expected one of {', '.join(NAMES)}")
+            raise UnknownNameError(
+                f"{name!r} does not exist; expected one of {', '.join((*NAMES, DIRECTIONS))}"
+            )
         if value is None:
             continue
         try:
@@ -53,35 +57,36 @@ def more_arrays(
             found[name] = array
     if not found:
         return found
-    given = np.logical_or.reduce([~np.isnan(array).all(axis=2) for array in found.values()])
-    for row, finger in np.argwhere(given).tolist():
-        vectors = {name: array[row, finger] for name, array in found.items()}
-        vectors |= {"points": points[row, finger], "normals": normals[row, finger]}
-        problem = _unit(vectors) or fault({name[:-1]: v for name, v in vectors.items()})
-        if problem:
-            number = first_row + row
-            raise RowError(f"row {number}, finger {finger}: {problem}", number)
-        if "tangents" in vectors:
-            vectors["tangents"] = squared(vectors["tangents"], vectors["normals"])
-        for name in found.keys() & vectors.keys():
-            found[name][row, finger] = vectors[name]
-    return found
+    wrong, units = np.zeros(points.shape[:2], dtype=bool), dict[str, Array]()
+    for name, array in found.items():
+        given = ~np.isnan(array).all(axis=2)
+        with np.errstate(invalid="ignore"):
+            units[name], zero = unit_vectors(array)
+        wrong |= given & (zero | ~np.isfinite(array).all(axis=2))
+    vectors = {name[:-1]: array for name, array in units.items()}
+    wrong |= faulty({"point": points, "normal": normals, **vectors})
+    for row, finger in np.argwhere(wrong)[:1].tolist():
+        of_contact = {"points": points, "normals": normals, **found}
+        problem = _problem({name: array[row, finger] for name, array in of_contact.items()})
+        raise RowError(f"row {first_row + row}, finger {finger}: {problem}", first_row + row)
+    if "tangents" in units:
+        units["tangents"] = squared(units["tangents"], normals)
+    return units
 
 
-def _unit(vectors: dict[str, Array]) -> str | None:
-    """Leave out what is free and make the directions unit vectors; what is wrong, if anything."""
-    for name, vector in list(vectors.items()):
+def _problem(vectors: Mapping[str, Array]) -> str:
+    """What is wrong with a contact, of which something is."""
+    units: dict[str, Array] = {}
+    for name, vector in vectors.items():
         if np.isnan(vector).all():
-            del vectors[name]
             continue
-        length = float(np.linalg.norm(vector))
-        if not np.isfinite(length):
+        if not np.isfinite(vector).all():
             return f"{name[:-1]}: found {vector.tolist()}, expected finite numbers, or all NaN"
-        if name in NAMES:
-            if length < 1e-9:
-                return f"{name[:-1]}: found {vector.tolist()}, expected a direction, not zero"
-            vectors[name] = vector / length
-    return None
+        unit, zero = unit_vectors(vector)
+        if name in NAMES and zero:
+            return f"{name[:-1]}: found {vector.tolist()}, expected a direction, not zero"
+        units[name[:-1]] = unit if name in NAMES else vector
+    return fault(units) or "malformed"
 
 
 def by_kinds(problems: Problems) -> Iterator[tuple[Kinds, NDArray[np.intp] | None, Problems]]:

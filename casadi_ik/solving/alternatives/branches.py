@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.common.arm_branches import SIDES, arm_at, arm_edges
 from casadi_ik.methods.common.arm_placement import ALLOWED
-from casadi_ik.problem.problems import Array
 from casadi_ik.symbolic.srs_arm import SrsArm
 
 TURN = 2 * np.pi

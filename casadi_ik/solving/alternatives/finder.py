@@ -10,13 +10,14 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.preference import preference
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
 from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
@@ -24,7 +25,11 @@ from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.measures import manipulability
 
 DISTINCT = 0.05
-"""Configurations count as different if a motor differs by this part of its range."""
+"""Hands and arms that are searched count as different if a motor differs by this part of its
+range."""
+
+APART = 0.25
+"""Least difference of alternatives unless said otherwise, see `AlternativeFinder.find`."""
 
 ARMS = 64
 """Random arms that an arm without a closed form is solved from."""
@@ -81,7 +86,7 @@ class AlternativeFinder:
         self._trials = Trials(robot, method)
         self._compiled = compiled
         self._arm = list(robot.description.arm_actuators)
-        self._hand = list(method.step.layouts.hand)
+        self._hand = list(robot.description.hand_actuators)
 
     @cached_property
     def _branches(self) -> ArmBranches | None:
@@ -96,9 +101,17 @@ class AlternativeFinder:
         return FunctionKernel(ca.Function("arm_manipulability", [q], [measure]), self._compiled)
 
     def find(
-        self, problems: Problems, q0: Array, seed: int, limit: int, prefer: str
+        self,
+        problems: Problems,
+        q0: Array,
+        seed: int,
+        limit: int,
+        prefer: str,
+        apart: float = APART,
     ) -> tuple[Alternative, ...]:
-        """All solutions of one target, best first.
+        """Different solutions of one target, best first.
+
+        All that are found are ranked; one that is closer than `apart` to a better one is left out.
 
         Args:
             problems: One target.
@@ -106,13 +119,17 @@ class AlternativeFinder:
             seed: Of the starts of arms without a closed form.
             limit: How many at most.
             prefer: One of `PREFERENCES`.
+            apart: Of any two, at least one motor differs by this part of its range. The motors of
+                a hand that may close as it likes, and elbows that may swing a little further,
+                would else fill the list with what is hardly to be told apart.
 
         Raises:
-            InputError: Bad limit or preference.
+            InputError: Bad limit, preference or distance.
         """
         if not isinstance(limit, (int, np.integer)) or limit < 1:
             raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
         preference(prefer, started=True)
+        apart = _distance(apart)
         limits = self._trials.limits(problems)
         found: list[_Found] = []
         for number, q in enumerate(self._postures(problems, q0, limits)):
@@ -122,8 +139,10 @@ class AlternativeFinder:
         q = np.stack([item.q for item in found])
         solved = self._trials.solved(problems, q, problems.enforce_limits)
         keys = np.stack([self._score(q, q0, prefer), self._margins(q, self._arm)])
-        order = [i for i in np.lexsort(-keys[::-1]) if solved[i]][:limit]
-        return tuple(self._described(problems, found[i], q0) for i in order)
+        order = [int(i) for i in np.lexsort(-keys[::-1]) if solved[i]]
+        parts = self._parts(q[order], list(range(q.shape[1])))
+        kept = _distinct(parts, apart, limit)
+        return tuple(self._described(problems, found[order[i]], q0) for i in kept)
 
     def best_arm(self, problems: Problems, q: Array, q0: Array, seed: int, prefer: str) -> Array:
         """The solution (n,) with the hand where a given one has it, and the best arm for it.
@@ -159,7 +178,7 @@ class AlternativeFinder:
             # Reachable thanks to the tolerances only, if at all.
             q = np.concatenate([q, trials.run(states, loose)])
             kept = q[trials.solved(problems, q, problems.enforce_limits)]
-        return _distinct(kept, self._parts(kept, self._hand))
+        return [kept[i] for i in _distinct(self._parts(kept, self._hand), DISTINCT)]
 
     def _arms(
         self,
@@ -201,7 +220,7 @@ class AlternativeFinder:
         ends = np.concatenate([q[None], ends])
         same = (np.abs(self._parts(ends - q, self._hand)) < DISTINCT).all(axis=1)
         kept = ends[same & self._trials.solved(problems, ends, problems.enforce_limits)]
-        return _distinct(kept, self._parts(kept, self._arm))
+        return [kept[i] for i in _distinct(self._parts(kept, self._arm), DISTINCT)]
 
     def _parts(self, q: Array, columns: list[int]) -> Array:
         """Some columns of configurations as parts of their ranges."""
@@ -248,10 +267,24 @@ class AlternativeFinder:
         )
 
 
-def _distinct(q: Array, parts: Array) -> list[Array]:
-    """Configurations whose parts differ from all that come before them."""
+def _distinct(parts: Array, apart: float, limit: int | None = None) -> list[int]:
+    """Rows of parts (k, n) that differ from all chosen before them, in their order."""
     kept: list[int] = []
-    for i in range(len(q)):
-        if all(np.abs(parts[i] - parts[j]).max() > DISTINCT for j in kept):
+    for i in range(len(parts)):
+        if len(kept) == limit:
+            break
+        if (np.abs(parts[i] - parts[kept]).max(axis=1, initial=0.0) >= apart).all():
             kept.append(i)
-    return [q[i] for i in kept]
+    return kept
+
+
+def _distance(apart: float) -> float:
+    """A least difference of configurations.
+
+    Raises:
+        InputError: It is none.
+    """
+    number = isinstance(apart, (int, float, np.integer, np.floating))
+    if not number or isinstance(apart, bool) or not 0 <= apart <= 1:
+        raise InputError(f"apart: found {apart!r}, expected a number from 0 to 1")
+    return float(apart)

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.alternatives.finder import CLOSE, AlternativeFinder
 from casadi_ik.solving.trials import Bounds, Trials, refinement_rows
@@ -127,7 +128,7 @@ class Tracker:
 
     def _starts(self, problems: Problems, q0: Array, prefer: str, seed: int) -> list[Array]:
         first = problems.rows(slice(0, 1))
-        found = self._finder.find(first, q0, seed, STARTS, prefer)
+        found = self._finder.find(first, q0, seed, STARTS, prefer, apart=0)
         if found:
             return [alternative.q for alternative in found]
         # Not to be solved: the nearest there is.

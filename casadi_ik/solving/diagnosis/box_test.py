@@ -12,10 +12,10 @@ from itertools import combinations
 
 import casadi as ca
 
+from casadi_ik.arrays import Array
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.problem.arm_cones import ArmCones
-from casadi_ik.problem.problems import Array
 from casadi_ik.solving.diagnosis.box_contacts import BoxContact, box_contacts
 from casadi_ik.solving.diagnosis.cone_bound import cone_excess
 from casadi_ik.solving.diagnosis.hand_space import HandSpace

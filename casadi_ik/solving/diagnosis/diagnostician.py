@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.grasps import Tolerance
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.diagnosis import (
@@ -20,7 +21,7 @@ from casadi_ik.problem.diagnosis import (
     Reason,
     Remedies,
 )
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.proof import Proof, ProofKind
 from casadi_ik.problem.verdict import Verdict, deviations, judge
 from casadi_ik.solving.diagnosis.minimax import Closest, closest
@@ -202,7 +203,7 @@ class Diagnostician:
         random = self.robot.random(np.random.default_rng(count), count)
         starts = np.tile(random, (len(problems), 1, 1))
         if self.robot.description.arm_actuators:
-            hand = list(self.method.step.layouts.hand)
+            hand = list(self.robot.description.hand_actuators)
             starts[:, ::2, hand] = best.fair[:, None, hand]
             starts[:, 1::2, hand] = best.q[:, None, hand]
             starts[:, ::ALIKE, hand] = self._alike(problems, -(-count // ALIKE))

@@ -13,8 +13,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.problem.hand_motors import OUTWARDS, finger_joints, hand_motors, motor_box
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.joint_ranges import Range, joint_ranges
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casadi_ik.problem.problems import Array
+from casadi_ik.arrays import Array
 from casadi_ik.solving.trials import Descent, Rows, allowed, smallest
 
 ROUNDS = 16

@@ -8,8 +8,8 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array, Bools, Counts, Rows
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.problem.arm_cones import NONE, ArmCones, arm_cones
 from casadi_ik.problem.arm_span import arm_span
@@ -21,7 +21,7 @@ from casadi_ik.problem.contact_quantities import (
 )
 from casadi_ik.problem.contacts.conditions import CONDITIONS, PLACE
 from casadi_ik.problem.hand_motors import endless_fingers, joint_limits, motor_box
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.proof import Proof, ProofKind
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solving.diagnosis.box_test import BoxTest
@@ -64,7 +64,7 @@ TINY = 1e-9
 PART = 0.01
 """Neither where less than so much of the smallest tolerance [m] is left."""
 
-Boxes = tuple[NDArray[np.intp], Array, Array]
+Boxes = tuple[Rows, Array, Array]
 """Numbers of targets, lower and upper ends (h,) of a box each."""
 
 
@@ -72,9 +72,9 @@ Boxes = tuple[NDArray[np.intp], Array, Array]
 class _Found:
     """The results of k searches: whether proved, boxes, and whether the arm was needed."""
 
-    proved: NDArray[np.bool_]
-    boxes: NDArray[np.int64]
-    reach: NDArray[np.bool_]
+    proved: Bools
+    boxes: Counts
+    reach: Bools
 
 
 class _Stated:
@@ -85,7 +85,7 @@ class _Stated:
         self._fixed = arm_span(robot) is None
         self._asked, self._give = asked_quantities(robot, kept, problems)
 
-    def decided(self, known: NDArray[np.bool_]) -> list[Proof | None]:
+    def decided(self, known: Bools) -> list[Proof | None]:
         """Proofs where a quantity decides by itself.
 
         Args:
@@ -208,7 +208,7 @@ class Prover:
         return cones if same and np.allclose(cones.wrist, self._arm.wrist, 0, SAME) else None
 
     def _search(
-        self, problems: Problems, fingers: NDArray[np.bool_], most: int, holding: Array | None
+        self, problems: Problems, fingers: Bools, most: int, holding: Array | None
     ) -> _Found:
         """Divide the boxes of k targets, some of them a level deeper in each pass.
 
@@ -262,9 +262,7 @@ class Prover:
         return _Found(~given_up, boxes, reach)
 
 
-def _halves(
-    target: NDArray[np.intp], lower: Array, upper: Array, widest: NDArray[np.intp]
-) -> Boxes:
+def _halves(target: Rows, lower: Array, upper: Array, widest: Rows) -> Boxes:
     """Boxes divided amid their widest coordinates."""
     rows = np.arange(len(target))
     middle = (lower[rows, widest] + upper[rows, widest]) / 2
@@ -274,7 +272,7 @@ def _halves(
     return np.concatenate([target, target]), lower, upper
 
 
-def _parts(target: NDArray[np.intp], lower: Array, upper: Array) -> Iterator[Boxes]:
+def _parts(target: Rows, lower: Array, upper: Array) -> Iterator[Boxes]:
     """Boxes in parts that are looked at together."""
     for start in range(0, len(target), CHUNK):
         some = slice(start, start + CHUNK)

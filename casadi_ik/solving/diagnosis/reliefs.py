@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.problem.diagnosis import Relief
-from casadi_ik.problem.problems import Array, Problems
+from casadi_ik.problem.problems import Problems
 from casadi_ik.solving.trials import Bounds, Descent, Trials
 
 HALVINGS = 8
@@ -54,7 +55,7 @@ def lifts(
     """
     every = tuple(map(int, np.flatnonzero(movable)))
     arm = tuple(i for i in every if i in robot.description.arm_actuators)
-    hand = tuple(i for i in every if i not in arm)
+    hand = tuple(i for i in every if i in robot.description.hand_actuators)
     asked = [i for i in (hand if hand_only else every) if pressed[i]]
     single = [Lift(robot.actuators[i], (i,)) for i in asked]
     groups = {"hand": hand} if hand_only else {"arm": arm, "hand": hand, "all": every}

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import casadi as ca
 
-from casadi_ik.problem.problems import Array
+from casadi_ik.arrays import Array
 from casadi_ik.solving.diagnosis.box_contacts import SLACK, BoxContact
 from casadi_ik.symbolic.linear_algebra import solve_spd
 from casadi_ik.symbolic.smooth import Expr, safe_norm

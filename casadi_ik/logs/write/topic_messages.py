@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.logs.mcap.clock import LogClock
-from casadi_ik.logs.mcap.message import HEAD
+from casadi_ik.logs.mcap.message_bytes import HEAD
 from casadi_ik.problem.recorder import SolveBlock
 
 

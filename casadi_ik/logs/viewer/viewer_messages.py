@@ -7,10 +7,10 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import MissingExtraError
-from casadi_ik.logs.mcap.message import CDR_HEADER
+from casadi_ik.logs.mcap.message_bytes import CDR_HEADER
 from casadi_ik.symbolic.so3 import quaternion_from_matrix
 
 try:
@@ -39,7 +39,6 @@ __all__ = [
     "vector_of",
 ]
 
-Array = NDArray[np.float64]
 Color = tuple[float, float, float]
 
 STRING = ("std_msgs/msg/String", "string data\n")

@@ -1,0 +1,152 @@
+"""`casadi-ik import`."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.cli.answer import Answer, Exit
+from casadi_ik.cli.outputs import check_outputs, write_output
+from casadi_ik.cli.question import located
+from casadi_ik.cli.report import fields, files, headline, table
+from casadi_ik.cli.say import PROGRAM
+from casadi_ik.errors import InputError, MissingExtraError
+from casadi_ik.importing import imported
+from casadi_ik.importing.check import largest_difference
+from casadi_ik.importing.imported import Imported
+from casadi_ik.robots.part import PREFIX
+
+SAMPLES = 20
+"""Postures in which kinematics are compared."""
+
+SAME = 1e-9
+"""Poses that differ by no more [m, or in their axes] are the same."""
+
+
+def import_robot(arguments: argparse.Namespace) -> Answer:
+    """Write a description of somebody's files.
+
+    Raises:
+        CasadiIKError: Bad input, or an output that cannot be written.
+    """
+    first, hand = Path(arguments.first), arguments.hand and Path(arguments.hand)
+    arm, hand = (first, hand) if hand else (None, first)
+    out, picture = arguments.out, arguments.picture
+    outputs = {"--out": out, "--picture": picture}
+    check_outputs(outputs.items(), inputs=[one for one in (arm, hand) if one])
+    draw = _drawing() if picture is not None else None
+    found = imported.import_robot(
+        arm,
+        hand,
+        out,
+        command=_command(arguments),
+        tip=arguments.tip,
+        palm=arguments.palm,
+        mount=_mount(arguments),
+        shapes=draw is not None,
+    )
+    robots: list[ArmHand] = []
+    differences: dict[str, float] = {}
+
+    def write(part: Path) -> None:
+        nonlocal found
+        part.write_text(found.written.text(), encoding="utf-8")
+        found = found.at_home(part)
+        part.write_text(found.written.text(), encoding="utf-8")
+        robots.append(imported.loaded(part))
+        if arguments.check:
+            differences.update(_differences(robots[0], found))
+        if draw is not None:
+            draw(robots[0], found, picture)
+
+    write_output(out, "--out", write)
+    same = all(value <= SAME for value in differences.values())
+    written = [("out", out)] + ([("picture", picture)] if picture is not None else [])
+    report = _report(robots[0], found, differences)
+    return Answer(Group(*report, *files(written)), Exit.DONE if same else Exit.NOT_SOLVED)
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    words = [PROGRAM, "import", arguments.first]
+    words += [arguments.hand] if arguments.hand else []
+    words += ["--out", str(arguments.out)]
+    for option in ("tip", "palm"):
+        if getattr(arguments, option) is not None:
+            words += [f"--{option}", getattr(arguments, option)]
+    if arguments.mount is not None:
+        words += ["--mount", *(f"{value:g}" for value in _mount(arguments) or ())]
+    return shlex.join(words)
+
+
+def _mount(arguments: argparse.Namespace) -> list[float] | None:
+    if arguments.mount is None:
+        return None
+    values = [value for group in arguments.mount for value in group]
+    if len(values) != 6:
+        raise InputError(
+            f"--mount: found {len(values)} numbers, expected six: x y z [m] r p y [rad]"
+        )
+    return values
+
+
+def _drawing() -> Callable[[ArmHand, Imported, Path], object]:
+    """The function that draws the pads, after making sure that it can."""
+    with located("--picture", (MissingExtraError,)):
+        from casadi_ik.views import draw_pads
+
+    def draw(robot: ArmHand, found: Imported, path: Path) -> object:
+        links = robot.description.links
+        named = {PREFIX + link if PREFIX + link in links else link: link for link in found.surfaces}
+        return draw_pads(robot, {ours: found.surfaces[link] for ours, link in named.items()}, path)
+
+    return draw
+
+
+def _differences(robot: ArmHand, found: Imported) -> dict[str, float]:
+    """The largest difference from the file's own library, by file."""
+    q = robot.random(np.random.default_rng(0), SAMPLES)
+    arm, hand = found.files
+    lines = found.written
+    values: dict[str, float] = {}
+    if arm is not None and lines.arm is not None:
+        values[arm.name] = largest_difference(robot, arm, q, lines.arm.locked)
+    values[hand.name] = largest_difference(robot, hand, q, lines.hand.locked, arm)
+    return values
+
+
+def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> list[RenderableType]:
+    description, lines = robot.description, found.written
+    arm = len(description.arm_actuators)
+    count = len(description.actuators)
+    what = (
+        f"{lines.name}: {count} motors ({arm} arm, {count - arm} hand), {len(found.pads)} fingers"
+    )
+    pairs = {}
+    if lines.arm is not None:
+        pairs["tip"] = f"{lines.arm.end}: {lines.arm.how}"
+        pairs["mount"] = lines.mount_how
+    pairs["palm"] = f"{lines.hand.end}: {lines.hand.how}"
+    pairs["thumb"] = f"{lines.thumb[0]}: {lines.thumb[1]}"
+    for line in filter(None, (lines.arm, lines.hand)):
+        if line.limits:
+            pairs["limits"] = f"assumed, since {Path(line.file).name} states none: " + ", ".join(
+                line.limits
+            )
+    for name, value in differences.items():
+        verdict = "as its own library has it" if value <= SAME else "NOT as its own library has it"
+        pairs[f"check {name}"] = f"{verdict}: poses differ by at most {value:.1e}"
+    rows = table("finger", "pad on link", "joints", "point [mm]", "normal", right=("joints",))
+    for branch, pad in zip(found.branches, found.pads, strict=True):
+        point = " ".join(f"{1e3 * value:.1f}" for value in pad.point)
+        normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal.tolist())
+        rows.add_row(branch.name, pad.link, str(len(branch.chain)), point, normal)
+    notes: list[RenderableType] = [Text(f"  {note}", "yellow") for note in lines.notes]
+    guessed = Text("  pads, thumb, palm and home are guesses: see the lines marked GUESS", "yellow")
+    return [headline(True, "IMPORTED", what), fields(pairs), rows, *notes, guessed]

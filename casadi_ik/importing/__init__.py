@@ -1,0 +1,1 @@
+"""From somebody's files to a description: what no file says is guessed, and the guess is shown."""

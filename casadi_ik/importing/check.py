@@ -1,0 +1,155 @@
+"""Whether an imported robot moves as its files say: their own libraries are asked again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+from xml.etree import ElementTree
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.robots.part import PREFIX
+from casadi_ik.robots.robot_files.mjcf_file import joint_name, mujoco_model
+from casadi_ik.robots.robot_files.read import read_tree, robot_element
+from casadi_ik.robots.robot_files.tree import RobotTree
+from casadi_ik.robots.robot_files.urdf_file import bare, pinocchio
+
+
+class Oracle(Protocol):
+    """Poses of a file's links as its own library finds them."""
+
+    def poses(self, values: Mapping[str, float]) -> dict[str, Array]:
+        """(4, 4) poses of the links, in any one frame, from the positions of the file's joints."""
+        ...
+
+
+def oracle(path: Path) -> Oracle:
+    """Pinocchio for URDF, MuJoCo for MJCF.
+
+    Raises:
+        DescriptionError: The file cannot be read.
+        MissingExtraError: The library is not installed.
+    """
+    element = robot_element(path)
+    return _MuJoCo(path) if element.tag == "mujoco" else _Pinocchio(element)
+
+
+def largest_difference(
+    robot: ArmHand,
+    path: Path,
+    q: Array,
+    locked: Mapping[str, float] | None = None,
+    beside: Path | None = None,
+) -> float:
+    """How far the links of a robot are from where its file's library has them.
+
+    Args:
+        robot: The robot, imported from the file, alone or as a part.
+        path: The file.
+        q: (k, n) positions of the actuators [rad or m].
+        locked: Joints that the description holds, and where.
+        beside: The file of the arm that this file's hand is on, whose names go before.
+
+    Returns:
+        The largest entry of the difference of any two poses, relative to the first link of the
+        file that the robot has.
+
+    Raises:
+        DescriptionError: The file cannot be read.
+        MissingExtraError: Its library is not installed.
+    """
+    tree = read_tree(path)
+    known = oracle(path)
+    taken = set() if beside is None else _names(read_tree(beside))
+    links = {link: _ours(link, robot.description.links, taken) for link in tree.links}
+    joints = {
+        one.name: _ours(one.name, robot.description.joint_names, taken) for one in tree.joints
+    }
+    worst = 0.0
+    for configuration in q:
+        angles = robot.joints(configuration)
+        given = {name: angles[ours] for name, ours in joints.items() if ours in angles}
+        values = {name: _value(tree, name, given, locked or {}) for name in tree.by_name}
+        theirs, found = known.poses(values), robot.links(configuration)
+        pairs = [
+            (theirs[link], found[ours])
+            for link, ours in links.items()
+            if ours in found and link in theirs
+        ]
+        first = pairs[0]
+        for one, other in pairs:
+            difference = np.linalg.inv(first[0]) @ one - np.linalg.inv(first[1]) @ other
+            worst = max(worst, float(np.abs(difference).max()))
+    return worst
+
+
+def _names(tree: RobotTree) -> set[str]:
+    return {*tree.links, *tree.by_name}
+
+
+def _ours(name: str, names: tuple[str, ...], taken: set[str]) -> str:
+    """What a link or joint of a file is called in the robot."""
+    prefixed = PREFIX + name
+    return prefixed if prefixed in names and name in taken else name
+
+
+def _value(
+    tree: RobotTree, name: str, given: Mapping[str, float], locked: Mapping[str, float]
+) -> float:
+    joint = tree.by_name[name]
+    if name in given or name in locked:
+        return given.get(name, locked.get(name, 0.0))
+    if joint.coupling is not None and joint.coupling.of in tree.by_name:
+        source = _value(tree, joint.coupling.of, given, locked)
+        return float(joint.coupling.followed(np.array([source]))[0])
+    if joint.limits is not None and joint.limits[0] == joint.limits[1]:
+        return joint.limits[0]
+    return 0.0
+
+
+class _Pinocchio:
+    def __init__(self, element: ElementTree.Element) -> None:
+        self._pin: Any = pinocchio()
+        text = ElementTree.tostring(bare(element), encoding="unicode")
+        self._model = self._pin.buildModelFromXML(text)
+        self._data = self._model.createData()
+
+    def poses(self, values: Mapping[str, float]) -> dict[str, Array]:
+        q = self._pin.neutral(self._model)
+        for name, value in values.items():
+            if not self._model.existJointName(name):
+                continue
+            joint = self._model.joints[self._model.getJointId(name)]
+            if joint.nq == 1:
+                q[joint.idx_q] = value
+            elif joint.nq == 2:  # a turn without end as cosine and sine
+                q[joint.idx_q : joint.idx_q + 2] = np.cos(value), np.sin(value)
+        self._pin.framesForwardKinematics(self._model, self._data, q)
+        return {
+            frame.name: self._data.oMf[i].homogeneous
+            for i, frame in enumerate(self._model.frames)
+            if frame.type == self._pin.BODY
+        }
+
+
+class _MuJoCo:
+    def __init__(self, path: Path) -> None:
+        self._mujoco, self._model = mujoco_model(path)
+        self._data = self._mujoco.MjData(self._model)
+
+    def poses(self, values: Mapping[str, float]) -> dict[str, Array]:
+        model, data = self._model, self._data
+        for joint in range(model.njnt):
+            name = joint_name(model, joint)
+            if name in values:
+                data.qpos[model.jnt_qposadr[joint]] = values[name]
+        self._mujoco.mj_kinematics(model, data)
+        found = {}
+        for body in range(model.nbody):
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
+            found[model.body(body).name or f"body_{body}"] = pose
+        return found

@@ -1,0 +1,157 @@
+"""A robot from the files of its parts, or of the whole: everything chosen, guessed and written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.errors import DescriptionError, InputError
+from casadi_ik.importing.choices import (
+    assumed_limits,
+    assumed_locks,
+    file_text,
+    kept_joints,
+    the_palm,
+    the_tip,
+)
+from casadi_ik.importing.fingers import Branch, find_fingers
+from casadi_ik.importing.home import guess_home
+from casadi_ik.importing.pads import Pad, guess_pads
+from casadi_ik.importing.posture import Postures
+from casadi_ik.importing.surfaces import Surface, checked_surfaces
+from casadi_ik.importing.thumb import guess_palm_frame, guess_thumb
+from casadi_ik.importing.write import FileLine, Written
+from casadi_ik.robots.file_parts import hand_from_file
+from casadi_ik.robots.load import load_description
+from casadi_ik.robots.robot_files.read import read_tree
+from casadi_ik.robots.schema import HandFromFile
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """What came out.
+
+    Attributes:
+        written: The description.
+        branches: The fingers as they were found, the thumb first.
+        pads: Their pads.
+        surfaces: Shapes of the hand's links, by the file's names.
+        files: The arm's and the hand's file.
+    """
+
+    written: Written
+    branches: tuple[Branch, ...]
+    pads: tuple[Pad, ...]
+    surfaces: dict[str, Surface]
+    files: tuple[Path | None, Path]
+
+    def at_home(self, path: Path) -> Imported:
+        """With a home, found for the description as it was written to a path.
+
+        Raises:
+            CasadiIKError: The description cannot be loaded.
+        """
+        description = load_description(path)
+        home = guess_home(description).tolist()
+        named = dict(zip(description.actuator_names, home, strict=True))
+        return replace(self, written=replace(self.written, home=named))
+
+
+def import_robot(
+    arm: Path | None,
+    hand: Path,
+    out: Path,
+    *,
+    command: str,
+    tip: str | None = None,
+    palm: str | None = None,
+    mount: Sequence[float] | None = None,
+    shapes: bool = False,
+) -> Imported:
+    """Choose and guess everything that a description needs but home.
+
+    Args:
+        arm: File of the arm; None if the hand's file has it, or there is none.
+        hand: File of the hand or of the whole robot.
+        out: Where the description will stand.
+        command: What made it, for its first line.
+        tip: Link of the arm that carries the hand; None: guessed.
+        palm: Link that the fingers hang on; None: guessed.
+        mount: (6,) pose of the hand's base on the tip [m, rad]; None: on it.
+        shapes: Whether the shapes of all links are wanted, for a picture.
+
+    Raises:
+        CasadiIKError: A file cannot be read, or nothing says what to choose.
+    """
+    tree = read_tree(hand)
+    palm_link, palm_how = the_palm(tree, palm)
+    joints = kept_joints(tree, palm_link, below=True)
+    moved = sum(joint.type != "fixed" for joint in tree.chain(tree.root, palm_link, str(hand)))
+    key = "robot" if arm is None and moved else "hand"
+    limits, locked = assumed_limits(joints), assumed_locks(joints)
+    entry = HandFromFile(str(hand.resolve()), palm_link, locked=locked, limits=limits)
+    part = hand_from_file(entry, {}, key, out)
+    postures = Postures(part)
+    branches = find_fingers(postures, palm_link)
+    if not branches:
+        raise DescriptionError(f"{hand}: no joint moves below the palm {palm_link!r}; try --palm")
+    wanted = (
+        {joint.child for joint in part.joints} | {part.root}
+        if shapes
+        else {one for branch in branches for one in _ends_of(postures, branch)}
+    )
+    surfaces, notes = checked_surfaces(hand, wanted)
+    pads = guess_pads(postures, palm_link, branches, surfaces)
+    thumb, thumb_how = guess_thumb(postures, branches, pads)
+    frame = guess_palm_frame(postures, palm_link, branches, pads, thumb)
+    if not any(branch.name == "thumb" for branch in branches):
+        branches[thumb] = replace(branches[thumb], name="thumb")
+    order = [thumb, *(i for i in range(len(branches)) if i != thumb)]
+    arm_line = None if arm is None else _arm_line(arm, out, tip)
+    if arm is None and (tip is not None or mount is not None):
+        option = "--tip" if tip is not None else "--mount"
+        raise InputError(f"{option}: there is no arm in a file of its own")
+    written = Written(
+        command=command,
+        name=out.stem,
+        arm=arm_line,
+        hand=FileLine(file_text(hand, out), palm_link, palm_how, limits, locked),
+        key=key,
+        mount=None if arm is None else list(mount or [0.0] * 6),
+        mount_how="--mount" if mount else "GUESS: the hand's base on the arm's tip",
+        palm=frame,
+        fingers={branches[i].name: pads[i] for i in order},
+        thumb=(branches[thumb].name, thumb_how),
+        notes=notes,
+    )
+    return Imported(
+        written,
+        tuple(branches[i] for i in order),
+        tuple(pads[i] for i in order),
+        surfaces,
+        (arm, hand),
+    )
+
+
+def _ends_of(postures: Postures, branch: Branch) -> list[str]:
+    """The links of a finger's last two phalanges, one of which has a shape, one hopes."""
+    return [link for joint in branch.chain[-2:] for link in postures.rigid(joint.child)]
+
+
+def _arm_line(arm: Path, out: Path, tip: str | None) -> FileLine:
+    tree = read_tree(arm)
+    if tip is None:
+        link, how = the_tip(tree)
+    elif tip in tree.links:
+        link, how = tip, "--tip"
+    else:
+        raise InputError(f"--tip: {arm.name} has no link {tip!r}; it has {', '.join(tree.links)}")
+    joints = kept_joints(tree, link, below=False)
+    return FileLine(file_text(arm, out), link, how, assumed_limits(joints), assumed_locks(joints))
+
+
+def loaded(path: Path) -> ArmHand:
+    """The robot of a description that was written."""
+    return ArmHand(load_description(path))

@@ -1,0 +1,79 @@
+"""Where the links of a part are, in plain numbers: before there is a robot to be compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.robots.description import Joint
+from casadi_ik.robots.part import Part
+from casadi_ik.robots.robot_files.tree import turned
+
+
+class Postures:
+    """A part and its joints in positions."""
+
+    def __init__(self, part: Part) -> None:
+        """Take a part."""
+        self.part = part
+        self.joints = {joint.name: joint for joint in part.joints}
+        self.by_child = {joint.child: joint for joint in part.joints}
+
+    def middle(self) -> dict[str, float]:
+        """Every joint in the middle of its range [rad or m]."""
+        return {
+            name: (joint.lower + joint.upper) / 2
+            for name, joint in self.joints.items()
+            if joint.type != "fixed"
+        }
+
+    def random(self, rng: np.random.Generator) -> dict[str, float]:
+        """Every joint anywhere in the middle half of its range, couplings left out."""
+        return {
+            name: joint.lower + (0.25 + 0.5 * rng.random()) * (joint.upper - joint.lower)
+            for name, joint in self.joints.items()
+            if joint.type != "fixed"
+        }
+
+    def poses(self, values: Mapping[str, float]) -> dict[str, Array]:
+        """(4, 4) pose of every link in the root's frame."""
+        found = {self.part.root: np.eye(4)}
+        for joint in self.part.joints:
+            pose = found[joint.parent] @ joint.placement
+            found[joint.child] = pose @ moved(joint, values.get(joint.name, 0.0))
+        return found
+
+    def chain(self, link: str, top: str) -> list[Joint]:
+        """The joints that move a link against one above it, in order."""
+        found: list[Joint] = []
+        while link != top and link in self.by_child:
+            joint = self.by_child[link]
+            if joint.type != "fixed":
+                found.append(joint)
+            link = joint.parent
+        return found[::-1]
+
+    def rigid(self, link: str) -> list[str]:
+        """A link and all that is fixed to it below."""
+        found = [link]
+        for joint in self.part.joints:
+            if joint.type == "fixed" and joint.parent in found:
+                found.append(joint.child)
+        return found
+
+    def moving_link(self, link: str) -> str:
+        """The link itself, or the next one above that a joint moves."""
+        while link in self.by_child and self.by_child[link].type == "fixed":
+            link = self.by_child[link].parent
+        return link
+
+
+def moved(joint: Joint, value: float) -> Array:
+    """(4, 4) what a joint does at a position [rad or m]."""
+    if joint.type == "prismatic":
+        pose = np.eye(4)
+        pose[:3, 3] = joint.axis * value
+        return pose
+    return turned(joint.axis, value if joint.type == "revolute" else 0.0)

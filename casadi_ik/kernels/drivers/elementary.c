@@ -1,0 +1,86 @@
+/* Sines, cosines and arc functions, as plain functions and once more for vectors.
+ *
+ * The C library takes one number at a time: of four or eight solves side by side a quarter of the
+ * time went there. These are arithmetic only, and the same arithmetic in both forms: a solve's
+ * iterates are bit for bit the same alone and among others, and do not depend on whose C library a
+ * machine has. Within 2 units in the last place of normal numbers; angles beyond 5e8 rad go to the C library.
+ * Reductions and coefficients are those of Moshier's Cephes library (sin.c, atan.c).
+ *
+ * Expects the macros NAME(f), QUALIFIERS, REAL and INTEGER, BITS(real) and REAL_OF(integer) for the
+ * same bits, MASK(comparison) with all bits of a true entry set, ROOT, SMALL(real) whether all
+ * entries are such as can be reduced here, and LIBRARY(f, x) for the others.
+ */
+#define K(number) ((REAL) {0} + (number))
+#define PICK(mask, yes, no) REAL_OF(((mask) & BITS(yes)) | (~(mask) & BITS(no)))
+
+/* The nearest whole number, as the last bits of a sum: without a call in either form. */
+#define SHIFT 6755399441055744.0
+#define SIGN ((INTEGER) {0} + INT64_MIN)
+
+QUALIFIERS REAL NAME(reduced)(REAL x, REAL *turns) {
+  const REAL k = x * 0.63661977236758134308 + SHIFT, whole = k - SHIFT;
+  *turns = k;
+  return ((x - whole * 1.57079625129699707031) - whole * 7.54978941586159635335e-8)
+       - whole * 5.39030285815811905290e-15;
+}
+
+/* Sine of x and `quarters` quarters of a turn. */
+QUALIFIERS REAL NAME(turned)(REAL x, int64_t quarters) {
+  REAL k;
+  const REAL r = NAME(reduced)(x, &k), z = r * r;
+  const REAL s = r + r * z * (-1.66666666666666307295e-1
+      + z * (8.33333333332211858878e-3 + z * (-1.98412698295885395996e-4
+      + z * (2.75573136213857245213e-6 + z * (-2.50507477628578072866e-8
+      + z * 1.58962301576546568060e-10)))));
+  const REAL c = (1.0 - 0.5 * z) + z * z * (4.16666666666665929218e-2
+      + z * (-1.38888888888730564116e-3 + z * (2.48015872888517045348e-5
+      + z * (-2.75573141792967388112e-7 + z * (2.08757008419747316778e-9
+      + z * -1.13585365213876817300e-11)))));
+  const INTEGER quarter = BITS(k) + quarters, odd = -(quarter & 1), below = -((quarter >> 1) & 1);
+  return REAL_OF(BITS(PICK(odd, c, s)) ^ (below & SIGN));
+}
+
+QUALIFIERS REAL NAME(sin)(REAL x) { return SMALL(x) ? NAME(turned)(x, 0) : LIBRARY(sin, x); }
+QUALIFIERS REAL NAME(cos)(REAL x) { return SMALL(x) ? NAME(turned)(x, 1) : LIBRARY(cos, x); }
+QUALIFIERS REAL NAME(tan)(REAL x) { return NAME(sin)(x) / NAME(cos)(x); }
+
+/* Angle of (x, y): that of the smaller coordinate over the larger, which is at most 1, or by
+ * tan(a - pi / 4) = (t - 1) / (t + 1) beyond 0.66; then by symmetry. */
+QUALIFIERS REAL NAME(atan2)(REAL y, REAL x) {
+  const REAL wide = REAL_OF(BITS(x) & ~SIGN), high = REAL_OF(BITS(y) & ~SIGN);
+  const INTEGER steep = MASK(high > wide);
+  const REAL large = PICK(steep, high, wide), less = PICK(steep, wide, high);
+  const INTEGER beyond = MASK(less > large * 0.66), none = MASK(large == 0.0);
+  const REAL above = PICK(beyond, less - large, less);
+  const REAL below = PICK(beyond, less + large, PICK(none, K(1.0), large));
+  const REAL t = above / below, z = t * t;
+  const REAL p = (((-8.750608600031904122785e-1 * z - 1.615753718733365076637e1) * z
+      - 7.500855792314704667340e1) * z - 1.228866684490136173410e2) * z - 6.485021904942025371773e1;
+  const REAL q = ((((z + 2.485846490142306297962e1) * z + 1.650270098316988542046e2) * z
+      + 4.328810604912902668951e2) * z + 4.853903996359136964868e2) * z + 1.945506571482613964425e2;
+  /* What pi has beyond a double is added with the small part. */
+  const REAL rest = t * (z * p / q) + REAL_OF(beyond & BITS(K(3.0616169978683830e-17)));
+  REAL angle = REAL_OF(beyond & BITS(K(0.78539816339744830962))) + (t + rest);
+  angle = PICK(steep, 1.57079632679489661923 - (angle - 6.123233995736766e-17), angle);
+  angle = PICK(BITS(x) >> 63, 3.14159265358979323846 - (angle - 1.2246467991473532e-16), angle);
+  return REAL_OF(BITS(angle) | (BITS(y) & SIGN));
+}
+
+QUALIFIERS REAL NAME(atan)(REAL x) { return NAME(atan2)(x, K(1.0)); }
+QUALIFIERS REAL NAME(asin)(REAL x) { return NAME(atan2)(x, ROOT((1.0 - x) * (1.0 + x))); }
+QUALIFIERS REAL NAME(acos)(REAL x) { return NAME(atan2)(ROOT((1.0 - x) * (1.0 + x)), x); }
+
+#undef K
+#undef PICK
+#undef SHIFT
+#undef SIGN
+#undef NAME
+#undef QUALIFIERS
+#undef REAL
+#undef INTEGER
+#undef BITS
+#undef REAL_OF
+#undef MASK
+#undef ROOT
+#undef SMALL
+#undef LIBRARY

@@ -1,0 +1,1 @@
+"""Hands that are calibrated although their dimensions are known: trials and their pictures."""

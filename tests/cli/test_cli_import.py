@@ -1,0 +1,187 @@
+"""`casadi-ik import`: from somebody's files to a description that is solved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from command_line import Command
+
+import casadi_ik as ik
+
+PHALANX = """<collision><origin xyz="0 0 {middle}"/><geometry>
+<box size="0.02 0.016 {length}"/></geometry></collision>"""
+
+
+def link(name: str, inside: str = "") -> str:
+    return f'<link name="{name}">{inside}</link>\n'
+
+
+def joint(name: str, parent: str, child: str, xyz: str, axis: str, limits: str, **more: str) -> str:
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    low, high = limits.split()
+    limit = f'<limit lower="{low}" upper="{high}" velocity="0" effort="1"/>'
+    origin = f'<origin xyz="{xyz}" rpy="{more.get("rpy", "0 0 0")}"/>'
+    kind = more.get("kind", "revolute")
+    inner = f'{origin}{ends}<axis xyz="{axis}"/>{limit if kind == "revolute" else ""}'
+    return f'<joint name="{name}" type="{kind}">{inner}</joint>\n'
+
+
+def hand(folder: Path, shapes: bool = True) -> Path:
+    """Two fingers at y = -40 mm that bend to +y, and one at +40 mm that bends to -y."""
+    end = PHALANX.format(middle=0.02, length=0.04) if shapes else ""
+    text = link("palm")
+    for name, x, side in (("ff", -0.03, -1), ("mf", 0.03, -1), ("opposed", 0.0, 1)):
+        place, axis = f"{x} {0.04 * side} 0.05", f"{side} 0 0"
+        text += link(f"{name}_1") + link(f"{name}_2") + link(f"{name}_3", end)
+        text += joint(f"{name}_a", "palm", f"{name}_1", place, "0 1 0", "-0.3 0.3")
+        text += joint(f"{name}_b", f"{name}_1", f"{name}_2", "0 0 0.01", axis, "-0.1 1.4")
+        text += joint(f"{name}_c", f"{name}_2", f"{name}_3", "0 0 0.04", axis, "0 1.5")
+    path = folder / "hand.urdf"
+    path.write_text(f'<robot name="hand">{text}</robot>')
+    return path
+
+
+def arm(folder: Path) -> Path:
+    """Six joints, then a fixed flange; the last joint turns without end."""
+    text = link("base") + "".join(link(f"l{i}") for i in range(6)) + link("tool_flange")
+    links = ["base", *(f"l{i}" for i in range(6))]
+    for i, axis in enumerate(("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")):
+        step = ("0 0 0.3", "0.05 0 0.1", "0 0 0.35", "0.3 0 0.05", "0.1 0 0", "0.08 0 0")[i]
+        kind = "continuous" if i == 5 else "revolute"
+        text += joint(f"j{i}", links[i], links[i + 1], step, axis, "-2.5 2.5", kind=kind)
+    text += joint(
+        "f", "l5", "tool_flange", "0.05 0 0", "0 0 1", "0 0", kind="fixed", rpy="0 1.57 0"
+    )
+    path = folder / "arm.urdf"
+    path.write_text(f'<robot name="arm">{text}</robot>')
+    return path
+
+
+def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.Generator) -> None:
+    arm(tmp_path)
+    hand(tmp_path)
+    done = run_process("import", "arm.urdf", "hand.urdf", "--out", "mine.yaml", "--check")
+    assert (done.exit, done.err) == (0, ""), done
+    words = done.out.split()
+    for word in ("IMPORTED", "tool_flange:", "15", "GUESS", "library", "mine.yaml"):
+        assert word in words, done.out
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "arm.urdf",
+        "hand.urdf",
+        "mine.yaml",
+    ]
+    robot = ik.load_robot(tmp_path / "mine.yaml")
+    # The file calls two fingers; the third bends against them.
+    assert robot.fingers == ("thumb", "index", "middle")
+    assert robot.thumb == "thumb"
+    assert (np.abs(robot.home - (robot.lower + robot.upper) / 2) < np.pi / 2 + 0.01).all()
+    points, normals = robot.contacts(robot.random(rng, 1)[0])
+    contacts = {
+        name: {"point": points[i].tolist(), "normal": normals[i].tolist()}
+        for i, name in enumerate(robot.fingers)
+    }
+    grasp = {"robot": "mine.yaml", "contacts": contacts}
+    (tmp_path / "grasp.yaml").write_text(yaml.safe_dump(grasp))
+    solved = run_process("solve", "grasp.yaml", "--out", "solved.json")
+    assert solved.exit == 0, solved
+    assert "SOLVED" in solved.out
+
+
+def test_guessed_pads_are_on_the_skin_of_the_closing_side(run: Command, tmp_path: Path) -> None:
+    done = run("import", hand(tmp_path), "--out", tmp_path / "mine.yaml")
+    assert (done.exit, done.err) == (0, "")
+    text = (tmp_path / "mine.yaml").read_text()
+    data = yaml.safe_load(text)
+    assert text.count("GUESS") >= 5
+    assert data["hand"] == data["hand"] | {"file": "hand.urdf"}
+    assert data["hand"]["palm"]["link"] == "palm"
+    for name, side in (("thumb", -1), ("index", 1), ("middle", 1)):
+        pad = data["fingers"][name]
+        np.testing.assert_allclose(pad["normal"], [0, side, 0], atol=1e-6)
+        # A box of 16 mm, 40 mm long: 8 mm from its end, in the middle of its side.
+        np.testing.assert_allclose(pad["xyz"], [0, side * 0.008, 0.032], atol=1e-6)
+
+
+def test_without_shapes_the_pad_is_guessed_from_the_joints(run: Command, tmp_path: Path) -> None:
+    done = run("import", hand(tmp_path, shapes=False), "--out", tmp_path / "mine.yaml")
+    assert done.exit == 0
+    data = yaml.safe_load((tmp_path / "mine.yaml").read_text())
+    np.testing.assert_allclose(data["fingers"]["index"]["normal"], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(data["fingers"]["index"]["xyz"], [0, 0, 0.032], atol=1e-6)
+    assert "the file has no shapes" in (tmp_path / "mine.yaml").read_text()
+
+
+def test_missing_meshes_are_named(run: Command, tmp_path: Path) -> None:
+    path = hand(tmp_path)
+    mesh = '<collision><geometry><mesh filename="package://x/tip.stl"/></geometry></collision>'
+    text = path.read_text().replace('<link name="ff_3">', f'<link name="ff_3">{mesh}')
+    path.write_text(text)
+    done = run("import", path, "--out", tmp_path / "mine.yaml")
+    assert (done.exit, done.err) == (0, "")
+    assert "no mesh 'package://x/tip.stl'" in done.out
+
+
+def test_options_go_before_guesses(run: Command, tmp_path: Path) -> None:
+    words = ("--tip", "l5", "--palm", "palm", "--mount", "0.01", "0", "-0.02", "0", "0.5", "0")
+    out = tmp_path / "mine.yaml"
+    assert run("import", arm(tmp_path), hand(tmp_path), *words, "--out", out).exit == 0
+    data = yaml.safe_load(out.read_text())
+    assert data["arm"]["tip"] == "l5"
+    assert data["mount"] == {"xyz": [0.01, 0, -0.02], "rpy": [0, 0.5, 0]}
+
+
+def test_joints_without_limits_get_assumed_ones(run: Command, tmp_path: Path) -> None:
+    path = hand(tmp_path)
+    limit = '<limit lower="-0.3" upper="0.3" velocity="0" effort="1"/>'
+    path.write_text(path.read_text().replace(limit, ""))
+    done = run("import", path, "--out", tmp_path / "mine.yaml")
+    assert done.exit == 0
+    data = yaml.safe_load((tmp_path / "mine.yaml").read_text())
+    assert data["hand"]["limits"]["ff_a"] == [-3.14159, 3.14159]
+    assert "assumed, since hand.urdf states none" in " ".join(done.out.split())
+
+
+REFUSALS = {
+    "no file": (("nothing.urdf",), "nothing.urdf: cannot be read: No such file"),
+    "no such palm": (("hand.urdf", "--palm", "hip"), "--palm: hand.urdf has no link 'hip'"),
+    "no such tip": (("arm.urdf", "hand.urdf", "--tip", "x"), "--tip: arm.urdf has no link 'x'"),
+    "mount of three": (("arm.urdf", "hand.urdf", "--mount", "1", "2", "3"), "found 3 numbers"),
+    "mount without arm": (("hand.urdf", "--mount", *"123456"), "--mount: there is no arm"),
+    "an arm for a hand": (("arm.urdf", "hand.urdf", "--palm", "mf_3"), "no joint moves below"),
+    "two arms": (("two.urdf",), "--palm: missing; from 'base' of two.urdf go chains as long"),
+    "arm that branches": (("two.urdf", "hand.urdf"), "--tip: missing; two.urdf branches at 'base'"),
+    "output is the input": (("hand.urdf", "--out", "hand.urdf"), "expected a name ending in .yaml"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_refusals_leave_nothing(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    words, says = REFUSALS[case]
+    monkeypatch.chdir(tmp_path)
+    hand(tmp_path)
+    body = arm(tmp_path).read_text().partition('<link name="l0">')[2].removesuffix("</robot>")
+    other = f'<link name="l0">{body}'.replace('"l', '"m').replace('"j', '"k').replace('"f"', '"g"')
+    body = f'<link name="base"/><link name="l0">{body}{other.replace("tool_", "tool2_")}'
+    Path("two.urdf").write_text(f'<robot name="two">{body}</robot>')
+    before = sorted(tmp_path.iterdir())
+    error = run("import", "--out", "mine.yaml", *words).error
+    assert says in error
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.opengl
+def test_picture(run: Command, tmp_path: Path) -> None:
+    out, picture = tmp_path / "mine.yaml", tmp_path / "mine.png"
+    done = run("import", hand(tmp_path), "--out", out, "--picture", picture)
+    assert (done.exit, done.err) == (0, "")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "hand.urdf",
+        "mine.png",
+        "mine.yaml",
+    ]

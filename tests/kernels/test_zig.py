@@ -1,0 +1,67 @@
+"""A machine whose only compiler is the Python package ziglang."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("ziglang") is None, reason="needs the package ziglang"
+)
+
+HERE = Path(__file__).parent
+
+ITERATES = """
+import sys
+import numpy as np
+from casadi_ik.kernels import LoopKernel
+from casadi_ik.kernels.compiler import find_compiler
+from tests.kernels.graphs import branching_step, random_step
+print("ziglang" in find_compiler().command, file=sys.stderr)
+rng = np.random.default_rng(0)
+for step in (random_step(0), branching_step()):
+    kernel = LoopKernel(step)
+    assert kernel.compiled
+    result = kernel.run(rng.normal(size=(40, 4)), rng.normal(size=(40, 2)), 300, trace=True)
+    sys.stdout.buffer.write(result.states.tobytes() + result.rows.tobytes())
+"""
+
+
+def environment(tmp_path: Path) -> dict[str, str]:
+    """One without any compiler on its path, and a cache of its own."""
+    (tmp_path / "empty").mkdir()
+    changed = {"PATH": str(tmp_path / "empty"), "CASADI_IK_CACHE": str(tmp_path / "cache")}
+    home = {"ZIG_GLOBAL_CACHE_DIR": str(tmp_path / "zig"), "PYTHONPATH": str(HERE.parents[1])}
+    return {key: value for key, value in os.environ.items() if key != "CC"} | changed | home
+
+
+def test_the_kernel_tests_pass(tmp_path: Path) -> None:
+    files = ("test_loop.py", "test_function_kernel.py", "test_lookup.py", "test_elementary.py")
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0"]
+    done = subprocess.run(
+        [*command, *(str(HERE / name) for name in files)],
+        env=environment(tmp_path),
+        cwd=HERE.parents[1],
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
+    assert "skipped" not in done.stdout
+
+
+def test_iterates_are_those_of_any_other_compiler(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", ITERATES]
+    told = {"capture_output": True, "cwd": HERE.parents[1], "timeout": 600}
+    zig = subprocess.run(command, env=environment(tmp_path), **told)
+    assert zig.stderr.split()[:1] == [b"True"], zig.stderr
+    usual = subprocess.run(command, env=os.environ | {"PYTHONPATH": str(HERE.parents[1])}, **told)
+    if b"False" not in usual.stderr:
+        pytest.skip("there is no other compiler to compare with")
+    assert len(zig.stdout) > 10_000
+    assert zig.stdout == usual.stdout

@@ -1,0 +1,145 @@
+"""Shipped arms with shipped hands, and their numbers against what others published.
+
+`published_poses.json` holds poses of links that pinocchio and MuJoCo found in published files,
+whose names stand beside them; the files themselves are no part of this project.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import casadi_ik as ik
+from casadi_ik.cli.question import the_robot
+from casadi_ik.errors import DescriptionError, UnknownNameError
+from casadi_ik.files.reading import read
+from casadi_ik.files.shipped import resolve
+from casadi_ik.importing.posture import Postures
+from casadi_ik.robots import load_description
+from casadi_ik.robots.described_parts import arm_part, hand_part
+from casadi_ik.robots.schema import ArmFile, HandFile
+
+ARMS = [
+    "kuka_lwr4",
+    "iiwa7",
+    "iiwa14",
+    "panda",
+    "fr3",
+    "ur3e",
+    "ur5e",
+    "ur10e",
+    "ur16e",
+    "ur5",
+    "ur10",
+    "xarm6",
+    "xarm7",
+    "kinova_gen3",
+    "jaco2",
+    "sawyer",
+    "baxter_right",
+    "baxter_left",
+    "viperx_300s",
+    "puma560",
+    "irb140",
+]
+HANDS = [
+    "barrett_bh8_280",
+    "barrett_bh8_280_coupled",
+    "allegro_right",
+    "allegro_left",
+    "shadow",
+    "leap",
+    "robotiq_3f",
+    "schunk_svh",
+    "ability",
+    "inspire_rh56",
+    "ar10",
+    "jaco_3f",
+    "dclaw",
+    "trifinger",
+    "unitree_dex3",
+]
+
+PUBLISHED = json.loads(Path(__file__).with_name("published_poses.json").read_text())
+
+
+def test_names():
+    assert set(ik.shipped_names("arms")) == set(ARMS)
+    assert set(ik.shipped_names("hands")) == set(HANDS)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_every_arm_takes_a_hand(arm):
+    description = load_description(f"{arm}+allegro_right")
+    assert description.name == f"{arm}+allegro_right"
+    assert len(description.arm_actuators) in (6, 7)
+    assert description.thumb == "thumb"
+    home, lower, upper = description.home, description.lower, description.upper
+    arm_part = list(description.arm_actuators)
+    assert (home[arm_part] != 0).sum() >= 3
+    assert (np.minimum(home - lower, upper - home)[arm_part] > np.deg2rad(4)).all()
+
+
+@pytest.mark.parametrize("hand", HANDS)
+def test_every_hand_goes_on_an_arm(hand):
+    description = load_description(f"ur5e+{hand}")
+    assert len(description.fingers) >= 3
+    assert description.actuator_names[:6] == tuple(f"ur5e_joint_{i}" for i in range(1, 7))
+    assert description.sources
+    for finger in description.fingers:
+        assert finger.joints
+        np.testing.assert_allclose(np.linalg.norm(finger.normal), 1, atol=1e-12)
+
+
+@pytest.mark.parametrize("arm", PUBLISHED["arms"])
+def test_arms_stand_where_published_files_have_them(arm):
+    known = PUBLISHED["arms"][arm]
+    path = resolve(arm, "arms")
+    part = arm_part(read(path, ArmFile)[0], path)
+    names = [joint.name for joint in part.joints if joint.type != "fixed"]
+    for q, pose in zip(known["q"], known["poses"], strict=True):
+        links = Postures(part).poses(dict(zip(names, q, strict=True)))
+        tip = np.array(known["base"]) @ links[part.tip_link] @ part.tip @ np.linalg.inv(part.tip)
+        theirs = np.array(pose) @ np.linalg.inv(known["tip"])
+        np.testing.assert_allclose(tip, theirs, atol=known["tolerance"])
+
+
+@pytest.mark.parametrize("hand", PUBLISHED["hands"])
+def test_hands_stand_where_published_files_have_them(hand):
+    known = PUBLISHED["hands"][hand]
+    path = resolve(hand, "hands")
+    part = hand_part(read(path, HandFile)[0], path)
+    for q, links in zip(known["q"], known["links"], strict=True):
+        found = Postures(part).poses(dict(zip(known["joints"], q, strict=True)))
+        assert len(links) >= 3
+        for link, pose in links.items():
+            np.testing.assert_allclose(found[link][:3], pose, atol=known["tolerance"])
+
+
+def test_unknown_arms_and_hands_are_named():
+    with pytest.raises(UnknownNameError, match=r"no shipped arm is called 'pander'; shipped: "):
+        ik.load_robot("pander+allegro_right")
+    with pytest.raises(UnknownNameError, match=r"no shipped hand is called 'allegra'; shipped: "):
+        ik.load_robot("panda+allegra")
+    with pytest.raises(DescriptionError, match="no such file"):
+        ik.load_robot("a+b/robot.yaml")
+
+
+@pytest.mark.parametrize("pair", ["panda+allegro_right", "ur5e+leap"])
+def test_random_reachable_targets_are_solved(pair, rng):
+    robot = ik.load_robot(pair)
+    q = robot.random(rng, 4)
+    solver = ik.Solver(robot, compiled=False, options={"table": 256})
+    assert solver.solve_batch(*robot.contacts(q)).success.all()
+
+
+def test_a_grasp_file_may_name_a_pair(tmp_path):
+    """The command line counts a path from the file, but a pair is no path."""
+    contact = {"point": [0.4, 0.1, 0.5], "normal": [0, 0, 1]}
+    path = tmp_path / "grasp.yaml"
+    path.write_text(yaml.safe_dump({"robot": "panda+leap", "contacts": {"thumb": contact}}))
+    assert the_robot(None, path, ik.load_grasp(path)).name == "panda+leap"

@@ -1,0 +1,200 @@
+"""What cannot be imported is refused in one line that names file and joint, and what to write."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from imported_files import FINGERS, describe, hand, joint, link, urdf
+
+from casadi_ik.errors import CasadiIKError
+from casadi_ik.robots import load_description
+
+BOMB = """<?xml version="1.0"?>
+<!DOCTYPE robot [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>
+<robot name="&b;"><link name="base_link"/></robot>
+"""
+
+TEXTS = {
+    # what is wrong: (text in the hand's file, its replacement, what is said)
+    "no XML": ("</robot>", "<robot>", "hand.urdf: not valid XML: "),
+    "no robot": ('<robot name="hand">', "<html>", "hand.urdf: not valid XML: mismatched tag"),
+    "unknown type": ('type="revolute"', 'type="screw"', "joint 'left_spread': type: found 'screw'"),
+    "no such link": (
+        'child link="left_1"',
+        'child link="left_7"',
+        "joint 'left_spread': child: there is no link 'left_7'",
+    ),
+    "link twice": (
+        '<link name="left_2"/>',
+        '<link name="left_1"/>',
+        "link 'left_1' appears twice",
+    ),
+    "joint twice": ('name="left_bend"', 'name="left_spread"', "joint 'left_spread' appears twice"),
+    "number": ('xyz="0 0.04 0.05"', 'xyz="0 0.04 5cm"', "origin: xyz: found '0 0.04 5cm'"),
+    "infinite": ('xyz="0 0.04 0.05"', 'xyz="0 inf 0"', "expected three finite numbers"),
+    "zero axis": ('axis xyz="0 0 1"', 'axis xyz="0 0 0"', "joint 'left_spread': axis: is zero"),
+    "limits": ('lower="-1"', 'lower="2"', "joint 'left_spread': limit: lower 2 is above upper 1.5"),
+    "limit": ('lower="-1"', 'lower="x"', "limit: lower: found 'x', expected a finite number"),
+    "no limits": (
+        '<limit lower="-1" upper="1.5" velocity="2" effort="1"/>',
+        "",
+        "joint 'left_spread' of link 'left_1' states no limits; write "
+        "limits: {left_spread: [LOWER, UPPER]} under hand",
+    ),
+    "a ball": (
+        'name="left_spread" type="revolute"',
+        'name="left_spread" type="floating"',
+        "joint 'left_spread' is floating, which has no single axis; write "
+        "locked: {left_spread: 0} under hand",
+    ),
+    "two parents": (
+        'child link="right_1"',
+        'child link="left_1"',
+        "joint 'right_spread': link 'left_1' hangs on two joints, expected a tree",
+    ),
+    "two roots": (
+        '<link name="left_2"/>',
+        '<link name="left_2"/><link name="more"/>',
+        "found several base links (base_link, more), expected one: join them by a fixed joint",
+    ),
+    "mimics nothing": ('joint="left_bend"', 'joint="elbow"', "mimics 'elbow', which is no joint"),
+    "mimics itself": (
+        'joint="left_bend"',
+        'joint="left_end"',
+        "mimics in a circle: left_end -> left_end; write locked: {left_end: 0} under hand",
+    ),
+    "no name": ('<link name="left_2"/>', "<link/>", "a link: name: missing"),
+}
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_refusals(tmp_path, case):
+    old, new, says = TEXTS[case]
+    path = hand(tmp_path)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    message = refusal(describe(tmp_path, "hand: {file: hand.urdf}"))
+    assert "hand.urdf" in message
+    assert says in message
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(CasadiIKError) as caught:
+        load_description(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+DESCRIPTIONS = {
+    "no file": ("hand: {file: nothing.urdf}", FINGERS, "nothing.urdf: cannot be read: No such"),
+    "palm": (
+        "hand: {file: hand.urdf, palm: nowhere}",
+        FINGERS,
+        "hand.palm: hand.urdf: unknown link 'nowhere'; known: base_link, left_1",
+    ),
+    "link of a finger": (
+        "hand: {file: hand.urdf}",
+        FINGERS.replace("left_tip", "thumb_tip"),
+        "fingers.left.link: hand.urdf: unknown link 'thumb_tip'; known: base_link",
+    ),
+    "finger not on the palm": (
+        "hand: {file: hand.urdf, palm: right_1}",
+        FINGERS,
+        "fingers.left.link: 'left_tip' does not hang on the palm 'right_1' of hand.urdf",
+    ),
+    "locked": (
+        "hand: {file: hand.urdf, locked: {left_knee: 0}}",
+        FINGERS,
+        "hand.locked: hand.urdf: unknown joint 'left_knee'; known: left_spread",
+    ),
+    "root": (
+        "hand: {file: hand.urdf, root: left_1, palm: right_1}",
+        FINGERS,
+        "hand.palm: hand.urdf: link 'right_1' does not hang on link 'left_1'",
+    ),
+    "stated limits": (
+        "hand: {file: hand.urdf, limits: {left_bend: [2, 1]}}",
+        FINGERS,
+        "hand.limits.left_bend: lower 2 is not below upper 1",
+    ),
+    "two descriptions": (
+        "hand: {file: hand.urdf}\nrobot: {file: hand.urdf}",
+        FINGERS,
+        "expected either 'hand' or 'robot'",
+    ),
+    "no fingers": ("hand: {file: hand.urdf}", "fingers: {}", "fingers: found none"),
+    "finger that cannot move": (
+        "hand: {file: hand.urdf, locked: {left_spread: 0, left_bend: 0}}",
+        FINGERS,
+        "fingers.left.link: no joint moves 'left_tip' against the palm 'base_link'",
+    ),
+    "unknown key": ("hand: {file: hand.urdf, lokced: {}}", FINGERS, "lokced"),
+    "thumb": ("hand: {file: hand.urdf}\nthumb: big", FINGERS, "has no finger 'big'; it has left"),
+}
+
+
+@pytest.mark.parametrize("case", DESCRIPTIONS)
+def test_refused_descriptions(tmp_path, case):
+    text, fingers, says = DESCRIPTIONS[case]
+    hand(tmp_path)
+    path = describe(tmp_path, text, fingers)
+    message = refusal(path)
+    assert says in message
+    assert message.startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (BOMB, "has a document type (<!DOCTYPE ...>), expected plain elements"),
+        ("<a>" * 100_000, "elements nested more than 200 deep"),
+        ("<html></html>", "found <html>, expected a URDF (<robot>) or an MJCF (<mujoco>)"),
+        ("<robot name='x'/>", "there is no base link, it has no link"),
+        ("<robot name='x'><link name='a'/></robot>", "has no joints (1 links)"),
+        ("", "not valid XML: no element found"),
+        ("\xff\xfe", "not UTF-8 text"),
+    ],
+)
+def test_hostile_files(tmp_path, text, says):
+    (tmp_path / "hand.urdf").write_bytes(text.encode("latin-1"))
+    assert says in refusal(describe(tmp_path, "hand: {file: hand.urdf}"))
+
+
+def test_circle_of_links(tmp_path):
+    circle = joint("a", "one", "two") + joint("b", "two", "one")
+    urdf(tmp_path / "hand.urdf", link("base", "one", "two"), circle)
+    message = refusal(describe(tmp_path, "hand: {file: hand.urdf}"))
+    assert "there is a cycle through link 'one'" in message
+
+
+def test_missing_meshes_are_no_matter(tmp_path):
+    mesh = '<mesh filename="package://nowhere/left.stl"/>'
+    shaped = f'<link name="left_1"><visual><geometry>{mesh}</geometry></visual></link>'
+    hand(tmp_path, ('<link name="left_1"/>', shaped))
+    assert load_description(describe(tmp_path, "hand: {file: hand.urdf}")).fingers
+
+
+@pytest.mark.parametrize(("module", "name"), [("mujoco", "x.xml"), ("xacro", "x.urdf.xacro")])
+def test_formats_whose_reader_is_missing_name_the_extra(tmp_path, module, name):
+    texts = {"mujoco": "<mujoco/>", "xacro": "<robot name='x'/>"}
+    (tmp_path / name).write_text(texts[module])
+    path = describe(tmp_path, f"hand: {{file: {name}}}")
+    program = (
+        f"import sys; sys.modules[{module!r}] = None\n"
+        f"import casadi_ik as ik\ntry: ik.load_robot({str(path)!r})\n"
+        "except ImportError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert f"pip install casadi-ik[{module}]" in done.stdout, done
+
+
+def test_pinocchio_says_nothing_of_its_own(tmp_path, capfd):
+    path = hand(tmp_path)
+    path.write_text(path.read_text().replace('<robot name="hand">', '<robot name="">'))
+    load_description(describe(tmp_path, "hand: {file: hand.urdf}"))
+    assert capfd.readouterr().err == ""

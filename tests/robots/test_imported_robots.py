@@ -1,0 +1,196 @@
+"""Robots in other people's files: every kind of joint, and the same kinematics as pinocchio's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from imported_files import FINGERS, arm, describe, hand, joint, link, urdf
+
+import casadi_ik as ik
+from casadi_ik.errors import DescriptionError, UnsupportedError
+from casadi_ik.importing.check import largest_difference
+
+MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"
+
+
+def both(tmp_path, arm_text="", hand_text="", more=MOUNT, hand_changes=(), joints=6):
+    """An arm and a hand in files of their own; the robot, and its files' differences from it."""
+    arm(tmp_path, joints)
+    hand(tmp_path, *hand_changes)
+    path = describe(
+        tmp_path,
+        f"arm: {{file: arm.urdf{arm_text}}}\nhand: {{file: hand.urdf{hand_text}}}\n{more}",
+    )
+    return ik.load_robot(path)
+
+
+def check(robot, path, rng, locked=None, beside=None):
+    q = robot.random(rng, 5)
+    assert largest_difference(robot, path, q, locked, beside) < 1e-12
+    assert (robot.beyond_limits(q) <= 1e-9).all()
+
+
+def test_arm_and_hand_move_as_pinocchio_says(tmp_path, rng):
+    robot = both(tmp_path)
+    check(robot, tmp_path / "arm.urdf", rng)
+    check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
+    names = [f"joint_{i}" for i in range(1, 7)]
+    assert robot.actuators == (*names, "left_spread", "left_bend", "right_spread", "right_bend")
+    q = robot.random(rng, 1)[0]
+    poses = robot.links(q)
+    # Both files call their first link base_link: the hand's gets a prefix.
+    mount = np.linalg.inv(poses["flange"]) @ poses["hand_base_link"]
+    np.testing.assert_allclose(mount[:3, 3], [0.01, 0.02, 0.03], atol=1e-15)
+    tip = poses["left_tip"] @ [0, -0.01, 0.03, 1]
+    np.testing.assert_allclose(robot.contacts(q)[0][0], tip[:3], atol=1e-15)
+    assert robot.description.named_thumb is None
+    np.testing.assert_allclose(robot.description.actuators[0].velocity, 2.0)
+
+
+def test_clashing_joints_of_the_hand_get_a_prefix(tmp_path, rng):
+    robot = both(tmp_path, hand_changes=[("left_bend", "joint_1")])
+    assert "hand_joint_1" in robot.actuators
+    # Its follower found it again, and pinocchio agrees.
+    check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
+
+
+def test_one_file_with_its_palm(tmp_path, rng):
+    text = link("world", "rail", "tool") + link("base_link", "left_1", "left_tip", "right_tip")
+    text += joint("slide", "world", "rail", "prismatic", axis="0 1 1")
+    text += joint("roll", "rail", "tool", "continuous", axis="0.6 0 0.8", rpy="0.4 0 0")
+    text += joint("flange", "tool", "base_link", "fixed", rpy="0.1 0.2 0.3")
+    text += joint("left_spread", "base_link", "left_1", axis="0 0 1")
+    text += joint("left_bend", "left_1", "left_tip", limit='velocity="0" effort="0"', more=MIMIC)
+    text += joint("right_bend", "base_link", "right_tip", limit='upper="1" velocity="0" effort="0"')
+    path = urdf(tmp_path / "whole.urdf", text)
+    robot = ik.load_robot(describe(tmp_path, "robot: {file: whole.urdf, palm: base_link}"))
+    check(robot, path, rng)
+    assert robot.actuators == ("slide", "roll", "left_spread", "right_bend")
+    assert robot.description.arm_actuators == (0, 1)
+    assert robot.description.actuators[0].unit == "m"
+    # Without ends a joint may turn once to either side; an end left out is zero; 0 is no velocity.
+    np.testing.assert_allclose(robot.upper[1], 2 * np.pi)
+    assert robot.description.actuators[3].lower == 0.0
+    assert robot.description.actuators[3].velocity == np.inf
+
+
+MIMIC = '<mimic joint="left_spread" multiplier="-2" offset="0.3"/>'
+
+
+def test_a_follower_without_limits_goes_as_far_as_what_it_follows(tmp_path):
+    path = urdf(
+        tmp_path / "hand.urdf",
+        link("base_link", "left_1", "left_tip", "right_tip"),
+        joint("left_spread", "base_link", "left_1"),
+        joint("left_bend", "left_1", "left_tip", "continuous", more=MIMIC),
+        joint("right_bend", "base_link", "right_tip"),
+    )
+    robot = ik.load_robot(describe(path.parent, "hand: {file: hand.urdf}"))
+    np.testing.assert_allclose([robot.lower[0], robot.upper[0]], [-1, 1.5])
+    assert robot.joints(robot.upper)["left_bend"] == pytest.approx(-2 * 1.5 + 0.3)
+
+
+def test_mimic_of_a_mimic(tmp_path, rng):
+    change = ('joint="left_bend" multiplier', 'joint="right_end" multiplier')
+    robot = both(tmp_path, hand_changes=[change])
+    check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
+    q = robot.random(rng, 1)[0]
+    angles = robot.joints(q)
+    assert angles["right_end"] == pytest.approx(0.5 * angles["right_bend"] + 0.1)
+    assert angles["left_end"] == pytest.approx(0.5 * angles["right_end"] + 0.1)
+
+
+def test_joint_that_mimics_nothing_stands_still(tmp_path, rng):
+    change = ('joint="left_bend" multiplier="0.5"', 'joint="left_bend" multiplier="0"')
+    robot = both(tmp_path, hand_changes=[change])
+    assert "left_end" not in robot.joints(robot.home)
+    check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
+
+
+def test_locked_joints_and_their_followers_stand_still(tmp_path, rng):
+    robot = both(tmp_path, hand_text=", locked: {left_bend: 0.4}")
+    assert "left_bend" not in robot.actuators
+    assert "left_end" not in robot.joints(robot.home)
+    locked = {"left_bend": 0.4}
+    check(robot, tmp_path / "hand.urdf", rng, locked, tmp_path / "arm.urdf")
+
+
+def test_limits_that_are_stated_go_before_the_files(tmp_path):
+    robot = both(tmp_path, arm_text=", limits: {joint_2: [-10 deg, 20 deg]}")
+    np.testing.assert_allclose(np.rad2deg([robot.lower[1], robot.upper[1]]), [-10, 20])
+
+
+def test_wrist_in_the_file_of_the_hand_moves_the_palm(tmp_path, rng):
+    wrist = link("forearm") + joint("wrist", "forearm", "base_link", axis="0 1 0")
+    hand(tmp_path, (link("base_link"), link("base_link") + wrist))
+    arm(tmp_path, 5)
+    text = "arm: {file: arm.urdf}\nhand: {file: hand.urdf, palm: base_link}"
+    robot = ik.load_robot(describe(tmp_path, text))
+    assert robot.description.arm_actuators == (0, 1, 2, 3, 4, 5)
+    assert robot.actuators[5] == "wrist"
+    assert robot.description.finger("left").joints == ("left_spread", "left_bend", "left_end")
+    check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
+    q = robot.random(rng, 20)
+    solver = ik.Solver(robot, compiled=False)
+    assert solver.solve_batch(*robot.contacts(q)).success.mean() >= 0.9
+
+
+def test_two_arms_in_one_file_with_one_chosen(tmp_path, rng):
+    text = link("torso")
+    for side in "ab":
+        names = [f"{side}{i}" for i in range(7)]
+        text += link(*names) + joint(f"{side}_start", "torso", f"{side}0", "fixed", xyz="0 1 0")
+        for i in range(6):
+            axis = ("0 0 1", "0 1 0")[i % 2]
+            text += joint(f"{side}_joint{i}", names[i], names[i + 1], axis=axis)
+    urdf(tmp_path / "arms.urdf", text)
+    hand(tmp_path)
+    description = "arm: {{file: arms.urdf{tip}}}\nhand: {{file: hand.urdf}}"
+    with pytest.raises(DescriptionError, match=r"arm.tip: missing; arms.urdf .* one of a6, b6"):
+        ik.load_robot(describe(tmp_path, description.format(tip="")))
+    robot = ik.load_robot(describe(tmp_path, description.format(tip=", tip: b6")))
+    assert [name for name in robot.actuators if name[1] == "_"] == [f"b_joint{i}" for i in range(6)]
+    check(robot, tmp_path / "arms.urdf", rng)
+
+
+def test_shipped_arm_with_a_hand_from_a_file(tmp_path):
+    hand(tmp_path)
+    robot = ik.load_robot(describe(tmp_path, "arm: kuka_lwr4\nhand: {file: hand.urdf}"))
+    assert robot.actuators[:2] == ("lwr_joint_1", "lwr_joint_2")
+    assert len(robot.actuators) == 11
+
+
+def test_arm_from_a_file_with_a_shipped_hand(tmp_path, rng):
+    arm(tmp_path)
+    text = "arm: {file: arm.urdf}\nhand: barrett_bh8_280_coupled\nthumb: thumb"
+    robot = ik.load_robot(describe(tmp_path, text, "fingers: [thumb, finger_2, finger_3]"))
+    assert len(robot.actuators) == 10
+    check(robot, tmp_path / "arm.urdf", rng)
+
+
+def test_a_method_that_needs_a_thumb_says_so(tmp_path):
+    robot = both(tmp_path)
+    with pytest.raises(UnsupportedError, match=r"names no thumb.*'thumb: FINGER'.*left, right"):
+        ik.Solver(robot, "enhanced-dls")
+    assert ik.Solver(robot).robot is robot
+
+
+@pytest.mark.parametrize("kind", ["one finger", "one motor"])
+def test_small_hands_are_solved(tmp_path, rng, kind):
+    fingers = FINGERS if kind == "one motor" else "\n".join(FINGERS.splitlines()[:3])
+    held = "" if kind == "one finger" else ", locked: {left_spread: 0, right_spread: 0}"
+    shared = ('joint="right_bend"', 'joint="left_bend"')
+    robot = both(tmp_path, hand_text=held, hand_changes=[shared] if held else [], more="", joints=6)
+    if held:
+        hand(tmp_path, shared, ("<mimic", "<mimic"))
+        text = f"arm: {{file: arm.urdf}}\nhand: {{file: hand.urdf{held[:-1]}, right_bend: 0}}}}"
+        robot = ik.load_robot(describe(tmp_path, text))
+        assert len(robot.actuators) == 7
+    else:
+        robot = ik.load_robot(
+            describe(tmp_path, "arm: {file: arm.urdf}\nhand: {file: hand.urdf}", fingers)
+        )
+        assert robot.fingers == ("left",)
+    q = robot.random(rng, 10)
+    solved = ik.Solver(robot, compiled=False).solve_batch(*robot.contacts(q))
+    assert solved.success.mean() >= 0.9

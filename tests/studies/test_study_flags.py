@@ -1,0 +1,54 @@
+"""What a study varies is on its command line, and the report says what was asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import closed_chain_singularities
+import closed_chain_workspace
+import numpy as np
+import pytest
+import virtual_joint_range
+from ar10 import tip_poses
+from ar10.hand import within
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError
+
+
+def test_the_turns_of_the_virtual_joint(tmp_path: Path) -> None:
+    arguments = ["--count", "30", "--steps", "8", "--out", str(tmp_path)]
+    virtual_joint_range.main(arguments)
+    text = (tmp_path / "virtual_joint_range" / "README.md").read_text()
+    assert f"`python studies/virtual_joint_range.py {' '.join(arguments)}`" in text
+    assert "in steps of 45 deg" in text
+    with pytest.raises(InputError, match="--steps: found 7, expected an even number"):
+        virtual_joint_range.main(["--steps", "7"])
+
+
+def test_palms_and_grasp_of_the_workspace(tmp_path: Path) -> None:
+    given = ["--count", "30", "--palms", "12", "--grasp", "mug", "--out", str(tmp_path)]
+    closed_chain_workspace.main(given)
+    text = (tmp_path / "closed_chain_workspace" / "README.md").read_text()
+    assert "12 palms uniform" in text
+    assert "`mug`" in text
+
+
+def test_what_counts_as_near_singular(tmp_path: Path) -> None:
+    shares = []
+    for near in ("10", "1000"):
+        given = ["--count", "100", "--near", near, "--out", str(tmp_path)]
+        closed_chain_singularities.main(given)
+        text = (tmp_path / "closed_chain_singularities" / "README.md").read_text()
+        assert f"condition above {near})" in text
+        shares.append(float(text.split("arm 7 and 6) ")[1].split(" %")[0]))
+    assert shares[0] > shares[1]
+
+
+def test_gains_and_resolution_of_the_sliders(tmp_path: Path) -> None:
+    robot, rng = ik.load_robot("ar10"), np.random.default_rng(0)
+    text = tip_poses.index_pose(robot, tmp_path, 1, rng, (0.3, 1.0), 3e-4)
+    assert "model, sliders in 0.3 mm: left over 1 goals" in text
+    assert "| 0.3 |  |  |" in text  # the paper has no such gain
+    assert "| 1 | -0.60, -0.71 | 0.93 |" in text
+    assert within(robot, 0.5) == pytest.approx((robot.lower + robot.upper) / 2)
