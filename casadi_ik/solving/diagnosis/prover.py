@@ -178,7 +178,8 @@ class Prover:
         """Fingers that may contradict each other, and boxes; of a fixed hand each by itself."""
         fingers = list(range(len(self._robot.fingers)))
         if self._arm is None:
-            return [([i], MOST) for i in fingers]
+            # One that reaches its contact must not take all the time before the one that does not.
+            return [([i], most) for most in (FEW, MOST) for i in fingers]
         if len(fingers) <= SUBSET:
             return [(fingers, MOST)]
         subsets = [(list(some), SOME) for some in combinations(fingers, SUBSET)]
