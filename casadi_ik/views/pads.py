@@ -107,7 +107,7 @@ def _hand(robot: ArmHand, surfaces: Mapping[str, Surface], inverse: Array) -> li
             continue
         placed = surface.moved(inverse @ links[link])
         mesh = pv.PolyData.from_regular_faces(placed.points, placed.triangles)
-        mesh = mesh.clean()
+        mesh.clean(inplace=True)
         mesh.compute_normals(
             auto_orient_normals=True, split_vertices=True, feature_angle=35.0, inplace=True
         )
@@ -115,7 +115,9 @@ def _hand(robot: ArmHand, surfaces: Mapping[str, Surface], inverse: Array) -> li
     if found:
         return found
     _, hand = robot_body(robot, robot.home)
-    return [(mesh.transform(inverse, inplace=False), color) for mesh, color in hand]
+    for mesh, _ in hand:
+        mesh.transform(inverse, inplace=True)
+    return hand
 
 
 def _label(axes: Axes, places: Mapping[str, Array], pixels: tuple[int, int]) -> None:
