@@ -8,10 +8,8 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -24,10 +22,9 @@ from casadi_ik.problem.diagnosis import Diagnosis, Reason
 from casadi_ik.problem.method import Method, Outcome, PreferringMethod, QuickMethod
 from casadi_ik.problem.preference import NO_PREFERENCE, preference
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Status
-from casadi_ik.problem.verdict import judge, judge_one
+from casadi_ik.problem.verdict import judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.tracking import Tracker
 from casadi_ik.solving.by_kinds import PerKinds
@@ -35,21 +32,11 @@ from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
+from casadi_ik.solving.solved_part import SolvedPart, judged
 from casadi_ik.solving.workers import workers
 
 MANIPULABILITY = "manipulability"
 """The preference that is seen to after the solve."""
-
-
-@dataclass(frozen=True, eq=False)
-class _SolvedPart:
-    """A part of a batch, solved: when it was begun [ns], and what it came to."""
-
-    problems: Problems
-    starts: Array
-    started: int
-    outcome: Outcome
-    batch: BatchSolution
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,29 +208,29 @@ class Engine:
             measures.prepare()
         batches = []
         for part in self._parts(problems, starts, run):
-            if recorder is not None and part.outcome.rows is not None:
-                recorder.record(self._block(part, run.seed, part.outcome.rows))
+            if recorder is not None:
+                part.record(recorder, self.method.trace_format, run.seed)
             batches.append(part.batch)
         return BatchSolution.joined(batches)
 
-    def _parts(self, problems: Problems, starts: Array, run: Run) -> Iterator[_SolvedPart]:
+    def _parts(self, problems: Problems, starts: Array, run: Run) -> Iterator[SolvedPart]:
         """Parts of the batch in order, solved, judged and diagnosed side by side."""
         trace, jobs, diagnose = run.recorder is not None, run.jobs, run.diagnose
 
         def method(kinds: Kinds) -> Method:
             return self.of_kinds(kinds).method
 
-        def solve(rows: slice) -> _SolvedPart:
+        def solve(rows: slice) -> SolvedPart:
             started, asked = time.time_ns(), problems.rows(rows)
             outcome = run_by_kinds(method, asked, starts[rows], run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
             if problems.prefer == MANIPULABILITY:
                 outcome = self._most_manipulable(asked, starts[rows], run.seed, outcome)
-            batch = self._judged(asked, outcome)
+            batch = judged(self.robot, self.method.name, asked, outcome)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
-            return _SolvedPart(asked, starts[rows], started, outcome, batch)
+            return SolvedPart(asked, starts[rows], started, outcome, batch)
 
         if diagnose:
             for kinds, _, _ in by_kinds(problems):
@@ -259,7 +246,7 @@ class Engine:
             yield from map(solve, parts)
             return
         with workers(jobs) as threads:
-            ahead: deque[Future[_SolvedPart]] = deque()
+            ahead: deque[Future[SolvedPart]] = deque()
             for part in parts:
                 ahead.append(threads.submit(solve, part))
                 if len(ahead) > jobs:
@@ -280,33 +267,6 @@ class Engine:
         seconds = outcome.time.copy()
         seconds[rows] += (time.perf_counter() - begin) / max(len(rows), 1)
         return replace(outcome, q=q, time=seconds)
-
-    def _judged(self, problems: Problems, outcome: Outcome) -> BatchSolution:
-        verdict = judge(self.robot, problems, outcome.q)
-        success = verdict.solved(problems.enforce_limits)
-        status, content = outcome.status, outcome.status == Status.SOLVED
-        if (content != success).any():
-            # A method that is content with what the verdict refuses has come to a standstill.
-            status = np.where(content, int(Status.STALLED), status)
-            status[success] = Status.SOLVED
-        return BatchSolution(
-            success=success,
-            status=status,
-            q=outcome.q,
-            iterations=outcome.iterations,
-            restarts=outcome.restarts,
-            time=outcome.time,
-            position_error=verdict.position_error,
-            angle_error=verdict.angle_error,
-            ok=verdict.ok,
-            limits_ok=verdict.limits_ok,
-            phases=outcome.phases,
-            tolerances=problems.tolerances,
-            fingers=self.robot.fingers,
-            method=self.method.name,
-            robot=self.robot.name,
-            actuators=self.robot.actuators,
-        )
 
     def _diagnosed(
         self, problems: Problems, starts: Array, outcome: Outcome, batch: BatchSolution
@@ -329,7 +289,7 @@ class Engine:
             if own and why.reason is Reason.REACHABLE:
                 q[row] = why.q
                 seconds[row] += why.time
-        batch = self._judged(problems, replace(outcome, q=q, time=seconds))
+        batch = judged(self.robot, self.method.name, problems, replace(outcome, q=q, time=seconds))
         diagnoses = tuple(
             None if solved else found[row] for row, solved in enumerate(batch.success)
         )
@@ -338,17 +298,3 @@ class Engine:
             if why is not None and why.reason is not Reason.REACHABLE:
                 status[row] = Status.UNREACHABLE if why.established else Status.NOT_FOUND
         return replace(batch, status=status, diagnoses=diagnoses)
-
-    def _block(self, part: _SolvedPart, seed: int, rows: NDArray[Any]) -> SolveBlock:
-        batch = part.batch
-        before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
-        return SolveBlock(
-            format=self.method.trace_format,
-            first=part.problems.first_row,
-            problems=part.problems,
-            starts=part.starts,
-            seed=seed,
-            batch=batch,
-            rows=rows,
-            started=part.started + (before * 1e9).astype(np.int64),
-        )

@@ -96,11 +96,11 @@ class LoopedMethod(ABC):
         """
 
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
-        """(k,) whether to begin failed solves again.
+        """(k,) whether failed solves take part in a round after the first.
 
         Args:
             states: (k, ns) in which they ended.
-            number: Of the next round.
+            number: Of the round.
         """
         del number
         return np.ones(len(states), dtype=bool)
@@ -167,10 +167,10 @@ class LoopedMethod(ABC):
         rounds = iter(range(1, self.rounds))
 
         def next_round(status: int, state: Array) -> Start | None:
-            number = next(rounds, None)
-            if status == Status.SOLVED or number is None:
+            if status == Status.SOLVED:
                 return None
-            if not self.hopeful(state[None], number)[0]:
+            number = next((n for n in rounds if self.hopeful(state[None], n)[0]), None)
+            if number is None:
                 return None
             states, parameters = self.begin(problems, q0[None], number, state[None])
             return states[0], parameters[0]
@@ -187,10 +187,15 @@ class LoopedMethod(ABC):
         records = _Records()
         states = np.empty((count, self.graph.state.size))
         status = np.empty(count, dtype=np.int64)
-        left, here, last = np.arange(count), q0, None
+        left, some, here, last = np.arange(count), problems, q0, None
         for number in range(self.rounds):
+            if number:
+                left = np.flatnonzero(status != Status.SOLVED)
+                left = left[self.hopeful(states[left], number)]
+                if not len(left):
+                    continue
+                some, here, last = problems.rows(left), q0[left], states[left]
             begun = time.perf_counter()
-            some = problems if last is None else problems.rows(left)
             first, parameters = self.begin(some, here, number, last)
             result = self.kernel.run(first, parameters, self.max_iterations, trace)
             ended = Status.from_loop(result.status)
@@ -204,11 +209,6 @@ class LoopedMethod(ABC):
             seconds[left] += result.time + max(outside, 0.0) / max(len(left), 1)
             if result.rows is not None:
                 records.add(left, result.iterations, result.rows)
-            again = self.hopeful(result.states, number + 1)
-            missed = np.flatnonzero((ended != Status.SOLVED) & again)
-            if not len(missed):
-                break
-            left, here, last = left[missed], here[missed], result.states[missed]
         counts = self.phase_counts(states, iterations)
         return Outcome(
             # A copy: the states are much larger and need not stay.

@@ -48,13 +48,13 @@ were balanced in vain, and what was found."""
 
 
 RETURNS = 8
-"""A solve ends unsolved when so many fits and balances have ended where one had before."""
+"""When so many fits and balances have ended where one had before, no table holds another kind."""
 
 SURE = 1e-8
 """Cost (0.01 mm, 0.1 mrad) above which this is a minimum, and not a long flat valley."""
 
 VARIED = 2
-"""Rounds in any case: the second takes hands that differ from each other."""
+"""Rounds of tables in any case: the second takes hands that differ from each other."""
 
 
 class HandFirstMethod(LoopedMethod):
@@ -122,14 +122,16 @@ class HandFirstMethod(LoopedMethod):
             layout = self.step.layouts.state
             for name in CARRIED:
                 states[:, layout.slice(name)] = last[:, layout.slice(name)]
-            states[:, layout.slice("earlier")] = number * self.options.candidates
+            earlier = layout.slice("earlier")
+            states[:, earlier] = last[:, earlier] + self.options.candidates
         return states, parameters
 
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
-        """Not if the fits come back to a minimum that just misses the contacts, again and again."""
+        """No more hands of tables if their fits come back to a minimum that just misses."""
+        tables = VARIED <= number < self.options.rounds
         layout = self.step.layouts.state
         returns, cost = (states[:, layout.slice(name).start] for name in ("returns", "best_cost"))
-        return (number < VARIED) | (returns < RETURNS) | (cost < SURE)
+        return (returns < RETURNS) | (cost < SURE) | (not tables)
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """The step counts them."""

@@ -34,19 +34,16 @@ from casadi_ik.methods.hand_first.balance_stage import balance_stage
 from casadi_ik.methods.hand_first.choice_stage import choice_stage
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
+from casadi_ik.methods.hand_first.start_stage import at_start, start_stage
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_rows
 from casadi_ik.methods.hand_first.whole_fit import whole_step
 from casadi_ik.problem.contacts.kinds import Kinds, suffix
-from casadi_ik.problem.contacts.rows import chord, within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
-
-WHOLE = 0.5
-"""Cost up to which a start is refined as a whole (three contacts off by 4 cm each)."""
 
 OWN_HAND = 0.5
 """Cost, with the best palm, up to which the hand as it is is fitted before other hands."""
@@ -96,7 +93,7 @@ class HandFirstStep:
         state = ca.MX.sym("state", layouts.state.size)
         parameters = ca.MX.sym("parameters", layouts.parameters.size)
         stages = {
-            Phase.REFINEMENT: self._refinement(),
+            Phase.REFINEMENT: self._start_or_refinement(),
             Phase.CANDIDATE: self._candidate(),
             Phase.BALANCE: balance_stage(layouts),
         }
@@ -255,26 +252,28 @@ class HandFirstStep:
         record = self.layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
         return ca.Function("place", [state, parameters, arm, margin], shared(after, record, status))
 
+    def _start_or_refinement(self) -> ca.Function:
+        state = ca.MX.sym("state", self.layouts.state.size)
+        parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
+        stages = start_stage(self.layouts), self._refinement()
+        choose = ca.Function.if_else("whole", *stages)
+        begins = at_start(self.layouts.state.unpack(state))
+        outputs = choose(begins, state, parameters)
+        return ca.Function("start_or_refinement", [state, parameters], list(outputs))
+
     def _refinement(self) -> ca.Function:
         state, parameters, s, p = self._inputs()
         contacts = self.layouts.contacts
         tried = whole_step(self.robot, contacts, s["q"], s["damping"], p)
         judged = judge_contacts(s, p, tried, contacts)
-        # Where the robot is: if that solves, nothing moves; if it is far off, this is no short way.
-        here = ca.logic_and(s["candidate"] < 0, s["spent"] < 1)
-        tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
-        met = ca.logic_and(here, within_tolerance(*contacts.errors(tried.before), *tolerances))
-        far = self._far(here, tried)
-        moved = ca.logic_and(judged.accepted, ca.logic_not(met))
-        q = ca.if_else(moved, tried.reached, s["q"])
-        solved = ca.logic_or(met, ca.logic_and(judged.settled, judged.within))
+        q = ca.if_else(judged.accepted, tried.reached, s["q"])
+        solved = ca.logic_and(judged.settled, judged.within)
         unsolved = ca.logic_and(judged.settled, ca.logic_not(judged.within))
         near = ca.logic_and(unsolved, near_tolerance(self._left(judged, tried), contacts, p))
         other = differs(judged.cost, s["balanced"])
         returned = ca.logic_and(near, ca.logic_not(other))
         near = ca.logic_and(near, other)
-        failed = ca.logic_or(far, ca.logic_and(unsolved, ca.logic_not(near)))
-        near = ca.logic_and(near, ca.logic_not(far))
+        failed = ca.logic_and(unsolved, ca.logic_not(near))
         better = judged.cost < s["best_cost"]
         after = self.layouts.state.pack(
             self.layouts.counted(s, Phase.REFINEMENT)
@@ -294,14 +293,8 @@ class HandFirstStep:
             | judged.fit
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, moved)
+        record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged.accepted)
         return ca.Function("refinement", [state, parameters], shared(after, record, status))
-
-    def _far(self, here: Expr, tried: Tried) -> Expr:
-        """Whether a start is so far from the contacts that refining it is not worth it."""
-        if not self.robot.arm_actuators:
-            return ca.SX(0)
-        return ca.logic_and(here, ca.sumsqr(tried.before) > WHOLE)
 
     def _left(self, judged: Judged, tried: Tried) -> Expr:
         """Residual of the contacts after a step was judged."""

@@ -1,0 +1,83 @@
+"""A part of a batch, solved: what the method came to, judged, and as it is recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.problem.method import Outcome
+from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.recorder import Recorder, SolveBlock
+from casadi_ik.problem.solution import BatchSolution
+from casadi_ik.problem.status import Status
+from casadi_ik.problem.trace import TraceFormat
+from casadi_ik.problem.verdict import judge
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPart:
+    """A part of a batch, solved.
+
+    Attributes:
+        problems: Its targets.
+        starts: (k, n) where they were begun.
+        started: When it was begun, since the Unix epoch [ns].
+        outcome: What the method came to.
+        batch: The same, judged.
+    """
+
+    problems: Problems
+    starts: Array
+    started: int
+    outcome: Outcome
+    batch: BatchSolution
+
+    def record(self, recorder: Recorder, form: TraceFormat, seed: int) -> None:
+        """Hand it on with its iterations, if they were kept."""
+        if self.outcome.rows is None:
+            return
+        batch = self.batch
+        before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
+        block = SolveBlock(
+            format=form,
+            first=self.problems.first_row,
+            problems=self.problems,
+            starts=self.starts,
+            seed=seed,
+            batch=batch,
+            rows=self.outcome.rows,
+            started=self.started + (before * 1e9).astype(np.int64),
+        )
+        recorder.record(block)
+
+
+def judged(robot: ArmHand, method: str, problems: Problems, outcome: Outcome) -> BatchSolution:
+    """An outcome with the verdict on it, which has the last word on what is solved."""
+    verdict = judge(robot, problems, outcome.q)
+    success = verdict.solved(problems.enforce_limits)
+    status, content = outcome.status, outcome.status == Status.SOLVED
+    if (content != success).any():
+        # A method that is content with what the verdict refuses has come to a standstill.
+        status = np.where(content, int(Status.STALLED), status)
+        status[success] = Status.SOLVED
+    return BatchSolution(
+        success=success,
+        status=status,
+        q=outcome.q,
+        iterations=outcome.iterations,
+        restarts=outcome.restarts,
+        time=outcome.time,
+        position_error=verdict.position_error,
+        angle_error=verdict.angle_error,
+        ok=verdict.ok,
+        limits_ok=verdict.limits_ok,
+        phases=outcome.phases,
+        tolerances=problems.tolerances,
+        fingers=robot.fingers,
+        method=method,
+        robot=robot.name,
+        actuators=robot.actuators,
+    )
