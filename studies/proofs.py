@@ -1,12 +1,15 @@
 """Is a proof of impossibility ever wrong, and how much of the impossible is proved?
 
-Reachable targets are contacts of random hands and arms, a part of them at limits, moved by up to
-99 % of the tolerance: none may be proved impossible. Impossible ones are those that many searches
-do not solve even with 20 mm and 10 deg more than the tolerance. Counts are kept in a file, so that
-a run goes on where the last one ended::
+Reachable targets are contacts of random hands and arms, at and near limits, moved by up to 99 % of
+the tolerance. A proof of one of them would have to refute every box of hand postures that holds the
+posture it was made from: these boxes are all looked at. Impossible targets are those that many
+searches do not solve even with 20 mm and 10 deg more than the tolerance::
 
-    nice python studies/proofs.py --reachable 2000 --kept counts.json    # again and again
-    python studies/proofs.py --reachable 0 --impossible 60 --kept counts.json
+    nice python studies/proofs.py                                  # 2,000 targets of every kind
+    nice python studies/proofs.py --count 50000 --impossible 100
+    nice python studies/proofs.py --robot kuka_lwr_barrett --report studies/results/proofs
+
+A run that is killed goes on where it stopped. Every false proof is listed with its configuration.
 """
 
 from __future__ import annotations
@@ -14,87 +17,270 @@ from __future__ import annotations
 import argparse
 import json
 import time
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from diagnosis import Targets, at_limits, impossible, moved
+from diagnosis import moved
+from hard_targets import close_to_limits, corners, random_hands, singular_arms
+from impossible_targets import CLASSES, impossible
+from missed import ROBOTS, load
+from rich.console import Console
+from rich.progress import Progress
+from runner import (
+    Metric,
+    markdown_table,
+    median_metric,
+    provenance,
+    rate_metric,
+    write_metrics,
+    write_page,
+)
+from runner.results import code_version
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.problem.problems import Problems
 from casadi_ik.solving.diagnosis.prover import Prover
 
-ROBOTS = "kuka_lwr_barrett", "kuka_lwr_barrett_coupled", "ar10", "baxter_ar10"
-BLOCK = 64
-"""Targets that are made with one seed."""
-
-CASES = (
-    (1e-12, 0.0, True),
-    (1e-12, 0.0, False),
-    (1e-6, 0.9, True),
-    (5e-3, 0.9, True),
-    (5e-3, 0.99, True),
-    (5e-3, 0.9, False),
-    (2e-2, 0.99, True),
-)
-"""Tolerance t [m], and 10 t [rad]; the part of it that contacts are moved by; limits enforced."""
+BLOCK = 2000
+"""Reachable targets that are made with one seed."""
 
 BEYOND = 20e-3, float(np.deg2rad(10))
 """What is impossible is so by this much more than the tolerance [m, rad]."""
 
+BLIND = np.deg2rad(
+    [[0, 100, 48, 78, 48, 48, 48], [0, 90, 48, 78, 46, 60, 31], [4, 94, 48, 78, 48, 47, 48]]
+)
+"""Hands (spread, thumb, finger 2, finger 3) that a lookup of postures tells badly apart."""
 
-def reachable(robot: ik.ArmHand, seed: int, case: tuple[float, float, bool]) -> Problems:
-    """Targets that can be reached."""
-    tolerance, part, limits = case
-    rng = np.random.default_rng(seed)
-    q = at_limits(robot, rng, BLOCK, 0.3)
+SHOWN = 30
+
+INTRODUCTION = """
+*Reachable* targets are contacts of configurations, moved by a part of the tolerance t (10 t rad for
+normals). A proof refutes every box of hand postures, hence those too that hold the posture a target
+was made from; all of these were looked at, down to a hundredth of the tolerance, and no others. One
+that is refuted is a *false* proof. *Impossible* targets are those of a class that the solver, asked
+for a diagnosis with its many searches, does not solve with 20 mm and 10 deg more than the usual 5
+mm and 3 deg: that is no proof of impossibility, so that what is not proved may be possible after
+all. Times are processor times in a batch of all proved ones, shared out by the boxes each took.
+*Not proved:* by whether a hand without an arm fits the contacts with the wider tolerance. If it
+does, only the arm can be the reason, and its bound is too weak or its boxes too many; if it does
+not, the hand's boxes were too many.
+"""
+
+
+def blind_hands(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Hands next to the blind ones, any arm."""
+    q = robot.random(rng, count)
+    hand = BLIND[rng.integers(0, len(BLIND), count)] + rng.uniform(-0.06, 0.06, (count, 7))
+    q[:, -7:] = np.clip(hand, robot.lower[-7:], robot.upper[-7:])
+    return q
+
+
+KINDS = {
+    "random": random_hands,
+    "corners": corners,
+    "near limits": close_to_limits,
+    "near-singular arms": singular_arms,
+    "blind hands": blind_hands,
+}
+
+CASES = (
+    ("random", 1e-11, 0.0, True),
+    ("random", 5e-3, 0.99, True),
+    ("random", 5e-3, 0.9, False),
+    ("random", 1e-11, 0.0, False),
+    ("corners", 5e-3, 0.99, True),
+    ("corners", 1e-6, 0.9, True),
+    ("near limits", 5e-3, 0.9, True),
+    ("near limits", 1e-11, 0.0, True),
+    ("near-singular arms", 2e-2, 0.99, True),
+    ("blind hands", 5e-3, 0.99, True),
+)
+"""Kind, tolerance t [m], the part of it that contacts are moved by, whether limits are enforced."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some targets of a robot: reachable ones of a case, or impossible ones of a class."""
+
+    robot: str
+    name: str
+    number: int
+    size: int
+    seed: int
+    folder: Path
+
+    @property
+    def path(self) -> Path:
+        """Where its counts are."""
+        return self.folder / self.robot / f"{self.name}-{self.number:05d}.json"
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Of these targets alone."""
+        return np.random.default_rng([self.seed, zlib.crc32(self.name.encode()), self.number])
+
+
+def case_name(case: tuple[str, float, float, bool]) -> str:
+    """Of a case of reachable targets."""
+    kind, tolerance, part, limits = case
+    moved_by = f"moved by {part:.0%} of t" if part else "exact"
+    return f"{kind}, t = {tolerance:g} m, {moved_by}{'' if limits else ', limits ignored'}"
+
+
+def reachable(part: Part, case: tuple[str, float, float, bool]) -> dict[str, Any]:
+    """Look for false proofs."""
+    kind, tolerance, share, limits = case
+    robot, rng = load(part.robot, part.folder / "robots"), part.rng
+    q = KINDS[kind](robot, rng, part.size)
     if not limits:
         turning = [a.unit == "rad" for a in robot.description.actuators]
-        q[:, turning] = rng.uniform(-7, 7, (BLOCK, sum(turning)))
-    targets = moved(robot.contacts(q), rng, part * tolerance, part * 10 * tolerance)
-    return Problems(*targets, ik.Tolerance(tolerance, 10 * tolerance), limits)
+        q[:, turning] = rng.uniform(-7, 7, (len(q), sum(turning)))
+    targets = moved(robot.contacts(q), rng, share * tolerance, share * 10 * tolerance)
+    problems = Problems(*targets, ik.Tolerance(tolerance, 10 * tolerance), limits)
+    prover = Prover(robot.description)
+    places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
+    proofs = prover.prove(problems, prover.space.of(places, problems))
+    false = [q[row].tolist() for row, proof in enumerate(proofs) if proof is not None]
+    return {"count": len(q), "false": false}
 
 
-def beyond_reach(robot: ik.ArmHand, count: int, seed: int) -> dict[str, Targets]:
-    """Targets that are not solved with a much wider tolerance either."""
+def clearly_impossible(part: Part) -> dict[str, Any]:
+    """Look for proofs of what is impossible."""
+    robot = load(part.robot, part.folder / "robots")
+    points, normals = impossible(robot, part.name, part.rng, part.size)
     usual = ik.Tolerance()
     wide = ik.Tolerance(usual.position + BEYOND[0], usual.angle + BEYOND[1])
-    solver, found = ik.Solver(robot, tolerance=wide), {}
-    for name, (points, normals) in impossible(robot, count, seed).items():
-        left = ~solver.solve_batch(points, normals, diagnose=True).success
-        found[name] = points[left], normals[left]
+    batch = ik.Solver(robot, tolerance=wide).solve_batch(points, normals, diagnose=True)
+    rows = np.flatnonzero(~batch.success)
+    found: dict[str, Any] = {"count": len(rows), "ms": [], "hand": 0, "arm": 0}
+    if not len(rows):
+        return found
+    prover, problems = Prover(robot.description), Problems(points, normals, usual, True)
+    prover.prove(problems.rows(rows[:1]))
+    proofs = prover.prove(problems.rows(rows))
+    for row, proof in zip(rows, proofs, strict=True):
+        diagnosis = batch.diagnoses[row]
+        if proof is None:
+            fits = diagnosis is not None and diagnosis.hand is not None and diagnosis.hand.fits
+            found["arm" if fits else "hand"] += 1
+    proved = [i for i, proof in enumerate(proofs) if proof is not None]
+    if proved:
+        boxes = np.array([proof.boxes for proof in proofs if proof is not None])
+        begin = time.thread_time()
+        prover.prove(problems.rows(rows[proved]))
+        each = 1e3 * (time.thread_time() - begin) * boxes / boxes.sum()
+        found["ms"] = each.tolist()
     return found
 
 
+def solve(part: Part) -> None:
+    """Look for proofs of a part's targets and keep the counts."""
+    cases = {case_name(case): case for case in CASES}
+    one = cases.get(part.name)
+    found = clearly_impossible(part) if one is None else reachable(part, one)
+    part.path.parent.mkdir(parents=True, exist_ok=True)
+    kept = part.path.with_suffix(".part")
+    kept.write_text(json.dumps({"code": code_version(), "found": found}), encoding="utf-8")
+    kept.replace(part.path)
+
+
+def parts(options: argparse.Namespace) -> Iterator[Part]:
+    """All parts, a little of everything first."""
+    robots, where = options.robot or ROBOTS, (options.seed, options.out)
+    for robot in robots if options.impossible else ():
+        for name in CLASSES[:-2] if robot == "ar10" else CLASSES:
+            yield Part(robot, name, 0, options.impossible, *where)
+    for number in range(-(-options.count // BLOCK)):
+        for robot in robots:
+            for case in CASES:
+                if case[0] != "blind hands" or robot == ROBOTS[0]:
+                    yield Part(robot, case_name(case), number, BLOCK, *where)
+
+
+def found_of(folder: Path, robot: str, name: str) -> tuple[list[dict[str, Any]], set[str]]:
+    """What all parts of a name found, and by which code."""
+    kept = [
+        json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted((folder / robot).glob(f"{name}-?????.json"))
+    ]
+    return [entry["found"] for entry in kept], {entry["code"] for entry in kept}
+
+
+def write_report(options: argparse.Namespace) -> None:
+    """Write the report on all parts there are."""
+    rows, shown, table, metrics, codes = [], [], [], list[Metric](), set[str]()
+    whole = 0
+    for robot in ROBOTS:
+        title = robot.replace("_", " ")
+        for case in CASES:
+            found, code = found_of(options.out, robot, case_name(case))
+            codes |= code
+            count, false = (
+                sum(entry["count"] for entry in found),
+                [q for entry in found for q in entry["false"]],
+            )
+            if not count:
+                continue
+            whole += count
+            rows.append([title, case_name(case), f"{count:,}", f"{len(false)}"])
+            metrics.append(
+                rate_metric(f"proofs/{robot}/{case_name(case)}/true", count - len(false), count)
+            )
+            shown += [
+                [title, case_name(case), " ".join(f"{x:.9g}" for x in q)] for q in false[:SHOWN]
+            ]
+        everything = [(name, *found_of(options.out, robot, name)) for name in CLASSES]
+        codes |= {one for _, _, code in everything for one in code}
+        lines = [(name, found) for name, found, _ in everything if found]
+        for name, found in [*lines, ("all", [entry for _, part in lines for entry in part])]:
+            count = sum(entry["count"] for entry in found)
+            if not count:
+                continue
+            times = [ms for entry in found for ms in entry["ms"]]
+            rate = rate_metric(f"proofs/{robot}/{name}/proved", len(times), count)
+            metrics += [rate, median_metric(f"proofs/{robot}/{name}/time", times, "ms")]
+            quantiles = np.quantile(times, [0.5, 0.99]) if times else [np.nan, np.nan]
+            hand, arm = (sum(entry[key] for entry in found) for key in ("hand", "arm"))
+            cells = [title, name, f"{count}", f"{rate.value:.1f}"]
+            table.append([*cells, *(f"{q:.2f}" for q in quantiles), f"{hand}", f"{arm}"])
+    heads = ["robot", "class", "n", "proved %", "median [ms]", "99 % [ms]"]
+    body = [INTRODUCTION, "## Reachable targets", f"{whole:,} targets, {len(shown)} false proofs."]
+    body += [markdown_table(["robot", "targets", "n", "false"], rows)]
+    if shown:
+        body += [markdown_table(["robot", "targets", "q"], shown)]
+    body += ["## Impossible targets"]
+    body += [markdown_table([*heads, "not proved: hand", "not proved: arm"], table)]
+    body += ["## Where this comes from"]
+    body += [provenance({"proofs": ", ".join(sorted(codes)) or None}), f"Seed {options.seed}."]
+    write_page("Proofs of impossibility", body, options.report)
+    write_metrics(metrics, options.report / "metrics.json")
+
+
 def main(arguments: list[str] | None = None) -> None:
-    """Prove, count, print."""
+    """Look for proofs of what is missing and write the report."""
     parser = argparse.ArgumentParser(description="Proofs of impossibility")
-    parser.add_argument("--reachable", type=int, default=2000, help="further targets per robot")
-    parser.add_argument("--impossible", type=int, default=0, help="targets per set")
-    parser.add_argument("--robots", nargs="*", default=list(ROBOTS))
-    parser.add_argument("--kept", type=Path, required=True, help="JSON file of the counts")
+    parser.add_argument("--count", type=int, default=BLOCK, help="reachable targets of every case")
+    parser.add_argument("--impossible", type=int, default=30, help="targets of every class")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="stop after so long")
+    parser.add_argument("--seed", type=int, default=2026, help="of the targets")
+    parser.add_argument("--robot", action="append", choices=ROBOTS, help="only this one")
+    parser.add_argument("--out", type=Path, default=Path("out/proofs"), help="counts by block")
+    parser.add_argument("--report", type=Path, default=Path("out/proofs/report"), help="folder")
     options = parser.parse_args(arguments)
-    kept = json.loads(options.kept.read_text()) if options.kept.exists() else {}
-    for name in options.robots:
-        robot = ik.load_robot(name)
-        prover = Prover(robot.description)
-        counts = kept.setdefault(name, {"blocks": 0, "targets": 0, "false": 0})
-        for _ in range(-(-options.reachable // BLOCK)):
-            case = CASES[counts["blocks"] % len(CASES)]
-            problems = reachable(robot, counts["blocks"], case)
-            counts["false"] += sum(proof is not None for proof in prover.prove(problems))
-            counts["targets"] += len(problems)
-            counts["blocks"] += 1
-            options.kept.write_text(json.dumps(kept, indent=2) + "\n")
-        print(f"{name}: {counts['targets']:,} reachable, {counts['false']} called impossible")
-    if options.impossible:
-        robot = ik.load_robot(ROBOTS[0])
-        prover = Prover(robot.description)
-        for title, (points, normals) in beyond_reach(robot, options.impossible, 2026).items():
-            begin = time.thread_time()
-            proofs = prover.prove(Problems(points, normals, ik.Tolerance(), True))
-            each = 1e3 * (time.thread_time() - begin) / max(len(points), 1)
-            share = sum(proof is not None for proof in proofs)
-            print(f"{title}: {share} of {len(points)} proved, {each:.2f} ms each")
+    todo = [part for part in parts(options) if not part.path.exists()]
+    end = time.monotonic() + 60 * options.minutes
+    with Progress(console=Console(stderr=True)) as progress:
+        for part in progress.track(todo, description="blocks"):
+            if time.monotonic() > end:
+                break
+            solve(part)
+    write_report(options)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ examples:
   casadi-ik import arm.urdf hand.urdf --out my_robot.yaml --picture my_robot.png
   casadi-ik import arm.urdf hand.xml --mount 0 0 0.05 0 0 1.57 --out my_robot.yaml
   casadi-ik import whole_robot.urdf --palm left_palm --out my_robot.yaml
+  casadi-ik import my_robot.yaml --picture my_robot.png     after a guess was corrected
   casadi-ik solve my_grasp.yaml --robot my_robot.yaml
 
 Files are URDF, xacro (needs casadi-ik[xacro]) or MJCF (needs casadi-ik[mujoco]). What no file says
@@ -39,8 +40,7 @@ def add_import(commands: Any) -> None:
         "--out",
         metavar="ROBOT.yaml",
         type=file_name(".yaml", ".yml"),
-        required=True,
-        help="write the description",
+        help="write the description (needed unless one is given to be drawn again)",
     )
     parser.add_argument("--tip", metavar="LINK", help="link of the arm that carries the hand")
     parser.add_argument("--palm", metavar="LINK", help="link that the fingers hang on")

@@ -21,6 +21,7 @@ from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.importing import imported
 from casadi_ik.importing.check import largest_difference
 from casadi_ik.importing.imported import Imported
+from casadi_ik.importing.surfaces import Surface
 from casadi_ik.robots.part import PREFIX
 
 SAMPLES = 20
@@ -39,6 +40,10 @@ def import_robot(arguments: argparse.Namespace) -> Answer:
     first, hand = Path(arguments.first), arguments.hand and Path(arguments.hand)
     arm, hand = (first, hand) if hand else (None, first)
     out, picture = arguments.out, arguments.picture
+    if first.suffix in (".yaml", ".yml"):
+        return _drawn_again(first, arguments)
+    if out is None:
+        raise InputError("--out: missing, expected the name of the description to be written")
     outputs = {"--out": out, "--picture": picture}
     check_outputs(outputs.items(), inputs=[one for one in (arm, hand) if one])
     draw = _drawing() if picture is not None else None
@@ -64,13 +69,26 @@ def import_robot(arguments: argparse.Namespace) -> Answer:
         if arguments.check:
             differences.update(_differences(robots[0], found))
         if draw is not None:
-            draw(robots[0], found, picture)
+            draw(robots[0], found.surfaces, picture)
 
     write_output(out, "--out", write)
     same = all(value <= SAME for value in differences.values())
     written = [("out", out)] + ([("picture", picture)] if picture is not None else [])
     report = _report(robots[0], found, differences)
     return Answer(Group(*report, *files(written)), Exit.DONE if same else Exit.NOT_SOLVED)
+
+
+def _drawn_again(path: Path, arguments: argparse.Namespace) -> Answer:
+    """The pads of a description as it stands now; nothing else is written."""
+    picture = arguments.picture
+    if arguments.hand or arguments.out is not None or picture is None:
+        raise InputError(f"{path}: is a description already, expected --picture and no --out")
+    check_outputs([("--picture", picture)], inputs=[path])
+    draw = _drawing()
+    robot = imported.loaded(path)
+    draw(robot, imported.described_surfaces(path), picture)
+    what = f"{robot.name}: {len(robot.fingers)} pads"
+    return Answer(Group(headline(True, "DRAWN", what), *files([("picture", picture)])))
 
 
 def _command(arguments: argparse.Namespace) -> str:
@@ -96,15 +114,15 @@ def _mount(arguments: argparse.Namespace) -> list[float] | None:
     return values
 
 
-def _drawing() -> Callable[[ArmHand, Imported, Path], object]:
+def _drawing() -> Callable[[ArmHand, dict[str, Surface], Path], object]:
     """The function that draws the pads, after making sure that it can."""
     with located("--picture", (MissingExtraError,)):
         from casadi_ik.views import draw_pads
 
-    def draw(robot: ArmHand, found: Imported, path: Path) -> object:
+    def draw(robot: ArmHand, surfaces: dict[str, Surface], path: Path) -> object:
         links = robot.description.links
-        named = {PREFIX + link if PREFIX + link in links else link: link for link in found.surfaces}
-        return draw_pads(robot, {ours: found.surfaces[link] for ours, link in named.items()}, path)
+        named = {PREFIX + link if PREFIX + link in links else link: link for link in surfaces}
+        return draw_pads(robot, {ours: surfaces[link] for ours, link in named.items()}, path)
 
     return draw
 

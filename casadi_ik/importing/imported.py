@@ -8,6 +8,7 @@ from pathlib import Path
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import DescriptionError, InputError
+from casadi_ik.files.reading import read_yaml
 from casadi_ik.importing.choices import (
     assumed_limits,
     assumed_locks,
@@ -98,7 +99,7 @@ def import_robot(
     if not branches:
         raise DescriptionError(f"{hand}: no joint moves below the palm {palm_link!r}; try --palm")
     wanted = (
-        {joint.child for joint in part.joints} | {part.root}
+        {palm_link, *(joint.child for joint in tree.below(palm_link))}
         if shapes
         else {one for branch in branches for one in _ends_of(postures, branch)}
     )
@@ -155,3 +156,21 @@ def _arm_line(arm: Path, out: Path, tip: str | None) -> FileLine:
 def loaded(path: Path) -> ArmHand:
     """The robot of a description that was written."""
     return ArmHand(load_description(path))
+
+
+def described_surfaces(path: Path) -> dict[str, Surface]:
+    """Shapes of the hand's links of a description, if its hand stands in somebody's file.
+
+    Raises:
+        CasadiIKError: A file cannot be read.
+    """
+    raw = read_yaml(path)
+    entry = raw.get("hand") or raw.get("robot")
+    if not isinstance(entry, dict) or "file" not in entry:
+        return {}
+    file = path.parent / Path(str(entry["file"])).expanduser()
+    tree = read_tree(file)
+    palm = entry.get("palm") or tree.root
+    palm = palm["link"] if isinstance(palm, dict) else palm
+    links = {palm, *(joint.child for joint in tree.below(palm))}
+    return checked_surfaces(file, links)[0]

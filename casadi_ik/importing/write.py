@@ -76,7 +76,7 @@ class Written:
         lines = [
             f"# Made by: {self.command}",
             "# What no file of a robot says was guessed: look at the lines marked GUESS, correct",
-            "# them here, and draw the picture again (--picture) to see that they are right.",
+            "# them here. To see them: casadi-ik import THIS.yaml --picture FILE.png",
             *(f"# {_one_line(note)}" for note in self.notes),
             f"name: {_scalar(self.name)}",
         ]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from casadi_ik.arrays import Array, Bools
+from casadi_ik.arrays import Array, Bools, Rows
+from casadi_ik.problem.hand_motors import finger_joints
 from casadi_ik.problem.joint_bounds import joint_bounds
 from casadi_ik.problem.joint_frames import link_frames, placed
 from casadi_ik.robots.description import RobotDescription
@@ -22,7 +23,8 @@ class Balls:
         normals: (k, f, 3) unit.
         radius: (k, f) how far the points can be from there [m].
         angle: (k, f) how far the normals can be turned from there [rad].
-        effect: (k, h) what each motor adds at most, a radian counting as 0.1 m.
+        moved: (k, f, h) what each motor adds to the radius [m].
+        swung: (k, f, h) what it adds to the angle [rad].
         empty: (k,) whether joint limits leave nothing.
     """
 
@@ -30,8 +32,18 @@ class Balls:
     normals: Array
     radius: Array
     angle: Array
-    effect: Array
+    moved: Array
+    swung: Array
     empty: Bools
+
+    def rows(self, rows: Rows) -> Balls:
+        """Some of the boxes."""
+        return Balls(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+    @property
+    def effect(self) -> Array:
+        """(k, h) what each motor adds at most, a radian counting as 0.1 m."""
+        return (self.moved / 0.1 + self.swung).max(axis=1)
 
 
 def balls(
@@ -54,20 +66,27 @@ def balls(
     """
     count = len(box[0])
     ranges, empty = {}, np.zeros(count, dtype=bool)
-    for i, (name, (low, high)) in enumerate(joint_bounds(robot, motors, *box).items()):
+    names = finger_joints(robot)
+    used = {name for i in fingers for name in robot.fingers[i].joints}
+    wanted = [name for name in names if name in used]
+    for name, (low, high) in joint_bounds(robot, motors, *box, wanted).items():
+        i = names.index(name)
         low, high = np.maximum(low, limits[0][i]), np.minimum(high, limits[1][i])
         empty |= low > high
         ranges[name] = (low + high) / 2, np.maximum(high - low, 0.0) / 2 + 1e-12
-    frames = link_frames(robot, {name: middle for name, (middle, _) in ranges.items()}, count)
+    links = [robot.palm_link, *(robot.fingers[i].link for i in fingers)]
+    chained = {joint.name for link in links for joint in robot.chain(link)}
+    chain = [joint for joint in robot.joints if joint.name in chained]
+    middles = {name: middle for name, (middle, _) in ranges.items()}
+    frames = link_frames(robot, middles, count, chain)
     kinds = {joint.name: joint for joint in robot.movable}
     points, normals, radius, angle = [], [], [], []
-    effect = np.zeros((count, len(motors)))
-    for i in fingers:
+    shares = np.zeros((2, count, len(fingers), len(motors)))
+    for place, i in enumerate(fingers):
         finger = robot.fingers[i]
         rotation, point = placed(frames[finger.link], finger.placement)
         normal = rotation @ finger.normal
         far, turned = np.zeros(count), np.zeros(count)
-        share = np.zeros_like(effect)
         for name in reversed(finger.joints):
             joint, half = kinds[name], ranges[name][1]
             frame, origin = frames[joint.child]
@@ -79,8 +98,8 @@ def balls(
                 moved, swung = 2 * sine * (lever + far), half
             far, turned = far + moved, turned + swung
             k = list(motors).index(_motor(robot, name))
-            share[:, k] += moved / 0.1 + swung
-        effect = np.maximum(effect, share)
+            shares[0, :, place, k] += moved
+            shares[1, :, place, k] += swung
         if in_palm:
             palm, centre = placed(frames[robot.palm_link], robot.palm_placement)
             point = np.einsum("kji,kj->ki", palm, point - centre)
@@ -90,7 +109,7 @@ def balls(
         radius.append(far)
         angle.append(turned)
     stacked = (np.stack(part, axis=1) for part in (points, normals, radius, angle))
-    return Balls(*stacked, effect=effect, empty=empty)
+    return Balls(*stacked, moved=shares[0], swung=shares[1], empty=empty)
 
 
 def _motor(robot: RobotDescription, name: str) -> str:

@@ -9,7 +9,6 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.problem.hand_motors import finger_joints
 from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear
 from casadi_ik.robots.description import RobotDescription
 
@@ -23,15 +22,20 @@ Bounds = tuple[Array, Array]
 
 
 def joint_bounds(
-    robot: RobotDescription, motors: Sequence[str], lower: Array, upper: Array
+    robot: RobotDescription,
+    motors: Sequence[str],
+    lower: Array,
+    upper: Array,
+    names: Sequence[str],
 ) -> dict[str, Bounds]:
-    """Lower and upper bounds (k,) of the joints of the fingers, by name.
+    """Lower and upper bounds (k,) of joints of the fingers, by name.
 
     Args:
         robot: The description.
         motors: Names of the actuators.
         lower: (k, h) ends of the motors.
         upper: (k, h).
+        names: Of the joints wanted.
     """
     found = {name: (lower[:, i], upper[:, i]) for i, name in enumerate(motors)}
     joints = {joint.name: joint for joint in robot.movable}
@@ -45,7 +49,7 @@ def joint_bounds(
             found[name] = low - ROUNDING, high + ROUNDING
         return found[name]
 
-    return {name: bounds(name) for name in finger_joints(robot)}
+    return {name: bounds(name) for name in names}
 
 
 def _followed(coupling: Coupling, lower: Array, upper: Array) -> Bounds:

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.robots.description import RobotDescription
+from casadi_ik.robots.description import Joint, RobotDescription
 
 
-def link_frames(robot: RobotDescription, values: Mapping[str, Array], count: int) -> dict:
+def link_frames(
+    robot: RobotDescription,
+    values: Mapping[str, Array],
+    count: int,
+    joints: Iterable[Joint] | None = None,
+) -> dict:
     """Pose of every link in the base frame: rotations (count, 3, 3) and origins (count, 3).
 
     Args:
         robot: The description.
         values: (count,) by joint name [rad or m]; joints that are not named stay at zero.
         count: How many configurations.
+        joints: Those that are wanted, from the root outwards; None: all.
     """
     frames = {robot.root: (np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)))}
-    for joint in robot.joints:
+    for joint in robot.joints if joints is None else joints:
         rotation, origin = placed(frames[joint.parent], joint.placement)
         if joint.name in values and joint.type == "prismatic":
             origin = origin + rotation @ joint.axis * values[joint.name][:, None]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import hashlib
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+
+import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.grasps import Tolerance
+from casadi_ik.problem.contact_quantities import Quantity
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.proof_check import holds
 
@@ -17,32 +21,6 @@ class ProofKind(StrEnum):
     FINGER = "a finger of the fixed hand comes nowhere near its contact"
     HAND = "no posture of the hand fits the contacts, wherever the palm is"
     REACH = "every posture of the hand that may fit puts the wrist out of the arm's reach"
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """What contacts keep however the palm is moved, or where the arm reaches.
-
-    Attributes:
-        name: What it is, with the fingers.
-        unit: "m", "rad" or "".
-        asked: Its value in the target.
-        give: By how much the tolerances let it differ.
-        lower: The smallest value that the robot can make; a guaranteed bound.
-        upper: The largest.
-    """
-
-    name: str
-    unit: str
-    asked: float
-    give: float
-    lower: float
-    upper: float
-
-    @property
-    def excess(self) -> float:
-        """By how much it is out of what is possible, whatever the tolerances give; <= 0 within."""
-        return max(self.lower - self.asked, self.asked - self.upper) - self.give
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +39,7 @@ class Proof:
         boxes: How many boxes cover the hand's postures, 1 if none had to be divided.
         tolerance: Within which the target is impossible, by finger; at least those asked for.
         target: The target that was proved impossible, one row.
+        seal: Of all the others, see `sealed`.
     """
 
     kind: ProofKind
@@ -69,6 +48,18 @@ class Proof:
     boxes: int
     tolerance: tuple[Tolerance, ...]
     target: Problems = field(repr=False)
+    seal: str = field(default="", repr=False)
+
+    def sealed(self) -> Proof:
+        """The same with a seal by which `check` sees whether something was changed since."""
+        return replace(self, seal=self._seal())
+
+    def _seal(self) -> str:
+        parts = (self.kind.name, self.fingers, self.quantities, self.boxes, self.tolerance)
+        digest = hashlib.sha256(repr(parts).encode())
+        for array in (self.target.points, self.target.normals):
+            digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
+        return digest.hexdigest()[:32]
 
     @property
     def deciding(self) -> tuple[Quantity, ...]:
@@ -84,13 +75,14 @@ class Proof:
         return (f"proved for {who} {parts}: {self.kind}",)
 
     def check(self, robot: ArmHand, target: Problems | None = None) -> bool:
-        """Prove it again by other means: whether the proof holds.
+        """Prove it again by other means: whether the proof holds and says what it said.
 
-        Another arithmetic in numpy, not compiled, that shares nothing with the search but the
-        robot's description; boxes as fine as it takes. Takes up to some seconds.
+        The seal is compared, every quantity computed anew from the robot's description, and the
+        hand's postures are divided anew with another arithmetic, in numpy and not compiled, in
+        boxes as fine as it takes. Takes up to some seconds, of hard targets up to a minute.
 
         Args:
             robot: The robot.
             target: One target that the proof has to be about; None: the one it names.
         """
-        return holds(self, robot.description, target)
+        return self.seal == self._seal() and holds(self, robot.description, target)

@@ -11,8 +11,15 @@ import numpy as np
 
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import UnsupportedError
+from casadi_ik.problem.arm_cones import NONE, ArmCones, arm_cones
 from casadi_ik.problem.arm_span import arm_span
 from casadi_ik.problem.contact_bounds import Balls, balls
+from casadi_ik.problem.contact_quantities import (
+    Quantity,
+    asked_quantities,
+    kept_quantities,
+    quantities_of,
+)
 from casadi_ik.problem.hand_motors import (
     OUTWARDS,
     endless_fingers,
@@ -37,6 +44,9 @@ MOST = 400_000
 TOGETHER = 512
 """Boxes that are looked at in one go."""
 
+SWIVELS = 180
+"""Places of the elbow that are looked at."""
+
 FINEST = 1e-5
 """A box is not divided any more where its contacts move by less [0.1 m, rad]: not confirmed."""
 
@@ -56,7 +66,23 @@ def holds(proof: Proof, robot: RobotDescription, target: Problems | None) -> boo
     if any(p.position < a.position or p.angle < a.angle for p, a in pairs):
         return False
     asked = replace(about, tolerance=tuple(proof.tolerance))
-    return _Search(robot, asked, numbers, proof.kind.name).refutes()
+    stated, kind = _quantities(robot, asked, numbers), proof.kind.name
+    if len(stated) != len(proof.quantities) or not all(
+        map(Quantity.agrees, stated, proof.quantities)
+    ):
+        return False
+    if any(item.excess > 0 and (kind == "REACH" or not item.reach) for item in stated):
+        return True
+    return _Search(robot, asked, numbers, kind).refutes()
+
+
+def _quantities(
+    robot: RobotDescription, asked: Problems, fingers: list[int]
+) -> tuple[Quantity, ...]:
+    """What the fingers' contacts keep, found anew."""
+    kept = kept_quantities(robot, asked)
+    values, give = asked_quantities(robot, kept, asked)
+    return quantities_of(kept, values[0], give[0], fingers)
 
 
 def _same(one: Problems, other: Problems) -> bool:
@@ -103,10 +129,11 @@ class _Search:
                 self.fingers,
                 self.in_palm,
             )
-            left = np.flatnonzero(~(found.empty | self._refuted(found)))
-            boxes, effect = boxes[left], found.effect[left]
-            rows, widest = np.arange(len(left)), effect.argmax(axis=1)
-            if (effect[rows, widest] < FINEST).any():
+            refuted, scores = self._refuted(found)
+            left = np.flatnonzero(~(found.empty | refuted))
+            boxes, scores = boxes[left], scores[left]
+            rows, widest = np.arange(len(left)), scores.argmax(axis=1)
+            if (found.effect[left][rows, widest] < FINEST).any():
                 return False
             middle = boxes.mean(axis=1)[rows, widest]
             low, high = boxes.copy(), boxes.copy()
@@ -115,37 +142,50 @@ class _Search:
             waiting += [halves[i : i + TOGETHER] for i in range(0, len(halves), TOGETHER)]
         return True
 
-    def _refuted(self, found: Balls) -> Bools:
+    def _refuted(self, found: Balls) -> tuple[Bools, Array]:
+        """Which boxes are impossible, and what each motor leaves open (k, h)."""
         radius, angle = found.radius + self.loose, found.angle + self.turned
         if not self.in_palm:
             apart = np.linalg.norm(self.points - found.points, axis=2) > radius
             facing = _angle(self.normals, found.normals) > angle
-            return (apart | facing).any(axis=1)
-        refuted = self._pairs(found, radius, angle)
+            return (apart | facing).any(axis=1), found.effect
+        refuted, scores = self._pairs(found, radius, angle)
         refuted[~refuted] = self._rigid(found, radius, angle, ~refuted)
         if self.kind == "REACH":
             refuted |= self._reach(found, radius)
-        return refuted
+            rows = np.flatnonzero(~refuted)
+            refuted[rows] = self._beyond_cones(found.rows(rows), radius[rows])
+        return refuted, scores
 
-    def _pairs(self, found: Balls, radius: Array, angle: Array) -> Bools:
-        """Distances of points, angles of normals, angles of normals and lines."""
-        refuted = np.zeros(len(radius), dtype=bool)
+    def _pairs(self, found: Balls, radius: Array, angle: Array) -> tuple[Bools, Array]:
+        """Distances of points, angles of normals, angles of normals and lines.
+
+        What is nearly broken counts most for where boxes are divided.
+        """
+        refuted, scores = np.zeros(len(radius), dtype=bool), 0.1 * found.effect
         for i, j in combinations(range(len(self.fingers)), 2):
             asked, here = self.points[j] - self.points[i], found.points[:, j] - found.points[:, i]
             give = radius[:, i] + radius[:, j]
             far, length = np.linalg.norm(asked), np.linalg.norm(here, axis=1)
-            refuted |= np.abs(length - far) > give + SLACK * far
+            moved = found.moved[:, i] + found.moved[:, j]
+            tests = [(np.abs(length - far) - SLACK * far, give, moved)]
             between = _angle(self.normals[i], self.normals[j])
             now = _angle(found.normals[:, i], found.normals[:, j])
-            refuted |= np.abs(now - between) > angle[:, i] + angle[:, j]
+            swung = found.swung[:, i] + found.swung[:, j]
+            tests.append((np.abs(now - between), angle[:, i] + angle[:, j], swung))
             # The line between the points turns by no more than asin(give / length).
             with np.errstate(divide="ignore", invalid="ignore"):
                 tilt = np.arcsin(np.clip(give / far, 0.0, 1.0))
                 tilt[give >= far] = np.pi
                 for n in (i, j):
-                    now = _angle(found.normals[:, n], here)
-                    refuted |= np.abs(now - _angle(self.normals[n], asked)) > angle[:, n] + tilt
-        return refuted
+                    off = np.abs(_angle(found.normals[:, n], here) - _angle(self.normals[n], asked))
+                    shares = found.swung[:, n] + moved / far
+                    tests.append((off, angle[:, n] + tilt, shares))
+                for off, width, shares in tests:
+                    ratio = np.nan_to_num(off / width)
+                    refuted |= ratio > 1
+                    scores += np.nan_to_num(ratio[:, None] ** 4 * shares / width[:, None])
+        return refuted, scores
 
     def _rigid(self, found: Balls, radius: Array, angle: Array, rows: Bools) -> Bools:
         """The best weighted rigid fit (Kabsch) against what the balls would allow."""
@@ -172,12 +212,15 @@ class _Search:
         arm = np.linalg.norm(wrist - found.points, axis=2)
         out = (away - arm - radius > far) | (arm - radius - away > far)
         out |= away + arm + radius < near
-        centre, give = self._carried(found, radius, wrist)
+        centre, give = self._carried(found, radius, wrist, 1)
         distance = np.linalg.norm(centre - shoulder, axis=1)
         return out.any(axis=1) | (distance - give > far) | (distance + give < near)
 
-    def _carried(self, found: Balls, radius: Array, wrist: Array) -> tuple[Array, Array]:
-        """A ball (k, 3), (k,) that holds the wrist: a weighted sum of contacts and normals."""
+    def _carried(self, found: Balls, radius: Array, palm: Array, whole: int) -> tuple[Array, Array]:
+        """A ball (k, 3), (k,) that holds a point of the palm (whole 1) or a direction (0).
+
+        A weighted sum of contacts and normals.
+        """
         known = ~np.isnan(self.normals[:, 0])
         chord = 2 * np.sin(np.minimum(found.angle + self.turned, np.pi) / 2)
         first, origin = found.points[:, :1], self.points[0]
@@ -188,16 +231,60 @@ class _Search:
         A = columns / loose[:, :, None]
         normal = np.einsum("kfi,kfj->kij", A, A)
         normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        across = wrist - first[:, 0]
+        across = palm - whole * first[:, 0]
         solved = np.linalg.solve(normal, across[:, :, None])[:, :, 0]
         share = np.einsum("kfi,ki->kf", A, solved) / loose
         rest = across - np.einsum("kf,kfi->ki", share, columns)
         n = len(self.fingers) - 1
         give = np.linalg.norm(rest, axis=1) + SLACK
-        give += radius[:, 0] * np.abs(1 - share[:, :n].sum(axis=1))
+        give += radius[:, 0] * np.abs(whole - share[:, :n].sum(axis=1))
         give += (np.abs(share[:, :n]) * radius[:, 1:]).sum(axis=1)
         give += (np.abs(share[:, n:]) * chord[:, known]).sum(axis=1)
-        return origin + share @ goals, give
+        return whole * origin + share @ goals, give
+
+    def _beyond_cones(self, found: Balls, radius: Array) -> Bools:
+        """Whether at every swivel of the elbow a limit of shoulder or wrist is passed."""
+        beyond = np.zeros(len(radius), dtype=bool)
+        if self._cones is None or not len(radius):
+            return beyond
+        cones, (_, _, near, far) = self._cones, self._arm
+        centre, give = self._carried(found, radius, cones.wrist, 1)
+        reach, length = centre - cones.shoulder, np.linalg.norm(centre - cones.shoulder, axis=1)
+        rows = np.flatnonzero(give < length)
+        least = np.clip(length - give, max(near, 1e-6), None)[rows]
+        most = np.maximum(np.clip(length + give, None, far)[rows], least)
+        tilt = np.arcsin(give[rows] / length[rows]) + SLACK
+        line = reach[rows] / length[rows, None]
+        axis, loose = self._carried(found.rows(rows), radius[rows], cones.last, 0)
+        side = np.eye(3)[np.abs(line).argmin(axis=1)]
+        x = np.cross(line, side)
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        y, step = np.cross(line, x), 2 * np.pi / SWIVELS
+        left = np.zeros(len(rows), dtype=bool)
+        (upper, wide), (fore, open_) = (
+            _opening(*pair, least, most) for pair in (cones.lengths, cones.lengths[::-1])
+        )
+        limits = self._cosines
+        for psi in step * np.arange(SWIVELS):
+            out = np.cos(psi) * x + np.sin(psi) * y
+            arm = np.cos(upper)[:, None] * line + np.sin(upper)[:, None] * out
+            hand = np.cos(fore)[:, None] * line - np.sin(fore)[:, None] * out
+            # Between two swivels a direction turns by no more than half a step.
+            one = arm @ cones.first + tilt + wide + step / 2
+            other = (hand * axis).sum(axis=1) + loose + tilt + open_ + step / 2
+            left |= (one >= limits[0]) & (other >= limits[1])
+        beyond[rows] = ~left
+        return beyond
+
+    @cached_property
+    def _cones(self) -> ArmCones | None:
+        cones = arm_cones(self.robot)
+        return None if cones is None or (cones.cosines(self.asked) == NONE).all() else cones
+
+    @cached_property
+    def _cosines(self) -> Array:
+        assert self._cones is not None
+        return self._cones.cosines(self.asked)
 
     @cached_property
     def _arm(self) -> tuple[Array, Array, float, float]:
@@ -213,6 +300,16 @@ class _Search:
         ends = reach(arm, lower[elbow] - OUTWARDS, upper[elbow] + OUTWARDS)
         near, far = (float(end) for end in ends)
         return arm.shoulder, arm.wrist_in_palm, near - SLACK, far + SLACK
+
+
+def _opening(a: float, b: float, least: Array, most: Array) -> tuple[Array, Array]:
+    """Angle at the end of side a of a triangle with sides a, b and one between two lengths."""
+    sides = [least, most]
+    if a > b:
+        sides.append(np.clip(np.sqrt(a * a - b * b), least, most))
+    angles = [np.arccos(np.clip((c * c + a * a - b * b) / (2 * a * c), -1, 1)) for c in sides]
+    low, high = np.min(angles, axis=0), np.max(angles, axis=0)
+    return (low + high) / 2, (high - low) / 2 + SLACK
 
 
 def _angle(a: Array, b: Array) -> Array:

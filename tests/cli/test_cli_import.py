@@ -153,6 +153,7 @@ REFUSALS = {
     "an arm for a hand": (("arm.urdf", "hand.urdf", "--palm", "mf_3"), "no joint moves below"),
     "two arms": (("two.urdf",), "--palm: missing; from 'base' of two.urdf go chains as long"),
     "arm that branches": (("two.urdf", "hand.urdf"), "--tip: missing; two.urdf branches at 'base'"),
+    "description": (("hand.yaml",), "is a description already, expected --picture and no --out"),
     "output is the input": (("hand.urdf", "--out", "hand.urdf"), "expected a name ending in .yaml"),
 }
 

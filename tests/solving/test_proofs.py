@@ -13,6 +13,8 @@ from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
+from casadi_ik.problem.arm_cones import arm_cones
+from casadi_ik.problem.contact_quantities import asked_quantities, kept_quantities
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.proof import Proof, ProofKind
 from casadi_ik.solving.diagnosis.prover import Prover
@@ -35,6 +37,13 @@ def moved(targets: tuple[Array, Array], rng: np.random.Generator, metres: float,
     turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
     turn /= np.linalg.norm(turn, axis=2, keepdims=True)
     return points, normals * np.cos(angle) + turn * np.sin(angle)
+
+
+def wrongly(robot: ik.ArmHand, prover: Prover, q: Array, problems: Problems) -> int:
+    """How many proofs would refute a box of hands that holds the hand of q."""
+    places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
+    proofs = prover.prove(problems, prover.space.of(places, problems))
+    return sum(proof is not None for proof in proofs)
 
 
 @pytest.fixture(scope="module", params=ROBOTS)
@@ -63,8 +72,8 @@ def test_no_proof_of_what_can_be_reached(
     # Contacts of which only the tolerance makes that they can be reached, too.
     part = rng.choice([0.0, 0.9, 0.99]) if tolerance > 1e-9 else 0.0
     targets = moved(any_robot.contacts(q), rng, part * tolerance, part * angle)
-    proofs = Prover(any_robot.description).prove(asked(targets, tolerance, angle, limits))
-    assert proofs == [None] * 12
+    problems = asked(targets, tolerance, angle, limits)
+    assert wrongly(any_robot, Prover(any_robot.description), q, problems) == 0
 
 
 @settings(max_examples=15)
@@ -79,7 +88,19 @@ def test_no_proof_within_tolerance(
     q = robot.lower + np.array(place) * (robot.upper - robot.lower)
     rng = np.random.default_rng(seed)
     targets = moved(robot.contacts(q[None]), rng, part * 5e-3, part * np.deg2rad(3))
-    assert prover.prove(asked(targets, 5e-3, np.deg2rad(3), True)) == [None]
+    assert wrongly(robot, prover, q[None], asked(targets, 5e-3, np.deg2rad(3), True)) == 0
+
+
+def test_a_wrong_hand_is_lost(robot: ik.ArmHand, prover: Prover) -> None:
+    """What is looked for is found: boxes that hold another hand are refuted."""
+    q = robot.random(np.random.default_rng(8), 40)
+    problems = asked(robot.contacts(q), 5e-3, np.deg2rad(3), True)
+    assert wrongly(robot, prover, q[::-1], problems) >= 38
+
+
+def test_the_whole_search_finds_no_proof_either(robot: ik.ArmHand, prover: Prover) -> None:
+    q = robot.random(np.random.default_rng(9), 4)
+    assert prover.prove(asked(robot.contacts(q), 5e-3, np.deg2rad(3), True)) == [None] * 4
 
 
 def test_blind_hands_are_never_unreachable(robot: ik.ArmHand) -> None:
@@ -117,7 +138,7 @@ def test_coupled_mechanisms_and_other_arms(tmp_path_factory: pytest.TempPathFact
         q = q[robot.beyond_limits(q) <= 0][:16]
         targets = robot.contacts(q)
         for limits in (True, False):
-            assert prover.prove(asked(targets, 1e-9, 1e-9, limits)) == [None] * len(q)
+            assert wrongly(robot, prover, q, asked(targets, 1e-9, 1e-9, limits)) == 0
         far = targets[0] + 5.0, targets[1]
         proofs = prover.prove(asked(far, 5e-3, 0.05, True))
         assert all(proof is not None and proof.check(robot) for proof in proofs)
@@ -139,7 +160,7 @@ def test_proofs_can_be_checked(robot: ik.ArmHand, prover: Prover) -> None:
         problems = asked(targets, 5e-3, np.deg2rad(3), True)
         proofs = [proof for proof in prover.prove(problems) if proof is not None]
         assert len(proofs) >= 11
-        for proof in proofs[:4]:
+        for proof in proofs[:2]:
             assert proof.check(robot)
             assert proof.check(robot, proof.target)
             kinds.add(proof.kind)
@@ -159,6 +180,7 @@ def test_a_finger_of_a_fixed_hand() -> None:
 
 
 def test_a_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
+    """Even one that was sealed anew after what was changed in it."""
     targets = impossible(robot)
     apart, shoulder = (
         prover.prove(asked(targets[name], 5e-3, np.deg2rad(3), True))[0]
@@ -168,17 +190,89 @@ def test_a_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
     assert isinstance(shoulder, Proof)
     loose = tuple(ik.Tolerance(1.0, 3.0) for _ in robot.fingers)
     tight = tuple(ik.Tolerance(1e-4, 1e-4) for _ in robot.fingers)
-    q = robot.home[None]
-    reachable = asked(robot.contacts(q), 5e-3, np.deg2rad(3), True)
-    assert not replace(apart, tolerance=loose).check(robot)
-    assert not replace(apart, tolerance=tight).check(robot)
-    assert not replace(apart, fingers=apart.fingers[:1]).check(robot)
-    assert not replace(apart, fingers=()).check(robot)
-    assert not replace(apart, fingers=("nobody",)).check(robot)
-    assert not replace(apart, target=reachable).check(robot)
+    reachable = asked(robot.contacts(robot.home[None]), 5e-3, np.deg2rad(3), True)
+    assert not replace(apart, tolerance=loose).sealed().check(robot)
+    assert not replace(apart, tolerance=tight).sealed().check(robot)
+    assert not replace(apart, fingers=()).sealed().check(robot)
+    assert not replace(apart, fingers=("nobody",)).sealed().check(robot)
+    assert not replace(apart, target=reachable).sealed().check(robot)
     assert not apart.check(robot, reachable)
     # Without the arm nothing is wrong with contacts in the shoulder.
-    assert not replace(shoulder, kind=ProofKind.HAND).check(robot)
+    assert not replace(shoulder, kind=ProofKind.HAND).sealed().check(robot)
+
+
+def reversed_normal(robot: ik.ArmHand, prover: Prover) -> Proof:
+    """A proof that no quantity decides by itself."""
+    points, normals = robot.contacts(robot.random(np.random.default_rng(10), 20))
+    normals[:, 0] *= -1
+    for proof in prover.prove(asked((points, normals), 5e-3, np.deg2rad(3), True)):
+        if proof is not None and not proof.deciding:
+            return proof
+    raise AssertionError("every one was decided by a quantity")
+
+
+@pytest.mark.parametrize("decided", [True, False])
+def test_every_number_of_a_proof_counts(robot: ik.ArmHand, prover: Prover, decided: bool) -> None:
+    """Changed, a quantity is found out even if sealed anew, the number of boxes by the seal."""
+    if decided:
+        targets = impossible(robot)["far"]
+        (proof, *_) = prover.prove(asked(targets, 5e-3, np.deg2rad(3), True))
+        assert proof is not None
+        assert proof.deciding
+        assert proof.boxes == 1
+    else:
+        proof = reversed_normal(robot, prover)
+        assert proof.boxes > 1
+        assert len(proof.quantities) == 9
+    assert proof.check(robot)
+    first, *others = proof.quantities
+    changes = [{part: getattr(first, part) + 1e-6} for part in ("asked", "give", "lower")]
+    changes += [{"upper": first.upper - 1e-6}, {"name": "another"}, {"unit": ""}]
+    changes.append({"reach": not first.reach})
+    for change in changes:
+        changed = replace(proof, quantities=(replace(first, **change), *others))
+        assert not changed.check(robot)
+        assert not changed.sealed().check(robot)
+    assert not replace(proof, quantities=proof.quantities[1:]).sealed().check(robot)
+    assert not replace(proof, quantities=()).sealed().check(robot)
+    assert not replace(proof, boxes=proof.boxes + 2).check(robot)
+    assert not replace(proof, seal="").check(robot)
+
+
+@pytest.mark.parametrize("limits", [True, False])
+def test_hands_keep_to_the_bounds_of_quantities(any_robot: ik.ArmHand, limits: bool) -> None:
+    rng = np.random.default_rng(11)
+    q = any_robot.random(rng, 2000)
+    if not limits:
+        turning = np.array([a.unit == "rad" for a in any_robot.description.actuators])
+        q[:, turning] = rng.uniform(-9, 9, (2000, turning.sum()))
+    problems = asked(any_robot.contacts(q), 1e-12, 1e-12, limits)
+    kept = kept_quantities(any_robot.description, problems)
+    values, give = asked_quantities(any_robot.description, kept, problems)
+    lower, upper = (np.array([getattr(item, end) for item in kept]) for end in ("lower", "upper"))
+    assert (values >= lower - give).all()
+    assert (values <= upper + give).all()
+    # A bound that excludes nothing would be kept to as well.
+    assert (upper - lower < 2.5).any()
+    assert np.isfinite([lower, upper]).all()
+
+
+def test_limits_of_shoulder_and_wrist_are_part_of_the_reach(
+    robot: ik.ArmHand, prover: Prover
+) -> None:
+    """Palms that only a wrist 0.8 rad beyond its limit would hold."""
+    rng = np.random.default_rng(12)
+    q, wrist = robot.random(rng, 8), robot.actuators.index("lwr_joint_6")
+    q[:, wrist] = robot.upper[wrist] + 0.8
+    problems = asked(robot.contacts(q), 1e-3, np.deg2rad(0.5), True)
+    proofs = [proof for proof in prover.prove(problems) if proof is not None]
+    assert proofs
+    assert {proof.kind for proof in proofs} == {ProofKind.REACH}
+    assert not any(proof.deciding for proof in proofs)
+    assert proofs[0].check(robot)
+    cones = arm_cones(robot.description)
+    assert cones is not None
+    np.testing.assert_allclose(cones.cosines(problems), np.cos(np.deg2rad(120)), atol=1e-6)
 
 
 def test_what_is_not_proved_is_not_unreachable(

@@ -6,6 +6,7 @@ slopes, the angle it makes does not. Otherwise it is the motor itself.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -75,6 +76,19 @@ class HandSpace:
         given = {name: Range(lower[i], upper[i]) for i, name in enumerate(self.coordinates)}
         found = joint_ranges(self.robot, given)
         return {name: found[name] for name in self.joints}
+
+    def of(self, places: Mapping[str, Array], problems: Problems) -> Array:
+        """(k, h) coordinates of joint and motor positions, turned by whole periods into the box.
+
+        Args:
+            places: (k,) by name of the joint or motor [rad or m].
+            problems: Whose limits count.
+        """
+        lower, upper = self.box(problems)
+        found = np.stack([places[name] for name in self.coordinates], axis=1)
+        turns = np.floor((found - lower) / (upper - lower))
+        turns[(found >= lower) & (found <= upper)] = 0
+        return found - turns * (upper - lower)
 
     def box(self, problems: Problems) -> tuple[Array, Array]:
         """(h,) ends of the coordinates within all that the problems let the hand do."""

@@ -1,8 +1,7 @@
 """What two contacts keep however the palm is moved: distance, angle, heights, handedness.
 
-Each as a row ``|value - slopes u| <= width``: the value asked for less that of the middle of the
-box, the slopes by the coordinates u in [-1, 1], and a width that holds the tolerances, what the
-slopes leave out, and the largest effect of u in second order.
+Each as a row ``|value| <= width``: the value asked for less that of the middle of the box, and a
+width that holds the tolerances and all that the box lets the contacts move.
 """
 
 from __future__ import annotations
@@ -15,67 +14,75 @@ import casadi as ca
 from casadi_ik.solving.diagnosis.box_contacts import BoxContact
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 
+ROUNDING = 1e-8
+"""What cosines are let off by: more than is lost where a sine is taken from one near 1."""
+
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One inequality; `plain` is the width of the same without slopes: |value| <= plain."""
+    """One inequality; `shares` is what each coordinate adds to its width."""
 
     value: Expr
-    slopes: Expr
     width: Expr
-    plain: Expr
+    shares: list[Expr]
 
 
 def pair_rows(a: BoxContact, b: BoxContact) -> Iterator[Row]:
     """The rows of two contacts; all zero where something of them is not asked for."""
     asked, here = b.target - a.target, b.point - a.point
-    G = b.moves - a.moves
-    long, short = safe_norm(asked), safe_norm(here)
-    most, near, far = _most(G), a.near + b.near, a.radius + b.radius
+    long, far = safe_norm(asked), a.radius + b.radius
     both = a.placed * b.placed
-    # The norm is convex, so its slope errs to one side only.
-    left_out = ca.fmin(most * most / (2 * ca.fmax(short - most, 1e-9)), 2 * most)
-    yield _asked(both, long - short, here.T @ G / short, near + left_out, far)
-    turning, facing = _most(a.turns), _most(b.turns)
+    moved = [one + other for one, other in zip(a.moved, b.moved, strict=True)]
+    turned = [one + other for one, other in zip(a.turned, b.turned, strict=True)]
+    yield Row(both * (long - safe_norm(here)), far, moved)
     faced = both * a.faced * b.faced
     cosine = ca.dot(a.facing, b.facing) - ca.dot(a.normal, b.normal)
-    yield _asked(
-        faced,
-        cosine,
-        a.normal.T @ b.turns + b.normal.T @ a.turns,
-        _product(a.close, b.close) + turning * facing,
-        a.chord + b.chord,
-    )
-    for one, other in ((a, turning), (b, facing)):
-        yield _asked(
-            both * one.faced,
-            ca.dot(one.facing, asked) - ca.dot(one.normal, here),
-            one.normal.T @ G + here.T @ one.turns,
-            near * (1 + one.close) + one.close * long + other * most,
-            far + one.chord * long,
-        )
+    yield Row(faced * cosine, a.chord + b.chord, turned)
+    for one in (a, b):
+        height = ca.dot(one.facing, asked) - ca.dot(one.normal, here)
+        shares = [m + t * long for m, t in zip(moved, one.turned, strict=True)]
+        yield Row(both * one.faced * height, far + one.chord * long, shares)
     across, there = ca.cross(a.normal, b.normal), ca.cross(a.facing, b.facing)
-    yield _asked(
-        faced,
-        ca.dot(there, asked) - ca.dot(across, here),
-        across.T @ G + ca.cross(b.normal, here).T @ a.turns + ca.cross(here, a.normal).T @ b.turns,
-        _product(a.close, b.close) * long
-        + (1 + a.close) * (1 + b.close) * near
-        + turning * facing * (short + most)
-        + (turning + facing) * most,
+    yield Row(
+        faced * (ca.dot(there, asked) - ca.dot(across, here)),
         far + (a.chord + b.chord) * long,
+        [m + t * long for m, t in zip(moved, turned, strict=True)],
     )
 
 
-def _asked(asked: Expr, value: Expr, slopes: Expr, width: Expr, plain: Expr) -> Row:
-    return Row(asked * value, asked * slopes, width, plain)
+def pair_angles(a: BoxContact, b: BoxContact) -> Iterator[Expr]:
+    """Tests > 0 if angles cannot be as asked: of the normals, and of each with the line of points.
+
+    They say more than cosines where the angles are near 0 or half a turn, as of normals that face
+    each other.
+    """
+    asked, here = b.target - a.target, b.point - a.point
+    long, short, far = safe_norm(asked), safe_norm(here), a.radius + b.radius
+    both, most = a.placed * b.placed, ca.fmax(long, short)
+    cosines = ca.dot(a.facing, b.facing), ca.dot(a.normal, b.normal)
+    turns = _turn(a.chord), _turn(b.chord)
+    yield both * a.faced * b.faced * _apart(cosines, turns)
+    # The line between the points turns by no more than asin(far / length), of either length.
+    sine = ca.fmin(far / most, 1.0)
+    tilt = ca.sqrt(1 - sine * sine), sine
+    for one, turn in zip((a, b), turns, strict=True):
+        cosines = ca.dot(one.facing, asked) / long, ca.dot(one.normal, here) / short
+        test = ca.if_else(far < most, _apart(cosines, (turn, tilt)), -1.0)
+        yield both * one.faced * test
 
 
-def _product(one: Expr, other: Expr) -> Expr:
-    """How far a product of unit vectors is off whose factors are off by so much."""
-    return one + other + one * other
+def _turn(chord: Expr) -> tuple[Expr, Expr]:
+    """Cosine and sine of the angle of a chord, half a turn at most."""
+    half = ca.fmin(chord, 2.0) / 2
+    return 1 - 2 * half * half, 2 * half * ca.sqrt(ca.fmax(1 - half * half, 0.0))
 
 
-def _most(G: Expr) -> Expr:
-    """The longest that G u can be with u in [-1, 1]."""
-    return sum((safe_norm(G[:, k]) for k in range(G.shape[1])), ca.SX(0))
+def _apart(cosines: tuple[Expr, Expr], turns: tuple[tuple[Expr, Expr], tuple[Expr, Expr]]) -> Expr:
+    """> 0 if two angles differ by more than the sum of two others (cosine, sine), if < pi."""
+    one, other = cosines
+    sines = [ca.sqrt(ca.fmax(1 - c * c, 0.0)) for c in cosines]
+    (cos_a, sin_a), (cos_b, sin_b) = turns
+    widest = cos_a * cos_b - sin_a * sin_b
+    excess = widest - ROUNDING - (one * other + sines[0] * sines[1])
+    # Both are at most half a turn: their sum is less than that where cosine a > -cosine b.
+    return ca.if_else(cos_a + cos_b > ROUNDING, excess, -1.0)

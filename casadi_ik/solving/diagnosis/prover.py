@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from casadi_ik.arrays import Array, Bools, Counts, Rows
 from casadi_ik.kernels import FunctionKernel
+from casadi_ik.problem.arm_cones import NONE, ArmCones, arm_cones
 from casadi_ik.problem.arm_span import arm_span
+from casadi_ik.problem.contact_quantities import (
+    Kept,
+    asked_quantities,
+    kept_quantities,
+    quantities_of,
+)
 from casadi_ik.problem.contacts.conditions import CONDITIONS, PLACE
 from casadi_ik.problem.hand_motors import endless_fingers, joint_limits, motor_box
 from casadi_ik.problem.problems import Problems
@@ -21,8 +29,21 @@ from casadi_ik.solving.diagnosis.hand_space import HandSpace
 from casadi_ik.solving.diagnosis.wrist_bound import Wrist
 from casadi_ik.symbolic.joint_ranges import are_bounded
 
-MOST = 6000
-"""Boxes of a target after which the search for a proof is given up."""
+FEW, SOME, MOST = 3000, 3000, 50_000
+"""Boxes of a target after which a search is given up: the first one with all fingers, those with
+some of them, and the last with all."""
+
+SUBSET = 3
+"""Fingers of more are looked at by so many, too: fewer motors to divide."""
+
+CHUNK = 4096
+"""Boxes that are looked at in one go: so many that calls cost little, few enough for a cache."""
+
+KEPT = 16
+"""Limits and locked motors whose quantities are kept."""
+
+SAME = 1e-9
+"""How far apart two findings of the same point may be [m]."""
 
 TOGETHER = 256
 """Targets whose boxes are divided side by side."""
@@ -38,48 +59,105 @@ SLIDING = {
 """Arrays that let a contact be elsewhere than at its point: no proof counts such a finger."""
 
 TINY = 1e-9
-"""A box whose contacts move by less than this is not divided any more [0.1 m, rad]."""
+"""A coordinate is not divided any more where less is left of it [rad or m]."""
+
+PART = 0.01
+"""Neither where less than so much of the smallest tolerance [m] is left."""
+
+Boxes = tuple[Rows, Array, Array]
+"""Numbers of targets, lower and upper ends (h,) of a box each."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
     """The results of k searches: whether proved, boxes, and whether the arm was needed."""
 
-    proved: NDArray[np.bool_]
-    boxes: NDArray[np.int64]
-    reach: NDArray[np.bool_]
+    proved: Bools
+    boxes: Counts
+    reach: Bools
+
+
+class _Stated:
+    """What targets ask of a robot's quantities, and proofs with their numbers."""
+
+    def __init__(self, robot: RobotDescription, kept: tuple[Kept, ...], problems: Problems) -> None:
+        self._robot, self._kept, self._problems = robot, kept, problems
+        self._fixed = arm_span(robot) is None
+        self._asked, self._give = asked_quantities(robot, kept, problems)
+
+    def decided(self, known: Bools) -> list[Proof | None]:
+        """Proofs where a quantity decides by itself.
+
+        Args:
+            known: (k, f) which contacts count.
+        """
+        ends = np.array([[item.lower, item.upper] for item in self._kept]).reshape(-1, 2)
+        excess = np.maximum(ends[:, 0] - self._asked, self._asked - ends[:, 1]) - self._give
+        for column, item in enumerate(self._kept):
+            excess[~known[:, item.fingers].all(axis=1), column] = np.nan
+        found: list[Proof | None] = [None] * len(excess)
+        for row in np.flatnonzero((excess > 0).any(axis=1)).tolist():
+            item = self._kept[int(np.nanargmax(excess[row] / self._give[row]))]
+            kind = ProofKind.REACH if item.reach else ProofKind.HAND
+            found[row] = self.proof(row, kind, item.fingers, 1)
+        return found
+
+    def proof(self, row: int, kind: ProofKind, fingers: Sequence[int], boxes: int) -> Proof:
+        """A proof of one of the targets."""
+        return Proof(
+            kind=ProofKind.FINGER if self._fixed else kind,
+            fingers=tuple(self._robot.finger_names[i] for i in fingers),
+            quantities=quantities_of(self._kept, self._asked[row], self._give[row], fingers),
+            boxes=boxes,
+            tolerance=self._problems.tolerances,
+            target=self._problems.rows(slice(row, row + 1)),
+        ).sealed()
 
 
 class Prover:
-    """Looks for proofs of impossibility on one robot."""
+    """Looks for proofs of impossibility on one robot.
+
+    Attributes:
+        space: The coordinates whose box is divided.
+    """
 
     def __init__(self, robot: RobotDescription, compiled: bool = True) -> None:
         """Keep the robot; the test is built when it is first needed."""
         self._robot = robot
         self._compiled = compiled
-        self._space = HandSpace(robot)
+        self.space = HandSpace(robot)
         self._arm = arm_span(robot)
+        self._known: dict[tuple[bool, bytes], tuple[Kept, ...]] = {}
 
-    def prove(self, problems: Problems) -> list[Proof | None]:
+    def prove(self, problems: Problems, holding: Array | None = None) -> list[Proof | None]:
         """Proofs of k targets, None where none was found.
 
         No proof says nothing: neither that a target can be reached nor that it cannot.
+
+        Args:
+            problems: The targets.
+            holding: (k, h) coordinates of hands (`HandSpace`) that reach them. Only boxes that
+                hold these are looked at: what comes out as proved would be proved wrongly, and
+                whatever would be proved wrongly comes out, in a fraction of the time.
         """
         if not are_bounded(self._robot):
             return [None] * len(problems)
         found: list[Proof | None] = []
         for start in range(0, len(problems), TOGETHER):
-            found += self._together(problems.rows(slice(start, start + TOGETHER)))
+            some = slice(start, start + TOGETHER)
+            known = None if holding is None else holding[some]
+            found += self._together(problems.rows(some), known)
         return found
 
-    def _together(self, problems: Problems) -> list[Proof | None]:
-        proofs: list[Proof | None] = [None] * len(problems)
+    def _together(self, problems: Problems, holding: Array | None) -> list[Proof | None]:
         known = ~np.isnan(problems.points[:, :, 0])
         for name in SLIDING & problems.more.keys():
             # Anywhere on a line or a plane: the point itself need not be reached.
             known &= np.isnan(problems.more[name][..., 0])
         known &= ~np.array(endless_fingers(self._robot, motor_box(self._robot, problems)))
-        for group in self._groups():
+        stated = _Stated(self._robot, self._kept(problems), problems)
+        proofs = stated.decided(known)
+        for group, most in self._groups():
             chosen = np.zeros(known.shape[1], dtype=bool)
             chosen[group] = True
             asked = known & chosen
@@ -87,42 +165,58 @@ class Prover:
             rows = np.flatnonzero(still & asked.any(axis=1))
             if not len(rows):
                 continue
-            result = self._search(problems.rows(rows), asked[rows])
+            kept = None if holding is None else holding[rows]
+            result = self._search(problems.rows(rows), asked[rows], most, kept)
             for place in np.flatnonzero(result.proved).tolist():
                 row = int(rows[place])
-                proofs[row] = self._proof(problems, row, asked[row], result, place)
+                kind = ProofKind.REACH if result.reach[place] else ProofKind.HAND
+                fingers = np.flatnonzero(asked[row]).tolist()
+                proofs[row] = stated.proof(row, kind, fingers, int(result.boxes[place]))
         return proofs
 
-    def _groups(self) -> list[list[int]]:
-        """Fingers that may contradict each other; of a fixed hand each by itself."""
+    def _groups(self) -> list[tuple[list[int], int]]:
+        """Fingers that may contradict each other, and boxes; of a fixed hand each by itself."""
         fingers = list(range(len(self._robot.fingers)))
-        return [[i] for i in fingers] if self._arm is None else [fingers]
+        if self._arm is None:
+            return [([i], MOST) for i in fingers]
+        if len(fingers) <= SUBSET:
+            return [(fingers, MOST)]
+        subsets = [(list(some), SOME) for some in combinations(fingers, SUBSET)]
+        return [(fingers, FEW), *subsets, (fingers, MOST)]
 
-    def _proof(
-        self, problems: Problems, row: int, asked: NDArray[np.bool_], found: _Found, place: int
-    ) -> Proof:
-        kind = ProofKind.REACH if found.reach[place] else ProofKind.HAND
-        names: Sequence[str] = self._robot.finger_names
-        return Proof(
-            kind=ProofKind.FINGER if self._arm is None else kind,
-            fingers=tuple(name for name, used in zip(names, asked.tolist(), strict=True) if used),
-            quantities=(),
-            boxes=int(found.boxes[place]),
-            tolerance=problems.tolerances,
-            target=problems.rows(slice(row, row + 1)),
-        )
+    def _kept(self, problems: Problems) -> tuple[Kept, ...]:
+        """The robot's quantities; bounds are found once for limits and locked motors."""
+        fixed = b"" if problems.fixed is None else problems.fixed.tobytes()
+        key = problems.enforce_limits, fixed
+        if key not in self._known:
+            if len(self._known) >= KEPT:
+                self._known.clear()
+            self._known[key] = kept_quantities(self._robot, problems)
+        return self._known[key]
 
     @cached_property
     def _test(self) -> FunctionKernel:
         wrist = None if self._arm is None else Wrist(self._arm.shoulder, self._arm.wrist)
-        return FunctionKernel(BoxTest(self._space, wrist).graph(), self._compiled)
+        return FunctionKernel(BoxTest(self.space, wrist, self._cones).graph(), self._compiled)
 
-    def _search(self, problems: Problems, fingers: NDArray[np.bool_]) -> _Found:
-        """Divide the boxes of k targets, all of them a level deeper in each pass.
+    @cached_property
+    def _cones(self) -> ArmCones | None:
+        cones = arm_cones(self._robot)
+        if cones is None or self._arm is None:
+            return None
+        same = np.allclose(cones.shoulder, self._arm.shoulder, rtol=0, atol=SAME)
+        return cones if same and np.allclose(cones.wrist, self._arm.wrist, 0, SAME) else None
+
+    def _search(
+        self, problems: Problems, fingers: Bools, most: int, holding: Array | None
+    ) -> _Found:
+        """Divide the boxes of k targets, some of them a level deeper in each pass.
 
         Args:
             problems: The targets.
             fingers: (k, f) which contacts count.
+            most: Boxes of a target after which it is given up.
+            holding: (k, h) see `prove`.
         """
         count = len(problems)
         points = np.where(fingers[..., None], problems.points, 0.0)
@@ -130,31 +224,56 @@ class Prover:
         normals = np.where(faced[..., None], problems.normals, 0.0)
         asked = np.stack([fingers, faced], axis=2).astype(float)
         tolerance = np.stack([problems.position_tolerance, problems.angle_tolerance], axis=1)
+        finest = max(TINY, PART * float(problems.position_tolerance.min()))
         limits = joint_limits(self._robot, problems)
-        span = np.zeros(2) if self._arm is None else np.array(self._arm.span(problems))
-        lower, upper = (np.tile(end, (count, 1)) for end in self._space.box(problems))
-        target, boxes = np.arange(count), np.zeros(count, dtype=np.int64)
+        arm = np.zeros(2), np.full(2, NONE)
+        if self._arm is not None:
+            cosines = arm[1] if self._cones is None else self._cones.cosines(problems)
+            arm = np.array(self._arm.span(problems)), cosines
+        ends = (np.tile(end, (count, 1)) for end in self.space.box(problems))
+        waiting: list[Boxes] = [(np.arange(count), *ends)]
+        boxes = np.zeros(count, dtype=np.int64)
         given_up, reach = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        while len(target):
+        while waiting:
+            target, lower, upper = waiting.pop()
+            wanted = ~given_up[target]
+            target, lower, upper = target[wanted], lower[wanted], upper[wanted]
             boxes += np.bincount(target, minlength=count)
             refuted, scores = self._test(
                 *(lower, upper, *limits, points[target], normals[target]),
-                *(tolerance, asked[target], span),
+                *(tolerance, asked[target], *arm),
             )
             refuted = refuted > 0
             reach[target[refuted[:, 1] & ~refuted[:, 0]]] = True
             widest = scores.argmax(axis=1)
             rows = np.arange(len(target))
-            tiny = scores[rows, widest] < TINY
+            tiny = (upper - lower)[rows, widest] < finest
+            tiny |= scores[rows, widest] <= 0
             left = ~refuted.any(axis=1)
             given_up[target[left & tiny]] = True
-            given_up |= boxes > MOST
+            given_up |= boxes > most
             left = np.flatnonzero(left & ~given_up[target])
-            target, lower, upper, widest = target[left], lower[left], upper[left], widest[left]
-            rows = np.arange(len(target))
-            middle = (lower[rows, widest] + upper[rows, widest]) / 2
-            lower, upper = np.concatenate([lower, lower]), np.concatenate([upper, upper])
-            upper[rows, widest] = middle
-            lower[len(rows) + rows, widest] = middle
-            target = np.concatenate([target, target])
+            halves = _halves(target[left], lower[left], upper[left], widest[left])
+            if holding is not None:
+                known = holding[halves[0]]
+                inside = ((halves[1] <= known) & (known <= halves[2])).all(axis=1)
+                halves = halves[0][inside], halves[1][inside], halves[2][inside]
+            waiting += _parts(*halves)
         return _Found(~given_up, boxes, reach)
+
+
+def _halves(target: Rows, lower: Array, upper: Array, widest: Rows) -> Boxes:
+    """Boxes divided amid their widest coordinates."""
+    rows = np.arange(len(target))
+    middle = (lower[rows, widest] + upper[rows, widest]) / 2
+    lower, upper = np.concatenate([lower, lower]), np.concatenate([upper, upper])
+    upper[rows, widest] = middle
+    lower[len(rows) + rows, widest] = middle
+    return np.concatenate([target, target]), lower, upper
+
+
+def _parts(target: Rows, lower: Array, upper: Array) -> Iterator[Boxes]:
+    """Boxes in parts that are looked at together."""
+    for start in range(0, len(target), CHUNK):
+        some = slice(start, start + CHUNK)
+        yield target[some], lower[some], upper[some]

@@ -1,0 +1,253 @@
+"""What contacts keep however the palm is moved, and what of it a robot can make: guaranteed bounds.
+
+For each finger with an arm the distance of its contact from the shoulder, for each pair of fingers
+the distance of their points and the angle of their normals; of a hand that cannot move the
+coordinates of each point. The bounds are those over all postures of the hand, by branch and bound
+with balls that hold every contact of a box of postures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.problem.arm_span import arm_span
+from casadi_ik.problem.contact_bounds import Balls, balls
+from casadi_ik.problem.hand_motors import endless_fingers, hand_motors, joint_limits, motor_box
+from casadi_ik.problem.problems import Problems
+from casadi_ik.robots.description import RobotDescription
+
+GAP = {"m": 0.01, "rad": 0.1}
+"""How near to what the hand can do a bound has to come before it is left as it is."""
+
+MOST = 1000
+"""Boxes after which a bound stays as far off as it is."""
+
+SLACK = 1e-8
+"""What bounds are moved outwards by and tolerances widened by [m, rad]: for rounding."""
+
+RELATIVE = 1e-12
+"""The same as a part of how far away the contacts are."""
+
+SAME = 1e-9
+"""How far apart two findings of the same number may be [m, rad]."""
+
+Measure = Callable[[Balls], tuple[Array, Array]]
+"""A quantity's value in the middle of boxes, and how far it can be from there."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """One quantity of a robot, whatever the target.
+
+    Attributes:
+        name: What it is, with the fingers.
+        unit: "m" or "rad".
+        fingers: Their numbers.
+        reach: Whether it follows from the arm, too.
+        lower: The smallest value that the robot can make; a guaranteed bound.
+        upper: The largest.
+    """
+
+    name: str
+    unit: str
+    fingers: tuple[int, ...]
+    reach: bool
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What contacts keep however the palm is moved, or where the arm reaches.
+
+    Attributes:
+        name: What it is, with the fingers.
+        unit: "m" or "rad".
+        asked: Its value in the target.
+        give: By how much the tolerances let it differ.
+        lower: The smallest value that the robot can make; a guaranteed bound.
+        upper: The largest.
+        reach: Whether the bounds follow from the arm, too.
+    """
+
+    name: str
+    unit: str
+    asked: float
+    give: float
+    lower: float
+    upper: float
+    reach: bool
+
+    @property
+    def excess(self) -> float:
+        """By how much it is out of what is possible, whatever the tolerances give; <= 0 within."""
+        return max(self.lower - self.asked, self.asked - self.upper) - self.give
+
+    def agrees(self, other: Quantity) -> bool:
+        """Whether both say the same, rounding aside."""
+        if (self.name, self.unit, self.reach) != (other.name, other.unit, other.reach):
+            return False
+        return all(
+            abs(getattr(self, part) - getattr(other, part)) <= SAME
+            for part in ("asked", "give", "lower", "upper")
+        )
+
+
+def kept_quantities(robot: RobotDescription, problems: Problems) -> tuple[Kept, ...]:
+    """All quantities of a robot under the limits and locked motors of some problems.
+
+    Takes some tenths of a second.
+    """
+    return tuple(_kept(_Hand(robot, problems)))
+
+
+def asked_quantities(
+    robot: RobotDescription, kept: tuple[Kept, ...], problems: Problems
+) -> tuple[Array, Array]:
+    """What k targets ask of the quantities, and by how much the tolerances let it differ.
+
+    Returns:
+        Two arrays (k, m), NaN where a target does not ask for it.
+    """
+    position, angle = problems.position_tolerance, problems.angle_tolerance
+    points, normals = problems.points, problems.normals
+    span = arm_span(robot)
+    asked = np.full((len(problems), len(kept)), np.nan)
+    give = np.full_like(asked, np.nan)
+    for column, item in enumerate(kept):
+        first, last = points[:, item.fingers[0]], points[:, item.fingers[-1]]
+        far = SLACK + RELATIVE * (np.abs(first).sum(axis=1) + np.abs(last).sum(axis=1))
+        loose = position[list(item.fingers)].sum() + far
+        if item.reach:
+            assert span is not None
+            asked[:, column] = np.linalg.norm(first - span.shoulder, axis=1)
+        elif len(item.fingers) == 1:
+            asked[:, column] = first[:, "xyz".index(item.name[0])]
+        elif item.unit == "m":
+            asked[:, column] = np.linalg.norm(last - first, axis=1)
+        else:
+            a, b = (normals[:, i] for i in item.fingers)
+            asked[:, column] = 2 * np.arctan2(
+                np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1)
+            )
+            loose = angle[list(item.fingers)].sum() + 2 * SLACK
+        give[:, column] = loose
+    return asked, np.where(np.isnan(asked), np.nan, give)
+
+
+def quantities_of(
+    kept: Sequence[Kept], asked: Array, give: Array, fingers: Collection[int]
+) -> tuple[Quantity, ...]:
+    """What one target asks of some fingers alone.
+
+    Args:
+        kept: The robot's quantities.
+        asked: (m,) of `asked_quantities`.
+        give: (m,) likewise.
+        fingers: Their numbers.
+    """
+    return tuple(
+        Quantity(item.name, item.unit, value, loose, item.lower, item.upper, item.reach)
+        for item, value, loose in zip(kept, asked.tolist(), give.tolist(), strict=True)
+        if set(item.fingers) <= set(fingers) and value == value
+    )
+
+
+class _Hand:
+    """All postures of a hand, and balls that hold its contacts."""
+
+    def __init__(self, robot: RobotDescription, problems: Problems) -> None:
+        self.robot = robot
+        self.motors = hand_motors(robot)
+        self.ends = motor_box(robot, problems)
+        self.limits = joint_limits(robot, problems)
+        self.endless = endless_fingers(robot, self.ends)
+        self.arm = arm_span(robot)
+        self.span = (0.0, 0.0) if self.arm is None else self.arm.span(problems)
+
+    def largest(self, fingers: tuple[int, ...], measure: Measure, sign: int, unit: str) -> float:
+        """An upper bound of `sign` times a measure over all postures."""
+        boxes, best, found, seen = self.ends[None], -np.inf, -np.inf, 0
+        while len(boxes):
+            seen += len(boxes)
+            ball = balls(
+                self.robot,
+                self.motors,
+                (boxes[:, 0], boxes[:, 1]),
+                self.limits,
+                fingers,
+                self.arm is not None,
+            )
+            value, give = measure(ball)
+            real = ~ball.empty
+            value, most, boxes = sign * value[real], (sign * value + give)[real], boxes[real]
+            effect = ball.effect[real]
+            best = max(best, value.max(initial=-np.inf))
+            near = most <= best + GAP[unit]
+            if seen > MOST:
+                near[:] = True
+            found = max(found, most[near].max(initial=-np.inf))
+            boxes, widest = boxes[~near], effect[~near].argmax(axis=1)
+            rows = np.arange(len(boxes))
+            middle = boxes.mean(axis=1)[rows, widest]
+            low, high = boxes.copy(), boxes.copy()
+            low[rows, 1, widest], high[rows, 0, widest] = middle, middle
+            boxes = np.concatenate([low, high])
+        return float(found) + SLACK
+
+    def range(self, fingers: tuple[int, ...], measure: Measure, unit: str) -> tuple[float, float]:
+        """Guaranteed bounds of a measure over all postures."""
+        ends = (self.largest(fingers, measure, sign, unit) for sign in (-1, 1))
+        lower, upper = ends
+        return -lower, upper
+
+
+def _kept(hand: _Hand) -> Iterator[Kept]:
+    names = hand.robot.finger_names
+    fingers = [i for i, endless in enumerate(hand.endless) if not endless]
+    if hand.arm is None:
+        for i in fingers:
+            for axis, letter in enumerate("xyz"):
+                ends = hand.range((i,), _coordinate(axis), "m")
+                yield Kept(f"{letter} of {names[i]}", "m", (i,), False, *ends)
+        return
+    for i, j in combinations(fingers, 2):
+        both, pair = f"{names[i]} and {names[j]}", (i, j)
+        least, most = hand.range(pair, _distance, "m")
+        yield Kept(f"distance of {both}", "m", pair, False, max(least, 0.0), most)
+        least, most = hand.range(pair, _angle, "rad")
+        angles = max(least, 0.0), min(most, np.pi)
+        yield Kept(f"angle of the normals of {both}", "rad", pair, False, *angles)
+    near, far = hand.span
+    for i in fingers:
+        least, most = hand.range((i,), _from(hand.arm.wrist), "m")
+        # The contact is that far from the wrist, and the wrist that far from the shoulder.
+        ends = max(least - far, near - most, 0.0), far + most
+        yield Kept(f"distance of {names[i]} from the shoulder", "m", (i,), True, *ends)
+
+
+def _coordinate(axis: int) -> Measure:
+    return lambda found: (found.points[:, 0, axis], found.radius[:, 0])
+
+
+def _from(point: Array) -> Measure:
+    return lambda found: (
+        np.linalg.norm(found.points[:, 0] - point, axis=1),
+        found.radius[:, 0],
+    )
+
+
+def _distance(found: Balls) -> tuple[Array, Array]:
+    apart = np.linalg.norm(found.points[:, 1] - found.points[:, 0], axis=1)
+    return apart, found.radius.sum(axis=1)
+
+
+def _angle(found: Balls) -> tuple[Array, Array]:
+    a, b = found.normals[:, 0], found.normals[:, 1]
+    between = 2 * np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
+    return between, found.angle.sum(axis=1)
