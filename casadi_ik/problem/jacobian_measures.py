@@ -91,13 +91,13 @@ class JacobianMeasures:
         self._without_arm = tuple(map(int, without_arm))
         self._compiled = compiled
         arm, hand = robot.arm_actuators, robot.hand_actuators
-        thumb = robot.finger_actuators(robot.thumb)
         parts = []
         if arm:
             parts.append(self._measured(ARM, arm, self._arm))
         if hand:
             parts.append(self._measured(HAND, hand, self._hand))
-        if closed_chain and arm:
+        if closed_chain and arm and robot.named_thumb is not None:
+            thumb = robot.finger_actuators(robot.thumb)
             parts.append(self._measured(CLOSED_CHAIN, (*arm, *thumb), self._thumb_contact))
         self._parts = tuple(parts)
 

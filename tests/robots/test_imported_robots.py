@@ -172,7 +172,16 @@ def test_a_method_that_needs_a_thumb_says_so(tmp_path):
     robot = both(tmp_path)
     with pytest.raises(UnsupportedError, match=r"names no thumb.*'thumb: FINGER'.*left, right"):
         ik.Solver(robot, "enhanced-dls")
-    assert ik.Solver(robot).robot is robot
+
+
+def test_a_robot_without_a_thumb_is_solved_and_logged(tmp_path, rng):
+    robot = both(tmp_path)
+    points, normals = robot.contacts(robot.random(rng, 1)[0])
+    contacts = zip(robot.fingers, points, normals, strict=True)
+    grasp = ik.Grasp({name: ik.Contact(point, normal) for name, point, normal in contacts})
+    solver = ik.Solver(robot, compiled=False)
+    assert solver.solve(grasp, log=tmp_path / "solve.mcap").success
+    assert (tmp_path / "solve.mcap").exists()
 
 
 @pytest.mark.parametrize("kind", ["one finger", "one motor"])

@@ -33,6 +33,9 @@ FEW, SOME, MOST = 3000, 3000, 50_000
 """Boxes of a target after which a search is given up: the first one with all fingers, those with
 some of them, and the last with all."""
 
+ALONE = 200
+"""Boxes of each finger of a fixed hand, before any has more."""
+
 SUBSET = 3
 """Fingers of more are looked at by so many, too: fewer motors to divide."""
 
@@ -178,7 +181,8 @@ class Prover:
         """Fingers that may contradict each other, and boxes; of a fixed hand each by itself."""
         fingers = list(range(len(self._robot.fingers)))
         if self._arm is None:
-            return [([i], MOST) for i in fingers]
+            # One that reaches its contact must not take all the time before the one that does not.
+            return [([i], most) for most in (ALONE, MOST) for i in fingers]
         if len(fingers) <= SUBSET:
             return [(fingers, MOST)]
         subsets = [(list(some), SOME) for some in combinations(fingers, SUBSET)]
