@@ -18,7 +18,7 @@ next one; None if the solve is over."""
 
 
 class Stepper:
-    """Runs a step graph in CasADi's virtual machine, with the iterates of the compiled loop.
+    """Runs a step graph in CasADi's virtual machine: the compiled loop's iterates up to rounding.
 
     Iterating over it steps until the solve is over, however long that takes; a budget is the
     caller's.

@@ -48,7 +48,10 @@ def solve_block(study: Study, block: Block, keep: Keep | None = None) -> SolvedB
     solver = study.ready_solver(block.setting)
     q = study.configurations(block.targets, block.number)[: block.size]
     points, normals = robot_of(study.robot).contacts(q)
-    asked: dict[str, Any] = {"q0": study.start(block.setting), "seed": study.seed}
+    asked: dict[str, Any] = {"seed": study.seed}
+    if block.setting.start:
+        # Said, it is also where the solution is to be near; else the same home is a start only.
+        asked["q0"] = study.start(block.setting)
     log = None
     if keep is None:
         batch = solver.solve_batch(points, normals, **asked)

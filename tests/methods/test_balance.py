@@ -9,7 +9,7 @@ import casadi_ik as ik
 from casadi_ik.methods.common.balance import NEAR
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.restarts import LATER
+from casadi_ik.methods.hand_first.restarts import ANYWHERE, VALLEYS
 from casadi_ik.problem.problems import Problems, target_arrays
 from casadi_ik.problem.status import Phase, Status
 
@@ -123,7 +123,7 @@ def test_fits_that_come_back_to_a_minimum_that_misses_end_the_rounds_of_tables(r
     missed = ~batch.success
     assert missed.sum() >= 10
     # Two rounds of tables instead of six.
-    given_up = 8 * (2 + LATER) - 1
+    given_up = 8 * (2 + VALLEYS + ANYWHERE) - 1
     assert np.median(batch.restarts[missed]) == given_up
     assert np.median(batch.phases["balance"][missed]) < 15
     whole = HandFirstMethod(robot.description, HandFirstParameters())

@@ -18,7 +18,7 @@ from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.restarts import LATER, VALLEYS, Restarts
+from casadi_ik.methods.hand_first.restarts import LATER, RUGGED, VALLEYS, Restarts
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts.kinds import Kinds, usual
@@ -52,6 +52,9 @@ RETURNS = 8
 
 SURE = 1e-8
 """Cost (0.01 mm, 0.1 mrad) above which this is a minimum, and not a long flat valley."""
+
+NEAR = 0.01
+"""Cost (1 cm, 6 deg) from which on a target that still misses is taken to be out of reach."""
 
 VARIED = 2
 """Rounds of tables in any case: the second takes hands that differ from each other."""
@@ -127,10 +130,13 @@ class HandFirstMethod(LoopedMethod):
         return states, parameters
 
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
-        """No more hands of tables if their fits come back to a minimum that just misses."""
-        tables = VARIED <= number < self.options.rounds
+        """Whether a round may still help: see RETURNS and `restarts.RUGGED`."""
         layout = self.step.layouts.state
         returns, cost = (states[:, layout.slice(name).start] for name in ("returns", "best_cost"))
+        if number >= self.rounds - RUGGED:
+            return (returns < RETURNS) & (cost < NEAR)
+        # No more hands of tables if their fits come back to a minimum that just misses.
+        tables = VARIED <= number < self.options.rounds
         return (returns < RETURNS) | (cost < SURE) | (not tables)
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:

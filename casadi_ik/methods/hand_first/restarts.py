@@ -5,7 +5,8 @@ many times as large, half of it at limits, and take only postures that differ fr
 neighbours of one that failed fail as well. What all of them miss is one of two things. Its fit has
 come to rest in a long valley, where the contacts hardly move while the hand does: so the next
 round begins along it, to either side of the best fit so far. Or no table holds its like: then
-postures drawn from anywhere follow, and a whole configuration of arm and hand.
+postures drawn from anywhere follow, and a whole configuration of arm and hand; many of them where
+the fits end somewhere else each time, as with many joints at their limits.
 """
 
 from __future__ import annotations
@@ -64,8 +65,14 @@ NUDGE = 1e-6
 VALLEYS = 3
 """Rounds along the directions in which the contacts move least, after those of the tables."""
 
-LATER = VALLEYS + 2
-"""With two more from anywhere: rounds after those of the tables."""
+ANYWHERE = 2
+"""Rounds from anywhere that every target gets which is not solved before."""
+
+RUGGED = 40
+"""More of them for a target whose fits end somewhere else each time."""
+
+LATER = VALLEYS + ANYWHERE + RUGGED
+"""Rounds after those of the tables, at most."""
 
 
 class Restarts:
