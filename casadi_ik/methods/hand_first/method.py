@@ -53,8 +53,8 @@ RETURNS = 8
 SURE = 1e-8
 """Cost (0.01 mm, 0.1 mrad) above which this is a minimum, and not a long flat valley."""
 
-NEAR = 0.01
-"""Cost (1 cm, 6 deg) from which on a target that still misses is taken to be out of reach."""
+NEAR = 0.02
+"""Cost (14 mm, 8 deg) from which on a target that still misses is taken to be out of reach."""
 
 VARIED = 2
 """Rounds of tables in any case: the second takes hands that differ from each other."""
