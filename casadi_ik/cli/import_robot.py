@@ -68,7 +68,7 @@ def import_robot(arguments: argparse.Namespace) -> Answer:
         robots.append(imported.loaded(part))
         if arguments.check:
             differences.update(_differences(robots[0], found))
-        if draw is not None:
+        if draw is not None and picture is not None:
             draw(robots[0], found.surfaces, picture)
 
     write_output(out, "--out", write)

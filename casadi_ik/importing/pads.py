@@ -198,7 +198,8 @@ def _across(vector: Array, axis: Array) -> Array:
 
 
 def _any_across(axis: Array) -> Array:
-    return _unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]), axis)
+    across: Array = np.asarray(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]), dtype=float)
+    return _unit(across, axis)
 
 
 def _unit(vector: Array, otherwise: Array) -> Array:

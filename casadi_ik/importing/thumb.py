@@ -63,7 +63,7 @@ def guess_palm_frame(
     to_thumb = bases[thumb] - (others.mean(axis=0) if len(others) else 0 * bases[thumb])
     if np.linalg.norm(to_thumb - (to_thumb @ z) * z) < 5e-3:
         to_thumb = tips[thumb] - (np.delete(tips, thumb, axis=0).mean(axis=0) if len(others) else 0)
-    across = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
+    across: Array = np.asarray(np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))]), dtype=float)
     y = _unit(to_thumb - (to_thumb @ z) * z, across)
     frame = np.eye(4)
     frame[:3, :3] = np.column_stack([np.cross(y, z), y, z])

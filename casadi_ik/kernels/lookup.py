@@ -170,7 +170,7 @@ class LookupKernel:
 
     def _job(
         self,
-        inputs: list[NDArray[np.float64]],
+        inputs: Sequence[NDArray[np.float64]],
         found: NDArray[np.int64],
         steps: Sequence[int] = (),
     ) -> tuple[_Job, Any]:

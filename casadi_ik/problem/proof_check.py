@@ -262,7 +262,8 @@ class _Search:
         y, step = np.cross(line, x), 2 * np.pi / SWIVELS
         left = np.zeros(len(rows), dtype=bool)
         (upper, wide), (fore, open_) = (
-            _opening(*pair, least, most) for pair in (cones.lengths, cones.lengths[::-1])
+            _opening(one, other, least, most)
+            for one, other in (cones.lengths, reversed(cones.lengths))
         )
         limits = self._cosines
         for psi in step * np.arange(SWIVELS):

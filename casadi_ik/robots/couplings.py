@@ -249,8 +249,8 @@ class Polynomial(CouplingKind, frozen=True, tag="polynomial"):
 
     def followed(self, source: Array) -> Array:
         """Positions (k,) of the joint."""
-        value: Array = np.polynomial.polynomial.polyval(source, self.coefficients)
-        return value
+        value = np.polynomial.polynomial.polyval(source, self.coefficients)
+        return np.asarray(value, dtype=np.float64)
 
 
 Coupling = Linear | LeadScrew | FourBar | Polynomial

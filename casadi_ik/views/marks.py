@@ -60,7 +60,8 @@ def _asked(contact: Contact, tip: Array) -> list[Solid]:
     place = target_place(contact, tip)
     solids = []
     if contact.line is not None:
-        low, high = np.sort([0.0, contact.line @ (place - contact.point)])
+        along = float(contact.line @ (place - contact.point))
+        low, high = min(0.0, along), max(0.0, along)
         first, last = (contact.point + t * contact.line for t in (low - BEYOND, high + BEYOND))
         solids.append(capsule(first, last, 0.0020))
     elif contact.plane is not None:

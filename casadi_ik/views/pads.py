@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import closing
 from os import PathLike
+from typing import Any
 
 import numpy as np
 import pyvista as pv
@@ -17,7 +18,7 @@ from casadi_ik.importing.surfaces import Surface
 from casadi_ik.views.captions import MET_COLOR, TARGET_COLOR
 from casadi_ik.views.picture import DPI, FAINT, INK, new_figure, save_picture
 from casadi_ik.views.robot_body import HAND_COLOR, robot_body
-from casadi_ik.views.shapes import Solid, arrow
+from casadi_ik.views.shapes import Solid, arrow, capsule
 from casadi_ik.views.stage import Stage, over
 from casadi_ik.views.viewpoint import View
 
@@ -62,7 +63,7 @@ def draw_pads(
         PictureError: The file cannot be written, or there is no OpenGL to draw with.
     """
     q = robot.home
-    inverse = np.linalg.inv(robot.palm(q))
+    inverse = np.asarray(np.linalg.inv(robot.palm(q)), dtype=np.float64)
     points, normals = robot.contacts(q)
     points = points @ inverse[:3, :3].T + inverse[:3, 3]
     normals = normals @ inverse[:3, :3].T
@@ -72,7 +73,7 @@ def draw_pads(
     for name, point, normal in zip(robot.fingers, points, normals, strict=True):
         color = THUMB_COLOR if name == robot.description.named_thumb else MET_COLOR
         marks += [
-            (pv.Sphere(radius=0.014 * size, center=point), color),
+            (capsule(point, point, 0.014 * size), color),
             (arrow(point, normal, 0.16 * size, 0.012 * size), color),
         ]
     figure = new_figure(*SIZE, dpi)
@@ -106,7 +107,7 @@ def _hand(robot: ArmHand, surfaces: Mapping[str, Surface], inverse: Array) -> li
         if link not in links or not len(surface.triangles):
             continue
         placed = surface.moved(inverse @ links[link])
-        mesh = pv.PolyData.from_regular_faces(placed.points, placed.triangles)
+        mesh: Any = pv.PolyData.from_regular_faces(placed.points, placed.triangles)
         mesh.clean(inplace=True)
         mesh.compute_normals(
             auto_orient_normals=True, split_vertices=True, feature_angle=35.0, inplace=True

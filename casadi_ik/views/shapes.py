@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pyvista as pv
@@ -75,7 +75,8 @@ def arrow(start: Array, direction: Array, length: float, width: float) -> pv.Pol
 
 def ring(center: Array, axis: Array, radius: float, width: float) -> pv.PolyData:
     """A thin ring about an axis through its centre."""
-    mesh = pv.ParametricTorus(ringradius=radius, crosssectionradius=width / 2).triangulate()
+    torus: Any = pv.ParametricTorus(ringradius=radius, crosssectionradius=width / 2)
+    mesh: pv.PolyData = torus.triangulate()
     z = axis / np.linalg.norm(axis)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x /= np.linalg.norm(x)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Generic, TypeVar
 
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.kernels import StepGraph
@@ -16,15 +17,17 @@ from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 
+Step = TypeVar("Step", EnhancedStep, OriginalStep)
 
-class _QiuMethod(LoopedMethod):
+
+class _QiuMethod(LoopedMethod, Generic[Step]):
     """What the methods of the paper share: one step graph, begun at q0, within the paper's budget.
 
     Attributes:
         step: Its step for this robot.
     """
 
-    step: EnhancedStep | OriginalStep
+    step: Step
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""
@@ -41,13 +44,11 @@ class _QiuMethod(LoopedMethod):
         return states, step.parameters.pack_rows(step.parameter_values(problems), count)
 
 
-class EnhancedMethod(_QiuMethod):
+class EnhancedMethod(_QiuMethod[EnhancedStep]):
     """`enhanced-*`: thumb reaching, then hand alignment along the arm-thumb closed chain.
 
     Its step runs in the virtual machine if the finger step is Ipopt's.
     """
-
-    step: EnhancedStep
 
     def __init__(
         self, robot: RobotDescription, options: QiuParameters, compiled: bool = True
@@ -69,10 +70,8 @@ class EnhancedMethod(_QiuMethod):
         return self.step.jacobians
 
 
-class OriginalMethod(_QiuMethod):
+class OriginalMethod(_QiuMethod[OriginalStep]):
     """`original-*`: all contacts in one hierarchy, what the paper compares with."""
-
-    step: OriginalStep
 
     def __init__(
         self, robot: RobotDescription, options: OriginalParameters, compiled: bool = True

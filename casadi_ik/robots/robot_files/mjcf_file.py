@@ -31,7 +31,8 @@ def mujoco_model(path: Path) -> tuple[Any, Any]:
             f"{path}: is MJCF; to read it: pip install casadi-ik[mujoco]"
         ) from error
     try:
-        return mujoco, mujoco.MjModel.from_xml_path(str(path))
+        library: Any = mujoco  # its types are made when it is imported
+        return library, library.MjModel.from_xml_path(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise DescriptionError(f"{path}: MuJoCo cannot read it: {reason}") from error
@@ -101,7 +102,7 @@ def _of_body(
         if kind in ("revolute", "continuous"):
             # The axis goes through the anchor: the link's frame is there while the joint turns.
             pose = placement @ anchor @ turned(axis, -zero)
-            after = np.linalg.inv(anchor)
+            after: Array = np.asarray(np.linalg.inv(anchor), dtype=np.float64)
         else:
             pose, after = placement.copy(), np.eye(4)
             if kind == "prismatic":

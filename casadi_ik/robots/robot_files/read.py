@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from casadi_ik.errors import DescriptionError, MissingExtraError
 from casadi_ik.robots.robot_files.mjcf_file import read_mjcf
@@ -70,7 +71,8 @@ def _expanded(path: Path) -> str:
             f"{path}: has xacro macros; to read them: pip install casadi-ik[xacro]"
         ) from error
     try:
-        return xacro.process_file(os.fspath(path)).toxml()
+        document: Any = xacro.process_file(os.fspath(path))
+        return str(document.toxml())
     except Exception as error:  # whatever its macros evaluate to
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DescriptionError(f"{path}: xacro cannot expand it: {reason}") from error

@@ -234,8 +234,8 @@ class Prover:
         if self._arm is not None:
             cosines = arm[1] if self._cones is None else self._cones.cosines(problems)
             arm = np.array(self._arm.span(problems)), cosines
-        ends = (np.tile(end, (count, 1)) for end in self.space.box(problems))
-        waiting: list[Boxes] = [(np.arange(count), *ends)]
+        lower, upper = (np.tile(end, (count, 1)) for end in self.space.box(problems))
+        waiting: list[Boxes] = [(np.arange(count), lower, upper)]
         boxes = np.zeros(count, dtype=np.int64)
         given_up, reach = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
         while waiting:
