@@ -259,10 +259,11 @@ class _Clock:
 
 
 def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) -> Reason | None:
-    if proof is not None:
-        return Reason.REACH if proof.kind is ProofKind.REACH else Reason.HAND
-    if hand is not None and not hand.fits:
+    # A proof by the reach may owe much to the hand: it shows only that no posture does both.
+    if (proof is not None and proof.kind is not ProofKind.REACH) or (hand and not hand.fits):
         return Reason.HAND
+    if proof is not None:
+        return Reason.REACH
     if reach is not None and abs(reach.excess) > REAL:
         return Reason.REACH
     return None
