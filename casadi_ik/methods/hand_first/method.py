@@ -15,6 +15,7 @@ from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
+from casadi_ik.methods.common.posture_table import squared_distance
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.first_round import FirstRound
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
@@ -247,7 +248,7 @@ class HandFirstMethod(LoopedMethod):
         if own:
             postures = postures[:, : max(postures.shape[1] - 1, 1)]
         ranges = np.maximum((self.robot.upper - self.robot.lower)[hand], TINY)
-        distance = (((postures - here) / ranges) ** 2).sum(axis=2)
+        distance = squared_distance(postures / ranges, here / ranges)
         rows = np.argsort(distance, axis=1, kind="stable")[:, :, None]
         ordered = np.take_along_axis(postures, rows, axis=1)
         if not own or self.options.candidates == 1:

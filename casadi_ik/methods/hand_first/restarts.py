@@ -17,9 +17,11 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.methods.hand_first.valley import valley
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
@@ -138,23 +140,28 @@ class Restarts:
             q: (k, n) where it did.
             which: The round. Even ones keep motors at a limit there; odd ones do not.
         """
-        size = self._size
         columns = self._hand
         rigid, slopes = self._slopes(q, problems)
-        if self._robot.description.arm_actuators:
-            # The palm follows as well as it can: what is left of a motor's motion counts.
-            base = np.linalg.qr(rigid)[0]
-            slopes = slopes - base @ (base.transpose(0, 2, 1) @ slopes)
-        squares = slopes.transpose(0, 2, 1) @ slopes
-        if which % 2 == 0:
-            ends = np.minimum(q - self._robot.lower, self._robot.upper - q)[:, columns]
-            held = ends < AT_END
-            squares += np.eye(len(columns)) * (held * HELD)[:, None]
-        chosen = np.linalg.eigh(squares)[1][:, :, 0]
-        chosen = chosen / np.abs(chosen).max(axis=1, keepdims=True)
+        ends = np.minimum(q - self._robot.lower, self._robot.upper - q)[:, columns]
+        held = (ends < AT_END) * HELD if which % 2 == 0 else np.zeros_like(ends)
+        # A kernel's column is a vector: of a hand with one motor there is no second dimension.
+        shapes = self.valley.input_shapes
+        (chosen,) = self.valley(
+            rigid, slopes.reshape(len(q), *shapes[1]), held.reshape(len(q), *shapes[2])
+        )
+        motion = chosen.reshape(ends.shape) * self.size
+        return q[:, None, columns] + self.strides(which)[:, None] * motion[:, None]
+
+    def strides(self, which: int) -> Array:
+        """(candidates,) how far the hands of a round begin along their valley."""
         first = (which + 1) // 2 * self._options.candidates
-        strides = np.resize(np.roll(STRIDES, -first), self._options.candidates)
-        return q[:, None, columns] + strides[:, None] * (chosen * size)[:, None]
+        return np.resize(np.roll(STRIDES, -first), self._options.candidates)
+
+    @cached_property
+    def valley(self) -> FunctionKernel:
+        """Finds the valley, from the contacts' slopes."""
+        rows = 6 * len(self._robot.fingers)
+        return FunctionKernel(valley(rows, len(self._hand)), self._compiled)
 
     def anywhere(self, problems: Problems, number: int) -> Array:
         """Whole configurations (candidates, n), evenly spread, other ones in every round."""
@@ -166,8 +173,8 @@ class Restarts:
         return lower + spread * (upper - lower)
 
     def _slopes(self, q: Array, problems: Problems) -> tuple[Array, Array]:
-        """How the contacts move with the palm (k, 6 f, 6) and with the hand (k, 6 f, h)."""
-        k, size, columns = len(q), self._size, self._hand
+        """How the contacts move with the palm (k, 6, 6 f) and with the hand (k, h, 6 f)."""
+        k, size, columns = len(q), self.size, self._hand
         moved = np.repeat(q[:, None], len(columns) + 1, axis=1)
         for place, column in enumerate(columns):
             moved[:, place + 1, column] += NUDGE * size[place]
@@ -178,14 +185,16 @@ class Restarts:
         counts = ~np.isnan(np.stack([problems.points, problems.normals], axis=1))
         both = np.stack([points, normals], axis=2)
         slopes = (both[:, 1:] - both[:, :1]) / NUDGE * counts[:, None]
+        if not self._robot.description.arm_actuators:
+            return np.zeros((k, 6, slopes[0, 0].size)), slopes.reshape(k, len(columns), -1)
         turns = np.cross(np.eye(3)[:, None, None], both[:, None, 0]) * counts[:, None]
         shifts = np.zeros((k, 3, *counts.shape[1:]))
         shifts[:, np.arange(3), 0, :, np.arange(3)] = 1
         rigid = np.concatenate([shifts * counts[:, None], turns], axis=1)
-        return _as_columns(rigid), _as_columns(slopes)
+        return rigid.reshape(k, 6, -1), slopes.reshape(k, len(columns), -1)
 
     @property
-    def _size(self) -> Array:
+    def size(self) -> Array:
         """(hand,) a radian of every motor, or half the range of a slider [m]."""
         units = [self._robot.description.actuators[column].unit for column in self._hand]
         ranges = (self._robot.upper - self._robot.lower)[self._hand]
@@ -209,9 +218,3 @@ class Restarts:
         return PostureTable(
             self._robot, hand, size, at_limits, compiled=self._compiled, bounds=bounds
         )
-
-
-def _as_columns(motions: Array) -> Array:
-    """(k, m, 2, f, 3) motions of all contacts as matrices (k, 6 f, m)."""
-    k, m = motions.shape[:2]
-    return motions.reshape(k, m, -1).transpose(0, 2, 1)
