@@ -110,7 +110,7 @@ class HandFirstMethod(LoopedMethod):
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
-        _ = self.kernel, self.hands.table, self._beginning
+        _ = self.kernel, self.hands.table, self.first
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:
@@ -163,7 +163,7 @@ class HandFirstMethod(LoopedMethod):
             first = self._singles.pop()
         except IndexError:
             first = FirstRound(
-                self.hands.table, self._beginning, self.kernel, self.step.layouts, self.order
+                self.hands.table, self.first, self.kernel, self.step.layouts, self.order
             )
         found = first(problems, q0, self._terms(problems), self.max_iterations)
         self._singles.append(first)
@@ -188,9 +188,9 @@ class HandFirstMethod(LoopedMethod):
         tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
         vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
         # A kernel's column is a vector: of a hand with one motor there is no second dimension.
-        tried = tried.reshape(len(problems), *self._beginning.input_shapes[-1])
+        tried = tried.reshape(len(problems), *self.first.input_shapes[-1])
         asked = *vectors, q0, self._terms(problems), tried
-        states, parameters = self._beginning(*asked)
+        states, parameters = self.first(*asked)
         if begun:
             layout = self.step.layouts.state
             states[:, layout.slice("phase")] = float(Phase.CANDIDATE)
@@ -272,7 +272,8 @@ class HandFirstMethod(LoopedMethod):
         return np.concatenate([*tolerances, *bounds, nearest])
 
     @cached_property
-    def _beginning(self) -> FunctionKernel:
+    def first(self) -> FunctionKernel:
+        """Makes first state and parameters of a round."""
         return FunctionKernel(beginning(self.step.layouts), self._compiled)
 
 

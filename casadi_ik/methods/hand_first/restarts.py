@@ -165,12 +165,14 @@ class Restarts:
 
     def anywhere(self, problems: Problems, number: int) -> Array:
         """Whole configurations (candidates, n), evenly spread, other ones in every round."""
-        lower, upper = self._everywhere
-        if problems.enforce_limits:
-            lower, upper = self._robot.lower, self._robot.upper
+        lower, upper = self.anywhere_bounds(problems.enforce_limits)
         count = self._options.candidates
         spread = evenly((number + 1) * count, len(lower))[-count:]
         return lower + spread * (upper - lower)
+
+    def anywhere_bounds(self, enforce_limits: bool) -> tuple[Array, Array]:
+        """(n,) between which configurations from anywhere are."""
+        return (self._robot.lower, self._robot.upper) if enforce_limits else self._everywhere
 
     def _slopes(self, q: Array, problems: Problems) -> tuple[Array, Array]:
         """How the contacts move with the palm (k, 6, 6 f) and with the hand (k, h, 6 f)."""
