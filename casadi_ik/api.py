@@ -23,6 +23,7 @@ from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.solving.alternatives.finder import APART, Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.stream import SolvedBlock, Stream
 
@@ -329,6 +330,18 @@ class Solver:
         preferred = self._engine.preference(None, q0 is not None)
         problems = self._questions.of_grasps([grasp], None, preferred)
         return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
+
+    def fast(self) -> FastSolver:
+        """One target a call, arrays in and arrays out, in memory made once.
+
+        ``fast = solver.fast(); q, status = fast(points, normals, q0)``: bit for bit the answers of
+        `solve` without a diagnosis; see `FastSolver` for what it does without. One instance per
+        thread.
+
+        Raises:
+            UnsupportedError: The method is not hand-first.
+        """
+        return FastSolver(self._engine, self._questions)
 
     def _recorder(
         self,

@@ -40,13 +40,12 @@ def numbers(values: Iterable[Any]) -> str:
     return "{\n" + "\n".join([*lines, line.rstrip(",")]) + "}"
 
 
-def define_arrays(arrays: Mapping[str, Array | Sequence[Any]], scope: str = "static const") -> str:
-    """Arrays of doubles, of 16-bit or of common whole numbers, by name."""
+def define_arrays(arrays: Mapping[str, Array], scope: str = "static const") -> str:
+    """Arrays of doubles, of 16-bit or of common whole numbers, by name; none is empty."""
     text = ""
-    for name, values in arrays.items():
-        array = np.asarray(values)
-        kind = "int16_t" if array.dtype == np.int16 else "int" if array.dtype.kind in "iu" else "double"
-        sizes = "".join(f"[{max(size, 1)}]" for size in array.shape)
-        rows = array if array.size else np.zeros([max(size, 1) for size in array.shape], array.dtype)
-        text += f"{scope} {kind} {name}{sizes} = {numbers(rows)};\n"
+    for name, array in arrays.items():
+        whole = "int16_t" if array.dtype == np.int16 else "int"
+        kind = whole if array.dtype.kind in "iu" else "double"
+        sizes = "".join(f"[{size}]" for size in array.shape)
+        text += f"{scope} {kind} {name}{sizes} = {numbers(array)};\n"
     return text

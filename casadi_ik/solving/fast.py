@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
-from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.errors import UnsupportedError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.methods.hand_first.rounds import OneTarget, RoundsPlan
-from casadi_ik.problem.preference import NO_PREFERENCE, preference
+from casadi_ik.methods.hand_first.one_target import OneTarget
+from casadi_ik.problem.preference import preference
 from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.status import Status
 from casadi_ik.solving.engine import Engine
@@ -45,21 +45,23 @@ class FastSolver:
         method.prepare()
         self._engine, self._questions = engine, questions
         robot = engine.robot
-        self._home = robot.home
         f, n = len(robot.fingers), len(robot.actuators)
-        self._shapes = (f, 3), (n,)
+        self._home, self._shapes = robot.home, ((f, 3), (f, 3), (n,))
         self.position_error, self.angle_error = np.full(f, np.nan), np.full(f, np.nan)
-        self._iterations = self._restarts = 0
-        self._one = None
+        self._one: OneTarget | None = None
         if method.kernel.compiled:
-            self._one = one = OneTarget(RoundsPlan(method, questions.enforce_limits))
-            self._points, self._normals, self._here = one.points, one.normals, one.here
-            self._terms = one.terms
-            nothing = np.full((1, f, 3), np.nan)
-            nothing[0, 0] = 0.0, 0.0, 1.0
-            self._terms[:] = method.terms(questions.of_arrays(nothing, nothing, None))
-            self._answer = one.q
-            self.position_error, self.angle_error = one.position_error, one.angle_error
+            self._lay_out(method)
+
+    def _lay_out(self, method: HandFirstMethod) -> None:
+        questions = self._questions
+        plan = method.rounds_plan(questions.enforce_limits)
+        self._one = one = OneTarget(plan, whole=True)
+        self._points, self._normals, self._here = one.points, one.normals, one.here
+        self._terms, self._q = one.terms, one.q
+        self.position_error, self.angle_error = one.position_error, one.angle_error
+        # Tolerances and limits are the same for all targets.
+        any_contact = np.zeros((1, *self._shapes[0])), np.ones((1, *self._shapes[0]))
+        self._terms[...] = method.terms(questions.of_arrays(*any_contact, None))
 
     def __call__(
         self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None = None
@@ -82,14 +84,33 @@ class FastSolver:
         one = self._one
         if one is None:
             return self._slowly(points, normals, q0)
-        try:
-            self._points[...] = points
-            self._normals[...] = normals
-            self._here[...] = self._home if q0 is None else q0
-        except (TypeError, ValueError):
+        start = self._home if q0 is None else q0
+        shapes = np.shape(points), np.shape(normals), np.shape(start)
+        if shapes != self._shapes:
             return self._slowly(points, normals, q0)
+        self._points[...] = points
+        self._normals[...] = normals
+        self._here[...] = start
         self._terms[-1] = q0 is not None
         status = one()
-        if status is None or np.shape(points) != self._shapes[0]:
+        if status is None:
             return self._slowly(points, normals, q0)
-        return self._answer, STATUSES[status]
+        return self._q, STATUSES[status]
+
+    def _slowly(
+        self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None
+    ) -> tuple[Array, Status]:
+        """The way of a batch: without a compiler, and for what has to be refused in words.
+
+        Raises:
+            InputError: Wrong shapes or numbers.
+        """
+        questions = self._questions
+        prefer = preference(None, q0 is not None)
+        problems = questions.of_arrays([points], [normals], None, prefer=prefer)
+        start = questions.start(q0)
+        solution = self._engine.solve(problems, Run(start)).solution(0)
+        verdicts = solution.contacts.values()
+        self.position_error[...] = [verdict.position_error for verdict in verdicts]
+        self.angle_error[...] = [verdict.angle_error for verdict in verdicts]
+        return solution.q, solution.status

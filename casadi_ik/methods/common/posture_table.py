@@ -25,9 +25,6 @@ class PostureTable:
 
     Attributes:
         postures: (t, k) positions of the hand's actuators.
-        lower: (k,) where their spread begins.
-        ranges: (k,) how far it goes.
-        at_limits: Part of the range that is moved to the limits.
         lookup: Finds rows of them.
     """
 
@@ -56,15 +53,14 @@ class PostureTable:
         """
         columns = list(hand)
         lower, upper = (ends[columns] for ends in bounds or (robot.lower, robot.upper))
-        self.lower, self.at_limits = lower, at_limits
         q = np.tile(robot.home, (size, 1))
         spread = (evenly(size, len(columns)) - 0.5) / (1 - at_limits) + 0.5
         spread = np.clip(spread, 0.0, 1.0)
         q[:, columns] = lower + spread * (upper - lower)
         self.postures = q[:, columns]
         self._pulled = pull > 0
-        self.ranges = upper - lower
-        half_ranges = self.ranges / 2
+        self._ranges = upper - lower
+        half_ranges = self._ranges / 2
         scales = np.sqrt(pull / len(columns)) / half_ranges
         key = contact_shape(len(robot.fingers), scales if self._pulled else ())
         contacts = robot.contacts(q)
@@ -116,7 +112,7 @@ class PostureTable:
 
     def _chosen(self, rows: NDArray[np.int64], count: int, similar: float) -> Array:
         """Of rows (k, pool) in order of nearness those that differ, (k, count, hand)."""
-        places = self.postures[rows] / np.where(self.ranges > 0, self.ranges, 1.0)
+        places = self.postures[rows] / np.where(self._ranges > 0, self._ranges, 1.0)
         alike = similar * similar * places.shape[2]
         every = np.arange(len(rows))
         closest = np.full(rows.shape, np.inf)

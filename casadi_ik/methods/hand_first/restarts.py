@@ -12,6 +12,7 @@ the fits end somewhere else each time, as with many joints at their limits.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,6 +78,22 @@ LATER = VALLEYS + ANYWHERE + RUGGED
 """Rounds after those of the tables, at most."""
 
 
+class Spread(NamedTuple):
+    """How postures of a table are spread.
+
+    Attributes:
+        count: How many.
+        at_limits: Part of the range that is moved to the limits.
+        lower: (n,) from where.
+        upper: (n,) to where.
+    """
+
+    count: int
+    at_limits: float
+    lower: Array
+    upper: Array
+
+
 class Restarts:
     """The hand postures that a robot's solves begin from."""
 
@@ -100,20 +117,35 @@ class Restarts:
         self._options = options
         self._compiled = compiled
 
+    @property
+    def spreads(self) -> tuple[Spread, Spread, Spread]:
+        """Those of the three tables."""
+        own, options = (self._robot.lower, self._robot.upper), self._options
+        return (
+            Spread(options.table, 0.0, *own),
+            Spread(options.wide_table, AT_LIMITS, *own),
+            Spread(options.wide_table, 0.0, *self._everywhere),
+        )
+
     @cached_property
     def table(self) -> PostureTable:
         """The hand postures of the first round."""
-        return self._table(self._options.table)
+        return self._table(self.spreads[0])
 
     @cached_property
     def wide_table(self) -> PostureTable:
         """Many more postures, a good part of them at limits."""
-        return self._table(self._options.wide_table, AT_LIMITS)
+        return self._table(self.spreads[1])
 
     @cached_property
     def free_table(self) -> PostureTable:
         """As many postures, limits ignored."""
-        return self._table(self._options.wide_table, bounds=self._everywhere)
+        return self._table(self.spreads[2])
+
+    def tables(self, enforce_limits: bool) -> tuple[PostureTable, ...]:
+        """Those that are asked, in the order of `spreads`."""
+        own = (self.table, self.wide_table)
+        return own if enforce_limits else (*own, self.free_table)
 
     def from_tables(self, problems: Problems, number: int) -> Array:
         """Postures (k, candidates, hand) of a round whose postures look like the targets.
@@ -213,10 +245,13 @@ class Restarts:
         ends = description.mechanical
         return np.maximum(lower, ends[0]), np.minimum(upper, ends[1])
 
-    def _table(
-        self, size: int, at_limits: float = 0.0, bounds: tuple[Array, Array] | None = None
-    ) -> PostureTable:
-        hand = tuple(self._hand)
+    def _table(self, spread: Spread) -> PostureTable:
+        hand, bounds = tuple(self._hand), (spread.lower, spread.upper)
         return PostureTable(
-            self._robot, hand, size, at_limits, compiled=self._compiled, bounds=bounds
+            self._robot,
+            hand,
+            spread.count,
+            spread.at_limits,
+            compiled=self._compiled,
+            bounds=bounds,
         )

@@ -9,6 +9,7 @@
 typedef struct {
   /* The question. */
   double points[3 * N_FINGERS], normals[3 * N_FINGERS];  /* base frame, NaN = free */
+  double more[3 * N_FINGERS * N_MORE + 1];  /* contacts' other vectors, which get no verdict here */
   double here[N_MOTORS];
   double terms[N_TERMS];        /* tolerances [m], [rad]; lower, upper bounds; 1 = nearest wanted */
   /* The answer. */
@@ -17,7 +18,8 @@ typedef struct {
   int64_t iterations, restarts;
   int64_t status;
   /* On its way. */
-  int64_t round, under_way, in_round, evaluations;
+  int64_t round, under_way, in_round;
+  int64_t rounds;               /* how many may be made */
   double state[N_STATE], last[N_STATE], parameters[N_PARAMETERS], mark[N_STATE];
   double postures[N_CANDIDATES * N_HAND];
   double places[N_POOL * N_HAND], closest[N_POOL];
@@ -29,9 +31,11 @@ typedef struct {
   OWN_FIELDS
 } rounds;
 
-static const int64_t ALONE[] = {0, 0, 0, 0, 0};
+static const int64_t ALONE[] = {0, 0, 0, 0, 0, 0, 0, 0};
 
 static int is_number(double x) { return x == x; }
+static int is_finite(double x) { return x * 0.0 == 0.0; }
+
 static double clipped(double x, double low, double high) {
   const double above = x > low ? x : low;
   return above < high ? above : high;
@@ -146,7 +150,7 @@ static void order(rounds *job, int own) {
 
 /* Postures whose contacts look like the target. */
 static int from_table(rounds *job, int64_t number) {
-  const int table = !number ? 0 : FREE && number % 2 ? 2 : 1;
+  const int table = !number ? 0 : !ENFORCE_LIMITS && number % 2 ? 2 : 1;
   const int64_t wanted = number ? number * N_CANDIDATES : N_CANDIDATES;
   const int64_t most = TABLE_ROWS[table];
   int64_t pool = number ? POOL * wanted : wanted;
@@ -257,7 +261,7 @@ static void from_anywhere(rounds *job, int64_t number, double *first) {
 }
 
 static int begin_round(rounds *job, int64_t number) {
-  const double *inputs[5];
+  const double *inputs[5 + N_MORE];
   double *outputs[2], first[N_MOTORS];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   const int64_t later = number - TABLE_ROUNDS;
@@ -269,9 +273,10 @@ static int begin_round(rounds *job, int64_t number) {
   if (code != DONE) return code;
   inputs[0] = job->points;
   inputs[1] = job->normals;
-  inputs[2] = job->here;
-  inputs[3] = job->terms;
-  inputs[4] = job->postures;
+  for (i = 0; i < N_MORE; ++i) inputs[2 + i] = job->more + 3 * N_FINGERS * i;
+  inputs[2 + N_MORE] = job->here;
+  inputs[3 + N_MORE] = job->terms;
+  inputs[4 + N_MORE] = job->postures;
   outputs[0] = job->state;
   outputs[1] = job->parameters;
   code = BEGIN(&map);
@@ -306,6 +311,9 @@ static int finish(rounds *job) {
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   int code, i, met = 1;
   memcpy(job->q, job->state + STATE_Q, sizeof job->q);
+  job->restarts = (int64_t) job->state[STATE_EARLIER]
+                + (int64_t) clipped((double) (int64_t) tried, 0.0, N_CANDIDATES - 1);
+  if (N_MORE) return DONE;
   inputs[0] = job->q;
   inputs[1] = job->points;
   inputs[2] = job->normals;
@@ -322,17 +330,40 @@ static int finish(rounds *job) {
   if (ENFORCE_LIMITS) met &= job->beyond <= LIMIT_SLACK;
   if (met) job->status = SOLVED_STATUS;
   else if (job->status == SOLVED_STATUS) job->status = STALLED_STATUS;
-  job->restarts = (int64_t) job->state[STATE_EARLIER]
-                + (int64_t) clipped((double) (int64_t) tried, 0.0, N_CANDIDATES - 1);
   return DONE;
 }
 
-/* Takes up the question that stands in the job. */
-static void rounds_begin(rounds *job) {
+/* A vector that is free, or whose length is made one as `unit_vectors` does it; 0 where it is neither. */
+static int made_unit(double *vector) {
+  double length;
+  if (vector[0] != vector[0]) return vector[1] != vector[1] && vector[2] != vector[2];
+  length = sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]);
+  if (!(length >= SMALL_LENGTH && length <= LARGE_LENGTH)) return 0;
+  if (length - 1 < UNIT && 1 - length < UNIT) return 1;
+  vector[0] /= length;
+  vector[1] /= length;
+  vector[2] /= length;
+  return 1;
+}
+
+/* Takes up the question that stands in the job; 0 if it is malformed. */
+static int rounds_begin(rounds *job) {
+  int i, asked = 0, sound = 1;
+  for (i = 0; i < N_FINGERS; ++i) {
+    double *point = job->points + 3 * i, *normal = job->normals + 3 * i;
+    const int placed = is_finite(point[0]) && is_finite(point[1]) && is_finite(point[2]);
+    const int placeless = !is_number(point[0]) && !is_number(point[1]) && !is_number(point[2]);
+    sound &= placed || (placeless && !is_number(normal[0]));
+    sound &= made_unit(normal);
+    asked |= placed;
+  }
+  for (i = 0; i < N_MOTORS; ++i) sound &= is_finite(job->here[i]);
   job->round = 0;
   job->under_way = 0;
   job->iterations = 0;
+  job->restarts = 0;
   job->status = RUNNING;
+  return sound && asked;
 }
 
 /* Goes on for so many iterations, and begins one round at most; `status` says whether it is over.
@@ -375,8 +406,8 @@ static int rounds_run(rounds *job, int64_t most) {
       return finish(job);
     }
     do ++job->round;
-    while (job->round < ROUNDS && !is_hopeful(job, job->round));
-    if (job->round < ROUNDS) continue;
+    while (job->round < job->rounds && !is_hopeful(job, job->round));
+    if (job->round < job->rounds) continue;
     job->status = status == RUNNING ? LIMIT_STATUS
                 : status == REPEATED ? STALLED_STATUS
                 : status < 0 ? INVALID_STATUS : status;

@@ -37,9 +37,7 @@ def valley(rows: int, hand: int) -> FunctionGraph:
     """
     name = f"valley_{rows}_{hand}"
     inputs = {"rigid": (6, rows), "slopes": (hand, rows), "held": (hand, 1)}
-    return FunctionGraph(
-        name, lambda: _build(name, rows, hand), inputs, ((hand, 1),), recipe(name)
-    )
+    return FunctionGraph(name, lambda: _build(name, rows, hand), inputs, ((hand, 1),), recipe(name))
 
 
 def _build(name: str, rows: int, hand: int) -> ca.Function:
