@@ -320,11 +320,11 @@ class Solver:
         """Solve one grasp by hand, one iteration at a time.
 
         Args:
-            grasp: A contact per finger; its fingers must be the robot's.
-            q0: (n,) start [rad or m]; None is `robot.home`.
+            grasp: As for `solve`.
+            q0: As for `solve`.
 
         Raises:
-            InputError: Bad q0, or a grasp the robot or the method cannot take.
+            InputError: As for `solve`.
             UnsupportedError: The method cannot be stepped; the message says why.
         """
         preferred = self._engine.preference(None, q0 is not None)
@@ -332,11 +332,7 @@ class Solver:
         return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
 
     def fast(self) -> FastSolver:
-        """One target a call, arrays in and arrays out, in memory made once.
-
-        ``fast = solver.fast(); q, status = fast(points, normals, q0)``: bit for bit the answers of
-        `solve` without a diagnosis; see `FastSolver` for what it does without. One instance per
-        thread.
+        """For loops that cannot wait: ``q, status = fast(points, normals, q0)``.
 
         Raises:
             UnsupportedError: The method is not hand-first.

@@ -124,7 +124,7 @@ class OneTarget:
         Args:
             judged: Whether there was a verdict.
         """
-        counts = [int(count) for count in self._counts.tolist()]
+        counts = map(int, self._counts.tolist())
         job = self._job
         errors = None
         if judged:
