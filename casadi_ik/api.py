@@ -332,7 +332,7 @@ class Solver:
         return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
 
     def fast(self) -> FastSolver:
-        """For loops that cannot wait: ``q, status = fast(points, normals, q0)``.
+        """Solve for loops that cannot wait: see `FastSolver`.
 
         Raises:
             UnsupportedError: The method is not hand-first.
