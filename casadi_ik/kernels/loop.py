@@ -46,6 +46,7 @@ class LoopKernel:
         compiled: Whether the loop runs in compiled code. Otherwise the same graph runs in
             CasADi's virtual machine, with the same iterates and records up to the last places of
             sines and arcs.
+        entry: The compiled loop that makes one solve after the other, None if there is none.
     """
 
     def __init__(self, step: StepGraph, compiled: bool = True) -> None:
@@ -62,7 +63,7 @@ class LoopKernel:
         self.step = step
         library = self._load() if compiled and step.compilable else None
         self.compiled = library is not None
-        self._loop: Any = None if library is None else library[SYMBOL]
+        self.entry: Any = None if library is None else library[SYMBOL]
 
     def _load(self) -> ctypes.CDLL | None:
         return load_library(
@@ -132,7 +133,7 @@ class LoopKernel:
             "FIRST_MARK": FIRST_MARK,
             "STAGE": self.step.stage_place,
         }
-        job = driver_text("loop_job")
+        job = driver_text("loop_job") + driver_text("marks")
         return define(constants) + row_driver(self.step.record) + job + driver_text(name)
 
     @cached_property
@@ -192,9 +193,9 @@ class LoopKernel:
         if several is not None:
             batch.run_side_by_side(several)
         else:
-            batch.run(self._loop)
+            batch.run(self.entry)
         return result
 
     def single(self) -> SingleSolve:
         """One solve with memory of its own, to be made again and again; of compiled loops only."""
-        return SingleSolve(self.step, self._loop)
+        return SingleSolve(self.step, self.entry)
