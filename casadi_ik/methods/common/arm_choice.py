@@ -38,7 +38,7 @@ STEP = 2 * np.pi / SAMPLES
 
 @dataclass(frozen=True, eq=False)
 class Wanted:
-    """What an arm is chosen by; (7, 1) each.
+    """What an arm is chosen by; (n, 1) each.
 
     Attributes:
         near: The given arm [rad].
@@ -52,7 +52,7 @@ class Wanted:
     lower: Expr
     upper: Expr
 
-    def part(self, rows: slice) -> Wanted:
+    def part(self, rows: slice | list[int]) -> Wanted:
         """Of some of the joints."""
         return Wanted(self.near[rows], self.scales[rows], self.lower[rows], self.upper[rows])
 

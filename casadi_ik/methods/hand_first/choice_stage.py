@@ -7,8 +7,10 @@ import numpy as np
 
 from casadi_ik.methods.common.arm_choice import TRIALS, Wanted, choose_arm, is_allowed
 from casadi_ik.methods.common.arm_placement import NO_MARGIN
+from casadi_ik.methods.common.form_search import CHOICE, choose_form, trials
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
@@ -17,7 +19,7 @@ TINY = 1e-9
 """Smallest range [rad] a motion is measured by."""
 
 
-def choice_stage(layouts: HandFirstLayouts, arm: SrsArm) -> ca.Function:
+def choice_stage(layouts: HandFirstLayouts, arm: ArmForm) -> ca.Function:
     """A trial of the stage.
 
     Where no arm is seen within limits, the placement that knows the swivels at which joints stand
@@ -35,12 +37,17 @@ def choice_stage(layouts: HandFirstLayouts, arm: SrsArm) -> ca.Function:
         p["upper"][columns],
     )
     palm = Pose(s["palm_rotation"], s["palm_origin"])
-    found = choose_arm(arm, palm, wanted, s["spent"], s["swivel"], s["elbow"])
-    outputs = _taken(layouts)(state, parameters, *found)
+    if isinstance(arm, SrsArm):
+        found = choose_arm(arm, palm, wanted, s["spent"], s["swivel"], s["elbow"])
+        taken = _taken(layouts, TRIALS, exact=True)
+    else:
+        found = (*choose_form(arm, palm, wanted, s["spent"], s["swivel"]), s["elbow"])
+        taken = _taken(layouts, trials(arm, CHOICE), arm.exact)
+    outputs = taken(state, parameters, *found)
     return ca.Function("choice", [state, parameters], list(outputs))
 
 
-def _taken(layouts: HandFirstLayouts) -> ca.Function:
+def _taken(layouts: HandFirstLayouts, most: int, exact: bool) -> ca.Function:
     """Keep the best arm; after the last trial it is the answer if the hand fits."""
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
@@ -51,7 +58,7 @@ def _taken(layouts: HandFirstLayouts) -> ca.Function:
     best = ca.if_else(better, arm, s["arm"])
     best_score = ca.fmax(score, s["margin"])
     allowed, spent = is_allowed(best_score), s["spent"] + 1
-    over = ca.logic_and(allowed, spent >= TRIALS)
+    over = ca.logic_and(allowed, spent >= most)
     q = with_rows(s["q"], columns, best)
     q = ca.fmin(ca.fmax(q, p["lower"]), p["upper"])
     leave = ca.logic_or(over, ca.logic_not(allowed))
@@ -68,7 +75,7 @@ def _taken(layouts: HandFirstLayouts) -> ca.Function:
             "elbow": ca.if_else(better, elbow, s["elbow"]),
         }
     )
-    solved = ca.logic_and(over, s["fits"] > 0)
+    solved = ca.logic_and(over, s["fits"] > 0) if exact else ca.SX(0)
     status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
     record = layouts.row(s, p, q, Phase.ARM_CHOICE, status)
     inputs = [state, parameters, arm, score, swivel, elbow]

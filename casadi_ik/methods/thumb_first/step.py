@@ -21,6 +21,7 @@ from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.methods.common.arm_placement import place_arm
 from casadi_ik.methods.common.contact_fit import DAMPING_START, fresh_fit, judge
+from casadi_ik.methods.common.form_search import place_form
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.methods.common.numeric_arm import nearest_start, pose_step
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
@@ -36,6 +37,7 @@ from casadi_ik.problem.contacts.kinds import suffix
 from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.actuated import motor_scales
+from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.srs_arm import SrsArm
@@ -59,10 +61,10 @@ class ThumbFirstStep(ThumbFirstLayouts):
     Without an arm the palm is fixed: the same step then moves the fingers alone.
 
     Attributes:
-        arm: Constants of an S-R-S arm, or None: then the arm's start is found numerically.
+        arm: The arm in closed form, or None: then its start is found numerically.
     """
 
-    arm: SrsArm | None
+    arm: ArmForm | None
 
     def graph(self) -> StepGraph:
         """The whole iteration; compilable unless the step is ProxQP's."""
@@ -113,7 +115,11 @@ class ThumbFirstStep(ThumbFirstLayouts):
         arm, passed = s["q"][columns], s["passed"]
         if self.arm is not None:
             lower, upper = p["lower"][columns], p["upper"][columns]
-            arm, _ = place_arm(self.arm, Pose(rotation, origin), lower, upper, ca.MX(0))
+            palm = Pose(rotation, origin)
+            if isinstance(self.arm, SrsArm):
+                arm, _ = place_arm(self.arm, palm, lower, upper, ca.MX(0))
+            else:
+                arm, *_ = place_form(self.arm, palm, lower, upper, ca.MX(0), ca.MX(0))
         elif columns:
             # Another start gets another arm as well: the next nearest of the table.
             arm, passed = nearest_start(self.robot)(rotation, origin, passed)
