@@ -32,9 +32,9 @@ def choice_stage(layouts: HandFirstLayouts, arm: ArmForm) -> ca.Function:
     ranges = (layouts.robot.upper - layouts.robot.lower)[columns]
     wanted = Wanted(
         p["start"][columns],
-        ca.DM((1 / np.maximum(ranges, TINY)).tolist()),
         p["lower"][columns],
         p["upper"][columns],
+        ca.DM((1 / np.maximum(ranges, TINY)).tolist()),
     )
     palm = Pose(s["palm_rotation"], s["palm_origin"])
     if isinstance(arm, SrsArm):
