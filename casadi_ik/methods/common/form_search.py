@@ -21,6 +21,8 @@ from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
 
+TURN = 2 * np.pi
+
 SAMPLES = 6
 """Positions of the swept joint looked at in a trial."""
 
@@ -117,10 +119,11 @@ def choose_form(
         The best arm (n, 1) [rad] of the trial, its score (see `Wanted`), its swept position.
     """
     symbols = _Symbols(form)
-    near, scales = (ca.SX.sym(name, len(form.screws)) for name in ("near", "scales"))
-    asked = Wanted(near, scales, symbols.lower, symbols.upper)
+    near = ca.SX.sym("near", len(form.screws))
+    asked = Wanted(near, symbols.lower, symbols.upper, wanted.scales)
     best: tuple[Expr, ...] = ()
-    for bend in form.bends(symbols.palm, symbols.position):
+    for found in form.bends(symbols.palm, symbols.position):
+        bend = _nearest_turns(form, found, asked)
         cost, margin = _cost(bend.joints, asked)
         margin = ca.fmin(margin, _short(bend))
         ends = [_cost(end, asked) for end in bend.ends]
@@ -128,8 +131,8 @@ def choose_form(
         arm = ca.if_else(scores[0] >= scores[1], *bend.arms())
         best = _better(best, (ca.fmax(*scores), arm))
     most, arm = best
-    at = ca.Function("choose_at", [*symbols.at, near, scales], shared(arm, most))
-    given = (palm.rotation, palm.origin, wanted.lower, wanted.upper, wanted.near, wanted.scales)
+    at = ca.Function("choose_at", [*symbols.at, near], shared(arm, most))
+    given = (palm.rotation, palm.origin, wanted.lower, wanted.upper, wanted.near)
     return _looked(form, "choose", at, CHOICE, given)(trial, around)
 
 
@@ -197,6 +200,28 @@ def _positions(
         width = ca.if_else(trial == i, wide, width)
     parts = ((2 * np.arange(SAMPLES) + 1) / SAMPLES - 1).tolist()
     return [ca.fmin(ca.fmax(centre + width * part, middle - half), middle + half) for part in parts]
+
+
+def _nearest_turns(form: ClosedForm, bend: Bend, wanted: Wanted) -> Bend:
+    """Joints that turn more than once moved by whole turns towards the given arm."""
+    screws = form.screws
+    more = {
+        joint
+        for place, joint in enumerate(screws.joints)
+        if screws.upper[place] - screws.lower[place] > TURN
+    }
+
+    def moved(joints: dict[int, Expr]) -> dict[int, Expr]:
+        found = dict(joints)
+        for joint in more & set(joints):
+            angle = joints[joint]
+            turns = ca.floor((wanted.near[joint] - angle) / TURN + 0.5)
+            near = angle + TURN * turns
+            inside = ca.logic_and(near >= wanted.lower[joint], near <= wanted.upper[joint])
+            found[joint] = ca.if_else(inside, near, angle)
+        return found
+
+    return Bend(moved(bend.joints), (moved(bend.ends[0]), moved(bend.ends[1])), bend.slack)
 
 
 def _margin(joints: dict[int, Expr], lower: Expr, upper: Expr) -> Expr:

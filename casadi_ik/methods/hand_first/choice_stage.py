@@ -22,8 +22,8 @@ TINY = 1e-9
 def choice_stage(layouts: HandFirstLayouts, arm: ArmForm) -> ca.Function:
     """A trial of the stage.
 
-    Where no arm is seen within limits, the placement that knows the swivels at which joints stand
-    at their limits takes over.
+    Where no arm is seen within limits, the placement takes over: of an S-R-S arm after the first
+    trial, since it knows the swivels at which joints stand at their limits.
     """
     state = ca.MX.sym("state", layouts.state.size)
     parameters = ca.MX.sym("parameters", layouts.parameters.size)
@@ -39,16 +39,24 @@ def choice_stage(layouts: HandFirstLayouts, arm: ArmForm) -> ca.Function:
     palm = Pose(s["palm_rotation"], s["palm_origin"])
     if isinstance(arm, SrsArm):
         found = choose_arm(arm, palm, wanted, s["spent"], s["swivel"], s["elbow"])
-        taken = _taken(layouts, TRIALS, exact=True)
+        taken = _taken(layouts, TRIALS, patience=1, exact=True)
     else:
         found = (*choose_form(arm, palm, wanted, s["spent"], s["swivel"]), s["elbow"])
-        taken = _taken(layouts, trials(arm, CHOICE), arm.exact)
+        most = trials(arm, CHOICE)
+        taken = _taken(layouts, most, most, arm.exact)
     outputs = taken(state, parameters, *found)
     return ca.Function("choice", [state, parameters], list(outputs))
 
 
-def _taken(layouts: HandFirstLayouts, most: int, exact: bool) -> ca.Function:
-    """Keep the best arm; after the last trial it is the answer if the hand fits."""
+def _taken(layouts: HandFirstLayouts, most: int, patience: int, exact: bool) -> ca.Function:
+    """Keep the best arm; after the last trial it is the answer if the hand fits.
+
+    Args:
+        layouts: Of the robot.
+        most: Trials of the stage.
+        patience: After so many without an arm within limits it is left.
+        exact: Whether the arm brings the palm where it was asked for; else it is refined.
+    """
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
     columns = layouts.robot.arm_actuators
@@ -61,15 +69,16 @@ def _taken(layouts: HandFirstLayouts, most: int, exact: bool) -> ca.Function:
     over = ca.logic_and(allowed, spent >= most)
     q = with_rows(s["q"], columns, best)
     q = ca.fmin(ca.fmax(q, p["lower"]), p["upper"])
-    leave = ca.logic_or(over, ca.logic_not(allowed))
+    given_up = ca.logic_and(ca.logic_not(allowed), spent >= patience)
+    leave = ca.logic_or(over, given_up)
     stay = ca.if_else(over, float(Phase.REFINEMENT), float(Phase.ARM_CHOICE))
     after = layouts.state.pack(
         layouts.counted(s, Phase.ARM_CHOICE)
         | {
             "q": ca.if_else(over, q, s["q"]),
-            "phase": ca.if_else(allowed, stay, float(Phase.ARM_PLACEMENT)),
+            "phase": ca.if_else(given_up, float(Phase.ARM_PLACEMENT), stay),
             "spent": ca.if_else(leave, 0.0, spent),
-            "margin": ca.if_else(allowed, best_score, NO_MARGIN),
+            "margin": ca.if_else(given_up, NO_MARGIN, best_score),
             "arm": best,
             "swivel": ca.if_else(better, swivel, s["swivel"]),
             "elbow": ca.if_else(better, elbow, s["elbow"]),
