@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
 from typing import Any
 
@@ -14,7 +13,8 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
-from casadi_ik.logs import Compression, Keep, McapRecorder
+from casadi_ik.logs import Compression, Keep
+from casadi_ik.logs.write.opening import recorder_of
 from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
@@ -23,6 +23,7 @@ from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.solving.alternatives.finder import APART, Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.stream import SolvedBlock, Stream
 
@@ -138,7 +139,7 @@ class Solver:
         )
         if log is None and (quick := self._engine.quick(problems, Run(q0, seed))) is not None:
             return quick
-        with self._recorder(log, seed) as recorder:
+        with recorder_of(self, log, seed) as recorder:
             run = Run(q0, seed, recorder=recorder, diagnose=diagnose)
             return self._engine.solve(problems, run).solution(0)
 
@@ -190,7 +191,7 @@ class Solver:
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
         problems = self._questions.of_arrays(points, normals, held, more=more, prefer=preferred)
-        with self._recorder(log, seed, keep, compression) as recorder:
+        with recorder_of(self, log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 
     def solve_blocks(
@@ -212,14 +213,14 @@ class Solver:
         Args:
             blocks: Points and normals of some targets each, as for `solve_batch`; or all of its
                 arrays by name.
-            q0: (n,) start of all; None is `robot.home`.
-            seed: Of all random numbers, an integer >= 0.
+            q0: (n,) start of all; as `seed`, `diagnose`, `fixed` and `prefer` for `solve_batch`.
+            seed: See there.
             jobs: Threads, at least 1; a few thousand targets a block keep them busy.
             log: Path of an MCAP file to write every iteration to; complete after the last block,
                 and given up if the iterator is closed before.
-            diagnose: Whether to find out why, for every target that is not solved.
-            fixed: Positions of actuators that are not to move, by name [rad or m].
-            prefer: As for `solve`.
+            diagnose: See there.
+            fixed: See there.
+            prefer: See there.
 
         Yields:
             The blocks, solved.
@@ -236,7 +237,7 @@ class Solver:
         def ask(block: Mapping[str, ArrayLike], first_row: int) -> Problems:
             return self._questions.of_named(block, held, first_row, preferred)
 
-        with self._recorder(log, seed) as recorder:
+        with recorder_of(self, log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
             run = Run(q0, seed, jobs, recorder, diagnose)
             yield from Stream(self._engine, ask, tolerances, run).solve(blocks)
@@ -319,32 +320,21 @@ class Solver:
         """Solve one grasp by hand, one iteration at a time.
 
         Args:
-            grasp: A contact per finger; its fingers must be the robot's.
-            q0: (n,) start [rad or m]; None is `robot.home`.
+            grasp: As for `solve`.
+            q0: As for `solve`.
 
         Raises:
-            InputError: Bad q0, or a grasp the robot or the method cannot take.
+            InputError: As for `solve`.
             UnsupportedError: The method cannot be stepped; the message says why.
         """
         preferred = self._engine.preference(None, q0 is not None)
         problems = self._questions.of_grasps([grasp], None, preferred)
         return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
 
-    def _recorder(
-        self,
-        log: str | PathLike[str] | Recorder | None,
-        seed: int,
-        keep: Keep | None = None,
-        compression: Compression = "zstd",
-    ) -> AbstractContextManager[Recorder | None]:
-        if not isinstance(log, str | PathLike):
-            return nullcontext(log)
-        return McapRecorder(
-            log,
-            robot_name=self.robot.name,
-            urdf=self.robot.urdf(),
-            parameters=self.parameters,
-            seed=seed,
-            keep=keep,
-            compression=compression,
-        )
+    def fast(self) -> FastSolver:
+        """Solve for loops that cannot wait: see `FastSolver`.
+
+        Raises:
+            UnsupportedError: The method is not hand-first.
+        """
+        return FastSolver(self._engine, self._questions)

@@ -30,9 +30,9 @@ def choice_stage(layouts: HandFirstLayouts, arm: SrsArm) -> ca.Function:
     ranges = (layouts.robot.upper - layouts.robot.lower)[columns]
     wanted = Wanted(
         p["start"][columns],
-        ca.DM((1 / np.maximum(ranges, TINY)).tolist()),
         p["lower"][columns],
         p["upper"][columns],
+        ca.DM((1 / np.maximum(ranges, TINY)).tolist()),
     )
     palm = Pose(s["palm_rotation"], s["palm_origin"])
     found = choose_arm(arm, palm, wanted, s["spent"], s["swivel"], s["elbow"])
