@@ -21,6 +21,9 @@ ROBOTS = ik.shipped_names("arm_hands")
 SLOW = {("original-dls", "baxter_ar10"), ("original-sdls", "baxter_ar10")}
 """A hierarchy of ten contact tasks on 17 motors: minutes to compile, and never at the contacts."""
 
+CHOOSING = ("hand-first", "thumb-first")
+"""Methods that take the nearest of several solutions."""
+
 CASES = [(m, r) for m in ik.METHODS for r in ROBOTS if (m, r) not in SLOW]
 
 
@@ -30,6 +33,7 @@ class Case:
 
     robot: ik.ArmHand
     method: str
+    q: np.ndarray
     points: np.ndarray
     normals: np.ndarray
     solvers: dict
@@ -61,8 +65,8 @@ def case(request) -> Case:
     # Near enough to home for every method to have a fair chance, and different enough to be work.
     spread = 0.05 * (robot.upper - robot.lower)
     q = robot.home + rng.uniform(-1, 1, (8, n)) * spread
-    points, normals = robot.contacts(np.clip(q, robot.lower, robot.upper))
-    case = Case(robot, method, points, normals, {})
+    q = np.clip(q, robot.lower, robot.upper)
+    case = Case(robot, method, q, *robot.contacts(q), {})
     try:
         case.solver()
     except UnsupportedError as error:
@@ -210,7 +214,7 @@ def test_starts_row_by_row(case):
         solver.solve_batch(case.points, case.normals, q0=robot.home),
         solver.solve_batch(case.points, case.normals, q0=q0),
     )
-    same = {"prefer": "limits"} if case.method == "hand-first" else {}
+    same = {"prefer": "limits"} if case.method in CHOOSING else {}
     home = solver.solve_batch(case.points, case.normals)
     fields_equal(home, solver.solve_batch(case.points, case.normals, q0=q0, **same))
     before = q0.copy()
@@ -218,6 +222,16 @@ def test_starts_row_by_row(case):
     moved = solver.solve_batch(case.points, case.normals, q0=q0, **same)
     np.testing.assert_array_equal(moved.q[0], home.q[0])
     np.testing.assert_array_equal(before[0], q0[0], "starts are not written to")
+
+
+def test_a_start_that_solves_already_is_the_answer(case):
+    """But for the paper's methods, which stand as the paper has them: they begin by moving."""
+    if case.method in PAPER:
+        pytest.skip("the paper's method reaches with the thumb first, wherever it is")
+    batch = case.solver().solve_batch(case.points, case.normals, q0=case.q)
+    np.testing.assert_array_equal(batch.q, case.q)
+    assert batch.success.all()
+    np.testing.assert_array_equal(case.solver().solve(case.grasp(), q0=case.q[0]).q, case.q[0])
 
 
 def test_an_empty_batch(case):
