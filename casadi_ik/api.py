@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
 from typing import Any
 
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import InputError
+from casadi_ik.collision.scene import Scene, checked_pose
+from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
-from casadi_ik.logs import Compression, Keep, McapRecorder
+from casadi_ik.logs import Compression, Keep, recorder_for
 from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
+from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
@@ -36,6 +37,7 @@ class Solver:
         tolerances: When a contact counts as reached, by finger.
         limits: "enforce" or "ignore".
         options: What was set of the method's own parameters.
+        scene: What answers must not touch; None: collisions are not checked.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class Solver:
         finger_step: str | None = None,
         options: Mapping[str, Any] | None = None,
         compiled: bool = True,
+        scene: Scene | None = None,
     ) -> None:
         """Build the solver; its kernel is compiled at the first solve and cached on the machine.
 
@@ -63,26 +66,33 @@ class Solver:
             options: Fields of the method's parameter record (`QiuParameters`), by name.
             compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
                 slower.
+            scene: What stands about the robot (`load_scene`, `Scene`): being solved then includes
+                that nothing is nearer than the scene's margin, the robot's links to each other
+                included. None: collisions are not checked.
 
         Raises:
             UnknownNameError: No such method or option.
             InputError: A value that an argument cannot have.
-            UnsupportedError: The robot is not of the kind the method needs.
+            UnsupportedError: The robot is not of the kind the method needs, or has no shapes.
+            DescriptionError: The scene does not fit the robot.
         """
         if not isinstance(robot, ArmHand):
             raise InputError(f"robot: found {robot!r}, expected what load_robot returns")
         if limits not in LIMITS:
             raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMITS)}")
-        self._asked = (robot, method, tolerance, limits, finger_step, options, compiled)
+        if scene is not None and not isinstance(scene, Scene):
+            raise InputError(f"scene: found {scene!r}, expected a Scene, or None")
+        self._asked = (robot, method, tolerance, limits, finger_step, options, compiled, scene)
         self.robot = robot
         self.method = method
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
         self.limits = limits
         self.options = with_finger_step(method, options or {}, finger_step)
         self._questions = Questions(robot, self.tolerances, limits == "enforce")
-        self._engine = Engine(
-            robot, build_method(method, robot.description, self.options, compiled), compiled
-        )
+        self.scene = scene
+        check = None if scene is None else SceneCheck(robot, scene, compiled)
+        built = build_method(method, robot.description, self.options, compiled)
+        self._engine = Engine(robot, built, compiled, check=check)
 
     def __reduce__(self) -> tuple[type[Solver], tuple[Any, ...]]:
         """What it was made from; a copy finds the compiled kernels on the machine it comes to."""
@@ -99,7 +109,7 @@ class Solver:
             "tolerance": {name: dataclasses.asdict(one) for name, one in self.tolerances.items()},
             "limits": self.limits,
             "options": dict(self._engine.method.parameters),
-        }
+        } | ({} if self.scene is None else {"scene": self.scene.name})
 
     def solve(
         self,
@@ -122,7 +132,7 @@ class Solver:
             fixed: Positions of actuators that are not to move, by name [rad or m].
             prefer: Which of several solutions: "q0" (near it, motions as parts of motors' ranges;
                 what solves is not moved), "limits" (far from them), "manipulability" (of the arm).
-                None: "q0" if q0 is given, else "limits".
+                "clearance" (from what may be hit). None: "q0" if q0 is given, else "limits".
 
         Returns:
             The solution; not converging is its status, never an exception.
@@ -138,7 +148,7 @@ class Solver:
         )
         if log is None and (quick := self._engine.quick(problems, Run(q0, seed))) is not None:
             return quick
-        with self._recorder(log, seed) as recorder:
+        with recorder_for(log, self.robot, self.parameters, seed) as recorder:
             run = Run(q0, seed, recorder=recorder, diagnose=diagnose)
             return self._engine.solve(problems, run).solution(0)
 
@@ -155,6 +165,7 @@ class Solver:
         keep: Keep | None = None,
         compression: Compression = "zstd",
         prefer: str | None = None,
+        object_pose: ArrayLike | None = None,
         **more: ArrayLike | None,
     ) -> BatchSolution:
         """Solve k targets.
@@ -174,6 +185,7 @@ class Solver:
             keep: Which solves keep their iterations in the log; None: all.
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
             prefer: As for `solve`.
+            object_pose: (4, 4) or (k, 4, 4) where what the scene calls grasped is, base frame.
             more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
                 `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point),
                 "directions" (a fingertip without a point faces this way).
@@ -190,7 +202,10 @@ class Solver:
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
         problems = self._questions.of_arrays(points, normals, held, more=more, prefer=preferred)
-        with self._recorder(log, seed, keep, compression) as recorder:
+        if object_pose is not None:
+            problems = problems.holding(self._grasped, checked_pose(object_pose, "object_pose"))
+        kept = keep, compression
+        with recorder_for(log, self.robot, self.parameters, seed, *kept) as recorder:
             return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 
     def solve_blocks(
@@ -213,22 +228,19 @@ class Solver:
             blocks: Points and normals of some targets each, as for `solve_batch`; or all of its
                 arrays by name.
             q0: (n,) start of all; None is `robot.home`.
-            seed: Of all random numbers, an integer >= 0.
+            seed: As for `solve_batch`.
+            diagnose: As there.
+            fixed: As there.
+            prefer: As there.
             jobs: Threads, at least 1; a few thousand targets a block keep them busy.
             log: Path of an MCAP file to write every iteration to; complete after the last block,
                 and given up if the iterator is closed before.
-            diagnose: Whether to find out why, for every target that is not solved.
-            fixed: Positions of actuators that are not to move, by name [rad or m].
-            prefer: As for `solve`.
 
         Yields:
             The blocks, solved.
 
         Raises:
-            InputError: Bad q0, seed or jobs, or a block of the wrong shape.
-            UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
-            LogError: The log cannot be written.
+            InputError: Bad q0, seed or jobs, or a block of the wrong shape; else as `solve_batch`.
         """
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
@@ -236,7 +248,7 @@ class Solver:
         def ask(block: Mapping[str, ArrayLike], first_row: int) -> Problems:
             return self._questions.of_named(block, held, first_row, preferred)
 
-        with self._recorder(log, seed) as recorder:
+        with recorder_for(log, self.robot, self.parameters, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
             run = Run(q0, seed, jobs, recorder, diagnose)
             yield from Stream(self._engine, ask, tolerances, run).solve(blocks)
@@ -261,10 +273,10 @@ class Solver:
             grasp: A contact per finger; its fingers must be the robot's.
             limit: How many at most.
             prefer: What comes first: "limits" (far from its limits), "manipulability" (of the
-                arm), or "q0" (close to it).
+                arm), "clearance", or "q0" (close to it).
             q0: (n,) where the robot is [rad or m]; None is `robot.home`.
-            seed: Of all random numbers, an integer >= 0.
-            fixed: Positions of actuators that are not to move, by name [rad or m].
+            seed: As for `solve`.
+            fixed: As for `solve`.
             apart: How different they are: of any two, at least one actuator differs by this part
                 of its range, 0 to 1. 0: all that are found.
 
@@ -277,7 +289,8 @@ class Solver:
         """
         problems = self._questions.of_grasps([grasp], fixed)
         finder = self._engine.kinds_of(problems).finder
-        return finder.find(problems, self._questions.start(q0), seed, limit, prefer, apart)
+        start, around = self._questions.start(q0), self._engine.around(problems)
+        return finder.find(problems, start, seed, limit, prefer, apart, around)
 
     def track(
         self,
@@ -300,13 +313,15 @@ class Solver:
             period: Time from one grasp to the next [s]; then the motors' velocity limits are kept,
                 and a grasp that moves too fast is followed as well as they allow.
             velocity: Other velocity limits, (n,) or a number [rad/s or m/s].
-            seed: Of all random numbers, an integer >= 0.
-            fixed: Positions of actuators that are not to move, by name [rad or m].
+            seed: As for `solve`.
+            fixed: As for `solve`.
 
         Raises:
             InputError: No grasp, bad q0, period or velocity, or a grasp the robot cannot take.
-            UnsupportedError: The method is not hand-first.
+            UnsupportedError: The method is not hand-first, or the solver has a scene.
         """
+        if self.scene is not None:
+            raise UnsupportedError("track: knows no scenes, expected a solver without one")
         if not grasps:
             raise InputError("grasps: found none, expected at least one")
         problems = self._questions.of_grasps(grasps, fixed)
@@ -330,21 +345,8 @@ class Solver:
         problems = self._questions.of_grasps([grasp], None, preferred)
         return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
 
-    def _recorder(
-        self,
-        log: str | PathLike[str] | Recorder | None,
-        seed: int,
-        keep: Keep | None = None,
-        compression: Compression = "zstd",
-    ) -> AbstractContextManager[Recorder | None]:
-        if not isinstance(log, str | PathLike):
-            return nullcontext(log)
-        return McapRecorder(
-            log,
-            robot_name=self.robot.name,
-            urdf=self.robot.urdf(),
-            parameters=self.parameters,
-            seed=seed,
-            keep=keep,
-            compression=compression,
-        )
+    @property
+    def _grasped(self) -> str:
+        if self.scene is None or self.scene.grasped is None:
+            raise InputError("object_pose: found one, expected a scene that says what is 'grasped'")
+        return self.scene.grasped

@@ -12,7 +12,9 @@ import json
 import os
 import time
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
+from os import PathLike
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -20,6 +22,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
 
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import LogError
 from casadi_ik.logs.events.detect import detect_events
 from casadi_ik.logs.events.kinds import SINGULAR, EventKind, event_format
@@ -36,7 +39,7 @@ from casadi_ik.logs.write.measured import measured_format, measured_rows
 from casadi_ik.logs.write.provenance import log_metadata
 from casadi_ik.logs.write.solve_rows import solve_format, solve_rows
 from casadi_ik.logs.write.topic_messages import block_messages
-from casadi_ik.problem.recorder import SolveBlock
+from casadi_ik.problem.recorder import Recorder, SolveBlock
 from casadi_ik.problem.trace import TraceFormat
 
 Compression = Literal["none", "lz4", "zstd"]
@@ -239,3 +242,34 @@ class McapRecorder:
 
 def _numbers(block: SolveBlock) -> range:
     return range(block.first, block.first + len(block))
+
+
+def recorder_for(
+    log: str | PathLike[str] | Recorder | None,
+    robot: ArmHand,
+    parameters: Mapping[str, Any],
+    seed: int,
+    keep: Keep | None = None,
+    compression: Compression = "zstd",
+) -> AbstractContextManager[Recorder | None]:
+    """The recorder of a file, open as long as the context; one that is open already stays so.
+
+    Args:
+        log: Path of the file, an open recorder, or None.
+        robot: The robot.
+        parameters: What determines a solve but target, start and seed.
+        seed: Of all random numbers.
+        keep: Which solves keep their iterations; None: all.
+        compression: Of the file.
+    """
+    if not isinstance(log, str | PathLike):
+        return nullcontext(log)
+    return McapRecorder(
+        log,
+        robot_name=robot.name,
+        urdf=robot.urdf(),
+        parameters=dict(parameters),
+        seed=seed,
+        keep=keep,
+        compression=compression,
+    )
