@@ -10,11 +10,12 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.collision.scene import Scene, checked_pose
+from casadi_ik.collision.scene import Scene, checked_pose, grasped_in
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
-from casadi_ik.logs import Compression, Keep, recorder_for
+from casadi_ik.logs import Compression, Keep
+from casadi_ik.logs.write.opening import recorder_of
 from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
@@ -24,6 +25,7 @@ from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.solving.alternatives.finder import APART, Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.stream import SolvedBlock, Stream
 
@@ -55,7 +57,7 @@ class Solver:
 
         Args:
             robot: From `load_robot`.
-            method: One of `METHODS`, or of those registered with `register_method`.
+            method: One of `METHODS`, or registered with `register_method`.
             tolerance: 5 mm and 3 deg unless said; one for all fingers, or by finger name (a
                 finger left out keeps the default). A contact's own tolerance goes before.
             limits: "enforce": being solved includes that every actuator and joint is within its
@@ -67,8 +69,7 @@ class Solver:
             compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
                 slower.
             scene: What stands about the robot (`load_scene`, `Scene`): being solved then includes
-                that nothing is nearer than the scene's margin, the robot's links to each other
-                included. None: collisions are not checked.
+                that nothing, links among themselves, is nearer than the scene's margin.
 
         Raises:
             UnknownNameError: No such method or option.
@@ -148,7 +149,7 @@ class Solver:
         )
         if log is None and (quick := self._engine.quick(problems, Run(q0, seed))) is not None:
             return quick
-        with recorder_for(log, self.robot, self.parameters, seed) as recorder:
+        with recorder_of(self, log, seed) as recorder:
             run = Run(q0, seed, recorder=recorder, diagnose=diagnose)
             return self._engine.solve(problems, run).solution(0)
 
@@ -175,13 +176,12 @@ class Solver:
                 NaN marks a free finger.
             normals: (k, f, 3) outward pad normals, base frame; NaN marks a free normal.
             q0: (n,) or (k, n) start; None is `robot.home`.
-            seed: Of all random numbers, an integer >= 0.
+            seed: As for `solve`.
             jobs: Threads, at least 1.
             log: Path of an MCAP file to write every iteration to; or an open recorder, which
                 stays open, for several batches in one log.
-            diagnose: Whether to find out why, for every target that is not solved
-                (`BatchSolution.diagnoses`).
-            fixed: Positions of actuators that are not to move, by name [rad or m].
+            diagnose: Whether to find out why, for every target that is not solved.
+            fixed: As for `solve`.
             keep: Which solves keep their iterations in the log; None: all.
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
             prefer: As for `solve`.
@@ -191,21 +191,17 @@ class Solver:
                 "directions" (a fingertip without a point faces this way).
 
         Returns:
-            The same fields as a `Solution`, as arrays.
+            The fields of a `Solution`, as arrays.
 
         Raises:
-            InputError: Bad shapes or values; the message names row and finger.
-            UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
-            LogError: The log cannot be written.
+            InputError: Bad shapes or values; the message names row and finger. Else as `solve`.
         """
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
         problems = self._questions.of_arrays(points, normals, held, more=more, prefer=preferred)
         if object_pose is not None:
-            problems = problems.holding(self._grasped, checked_pose(object_pose, "object_pose"))
-        kept = keep, compression
-        with recorder_for(log, self.robot, self.parameters, seed, *kept) as recorder:
+            problems = problems.holding(grasped_in(self.scene), checked_pose(object_pose))
+        with recorder_of(self, log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 
     def solve_blocks(
@@ -227,14 +223,14 @@ class Solver:
         Args:
             blocks: Points and normals of some targets each, as for `solve_batch`; or all of its
                 arrays by name.
-            q0: (n,) start of all; None is `robot.home`.
-            seed: As for `solve_batch`.
-            diagnose: As there.
-            fixed: As there.
-            prefer: As there.
+            q0: (n,) start of all; as `seed`, `diagnose`, `fixed` and `prefer` for `solve_batch`.
+            seed: See there.
             jobs: Threads, at least 1; a few thousand targets a block keep them busy.
             log: Path of an MCAP file to write every iteration to; complete after the last block,
                 and given up if the iterator is closed before.
+            diagnose: See there.
+            fixed: See there.
+            prefer: See there.
 
         Yields:
             The blocks, solved.
@@ -248,7 +244,7 @@ class Solver:
         def ask(block: Mapping[str, ArrayLike], first_row: int) -> Problems:
             return self._questions.of_named(block, held, first_row, preferred)
 
-        with recorder_for(log, self.robot, self.parameters, seed) as recorder:
+        with recorder_of(self, log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
             run = Run(q0, seed, jobs, recorder, diagnose)
             yield from Stream(self._engine, ask, tolerances, run).solve(blocks)
@@ -285,7 +281,6 @@ class Solver:
 
         Raises:
             InputError: Bad limit, preference, distance or q0, or a grasp the robot cannot take.
-            UnsupportedError: The method is not hand-first.
         """
         problems = self._questions.of_grasps([grasp], fixed)
         finder = self._engine.kinds_of(problems).finder
@@ -334,19 +329,21 @@ class Solver:
         """Solve one grasp by hand, one iteration at a time.
 
         Args:
-            grasp: A contact per finger; its fingers must be the robot's.
-            q0: (n,) start [rad or m]; None is `robot.home`.
+            grasp: As for `solve`.
+            q0: As for `solve`.
 
         Raises:
-            InputError: Bad q0, or a grasp the robot or the method cannot take.
+            InputError: As for `solve`.
             UnsupportedError: The method cannot be stepped; the message says why.
         """
         preferred = self._engine.preference(None, q0 is not None)
         problems = self._questions.of_grasps([grasp], None, preferred)
         return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
 
-    @property
-    def _grasped(self) -> str:
-        if self.scene is None or self.scene.grasped is None:
-            raise InputError("object_pose: found one, expected a scene that says what is 'grasped'")
-        return self.scene.grasped
+    def fast(self) -> FastSolver:
+        """Solve for loops that cannot wait: see `FastSolver`.
+
+        Raises:
+            UnsupportedError: The method is not hand-first, or the solver has a scene.
+        """
+        return FastSolver(self._engine, self._questions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import combinations
@@ -30,6 +31,7 @@ class CollisionModel:
         pairs: (p, 2) what is checked against each other: a capsule; another, or a solid of the
             robot, counted on behind the capsules.
         excluded: Links that are not, and why.
+        allowed: Links that are, but may overlap a little, and why.
     """
 
     robot: RobotDescription
@@ -37,6 +39,7 @@ class CollisionModel:
     bodies: dict[str, str]
     pairs: NDArray[np.int32]
     excluded: tuple[Touching, ...]
+    allowed: tuple[Touching, ...] = ()
 
     @property
     def radii(self) -> Array:
@@ -72,7 +75,14 @@ class CollisionModel:
             self.bodies,
             self.pairs[np.array(kept, dtype=bool)],
             self.excluded + added,
+            self.allowed,
         )
+
+    @property
+    def offsets(self) -> Array:
+        """(p,) what is added to what a pair has to be apart: minus what it may overlap [m]."""
+        depths = {frozenset(one.links): one.depth for one in self.allowed}
+        return np.array([-depths.get(frozenset(self.names(i, j)), 0.0) for i, j in self.pairs])
 
 
 def collision_model(robot: RobotDescription) -> CollisionModel:
@@ -97,7 +107,7 @@ def collision_model(robot: RobotDescription) -> CollisionModel:
         bodies[joint.child] = parent if joint.type == "fixed" else joint.child
         neighbours.add(frozenset((parent, bodies[joint.child])))
     excluded: dict[frozenset[str], Touching] = {
-        frozenset(one.links): one for one in robot.shapes.touching
+        frozenset(one.links): one for one in robot.shapes.touching if math.isinf(one.depth)
     }
 
     def checked(one: str, other: str) -> bool:
@@ -114,7 +124,8 @@ def collision_model(robot: RobotDescription) -> CollisionModel:
         if checked(capsules[pair[0]].link, _link(robot.shapes, pair[1]))
     ]
     pairs = np.array(found, dtype=np.int32).reshape(-1, 2)
-    return CollisionModel(robot, capsules, bodies, pairs, tuple(excluded.values()))
+    allowed = tuple(one for one in robot.shapes.touching if not math.isinf(one.depth))
+    return CollisionModel(robot, capsules, bodies, pairs, tuple(excluded.values()), allowed)
 
 
 def _pairs(shapes: Shapes) -> Iterator[tuple[int, int]]:

@@ -259,7 +259,18 @@ def load_scene(name_or_path: str | Path) -> Scene:
     return Scene._of_file(resolve(name_or_path, "scenes"))
 
 
-def checked_pose(pose: ArrayLike, name: str) -> Array:
+def grasped_in(scene: Scene | None) -> str:
+    """Name of what is grasped in a scene.
+
+    Raises:
+        InputError: There is no scene, or it does not say.
+    """
+    if scene is None or scene.grasped is None:
+        raise InputError("object_pose: found one, expected a scene that says what is 'grasped'")
+    return scene.grasped
+
+
+def checked_pose(pose: ArrayLike, name: str = "object_pose") -> Array:
     """A pose (4, 4), or (k, 4, 4), as an array.
 
     Raises:

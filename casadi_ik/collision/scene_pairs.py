@@ -54,11 +54,11 @@ def pair_table(model: CollisionModel, scene: Scene, touched_by: Sequence[str]) -
             solids.append(solid)
             places.append(place)
             items.append(name)
-    for i, j in model.pairs.tolist():
+    for (i, j), offset in zip(model.pairs.tolist(), model.offsets.tolist(), strict=True):
         both = model.names(i, j)
         if frozenset(both) not in stated:
             pairs.append((i, j))
-            offsets.append(0.0)
+            offsets.append(offset)
             names.append(both)
     return Table(
         model.radii,

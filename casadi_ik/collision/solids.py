@@ -19,9 +19,9 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.grasps.shapes import BentCapsule, Box, Cylinder, EllipticCylinder, Shape, Sphere
 
-DIRECTIONS = 256
+DIRECTIONS = 512
 """Planes that round a convex body off, besides those of its faces: between two of them a corner
-stands out by at most 1 % of the distance from it."""
+stands out by at most 2 % of the distance from it."""
 
 LINKS = 5
 """Capsules that a bent one is made of."""

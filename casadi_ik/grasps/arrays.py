@@ -43,13 +43,19 @@ def unit_vectors(vectors: Array) -> tuple[Array, NDArray[np.bool_]]:
         length to the last digits stays as it is.
     """
     with np.errstate(over="ignore", under="ignore"):
-        length = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+        length = _length(vectors)
     odd = (length < SMALL) | (length > LARGE)
     if odd.any():
         # By powers of two, which change no digit; in two halves, as one may be out of range.
         power = np.where(odd, -np.frexp(np.abs(vectors).max(axis=-1))[1], 0)[..., None]
         vectors = np.ldexp(np.ldexp(vectors, power // 2), power - power // 2)
-        length = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+        length = _length(vectors)
     length = np.where(np.abs(length - 1) < UNIT, 1.0, length)
     zero = length == 0
     return vectors / np.where(zero, np.nan, length)[..., None], zero
+
+
+def _length(vectors: Array) -> Array:
+    """(...), summed in order: the same bits in an exported solver."""
+    squares = vectors * vectors
+    return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])

@@ -87,6 +87,7 @@ class FunctionKernel:
             the same results up to the last places of sines and arcs).
         input_shapes: Shape of one sample of each input.
         output_shapes: Shape of one sample of each output.
+        entry: The compiled function, None if there is none.
     """
 
     def __init__(self, function: ca.Function | FunctionGraph, compiled: bool = True) -> None:
@@ -109,7 +110,7 @@ class FunctionKernel:
         self._output_steps = np.array([r * c for r, c in graph.outputs], dtype=np.int64)
         library = self._load() if compiled else None
         self.compiled = library is not None
-        self._map: Any = None if library is None else library[SYMBOL]
+        self.entry: Any = None if library is None else library[SYMBOL]
         self._singles: list[SingleCall] = []
 
     def _load(self) -> ctypes.CDLL | None:
@@ -160,7 +161,7 @@ class FunctionKernel:
         """
         return SingleCall(
             self.name,
-            self._map,
+            self.entry,
             inputs or [np.zeros(shape) for shape in self.input_shapes],
             outputs or [np.zeros(shape) for shape in self.output_shapes],
         )
@@ -249,7 +250,7 @@ class FunctionKernel:
             0,
             SLICE,
         )
-        while (code := self._map(ctypes.byref(job))) != DriverCode.DONE:
+        while (code := self.entry(ctypes.byref(job))) != DriverCode.DONE:
             check(self.name, code)
 
     def _run_vm(

@@ -35,7 +35,7 @@ CHUNK = 256
 
 
 class _Job(ctypes.Structure):
-    """`lookup_job` of drivers/lookup.c."""
+    """`lookup_job` of drivers/lookup_job.c."""
 
     _fields_ = (
         ("inputs", ctypes.c_void_p),
@@ -89,6 +89,8 @@ class LookupKernel:
     Attributes:
         key: The function that makes keys.
         compiled: Whether calls run in compiled code; numpy finds the same rows.
+        tiles: (tiles, pairs of entries, TILE, 2) keys of the table in steps, for compiled code.
+        entry: The compiled function, None if there is none.
     """
 
     def __init__(
@@ -112,10 +114,10 @@ class LookupKernel:
         # columns a power of two apart would fall on each other in the cache.
         width = self._keys.shape[1]
         padded = np.pad(self._keys, ((0, -len(keys) % TILE), (0, width % 2))).astype(np.int16)
-        self._tiles = padded.reshape(-1, TILE, (width + 1) // 2, 2).transpose(0, 2, 1, 3).copy()
+        self.tiles = padded.reshape(-1, TILE, (width + 1) // 2, 2).transpose(0, 2, 1, 3).copy()
         library = self._load(graph) if compiled else None
         self.compiled = library is not None
-        self._lookup: Any = None if library is None else library[SYMBOL]
+        self.entry: Any = None if library is None else library[SYMBOL]
 
     def _load(self, graph: FunctionGraph) -> ctypes.CDLL | None:
         constants = {
@@ -125,7 +127,8 @@ class LookupKernel:
             "STEPS": STEPS,
             "LARGEST": LARGEST,
         }
-        driver = define(constants) + driver_text("registers") + driver_text("lookup")
+        texts = map(driver_text, ("registers", "lookup_job", "lookup"))
+        driver = define(constants) + "".join(texts)
         return load_library(
             graph.name, lambda: row_major(graph.function), driver, SYMBOL, graph.recipe
         )
@@ -159,13 +162,13 @@ class LookupKernel:
             inputs: Contiguous arrays to read from, of one sample's shapes.
         """
         found = np.zeros((1, count), dtype=np.int64)
-        return SingleLookup(self.key.name, self._lookup, inputs, found, *self._job(inputs, found))
+        return SingleLookup(self.key.name, self.entry, inputs, found, *self._job(inputs, found))
 
     def _run_compiled(
         self, arrays: list[NDArray[np.float64]], steps: list[int], found: NDArray[np.int64]
     ) -> None:
         job, _kept = self._job(arrays, found, steps)
-        while (code := self._lookup(ctypes.byref(job))) != DriverCode.DONE:
+        while (code := self.entry(ctypes.byref(job))) != DriverCode.DONE:
             check(self.key.name, code)
 
     def _job(
@@ -180,7 +183,7 @@ class LookupKernel:
         job = _Job(
             inputs=ctypes.addressof(sources),
             input_steps=ctypes.addressof(strides),
-            tiles=memory(self._tiles),
+            tiles=memory(self.tiles),
             found=memory(found),
             rows=len(self._keys),
             wanted=found.shape[1],

@@ -33,6 +33,10 @@ SYMBOL_LANES = "casadi_ik_loop_lanes"
 FEWEST = 4
 """Solves from which on they are made side by side."""
 
+WORTH = 64
+"""Solves from which on a compiler is waited for, if no library that makes them side by side is at
+hand. One by one they take a millisecond or two, and the compiler the better part of a minute."""
+
 
 class LoopKernel:
     """Runs a step until it ends, for each solve of a batch; several threads may run it at once.
@@ -42,6 +46,7 @@ class LoopKernel:
         compiled: Whether the loop runs in compiled code. Otherwise the same graph runs in
             CasADi's virtual machine, with the same iterates and records up to the last places of
             sines and arcs.
+        entry: The compiled loop that makes one solve after the other, None if there is none.
     """
 
     def __init__(self, step: StepGraph, compiled: bool = True) -> None:
@@ -58,7 +63,7 @@ class LoopKernel:
         self.step = step
         library = self._load() if compiled and step.compilable else None
         self.compiled = library is not None
-        self._loop: Any = None if library is None else library[SYMBOL]
+        self.entry: Any = None if library is None else library[SYMBOL]
 
     def _load(self) -> ctypes.CDLL | None:
         return load_library(
@@ -70,9 +75,29 @@ class LoopKernel:
         """How many solves of a batch are made side by side; 1 where that is not possible."""
         return 1 if self._side_by_side is None else machine_lanes()
 
+    def _for(self, count: int) -> Any:
+        """The loop that makes some solves of so many at a time; None: one after the other."""
+        if count < FEWEST:
+            return None
+        return self._at_hand if count < WORTH else self._side_by_side
+
+    @cached_property
+    def _at_hand(self) -> Any:
+        """The loop that makes some solves at a time, if it need not be compiled."""
+        return self._load_lanes(at_hand=True)
+
     @cached_property
     def _side_by_side(self) -> Any:
         """The loop that makes some solves at a time; None where there is none."""
+        self.__dict__["_at_hand"] = found = self._load_lanes()
+        return found
+
+    def _load_lanes(self, at_hand: bool = False) -> Any:
+        """That loop, or None.
+
+        Args:
+            at_hand: Whether it is none, too, where it would have to be compiled.
+        """
         lanes = machine_lanes() if self.compiled else 0
         if not lanes:
             return None
@@ -84,6 +109,7 @@ class LoopKernel:
                 SYMBOL_LANES,
                 f"{self.step.recipe} lanes {lanes}" if self.step.recipe else "",
                 partial(lanes_source, lanes=lanes),
+                at_hand=at_hand,
             )
         except UnsuitedError as error:
             logger.info("%s: one solve at a time: %s", self.step.name, error)
@@ -107,7 +133,7 @@ class LoopKernel:
             "FIRST_MARK": FIRST_MARK,
             "STAGE": self.step.stage_place,
         }
-        job = driver_text("loop_job")
+        job = driver_text("loop_job") + driver_text("marks")
         return define(constants) + row_driver(self.step.record) + job + driver_text(name)
 
     @cached_property
@@ -163,12 +189,13 @@ class LoopKernel:
             run_vm(self.step, self._function, result, given, max_iterations)
             return result
         batch = CompiledBatch(self.step, result, given, max_iterations)
-        if count >= FEWEST and max_iterations > 0 and self._side_by_side is not None:
-            batch.run_side_by_side(self._side_by_side)
+        several = self._for(count) if max_iterations > 0 else None
+        if several is not None:
+            batch.run_side_by_side(several)
         else:
-            batch.run(self._loop)
+            batch.run(self.entry)
         return result
 
     def single(self) -> SingleSolve:
         """One solve with memory of its own, to be made again and again; of compiled loops only."""
-        return SingleSolve(self.step, self._loop)
+        return SingleSolve(self.step, self.entry)

@@ -15,7 +15,7 @@ from casadi_ik.logs.read.table import MethodRows, Table
 from casadi_ik.logs.repair.finish import finish_log
 from casadi_ik.logs.repair.merge import merge_logs
 from casadi_ik.logs.write.keep import Keep
-from casadi_ik.logs.write.recorder import Compression, McapRecorder, recorder_for
+from casadi_ik.logs.write.recorder import Compression, McapRecorder
 
 __all__ = [
     "Asked",
@@ -38,6 +38,5 @@ __all__ = [
     "merge_logs",
     "one_solve",
     "open",
-    "recorder_for",
     "side_by_side",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,9 @@ from casadi_ik.robots.collision import Touching
 SAMPLES = 256
 """Random configurations (seed 0) in all of which links touch that are said to touch always."""
 
+SLACK = 0.5e-3
+"""How much more than at home shapes may overlap that overlap there [m]."""
+
 ROUNDING = 1e-9
 """What a distance may be below the margin [m]."""
 
@@ -34,8 +37,9 @@ class Clearances:
     """What was found for k configurations.
 
     Attributes:
-        distance: (k,) of the pair that is nearest to being too near [m]; negative: penetration;
-            infinite where there is nothing to hit; NaN for NaN.
+        distance: (k,) of the pair that is nearest to being too near [m], counted from what shapes
+            may overlap; negative: penetration; infinite where there is nothing to hit; NaN for
+            NaN.
         free: (k,) whether every pair is as far apart as it has to be.
         pairs: (k,) number of that pair in `names`, -1: none.
         names: What pairs are called.
@@ -87,7 +91,7 @@ class Surroundings:
         unknown = ~np.isfinite(q).all(axis=1)
         room = np.where(unknown, np.nan, room - self.margin)
         free = room >= -ROUNDING
-        return Clearances(room + self.margin + offsets, free, pairs, self.table.names, room)
+        return Clearances(room + self.margin + np.maximum(offsets, 0.0), free, pairs, self.table.names, room)
 
     def free(self, q: Array) -> NDArray[np.bool_]:
         """(k,) whether configurations (k, n) are free; quicker than `check`."""
@@ -181,27 +185,39 @@ class SceneCheck:
         """
         self.robot = robot
         self.scene = scene
-        model = collision_model(robot.description)
         self.kernel = ClearanceKernel(robot.description, compiled)
-        self.model = self._without_always(model)
+        self.model = self._as_it_stands(collision_model(robot.description))
         self._tables: dict[tuple[str, frozenset[str]], tuple[Table, dict[str, Item]]] = {}
         (placed,) = self.kernel.placed(robot.home)
         check_base(self.model, scene, placed)
         self._table(scene, frozenset())
 
-    def _without_always(self, model: CollisionModel) -> CollisionModel:
-        """Without links that touch in whatever configuration."""
+    def _as_it_stands(self, model: CollisionModel) -> CollisionModel:
+        """Without links that touch always; those that touch at home may overlap as much as there.
+
+        Shapes are larger than what they hold: where fingers lie side by side they overlap though
+        the fingers do not.
+        """
         table = pair_table(model, Scene(), ())
-        q = self.robot.random(np.random.default_rng(0), SAMPLES)
+        drawn = self.robot.random(np.random.default_rng(0), SAMPLES)
+        q = np.concatenate([self.robot.home[None], drawn])
         distances = self.kernel.every(q, np.zeros((0, 12)), table)
         nearest_of: dict[Pair, Array] = {}
         for i, names in enumerate(table.names):
             known = nearest_of.get(names)
             here = distances[:, i]
             nearest_of[names] = here if known is None else np.minimum(known, here)
-        reason = f"their shapes touch in all of {SAMPLES} random configurations, seed 0"
-        always = [Touching(names, reason) for names, d in nearest_of.items() if (d < 0).all()]
-        return model.without(always)
+        why = f"their shapes touch in all of {SAMPLES} random configurations, seed 0"
+        always = [Touching(names, why) for names, d in nearest_of.items() if (d < 0).all()]
+        why = "their shapes overlap at home, where the robot is taken to be free"
+        given = {frozenset(one.links): one.depth for one in model.allowed}
+        home = [
+            Touching(names, why, SLACK - float(d[0]) + given.get(frozenset(names), 0.0))
+            for names, d in nearest_of.items()
+            if d[0] < 0
+        ]
+        kept = model.without(always)
+        return replace(kept, allowed=kept.allowed + tuple(home))
 
     @cached_property
     def bodies_of_fingers(self) -> dict[str, frozenset[str]]:

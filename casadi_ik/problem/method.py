@@ -81,12 +81,18 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Quick:
-    """What a method believes to be the solution of one target; fields as in `Outcome`."""
+    """What a method believes to be the solution of one target; fields as in `Outcome`.
+
+    Attributes:
+        errors: As the verdict measures them, if it was asked: distances [m] and angles [rad] by
+            finger, NaN where free; by how much the worst actuator or joint is beyond its limits.
+    """
 
     q: Array
     iterations: int
     restarts: int
     phases: Mapping[str, int]
+    errors: tuple[list[float], list[float], float] | None = None
 
 
 class Method(Protocol):

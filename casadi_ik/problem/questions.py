@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -100,22 +101,34 @@ class Questions:
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
         # Contacts are checked when they are made.
         arrays = [grasp.arrays(fingers) for grasp in grasps]
-        own, usual = grasps[0].contacts, self.tolerances
-        tolerances = tuple(
-            (own[name].tolerance if name in own else None) or usual[name] for name in fingers
+        more = [grasp.more(fingers) for grasp in grasps]
+        own, tolerances = grasps[0].contacts, self._usual
+        if any(contact.tolerance for contact in own.values()):
+            usual = self.tolerances
+            tolerances = tuple(
+                (own[name].tolerance if name in own else None) or usual[name] for name in fingers
+            )
+        # A new dimension costs nothing; one grasp is solved in the time that joining some takes.
+        points, normals = (
+            (arrays[0][0][None], arrays[0][1][None])
+            if len(arrays) == 1
+            else (np.array(both) for both in zip(*arrays, strict=True))
         )
-        held = self.held(fixed)
         return Problems(
-            np.concatenate([points[None] for points, _ in arrays]),
-            np.concatenate([normals[None] for _, normals in arrays]),
+            points,
+            normals,
             tolerances,
             self.enforce_limits,
-            fixed=held,
-            more=_stacked([grasp.more(fingers) for grasp in grasps], len(fingers)),
+            fixed=self.held(fixed) if fixed else None,
+            more=_stacked(more, len(fingers)) if any(more) else {},
             prefer=prefer,
             object=grasps[0].object,
             object_pose=_object_poses(grasps),
         )
+
+    @cached_property
+    def _usual(self) -> tuple[Tolerance, ...]:
+        return tuple(self.tolerances.values())
 
     def held(self, fixed: Mapping[str, float] | None) -> Array | None:
         """Held actuators as an array; see `fixed_array`."""

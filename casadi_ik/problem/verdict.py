@@ -83,12 +83,26 @@ def judge_one(robot: ArmHand, problems: Problems, q: Array) -> SolvedVerdict | N
         q: (n,).
     """
     position, angle, beyond = deviations(robot, problems, q)
-    limits_ok = bool(beyond <= LIMIT_SLACK)
+    return judge_errors(problems, position.tolist(), angle.tolist(), float(beyond))
+
+
+def judge_errors(
+    problems: Problems, position: list[float], angle: list[float], beyond: float
+) -> SolvedVerdict | None:
+    """`judge_one` from what was measured.
+
+    Args:
+        problems: One target.
+        position: Distances by finger [m].
+        angle: Angles by finger [rad].
+        beyond: By how much the worst actuator or joint is beyond its limits [rad or m].
+    """
+    limits_ok = beyond <= LIMIT_SLACK
     if problems.enforce_limits and not limits_ok:
         return None
     contacts = []
     slack = 1 + TOLERANCE_SLACK
-    errors = zip(position.tolist(), angle.tolist(), problems.tolerances, strict=True)
+    errors = zip(position, angle, problems.tolerances, strict=True)
     for distance, turn, tolerance in errors:
         if not (distance <= tolerance.position * slack and turn <= tolerance.angle * slack):
             return None

@@ -68,10 +68,11 @@ ShapeEntry = SphereEntry | CapsuleEntry | BoxEntry | CylinderEntry
 
 
 class TouchingEntry(Struct, frozen=True):
-    """Two links that may touch, and why."""
+    """Two links that may touch, and why; with ``depth`` by no more than that."""
 
     links: tuple[str, str]
     reason: str
+    depth: Length | None = None
 
 
 class CollisionEntry(Struct, frozen=True):
@@ -126,10 +127,12 @@ class Touching:
     Attributes:
         links: Their names.
         reason: Why.
+        depth: By how much they may overlap [m].
     """
 
     links: tuple[str, str]
     reason: str
+    depth: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +149,8 @@ class Shapes:
             tuple(replace(one, link=names.get(one.link, one.link)) for one in self.capsules),
             tuple(replace(one, link=names.get(one.link, one.link)) for one in self.solids),
             tuple(
-                Touching(
-                    (names.get(t.links[0], t.links[0]), names.get(t.links[1], t.links[1])), t.reason
-                )
-                for t in self.touching
+                replace(one, links=tuple(names.get(link, link) for link in one.links))
+                for one in self.touching
             ),
         )
 
@@ -201,7 +202,9 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
             _known(link, known, f"{key}.links")
         if not pair.reason.strip():
             raise DescriptionError(f"{key}.reason: is empty, expected why they may touch")
-        touching.append(Touching(pair.links, pair.reason))
+        if pair.depth is not None and not pair.depth > 0:
+            raise DescriptionError(f"{key}.depth: found {pair.depth:g}, expected > 0 m")
+        touching.append(Touching(pair.links, pair.reason, pair.depth or math.inf))
     if entry.srdf is not None:
         place = Path(entry.srdf).expanduser()
         place = place if place.is_absolute() else path.parent / place

@@ -25,7 +25,7 @@ from casadi_ik.problem.preference import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Status
-from casadi_ik.problem.verdict import judge_one
+from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.free import FreeFinder
 from casadi_ik.solving.alternatives.tracking import Tracker
@@ -192,7 +192,10 @@ class Engine:
         seconds = time.perf_counter() - begin
         if found is None:
             return None
-        verdict = judge_one(robot, problems, found.q)
+        if found.errors is None:
+            verdict = judge_one(robot, problems, found.q)
+        else:
+            verdict = judge_errors(problems, *found.errors)
         if verdict is None:
             return None
         distance = closest = None

@@ -4,18 +4,6 @@
  */
 #include <math.h>
 
-typedef struct {
-  const double **inputs;       /* first sample of each input */
-  const int64_t *input_steps;  /* doubles from one sample to the next, 0 = the same for all */
-  const int16_t *tiles;        /* (tiles, pairs of entries, TILE, 2) keys of the table in steps */
-  int64_t *found;              /* (count, wanted) */
-  int64_t rows;                /* of the table */
-  int64_t wanted;
-  int64_t count;               /* samples */
-  int64_t next;                /* first sample not yet done */
-  double slice;                /* [s] after which Python gets a look at its signals */
-} lookup_job;
-
 /* Twice a key of whole steps, for two entries of all rows of a tile. Entries that are not known
  * count nothing: `kept` is zero there, else all its bits are set. */
 typedef struct {
@@ -159,9 +147,16 @@ __attribute__((target("avx512f,avx512bw"))) FORM void with_avx512(
 }
 #endif
 
+/* Asked once: in a virtual machine the question takes longer than a lookup. Threads that ask at the
+ * same time get the same answer. */
 static look_up *best_form(void) {
 #if defined(__x86_64__)
-  const int bits = register_bits();
+  static int known;
+  int bits = __atomic_load_n(&known, __ATOMIC_RELAXED);
+  if (!bits) {
+    bits = register_bits();
+    __atomic_store_n(&known, bits, __ATOMIC_RELAXED);
+  }
   if (bits == 512) return with_avx512;
   if (bits == 256) return with_avx2;
 #endif

@@ -19,8 +19,3 @@ typedef struct {
   int64_t *places;             /* (capacity, 2) solve and iteration of each row */
   int64_t *slots;              /* (SLOTS) the solves under way, -1 = none */
 } loop_job;
-
-/* Whether later states are compared with that of this iteration. */
-static int is_marked(int64_t iteration) {
-  return iteration >= FIRST_MARK && !(iteration & (iteration - 1));
-}

@@ -12,9 +12,7 @@ import json
 import os
 import time
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
-from os import PathLike
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -22,7 +20,6 @@ from typing import Any, Literal, Self
 import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import LogError
 from casadi_ik.logs.events.detect import detect_events
 from casadi_ik.logs.events.kinds import SINGULAR, EventKind, event_format
@@ -39,7 +36,7 @@ from casadi_ik.logs.write.measured import measured_format, measured_rows
 from casadi_ik.logs.write.provenance import log_metadata
 from casadi_ik.logs.write.solve_rows import solve_format, solve_rows
 from casadi_ik.logs.write.topic_messages import block_messages
-from casadi_ik.problem.recorder import Recorder, SolveBlock
+from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.trace import TraceFormat
 
 Compression = Literal["none", "lz4", "zstd"]
@@ -94,8 +91,8 @@ class McapRecorder:
             clock: Rule of the log times.
 
         Raises:
-            LogError: The path cannot be written, somebody is writing it, or the compression is
-                unknown.
+            LogError: The path cannot be written, somebody is writing it, the compression is
+                unknown, or URDF or parameters are larger than what a reader takes.
         """
         if compression not in COMPRESSORS:
             raise LogError(f"compression {compression!r}: expected one of {', '.join(COMPRESSORS)}")
@@ -117,21 +114,21 @@ class McapRecorder:
         if urdf is not None:
             data = urdf.encode()
             attached.append(Attachment(now, now, URDF_ATTACHMENT, "application/xml", data))
-        file, summary = McapFile(self.path), Summary()
-        beginning = summary.beginning(
-            "ros2",
-            f"casadi_ik {metadata['code_version']}",
-            Metadata(METADATA_NAME, metadata),
-            attached,
-        )
-        self._chunks = ChunkStream(file, summary, beginning, compression)
+        summary, library = Summary(), f"casadi_ik {metadata['code_version']}"
+        record = Metadata(METADATA_NAME, metadata)
+        try:
+            beginning = summary.beginning("ros2", library, record, attached)
+        except LogError as error:
+            raise LogError(f"{self.path}: {error}") from None
+        self._chunks = ChunkStream(McapFile(self.path), summary, beginning, compression)
 
     def record(self, block: SolveBlock) -> None:
         """Write solves: their totals, and of those that are kept their iterations and events.
 
         Raises:
-            LogError: The block contradicts itself or an earlier one (the log stays usable), or it
-                could not be written (the log ends with the chunk before).
+            LogError: The block contradicts itself or an earlier one, or a solve of it is larger
+                than what a reader takes (the log stays usable), or it could not be written (the
+                log ends with the chunk before).
         """
         if len(block) == 0:
             return
@@ -147,8 +144,10 @@ class McapRecorder:
         solves = solve_rows(block, tally, method.formats["solve"].layout)
         singular = tally[:, list(SINGULAR)].sum(axis=1) > 0
         solves["kept"] = self.keep(block.first, block.batch.success, singular)
+        messages = block_messages(block, events, solves, method.channels, self.clock)
+        self._chunks.check(messages, f"{self.path}: method {block.method!r}", block.first)
         self._note(block)
-        self._chunks.add(block_messages(block, events, solves, method.channels, self.clock))
+        self._chunks.add(messages)
 
     def close(self) -> None:
         """Finish the file; a second call does nothing.
@@ -242,34 +241,3 @@ class McapRecorder:
 
 def _numbers(block: SolveBlock) -> range:
     return range(block.first, block.first + len(block))
-
-
-def recorder_for(
-    log: str | PathLike[str] | Recorder | None,
-    robot: ArmHand,
-    parameters: Mapping[str, Any],
-    seed: int,
-    keep: Keep | None = None,
-    compression: Compression = "zstd",
-) -> AbstractContextManager[Recorder | None]:
-    """The recorder of a file, open as long as the context; one that is open already stays so.
-
-    Args:
-        log: Path of the file, an open recorder, or None.
-        robot: The robot.
-        parameters: What determines a solve but target, start and seed.
-        seed: Of all random numbers.
-        keep: Which solves keep their iterations; None: all.
-        compression: Of the file.
-    """
-    if not isinstance(log, str | PathLike):
-        return nullcontext(log)
-    return McapRecorder(
-        log,
-        robot_name=robot.name,
-        urdf=robot.urdf(),
-        parameters=dict(parameters),
-        seed=seed,
-        keep=keep,
-        compression=compression,
-    )

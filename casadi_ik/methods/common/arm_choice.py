@@ -38,23 +38,24 @@ STEP = 2 * np.pi / SAMPLES
 
 @dataclass(frozen=True, eq=False)
 class Wanted:
-    """What an arm is chosen by; (7, 1) each.
+    """What an arm is chosen by; (n, 1) each.
 
     Attributes:
         near: The given arm [rad].
-        scales: What joint motions are multiplied by before they are squared.
         lower: Bounds [rad].
         upper: Bounds [rad].
+        scales: What joint motions are multiplied by before they are squared, numbers: as an input
+            of a function they would keep solves from going side by side.
     """
 
     near: Expr
-    scales: Expr
     lower: Expr
     upper: Expr
+    scales: ca.DM
 
-    def part(self, rows: slice) -> Wanted:
+    def part(self, rows: slice | list[int]) -> Wanted:
         """Of some of the joints."""
-        return Wanted(self.near[rows], self.scales[rows], self.lower[rows], self.upper[rows])
+        return Wanted(self.near[rows], self.lower[rows], self.upper[rows], self.scales[rows])
 
     def cost(self, q: Expr) -> tuple[Expr, Expr]:
         """Squared distance of joints from the given ones, and their margin within the bounds."""
@@ -83,23 +84,25 @@ def choose_arm(
     Returns:
         The best arm (7, 1) [rad] of the trial, its score (higher is better), swivel and elbow sign.
     """
-    choose = ca.Function.if_else("trial", _everywhere(arm), _around(arm))
+    scales = wanted.scales
+    choose = ca.Function.if_else("trial", _everywhere(arm, scales), _around(arm, scales))
     inputs = [palm.rotation, palm.origin]
-    inputs += [wanted.near, wanted.scales, wanted.lower, wanted.upper, trial, around, elbow]
+    inputs += [wanted.near, wanted.lower, wanted.upper, trial, around, elbow]
     q, score, psi, sign = choose(trial < 1, *inputs)
     return q, score, psi, sign
 
 
-def _inputs() -> tuple[list[ca.SX], Pose, Wanted, ca.SX, ca.SX, ca.SX]:
+def _inputs(scales: ca.DM) -> tuple[list[ca.SX], Pose, Wanted, ca.SX, ca.SX, ca.SX]:
     rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
-    vectors = [ca.SX.sym(name, 7) for name in ("near", "scales", "lower", "upper")]
-    numbers = [ca.SX.sym(name) for name in ("trial", "around", "elbow")]
-    inputs = [rotation, origin, *vectors, *numbers]
-    return (inputs, Pose(rotation, origin), Wanted(*vectors), numbers[0], numbers[1], numbers[2])
+    near, lower, upper = (ca.SX.sym(name, 7) for name in ("near", "lower", "upper"))
+    trial, around, elbow = (ca.SX.sym(name) for name in ("trial", "around", "elbow"))
+    inputs = [rotation, origin, near, lower, upper, trial, around, elbow]
+    wanted = Wanted(near, lower, upper, scales)
+    return inputs, Pose(rotation, origin), wanted, trial, around, elbow
 
 
-def _everywhere(arm: SrsArm) -> ca.Function:
-    inputs, palm, wanted, *_ = _inputs()
+def _everywhere(arm: SrsArm, scales: ca.DM) -> ca.Function:
+    inputs, palm, wanted, *_ = _inputs(scales)
     angles = ca.DM((STEP * (np.arange(SAMPLES) + 0.5)).tolist())
     found = _Best()
     for sign in (1.0, -1.0):
@@ -107,8 +110,8 @@ def _everywhere(arm: SrsArm) -> ca.Function:
     return ca.Function("everywhere", inputs, shared(*found.best))
 
 
-def _around(arm: SrsArm) -> ca.Function:
-    inputs, palm, wanted, trial, around, elbow = _inputs()
+def _around(arm: SrsArm, scales: ca.DM) -> ca.Function:
+    inputs, palm, wanted, trial, around, elbow = _inputs(scales)
     width = STEP * 0.25 ** (trial - 1)
     offsets = (2 * np.arange(CLOSER) + 1 - CLOSER) / CLOSER
     found = _Best()

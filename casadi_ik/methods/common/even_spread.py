@@ -12,8 +12,12 @@ def evenly(count: int, dimensions: int) -> Array:
 
     Roberts' generalised golden ratio: the root of x^(d+1) = x + 1 gives the increments.
     """
+    return (0.5 + np.arange(1, count + 1)[:, None] * even_steps(dimensions)) % 1.0
+
+
+def even_steps(dimensions: int) -> Array:
+    """(dimensions,) from one point of an even spread to the next."""
     ratio = 2.0
     for _ in range(64):
         ratio = (1 + ratio) ** (1 / (dimensions + 1))
-    steps = ratio ** -np.arange(1.0, dimensions + 1)
-    return (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
+    return ratio ** -np.arange(1.0, dimensions + 1)

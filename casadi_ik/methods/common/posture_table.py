@@ -113,8 +113,6 @@ class PostureTable:
     def _chosen(self, rows: NDArray[np.int64], count: int, similar: float) -> Array:
         """Of rows (k, pool) in order of nearness those that differ, (k, count, hand)."""
         places = self.postures[rows] / np.where(self._ranges > 0, self._ranges, 1.0)
-        squares = (places * places).sum(axis=2)
-        products = places @ places.transpose(0, 2, 1)
         alike = similar * similar * places.shape[2]
         every = np.arange(len(rows))
         closest = np.full(rows.shape, np.inf)
@@ -125,6 +123,13 @@ class PostureTable:
             rank = taken * 2 + (closest < alike)
             chosen[:, place] = pick = rank.argmin(axis=1)
             taken[every, pick] = True
-            apart = squares + squares[every, pick][:, None] - 2 * products[every, pick]
-            np.minimum(closest, apart, out=closest)
+            np.minimum(closest, squared_distance(places, places[every, pick][:, None]), out=closest)
         return self.postures[rows[every[:, None], chosen]]
+
+
+def squared_distance(one: Array, other: Array) -> Array:
+    """Squared lengths (...) of differences (..., m), summed in order: the same bits anywhere."""
+    total = np.square(one[..., 0] - other[..., 0])
+    for column in range(1, one.shape[-1]):
+        total += np.square(one[..., column] - other[..., column])
+    return total

@@ -10,54 +10,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array, Counts
-from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
+from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
+from casadi_ik.methods.common.posture_table import squared_distance
 from casadi_ik.methods.hand_first.beginning import beginning
-from casadi_ik.methods.hand_first.first_round import FirstRound
+from casadi_ik.methods.hand_first.going_on import CARRIED, NEAR, RETURNS, SURE, TINY, VARIED
+from casadi_ik.methods.hand_first.one_target import OneTarget
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.restarts import LATER, RUGGED, VALLEYS, Restarts
+from casadi_ik.methods.hand_first.rounds import RoundsPlan
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Quick
 from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.status import Phase
+from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
+from casadi_ik.symbolic.closed_arms.recognise import arm_form
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
 
 NEAREST = "q0"
 """The preference for what is near the start."""
-
-TINY = 1e-9
-"""Smallest range [rad or m] a motion is measured by."""
-
-CARRIED = (
-    *("passed", "near", "balanced", "least", "returns"),
-    *("best_cost", "best_q", "counts"),
-)
-"""What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
-were balanced in vain, and what was found."""
-
-
-RETURNS = 8
-"""When so many fits and balances have ended where one had before, no table holds another kind."""
-
-SURE = 1e-8
-"""Cost (0.01 mm, 0.1 mrad) above which this is a minimum, and not a long flat valley."""
-
-NEAR = 0.02
-"""Cost (14 mm, 8 deg) from which on a target that still misses is taken to be out of reach."""
-
-VARIED = 2
-"""Rounds of tables in any case: the second takes hands that differ from each other."""
 
 
 class HandFirstMethod(LoopedMethod):
@@ -88,8 +68,8 @@ class HandFirstMethod(LoopedMethod):
         self.options: HandFirstParameters = options
         self.rounds = options.rounds + LATER
         self._kinds = kinds or usual(len(robot.fingers))
-        self.step = HandFirstStep(robot, _closed_form(robot), options.candidates, self._kinds)
-        self._singles: list[FirstRound] = []
+        self.step = HandFirstStep(robot, arm_form(robot), options.candidates, self._kinds)
+        self._ready: dict[bool, list[OneTarget]] = {True: [], False: []}
         self._kept: tuple[Any, Array] | None = None
 
     def step_graph(self) -> StepGraph:
@@ -109,7 +89,7 @@ class HandFirstMethod(LoopedMethod):
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
-        _ = self.kernel, self.hands.table, self._beginning
+        _ = self.kernel, self.hands.table, self.first
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:
@@ -158,15 +138,35 @@ class HandFirstMethod(LoopedMethod):
         """The first round of one target; see `QuickMethod.quick`."""
         if not self.kernel.compiled:
             return None
+        ready = self._ready[problems.enforce_limits]
         try:
-            first = self._singles.pop()
+            one = ready.pop()
         except IndexError:
-            first = FirstRound(
-                self.hands.table, self._beginning, self.kernel, self.step.layouts, self.order
-            )
-        found = first(problems, q0, self._terms(problems), self.max_iterations)
-        self._singles.append(first)
+            one = OneTarget(self.rounds_plan(problems.enforce_limits), whole=False)
+        one.points[...], one.normals[...], one.here[...] = problems.points, problems.normals, q0
+        one.terms[...] = self.terms(problems)
+        for vectors, name in zip(one.more, self.step.layouts.contacts.data[2:], strict=True):
+            vectors[...] = problems.vectors(f"{name}s")
+        status = one()
+        found = one.quick(not one.more) if status == Status.SOLVED else None
+        ready.append(one)
         return found
+
+    def rounds_plan(self, enforce_limits: bool) -> RoundsPlan:
+        """All rounds of one target, as compiled code makes them."""
+        kernels = RobotKernels(self.robot)
+        return RoundsPlan(
+            layouts=self.step.layouts,
+            options=self.options,
+            rounds=self.rounds,
+            budget=self.max_iterations,
+            hands=self.hands,
+            enforce_limits=enforce_limits,
+            begin=self.first,
+            solve=self.kernel,
+            contacts=kernels.contacts,
+            judge=kernels.deviations,
+        )
 
     def rows(
         self, problems: Problems, q0: Array, postures: Array, begun: bool = False
@@ -187,9 +187,9 @@ class HandFirstMethod(LoopedMethod):
         tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
         vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
         # A kernel's column is a vector: of a hand with one motor there is no second dimension.
-        tried = tried.reshape(len(problems), *self._beginning.input_shapes[-1])
-        asked = *vectors, q0, self._terms(problems), tried
-        states, parameters = self._beginning(*asked)
+        tried = tried.reshape(len(problems), *self.first.input_shapes[-1])
+        asked = *vectors, q0, self.terms(problems), tried
+        states, parameters = self.first(*asked)
         if begun:
             layout = self.step.layouts.state
             states[:, layout.slice("phase")] = float(Phase.CANDIDATE)
@@ -247,14 +247,14 @@ class HandFirstMethod(LoopedMethod):
         if own:
             postures = postures[:, : max(postures.shape[1] - 1, 1)]
         ranges = np.maximum((self.robot.upper - self.robot.lower)[hand], TINY)
-        distance = (((postures - here) / ranges) ** 2).sum(axis=2)
+        distance = squared_distance(postures / ranges, here / ranges)
         rows = np.argsort(distance, axis=1, kind="stable")[:, :, None]
         ordered = np.take_along_axis(postures, rows, axis=1)
         if not own or self.options.candidates == 1:
             return ordered
         return np.concatenate([here, ordered], axis=1)
 
-    def _terms(self, problems: Problems) -> Array:
+    def terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms; kept, since making them costs as much as a solve."""
         if problems.fixed is not None:
             return self._terms_of(problems)
@@ -271,12 +271,6 @@ class HandFirstMethod(LoopedMethod):
         return np.concatenate([*tolerances, *bounds, nearest])
 
     @cached_property
-    def _beginning(self) -> FunctionKernel:
+    def first(self) -> FunctionKernel:
+        """Makes first state and parameters of a round."""
         return FunctionKernel(beginning(self.step.layouts), self._compiled)
-
-
-def _closed_form(robot: RobotDescription) -> SrsArm | None:
-    try:
-        return srs_arm(robot)
-    except UnsupportedError:
-        return None

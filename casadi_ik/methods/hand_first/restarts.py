@@ -12,14 +12,17 @@ the fits end somewhere else each time, as with many joints at their limits.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.methods.hand_first.valley import valley
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
@@ -75,6 +78,22 @@ LATER = VALLEYS + ANYWHERE + RUGGED
 """Rounds after those of the tables, at most."""
 
 
+class Spread(NamedTuple):
+    """How postures of a table are spread.
+
+    Attributes:
+        count: How many.
+        at_limits: Part of the range that is moved to the limits.
+        lower: (n,) from where.
+        upper: (n,) to where.
+    """
+
+    count: int
+    at_limits: float
+    lower: Array
+    upper: Array
+
+
 class Restarts:
     """The hand postures that a robot's solves begin from."""
 
@@ -98,20 +117,35 @@ class Restarts:
         self._options = options
         self._compiled = compiled
 
+    @property
+    def spreads(self) -> tuple[Spread, Spread, Spread]:
+        """Those of the three tables."""
+        own, options = (self._robot.lower, self._robot.upper), self._options
+        return (
+            Spread(options.table, 0.0, *own),
+            Spread(options.wide_table, AT_LIMITS, *own),
+            Spread(options.wide_table, 0.0, *self._everywhere),
+        )
+
     @cached_property
     def table(self) -> PostureTable:
         """The hand postures of the first round."""
-        return self._table(self._options.table)
+        return self._table(self.spreads[0])
 
     @cached_property
     def wide_table(self) -> PostureTable:
         """Many more postures, a good part of them at limits."""
-        return self._table(self._options.wide_table, AT_LIMITS)
+        return self._table(self.spreads[1])
 
     @cached_property
     def free_table(self) -> PostureTable:
         """As many postures, limits ignored."""
-        return self._table(self._options.wide_table, bounds=self._everywhere)
+        return self._table(self.spreads[2])
+
+    def tables(self, enforce_limits: bool) -> tuple[PostureTable, ...]:
+        """Those that are asked, in the order of `spreads`."""
+        own = (self.table, self.wide_table)
+        return own if enforce_limits else (*own, self.free_table)
 
     def from_tables(self, problems: Problems, number: int) -> Array:
         """Postures (k, candidates, hand) of a round whose postures look like the targets.
@@ -138,36 +172,43 @@ class Restarts:
             q: (k, n) where it did.
             which: The round. Even ones keep motors at a limit there; odd ones do not.
         """
-        size = self._size
         columns = self._hand
         rigid, slopes = self._slopes(q, problems)
-        if self._robot.description.arm_actuators:
-            # The palm follows as well as it can: what is left of a motor's motion counts.
-            base = np.linalg.qr(rigid)[0]
-            slopes = slopes - base @ (base.transpose(0, 2, 1) @ slopes)
-        squares = slopes.transpose(0, 2, 1) @ slopes
-        if which % 2 == 0:
-            ends = np.minimum(q - self._robot.lower, self._robot.upper - q)[:, columns]
-            held = ends < AT_END
-            squares += np.eye(len(columns)) * (held * HELD)[:, None]
-        chosen = np.linalg.eigh(squares)[1][:, :, 0]
-        chosen = chosen / np.abs(chosen).max(axis=1, keepdims=True)
+        ends = np.minimum(q - self._robot.lower, self._robot.upper - q)[:, columns]
+        held = (ends < AT_END) * HELD if which % 2 == 0 else np.zeros_like(ends)
+        # A kernel's column is a vector: of a hand with one motor there is no second dimension.
+        shapes = self.valley.input_shapes
+        (chosen,) = self.valley(
+            rigid, slopes.reshape(len(q), *shapes[1]), held.reshape(len(q), *shapes[2])
+        )
+        motion = chosen.reshape(ends.shape) * self.size
+        return q[:, None, columns] + self.strides(which)[:, None] * motion[:, None]
+
+    def strides(self, which: int) -> Array:
+        """(candidates,) how far the hands of a round begin along their valley."""
         first = (which + 1) // 2 * self._options.candidates
-        strides = np.resize(np.roll(STRIDES, -first), self._options.candidates)
-        return q[:, None, columns] + strides[:, None] * (chosen * size)[:, None]
+        return np.resize(np.roll(STRIDES, -first), self._options.candidates)
+
+    @cached_property
+    def valley(self) -> FunctionKernel:
+        """Finds the valley, from the contacts' slopes."""
+        rows = 6 * len(self._robot.fingers)
+        return FunctionKernel(valley(rows, len(self._hand)), self._compiled)
 
     def anywhere(self, problems: Problems, number: int) -> Array:
         """Whole configurations (candidates, n), evenly spread, other ones in every round."""
-        lower, upper = self._everywhere
-        if problems.enforce_limits:
-            lower, upper = self._robot.lower, self._robot.upper
+        lower, upper = self.anywhere_bounds(problems.enforce_limits)
         count = self._options.candidates
         spread = evenly((number + 1) * count, len(lower))[-count:]
         return lower + spread * (upper - lower)
 
+    def anywhere_bounds(self, enforce_limits: bool) -> tuple[Array, Array]:
+        """(n,) between which configurations from anywhere are."""
+        return (self._robot.lower, self._robot.upper) if enforce_limits else self._everywhere
+
     def _slopes(self, q: Array, problems: Problems) -> tuple[Array, Array]:
-        """How the contacts move with the palm (k, 6 f, 6) and with the hand (k, 6 f, h)."""
-        k, size, columns = len(q), self._size, self._hand
+        """How the contacts move with the palm (k, 6, 6 f) and with the hand (k, h, 6 f)."""
+        k, size, columns = len(q), self.size, self._hand
         moved = np.repeat(q[:, None], len(columns) + 1, axis=1)
         for place, column in enumerate(columns):
             moved[:, place + 1, column] += NUDGE * size[place]
@@ -178,14 +219,16 @@ class Restarts:
         counts = ~np.isnan(np.stack([problems.points, problems.normals], axis=1))
         both = np.stack([points, normals], axis=2)
         slopes = (both[:, 1:] - both[:, :1]) / NUDGE * counts[:, None]
+        if not self._robot.description.arm_actuators:
+            return np.zeros((k, 6, slopes[0, 0].size)), slopes.reshape(k, len(columns), -1)
         turns = np.cross(np.eye(3)[:, None, None], both[:, None, 0]) * counts[:, None]
         shifts = np.zeros((k, 3, *counts.shape[1:]))
         shifts[:, np.arange(3), 0, :, np.arange(3)] = 1
         rigid = np.concatenate([shifts * counts[:, None], turns], axis=1)
-        return _as_columns(rigid), _as_columns(slopes)
+        return rigid.reshape(k, 6, -1), slopes.reshape(k, len(columns), -1)
 
     @property
-    def _size(self) -> Array:
+    def size(self) -> Array:
         """(hand,) a radian of every motor, or half the range of a slider [m]."""
         units = [self._robot.description.actuators[column].unit for column in self._hand]
         ranges = (self._robot.upper - self._robot.lower)[self._hand]
@@ -202,16 +245,13 @@ class Restarts:
         ends = description.mechanical
         return np.maximum(lower, ends[0]), np.minimum(upper, ends[1])
 
-    def _table(
-        self, size: int, at_limits: float = 0.0, bounds: tuple[Array, Array] | None = None
-    ) -> PostureTable:
-        hand = tuple(self._hand)
+    def _table(self, spread: Spread) -> PostureTable:
+        hand, bounds = tuple(self._hand), (spread.lower, spread.upper)
         return PostureTable(
-            self._robot, hand, size, at_limits, compiled=self._compiled, bounds=bounds
+            self._robot,
+            hand,
+            spread.count,
+            spread.at_limits,
+            compiled=self._compiled,
+            bounds=bounds,
         )
-
-
-def _as_columns(motions: Array) -> Array:
-    """(k, m, 2, f, 3) motions of all contacts as matrices (k, 6 f, m)."""
-    k, m = motions.shape[:2]
-    return motions.reshape(k, m, -1).transpose(0, 2, 1)

@@ -26,10 +26,13 @@ from casadi_ik.solving.trials import Descent
 TOGETHER = 128
 """Targets that are worked on at once."""
 
-STARTS = 48
+STARTS = 24
 """Random arms that a target is solved from."""
 
-ESCAPES = 12
+ROUNDS = 3
+"""Rounds of hand postures."""
+
+ESCAPES = 4
 """Steps away from what is nearest."""
 
 STEPS = (0.3, 0.1, 0.03, 0.01)
@@ -191,6 +194,10 @@ class _Search:
             self.take(q, owner)
             return
         targets = owner[swung.owner]
+        good = self.trials.solved(
+            self.problems.rows(targets), swung.q, self.problems.enforce_limits
+        )
+        swung, targets = swung.rows(good), targets[good]
         room = self.look(swung.q, targets)
         self.take(swung.q, targets, room)
         free = np.flatnonzero(room >= 0)
@@ -202,14 +209,14 @@ class _Search:
         order = np.lexsort((score, targets[free]))
         sorted_targets = targets[free][order]
         last = free[order[np.append(sorted_targets[1:] != sorted_targets[:-1], True)]]
-        chosen = Swung(swung.q[last], swung.owner[last], swung.swivel[last], swung.branch[last])
+        chosen = swung.rows(last)
         near = self.finder.closer(q[chosen.owner], chosen, lower, upper)
-        self.take(near.q, targets[last][near.owner])
+        self.take(*self._solved(near.q, targets[last][near.owner]))
 
     def _others(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:
         """Answers with other hands and arms, of the targets that are not free."""
         method, hand = self.trials.method, self.finder.hand
-        for number in range(method.options.rounds):
+        for number in range(min(ROUNDS, method.options.rounds)):
             rows = np.flatnonzero(~self.free)
             if not len(rows):
                 return
@@ -220,9 +227,8 @@ class _Search:
             starts = self.limits.clip(self.starts[owner])
             flat = postures.reshape(-1, postures.shape[2])
             asked = self.problems.rows(owner)
-            yield self._solved(
-                asked, self.trials.run(*self.trials.posture_rows(asked, starts, flat)), owner
-            )
+            ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat))
+            yield self._solved(ends, owner)
         rows = np.flatnonzero(~self.free)
         if not len(rows):
             return
@@ -236,13 +242,11 @@ class _Search:
             ]
         )
         starts[::2, hand] = self.nearest[owner[::2]][:, hand]
-        asked = self.problems.rows(owner)
         ends = Descent(self.trials, self.problems).run(owner, self.limits.clip(starts))
-        yield self._solved(asked, ends, owner)
+        yield self._solved(ends, owner)
 
-    def _solved(
-        self, asked: Problems, q: Array, owner: NDArray[np.intp]
-    ) -> tuple[Array, NDArray[np.intp]]:
+    def _solved(self, q: Array, owner: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+        asked = self.problems.rows(owner)
         good = self.trials.solved(asked, q, asked.enforce_limits)
         return q[good], owner[good]
 
@@ -262,7 +266,7 @@ class _Search:
             steps = np.tile(STEPS, len(rows))[:, None]
             there = self.nearest[owner] + steps * (way * ranges).repeat(len(STEPS), axis=0)
             ends = Descent(self.trials, self.problems).run(owner, self.limits.clip(there))
-            q, owner = self._solved(self.problems.rows(owner), ends, owner)
+            q, owner = self._solved(ends, owner)
             room = self.look(q, owner)
             self.take(q, owner, room)
             if (self.room[rows] <= before + 1e-6).all():

@@ -1,0 +1,417 @@
+/* All rounds of hand-first for one target, as method.py and restarts.py make them for a batch.
+ *
+ * Calls the compiled kernels by the macros LOOK_UP, BEGIN, SOLVE, CONTACTS, VALLEY and JUDGE, which
+ * take a pointer to a job of the drivers. The constants come from rounds.py. Bit for bit the answers
+ * of a batch: what is computed here is computed in the same order there.
+ */
+
+/* State of a solver; everything is in it, and nothing points into it between two calls. */
+typedef struct {
+  /* The question. */
+  double points[3 * N_FINGERS], normals[3 * N_FINGERS];  /* base frame, NaN = free */
+  double more[3 * N_FINGERS * N_MORE + 1];  /* contacts' other vectors, which get no verdict here */
+  double here[N_MOTORS];
+  double terms[N_TERMS];        /* tolerances [m], [rad]; lower, upper bounds; 1 = nearest wanted */
+  /* The answer. */
+  double q[N_MOTORS];
+  double position_error[N_FINGERS], angle_error[N_FINGERS], beyond;
+  int64_t iterations, restarts;
+  int64_t status;
+  /* On its way. */
+  int64_t round, under_way, in_round;
+  int64_t rounds;               /* how many may be made */
+  double state[N_STATE], last[N_STATE], parameters[N_PARAMETERS], mark[N_STATE];
+  double postures[N_CANDIDATES * N_HAND];
+  double places[N_POOL * N_HAND], closest[N_POOL];
+  int64_t found[N_POOL];
+  int64_t taken[N_POOL];
+  double moved[(N_HAND + 1) * N_MOTORS];
+  double moved_points[(N_HAND + 1) * 3 * N_FINGERS], moved_normals[(N_HAND + 1) * 3 * N_FINGERS];
+  double rigid[36 * N_FINGERS], slopes[6 * N_FINGERS * N_HAND], held[N_HAND], motion[N_HAND];
+  OWN_FIELDS
+} rounds;
+
+static const int64_t ALONE[] = {0, 0, 0, 0, 0, 0, 0, 0};
+
+static int is_number(double x) { return x == x; }
+static int is_finite(double x) { return x * 0.0 == 0.0; }
+
+static double clipped(double x, double low, double high) {
+  const double above = x > low ? x : low;
+  return above < high ? above : high;
+}
+
+/* Entry of the i-th point, counted from 1, of an even spread. */
+static double even(int64_t i, double step) {
+  const double x = 0.5 + (double) i * step;
+  return x - (double) (int64_t) x;
+}
+
+static double posture(int table, int64_t row, int motor) {
+  const double spread = (even(row + 1, HAND_STEPS[motor]) - 0.5) / TABLE_SQUEEZE[table] + 0.5;
+  return TABLE_LOWER[table][motor] + clipped(spread, 0.0, 1.0) * TABLE_RANGE[table][motor];
+}
+
+static int look_up(rounds *job, int table, int64_t wanted) {
+  const double *inputs[2];
+  lookup_job look = {0};
+  inputs[0] = job->points;
+  inputs[1] = job->normals;
+  look.inputs = inputs;
+  look.input_steps = ALONE;
+  look.tiles = TILES(table);
+  look.found = job->found;
+  look.rows = TABLE_ROWS[table];
+  look.wanted = wanted;
+  look.count = 1;
+  return LOOK_UP(&look);
+}
+
+static map_job mapping(int64_t count, const double **inputs, const int64_t *input_steps,
+                       double **outputs, const int64_t *output_steps) {
+  map_job map = {0};
+  map.inputs = inputs;
+  map.input_steps = input_steps;
+  map.outputs = outputs;
+  map.output_steps = output_steps;
+  map.count = count;
+  map.slice = SLICE;
+  return map;
+}
+
+static double apart(const double *one, const double *other) {
+  double sum = (one[0] - other[0]) * (one[0] - other[0]);
+  int i;
+  for (i = 1; i < N_HAND; ++i) sum += (one[i] - other[i]) * (one[i] - other[i]);
+  return sum;
+}
+
+/* Of the pool of nearest postures those that differ, best first; the last of them are the round's. */
+static void vary(rounds *job, int table, int64_t pool, int64_t count) {
+  int64_t i, k, place, pick;
+  for (i = 0; i < pool; ++i) {
+    for (k = 0; k < N_HAND; ++k) {
+      const double range = TABLE_RANGE[table][k];
+      job->places[i * N_HAND + k] = posture(table, job->found[i], (int) k) / (range > 0 ? range : 1.0);
+    }
+    job->closest[i] = 1e300;
+    job->taken[i] = 0;
+  }
+  for (place = 0; place < count; ++place) {
+    int64_t least = 4;
+    pick = 0;
+    for (i = 0; i < pool; ++i) {
+      const int64_t rank = 2 * job->taken[i] + (job->closest[i] < ALIKE);
+      if (rank < least) {
+        least = rank;
+        pick = i;
+      }
+    }
+    job->taken[pick] = 1;
+    for (i = 0; i < pool; ++i) {
+      const double off = apart(job->places + i * N_HAND, job->places + pick * N_HAND);
+      if (off < job->closest[i]) job->closest[i] = off;
+    }
+    if (place < count - N_CANDIDATES) continue;
+    for (k = 0; k < N_HAND; ++k) {
+      job->postures[(place - count + N_CANDIDATES) * N_HAND + k] =
+          posture(table, job->found[pick], (int) k);
+    }
+  }
+}
+
+/* Nearest to where the robot is first; its own posture before them, instead of the last. */
+static void order(rounds *job, int own) {
+  double here[N_HAND], near[N_HAND], sorted[N_CANDIDATES * N_HAND], distance[N_CANDIDATES];
+  const int first = own && HAS_ARM && N_CANDIDATES > 1;
+  const int count = first ? N_CANDIDATES - 1 : N_CANDIDATES;
+  int i, j, k;
+  for (k = 0; k < N_HAND; ++k) {
+    const int column = HAND[k];
+    here[k] = clipped(job->here[column], job->terms[TERMS_LOWER + column],
+                      job->terms[TERMS_UPPER + column]);
+    near[k] = here[k] / ORDER_RANGES[k];
+  }
+  for (i = 0; i < count; ++i) {
+    double place[N_HAND];
+    for (k = 0; k < N_HAND; ++k) place[k] = job->postures[i * N_HAND + k] / ORDER_RANGES[k];
+    distance[i] = apart(place, near);
+  }
+  for (i = 0; i < count; ++i) {
+    int before = first;
+    for (j = 0; j < count; ++j) {
+      before += distance[j] < distance[i] || (distance[j] == distance[i] && j < i);
+    }
+    for (k = 0; k < N_HAND; ++k) sorted[before * N_HAND + k] = job->postures[i * N_HAND + k];
+  }
+  for (k = 0; first && k < N_HAND; ++k) sorted[k] = here[k];
+  memcpy(job->postures, sorted, sizeof sorted);
+}
+
+/* Postures whose contacts look like the target. */
+static int from_table(rounds *job, int64_t number) {
+  const int table = !number ? 0 : !ENFORCE_LIMITS && number % 2 ? 2 : 1;
+  const int64_t wanted = number ? number * N_CANDIDATES : N_CANDIDATES;
+  const int64_t most = TABLE_ROWS[table];
+  int64_t pool = number ? POOL * wanted : wanted;
+  int code, i, k;
+  if (pool > most) pool = most;
+  code = look_up(job, table, pool);
+  if (code != DONE) return code;
+  if (number) {
+    vary(job, table, pool, wanted);
+  } else {
+    for (i = 0; i < N_CANDIDATES; ++i) {
+      for (k = 0; k < N_HAND; ++k) job->postures[i * N_HAND + k] = posture(0, job->found[i], k);
+    }
+  }
+  if (job->terms[TERMS_NEAREST] > 0) order(job, !number);
+  return DONE;
+}
+
+/* How the contacts move with palm and hand. */
+static int find_slopes(rounds *job, const double *q) {
+  const double *inputs[1];
+  double *outputs[2];
+  static const int64_t in[] = {N_MOTORS}, out[] = {3 * N_FINGERS, 3 * N_FINGERS};
+  const double *base[2];
+  map_job map = mapping(N_HAND + 1, inputs, in, outputs, out);
+  int code, kind, i, k, m;
+  for (k = 0; k <= N_HAND; ++k) {
+    memcpy(job->moved + k * N_MOTORS, q, N_MOTORS * sizeof(double));
+    if (k) job->moved[k * N_MOTORS + HAND[k - 1]] += NUDGE * SIZE[k - 1];
+  }
+  inputs[0] = job->moved;
+  outputs[0] = job->moved_points;
+  outputs[1] = job->moved_normals;
+  code = CONTACTS(&map);
+  if (code != DONE) return code;
+  for (i = 0; i < (N_HAND + 1) * 3 * N_FINGERS; ++i) job->moved_points[i] /= LENGTH;
+  base[0] = job->moved_points;
+  base[1] = job->moved_normals;
+  memset(job->rigid, 0, sizeof job->rigid);
+  for (kind = 0; kind < 2; ++kind) {
+    const double *target = kind ? job->normals : job->points;
+    for (i = 0; i < 3 * N_FINGERS; ++i) {
+      const int place = kind * 3 * N_FINGERS + i;
+      const double counts = is_number(target[i - i % 3]) ? 1.0 : 0.0;
+      for (k = 0; k < N_HAND; ++k) {
+        const double there = base[kind][(k + 1) * 3 * N_FINGERS + i];
+        job->slopes[k * 6 * N_FINGERS + place] = (there - base[kind][i]) / NUDGE * counts;
+      }
+      if (!HAS_ARM) continue;
+      if (!kind) job->rigid[i % 3 * 6 * N_FINGERS + place] = counts;
+      for (m = 0; m < 3; ++m) {
+        /* The m-th axis times the vector. */
+        const double *vector = base[kind] + i - i % 3;
+        const int axis = i % 3;
+        double turn = 0.0;
+        if (axis == (m + 1) % 3) turn = -vector[(m + 2) % 3];
+        if (axis == (m + 2) % 3) turn = vector[(m + 1) % 3];
+        job->rigid[(3 + m) * 6 * N_FINGERS + place] = turn * counts;
+      }
+    }
+  }
+  return DONE;
+}
+
+/* Postures to either side of a fit that came to rest. */
+static int along_valley(rounds *job, int64_t which) {
+  const double *q = job->last + STATE_BEST_Q;
+  const double *inputs[3];
+  double *outputs[1];
+  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
+  int code = find_slopes(job, q), i, k;
+  if (code != DONE) return code;
+  for (k = 0; k < N_HAND; ++k) {
+    const double at = q[HAND[k]], below = at - LOWER[HAND[k]], above = UPPER[HAND[k]] - at;
+    const double end = below < above ? below : above;
+    job->held[k] = which % 2 == 0 && end < AT_END ? HELD : 0.0;
+  }
+  inputs[0] = job->rigid;
+  inputs[1] = job->slopes;
+  inputs[2] = job->held;
+  outputs[0] = job->motion;
+  code = VALLEY(&map);
+  if (code != DONE) return code;
+  for (i = 0; i < N_CANDIDATES; ++i) {
+    for (k = 0; k < N_HAND; ++k) {
+      const double step = job->motion[k] * SIZE[k];
+      job->postures[i * N_HAND + k] = q[HAND[k]] + STRIDES[which * N_CANDIDATES + i] * step;
+    }
+  }
+  return DONE;
+}
+
+/* Hand postures from anywhere, and all motors of the first of them. */
+static void from_anywhere(rounds *job, int64_t number, double *first) {
+  int i, k;
+  for (i = 0; i < N_CANDIDATES; ++i) {
+    const int64_t place = number * N_CANDIDATES + i + 1;
+    for (k = 0; k < N_HAND; ++k) {
+      const int column = HAND[k];
+      job->postures[i * N_HAND + k] =
+          ANYWHERE_LOWER[column] + even(place, ALL_STEPS[column]) * ANYWHERE_RANGE[column];
+    }
+  }
+  for (k = 0; k < N_MOTORS; ++k) {
+    first[k] = ANYWHERE_LOWER[k]
+             + even(number * N_CANDIDATES + 1, ALL_STEPS[k]) * ANYWHERE_RANGE[k];
+  }
+}
+
+static int begin_round(rounds *job, int64_t number) {
+  const double *inputs[5 + N_MORE];
+  double *outputs[2], first[N_MOTORS];
+  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
+  const int64_t later = number - TABLE_ROUNDS;
+  int code = DONE, i, k;
+  memcpy(job->last, job->state, sizeof job->last);
+  if (later < 0 || !number) code = from_table(job, number);
+  else if (later < VALLEYS) code = along_valley(job, later);
+  else from_anywhere(job, later - VALLEYS, first);
+  if (code != DONE) return code;
+  inputs[0] = job->points;
+  inputs[1] = job->normals;
+  for (i = 0; i < N_MORE; ++i) inputs[2 + i] = job->more + 3 * N_FINGERS * i;
+  inputs[2 + N_MORE] = job->here;
+  inputs[3 + N_MORE] = job->terms;
+  inputs[4 + N_MORE] = job->postures;
+  outputs[0] = job->state;
+  outputs[1] = job->parameters;
+  code = BEGIN(&map);
+  if (code != DONE || !number) return code;
+  job->state[STATE_PHASE] = CANDIDATE_PHASE;
+  job->state[STATE_CANDIDATE] = 0.0;
+  if (later >= VALLEYS) {
+    /* The first begins as a whole: what stands in the way may be arm and hand together. */
+    for (k = 0; k < N_MOTORS; ++k) {
+      job->state[STATE_Q + k] = clipped(first[k], job->parameters[PARAMETERS_LOWER + k],
+                                        job->parameters[PARAMETERS_UPPER + k]);
+    }
+    job->state[STATE_PHASE] = REFINEMENT_PHASE;
+    for (i = 0; i < N_FRESH; ++i) job->state[FRESH_PLACES[i]] = FRESH_VALUES[i];
+  }
+  for (i = 0; i < N_CARRIED; ++i) job->state[CARRIED[i]] = job->last[CARRIED[i]];
+  job->state[STATE_EARLIER] = job->last[STATE_EARLIER] + N_CANDIDATES;
+  return DONE;
+}
+
+static int is_hopeful(const rounds *job, int64_t number) {
+  const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
+  if (number >= ROUNDS - RUGGED) return returns < RETURNS && cost < NEAR_COST;
+  return returns < RETURNS || cost < SURE || number < VARIED || number >= TABLE_ROUNDS;
+}
+
+/* The verdict, which has the last word on what is solved. */
+static int finish(rounds *job) {
+  const double slack = 1 + TOLERANCE_SLACK, tried = job->state[STATE_CANDIDATE];
+  const double *inputs[3];
+  double *outputs[3];
+  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
+  int code, i, met = 1;
+  memcpy(job->q, job->state + STATE_Q, sizeof job->q);
+  job->restarts = (int64_t) job->state[STATE_EARLIER]
+                + (int64_t) clipped((double) (int64_t) tried, 0.0, N_CANDIDATES - 1);
+  if (N_MORE) return DONE;
+  inputs[0] = job->q;
+  inputs[1] = job->points;
+  inputs[2] = job->normals;
+  outputs[0] = job->position_error;
+  outputs[1] = job->angle_error;
+  outputs[2] = &job->beyond;
+  code = JUDGE(&map);
+  if (code != DONE) return code;
+  for (i = 0; i < N_FINGERS; ++i) {
+    met &= job->position_error[i] <= job->terms[i] * slack || !is_number(job->points[3 * i]);
+    met &= job->angle_error[i] <= job->terms[N_FINGERS + i] * slack
+        || !is_number(job->normals[3 * i]);
+  }
+  if (ENFORCE_LIMITS) met &= job->beyond <= LIMIT_SLACK;
+  if (met) job->status = SOLVED_STATUS;
+  else if (job->status == SOLVED_STATUS) job->status = STALLED_STATUS;
+  return DONE;
+}
+
+/* A vector that is free, or whose length is made one as `unit_vectors` does it; 0 where it is neither. */
+static int made_unit(double *vector) {
+  double length;
+  if (vector[0] != vector[0]) return vector[1] != vector[1] && vector[2] != vector[2];
+  length = sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]);
+  if (!(length >= SMALL_LENGTH && length <= LARGE_LENGTH)) return 0;
+  if (length - 1 < UNIT && 1 - length < UNIT) return 1;
+  vector[0] /= length;
+  vector[1] /= length;
+  vector[2] /= length;
+  return 1;
+}
+
+/* Takes up the question that stands in the job; 0 if it is malformed. */
+static int rounds_begin(rounds *job) {
+  int i, asked = 0, sound = 1;
+  for (i = 0; i < N_FINGERS; ++i) {
+    double *point = job->points + 3 * i, *normal = job->normals + 3 * i;
+    const int placed = is_finite(point[0]) && is_finite(point[1]) && is_finite(point[2]);
+    const int placeless = !is_number(point[0]) && !is_number(point[1]) && !is_number(point[2]);
+    sound &= placed || (placeless && !is_number(normal[0]));
+    sound &= made_unit(normal);
+    asked |= placed;
+  }
+  for (i = 0; i < N_MOTORS; ++i) sound &= is_finite(job->here[i]);
+  job->round = 0;
+  job->under_way = 0;
+  job->iterations = 0;
+  job->restarts = 0;
+  job->status = RUNNING;
+  return sound && asked;
+}
+
+/* Goes on for so many iterations, and begins one round at most; `status` says whether it is over.
+ *
+ * Returns DONE, SLICE_OVER if it has to be called again, or what went wrong.
+ */
+static int rounds_run(rounds *job, int64_t most) {
+  int begun = 0, code;
+  while (job->status == RUNNING) {
+    int32_t status = RUNNING;
+    int64_t spent;
+    double seconds = 0;
+    loop_job loop = {0};
+    if (!job->under_way) {
+      if (begun++ || most <= 0) return DONE;
+      code = begin_round(job, job->round);
+      if (code != DONE) return code;
+      job->under_way = 1;
+      job->in_round = 0;
+    }
+    spent = job->in_round;
+    loop.states = job->state;
+    loop.parameters = job->parameters;
+    loop.iterations = &job->in_round;
+    loop.status = &status;
+    loop.seconds = &seconds;
+    loop.mark = job->mark;
+    loop.count = 1;
+    loop.max_iterations = spent + most < BUDGET ? spent + most : BUDGET;
+    loop.slice = SLICE;
+    code = SOLVE(&loop);
+    spent = job->in_round - spent;
+    job->iterations += spent;
+    most -= spent;
+    if (code != DONE) return code;
+    if (status == RUNNING && job->in_round < BUDGET) return DONE;
+    job->under_way = 0;
+    if (status == SOLVED_STATUS) {
+      job->status = SOLVED_STATUS;
+      return finish(job);
+    }
+    do ++job->round;
+    while (job->round < job->rounds && !is_hopeful(job, job->round));
+    if (job->round < job->rounds) continue;
+    job->status = status == RUNNING ? LIMIT_STATUS
+                : status == REPEATED ? STALLED_STATUS
+                : status < 0 ? INVALID_STATUS : status;
+    return finish(job);
+  }
+  return DONE;
+}

@@ -1,0 +1,118 @@
+"""One target a call, arrays in and arrays out: for loops that cannot wait."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.methods.hand_first.one_target import OneTarget
+from casadi_ik.problem.preference import preference
+from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.status import Status
+from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
+
+STATUSES = {int(status): status for status in Status}
+
+
+class FastSolver:
+    """Solves one target a call by hand-first, in memory made once.
+
+    The answers are bit for bit those of `Solver.solve(..., diagnose=False)`, all restarts and the
+    verdict included. What it does without: a diagnosis, a log, a `Solution` (errors are in two
+    arrays), grasps and what contacts may have beside point and normal, actuators held where they
+    are, and interruption of a call by Ctrl-C before its kernel comes back (0.2 s at most).
+
+    An instance has one answer at a time: threads need one each.
+
+    Attributes:
+        position_error: (f,) [m] of the last answer, NaN where free; the next call overwrites it.
+        angle_error: (f,) [rad], likewise.
+    """
+
+    def __init__(self, engine: Engine, questions: Questions) -> None:
+        """Compile what is not compiled yet, and lay the arrays out.
+
+        Raises:
+            UnsupportedError: The method is not hand-first, or there is a scene.
+        """
+        if engine.check is not None:
+            raise UnsupportedError("fast: checks no collisions, expected a solver without a scene")
+        method = engine.method
+        if not isinstance(method, HandFirstMethod):
+            raise UnsupportedError(f"fast: expected method 'hand-first', found {method.name!r}")
+        method.prepare()
+        self._engine, self._questions = engine, questions
+        robot = engine.robot
+        f, n = len(robot.fingers), len(robot.actuators)
+        self._home, self._shapes = robot.home, ((f, 3), (f, 3), (n,))
+        self.position_error, self.angle_error = np.full(f, np.nan), np.full(f, np.nan)
+        self._one: OneTarget | None = None
+        if method.kernel.compiled:
+            self._lay_out(method)
+
+    def _lay_out(self, method: HandFirstMethod) -> None:
+        questions = self._questions
+        plan = method.rounds_plan(questions.enforce_limits)
+        self._one = one = OneTarget(plan, whole=True)
+        self._points, self._normals, self._here = one.points, one.normals, one.here
+        self._terms, self._q = one.terms, one.q
+        self.position_error, self.angle_error = one.position_error, one.angle_error
+        # Tolerances and limits are the same for all targets.
+        any_contact = np.zeros((1, *self._shapes[0])), np.ones((1, *self._shapes[0]))
+        self._terms[...] = method.terms(questions.of_arrays(*any_contact, None))
+
+    def __call__(
+        self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None = None
+    ) -> tuple[Array, Status]:
+        """Solve one target.
+
+        Args:
+            points: (f, 3) contact points [m], base frame, in `robot.fingers` order; NaN marks a
+                free finger.
+            normals: (f, 3) outward pad normals; NaN marks a free normal.
+            q0: (n,) where the robot is: of several solutions one near it is wanted. None: it is
+                at home, and one far from limits is wanted.
+
+        Returns:
+            q (n,) [rad or m], which the next call overwrites (`q.copy()` stays), and the status.
+
+        Raises:
+            InputError: Wrong shapes or numbers.
+        """
+        one = self._one
+        if one is None:
+            return self._slowly(points, normals, q0)
+        start = self._home if q0 is None else q0
+        shapes = np.shape(points), np.shape(normals), np.shape(start)
+        if shapes != self._shapes:
+            return self._slowly(points, normals, q0)
+        self._points[...] = points
+        self._normals[...] = normals
+        self._here[...] = start
+        self._terms[-1] = q0 is not None
+        status = one()
+        if status is None:
+            return self._slowly(points, normals, q0)
+        return self._q, STATUSES[status]
+
+    def _slowly(
+        self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None
+    ) -> tuple[Array, Status]:
+        """The way of a batch: without a compiler, and for what has to be refused in words.
+
+        Raises:
+            InputError: Wrong shapes or numbers.
+        """
+        questions = self._questions
+        prefer = preference(None, q0 is not None)
+        problems = questions.of_arrays([points], [normals], None, prefer=prefer)
+        start = questions.start(q0)
+        solution = self._engine.solve(problems, Run(start)).solution(0)
+        verdicts = solution.contacts.values()
+        self.position_error[...] = [verdict.position_error for verdict in verdicts]
+        self.angle_error[...] = [verdict.angle_error for verdict in verdicts]
+        return solution.q, solution.status
