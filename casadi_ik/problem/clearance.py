@@ -91,7 +91,9 @@ class Surroundings:
         unknown = ~np.isfinite(q).all(axis=1)
         room = np.where(unknown, np.nan, room - self.margin)
         free = room >= -ROUNDING
-        return Clearances(room + self.margin + np.maximum(offsets, 0.0), free, pairs, self.table.names, room)
+        return Clearances(
+            room + self.margin + np.maximum(offsets, 0.0), free, pairs, self.table.names, room
+        )
 
     def free(self, q: Array) -> NDArray[np.bool_]:
         """(k,) whether configurations (k, n) are free; quicker than `check`."""
