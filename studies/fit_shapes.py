@@ -355,6 +355,8 @@ def write(
     lines = text.split("\n")
     lines = without_source(lines)
     at = lines.index("sources:") + 1
+    while lines[at].startswith("  "):
+        at += 1
     lines[at:at] = wrapped(source)
     out = ["\n".join(lines).rstrip("\n"), "", "collision:", "  source: shapes", "  links:"]
     for link, (found, boxes, beyond) in fitted.items():
