@@ -99,7 +99,8 @@ def test_wrapper_in_cpp(project, tmp_path):
 @pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="no ziglang")
 def test_module_in_node(tmp_path, capsys):
     out = tmp_path / "page"
-    assert main(["export", "kuka_lwr_barrett", "--out", str(out), "--target", "wasm"]) == 0
+    # A hand alone: a small module compiles in a third of the time.
+    assert main(["export", "ar10", "--out", str(out), "--target", "wasm"]) == 0
     done = subprocess.run(["node", "test.mjs"], cwd=out, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     said = json.loads(done.stdout)
