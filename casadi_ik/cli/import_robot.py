@@ -162,7 +162,8 @@ def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> l
         pairs[f"check {name}"] = f"{verdict}: poses differ by at most {value:.1e}"
     rows = table("finger", "pad on link", "joints", "point [mm]", "normal", right=("joints",))
     for branch, pad in zip(found.branches, found.pads, strict=True):
-        point = " ".join(f"{1e3 * value:.1f}" for value in pad.point)
+        # What is rounded to -0.0 is zero.
+        point = " ".join(f"{round(1e3 * value, 1) + 0.0:.1f}" for value in pad.point)
         normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal.tolist())
         rows.add_row(branch.name, pad.link, str(len(branch.chain)), point, normal)
     notes: list[RenderableType] = [Text(f"  {note}", "yellow") for note in lines.notes]

@@ -54,6 +54,7 @@ def load_library(
     symbol: str,
     recipe: str = "",
     write: Callable[[ca.Function, str], str] = library_source,
+    at_hand: bool = False,
 ) -> ctypes.CDLL | None:
     """The compiled library of a function and a driver: from this process, from disk, or built.
 
@@ -65,10 +66,11 @@ def load_library(
         recipe: What the function follows from (`recipe`), "" if that is not known. Where a
             library of that recipe is at hand, the function is not built.
         write: Gives the library's text from the function and the driver.
+        at_hand: Whether to look for a library of that recipe only, and build nothing.
 
     Returns:
         The library, or None where there is no compiler, or no room for what it makes (a warning
-        says so once).
+        says so once), or where it is not at hand and nothing is to be built.
 
     Raises:
         KernelError: The function has no C code, or the compiler refused it or made no library.
@@ -85,7 +87,7 @@ def load_library(
         )
         note = f"{short}-{brief}.key"
         library = _recognised(directory, short, note, symbol) if directory and brief else None
-        if library is not None:
+        if library is not None or at_hand:
             return library
         source = write(build(), driver)
         key = library_key(source, compiler)

@@ -33,6 +33,10 @@ SYMBOL_LANES = "casadi_ik_loop_lanes"
 FEWEST = 4
 """Solves from which on they are made side by side."""
 
+WORTH = 64
+"""Solves from which on a compiler is waited for, if no library that makes them side by side is at
+hand. One by one they take a millisecond or two, and the compiler the better part of a minute."""
+
 
 class LoopKernel:
     """Runs a step until it ends, for each solve of a batch; several threads may run it at once.
@@ -71,9 +75,29 @@ class LoopKernel:
         """How many solves of a batch are made side by side; 1 where that is not possible."""
         return 1 if self._side_by_side is None else machine_lanes()
 
+    def _for(self, count: int) -> Any:
+        """The loop that makes some solves of so many at a time; None: one after the other."""
+        if count < FEWEST:
+            return None
+        return self._at_hand if count < WORTH else self._side_by_side
+
+    @cached_property
+    def _at_hand(self) -> Any:
+        """The loop that makes some solves at a time, if it need not be compiled."""
+        return self._load_lanes(at_hand=True)
+
     @cached_property
     def _side_by_side(self) -> Any:
         """The loop that makes some solves at a time; None where there is none."""
+        self.__dict__["_at_hand"] = found = self._load_lanes()
+        return found
+
+    def _load_lanes(self, at_hand: bool = False) -> Any:
+        """That loop, or None.
+
+        Args:
+            at_hand: Whether it is none, too, where it would have to be compiled.
+        """
         lanes = machine_lanes() if self.compiled else 0
         if not lanes:
             return None
@@ -85,6 +109,7 @@ class LoopKernel:
                 SYMBOL_LANES,
                 f"{self.step.recipe} lanes {lanes}" if self.step.recipe else "",
                 partial(lanes_source, lanes=lanes),
+                at_hand=at_hand,
             )
         except UnsuitedError as error:
             logger.info("%s: one solve at a time: %s", self.step.name, error)
@@ -169,8 +194,9 @@ class LoopKernel:
             run_vm(self.step, self.function, result, given, max_iterations)
             return result
         batch = CompiledBatch(self.step, result, given, max_iterations)
-        if count >= FEWEST and max_iterations > 0 and self._side_by_side is not None:
-            batch.run_side_by_side(self._side_by_side)
+        several = self._for(count) if max_iterations > 0 else None
+        if several is not None:
+            batch.run_side_by_side(several)
         else:
             batch.run(self.entry)
         return result

@@ -14,3 +14,4 @@ def session_cache(tmp_path_factory: pytest.TempPathFactory) -> str:
 def own_cache(session_cache: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests share one cache, apart from the user's and from tests of the cache itself."""
     monkeypatch.setenv("CASADI_IK_CACHE", session_cache)
+    monkeypatch.delenv("CASADI_IK_CFLAGS", raising=False)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -19,7 +22,7 @@ from casadi_ik.kernels import (
 )
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
-from casadi_ik.kernels.loop import FEWEST
+from casadi_ik.kernels.loop import FEWEST, WORTH
 from casadi_ik.kernels.loop_job import SLOTS
 from casadi_ik.kernels.machine_lanes import machine_lanes
 
@@ -241,6 +244,31 @@ def test_unforeseen_code_is_refused_and_runs_one_by_one() -> None:
     assert kernel.lanes == 1
     result = kernel.run(np.full((9, 1), 0.1), [0.0], 1)
     np.testing.assert_array_equal(result.states, np.sinh(0.1))
+
+
+def test_few_solves_wait_for_no_compiler(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, lanes: int
+) -> None:
+    """Until a library is at hand, whoever had it made."""
+    monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
+    step = dataclasses.replace(counting_step(f"few_{lanes}"), recipe="counting")
+
+    def compiled() -> int:
+        return len(list(tmp_path.glob(f"few_{lanes}_lanes*.so")))
+
+    def run(kernel: LoopKernel, count: int) -> bytes:
+        states = np.arange(float(count))[:, None]
+        return kernel.run(states, [500.0], 1000, trace=True).states.tobytes()
+
+    early = LoopKernel(step)
+    few = run(early, WORTH - 1)
+    assert compiled() == 0
+    assert run(early, WORTH)[: len(few)] == few
+    assert compiled() == 1
+    later = LoopKernel(step)
+    assert later._for(FEWEST - 1) is None
+    assert later._for(FEWEST) is not None
+    assert run(later, WORTH - 1) == few
 
 
 def test_without_compiler_there_are_no_lanes() -> None:

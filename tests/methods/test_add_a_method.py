@@ -43,11 +43,11 @@ def near_home(page):
 
 
 def test_it_solves_a_batch_side_by_side(page, near_home):
+    kernel = page.solver._engine.method.kernel
+    assert not kernel.compiled or kernel.lanes > 1
     batch = page.solver.solve_batch(*near_home)
     assert batch.success.all(), batch.status_names
     assert (batch.iterations > 1).all()
-    kernel = page.solver._engine.method.kernel
-    assert not kernel.compiled or kernel.lanes > 1
     assert page.solver.parameters["options"] == {"damping": 0.2, "max_iterations": 300}
 
 

@@ -12,12 +12,17 @@ from pinocchio_oracle import PinocchioRobot, verdict
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnknownNameError, UnsupportedError
+from casadi_ik.kernels.codegen import row_major
+from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.methods.registry import build_method, method_summary
 
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
 ROBOTS = ik.shipped_names("arm_hands")
 SLOW = {("original-dls", "baxter_ar10"), ("original-sdls", "baxter_ar10")}
 """A hierarchy of ten contact tasks on 17 motors: minutes to compile, and never at the contacts."""
+
+CHOOSING = ("hand-first", "thumb-first")
+"""Methods that take the nearest of several solutions."""
 
 CASES = [(m, r) for m in ik.METHODS for r in ROBOTS if (m, r) not in SLOW]
 
@@ -28,6 +33,7 @@ class Case:
 
     robot: ik.ArmHand
     method: str
+    q: np.ndarray
     points: np.ndarray
     normals: np.ndarray
     solvers: dict
@@ -59,8 +65,8 @@ def case(request) -> Case:
     # Near enough to home for every method to have a fair chance, and different enough to be work.
     spread = 0.05 * (robot.upper - robot.lower)
     q = robot.home + rng.uniform(-1, 1, (8, n)) * spread
-    points, normals = robot.contacts(np.clip(q, robot.lower, robot.upper))
-    case = Case(robot, method, points, normals, {})
+    q = np.clip(q, robot.lower, robot.upper)
+    case = Case(robot, method, q, *robot.contacts(q), {})
     try:
         case.solver()
     except UnsupportedError as error:
@@ -174,12 +180,23 @@ def test_a_batch_is_its_single_solves(case):
 
 
 def test_a_batch_goes_side_by_side(case):
-    """No line of any shipped method's code is refused by the rewriting."""
+    """No line of any method's code is refused by the rewriting, and on one robot it is run."""
     options = {"finger_step": "closed-form"} if case.method.startswith("enhanced") else {}
     kernel = getattr(build_method(case.method, case.robot.description, options), "kernel", None)
     if kernel is None or not kernel.compiled:
         pytest.skip("no compiled loop")
+    if case.robot.name != "kuka_lwr_barrett":
+        assert "lanes_" in lanes_source(row_major(kernel.step.function), "", 4)
+        return
     assert kernel.lanes > 1
+    one_by_one = [
+        case.solver().solve_batch(point[None], normal[None])
+        for point, normal in zip(case.points, case.normals, strict=True)
+    ]
+    options = {"finger_step": "closed-form"} if case.method in PAPER else {}
+    batch = ik.Solver(case.robot, case.method, **options).solve_batch(case.points, case.normals)
+    for row, alone in enumerate(one_by_one):
+        fields_equal(batch, alone, slice(row, row + 1))
 
 
 def test_threads_change_nothing(case):
@@ -197,7 +214,7 @@ def test_starts_row_by_row(case):
         solver.solve_batch(case.points, case.normals, q0=robot.home),
         solver.solve_batch(case.points, case.normals, q0=q0),
     )
-    same = {"prefer": "limits"} if case.method == "hand-first" else {}
+    same = {"prefer": "limits"} if case.method in CHOOSING else {}
     home = solver.solve_batch(case.points, case.normals)
     fields_equal(home, solver.solve_batch(case.points, case.normals, q0=q0, **same))
     before = q0.copy()
@@ -205,6 +222,16 @@ def test_starts_row_by_row(case):
     moved = solver.solve_batch(case.points, case.normals, q0=q0, **same)
     np.testing.assert_array_equal(moved.q[0], home.q[0])
     np.testing.assert_array_equal(before[0], q0[0], "starts are not written to")
+
+
+def test_a_start_that_solves_already_is_the_answer(case):
+    """But for the paper's methods, which stand as the paper has them: they begin by moving."""
+    if case.method in PAPER:
+        pytest.skip("the paper's method reaches with the thumb first, wherever it is")
+    batch = case.solver().solve_batch(case.points, case.normals, q0=case.q)
+    np.testing.assert_array_equal(batch.q, case.q)
+    assert batch.success.all()
+    np.testing.assert_array_equal(case.solver().solve(case.grasp(), q0=case.q[0]).q, case.q[0])
 
 
 def test_an_empty_batch(case):

@@ -14,6 +14,7 @@ from casadi_ik.methods.common.numeric_arm import (
     pose_step,
 )
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
+from casadi_ik.methods.common.whole_contacts import whole_jacobian, whole_residual
 from casadi_ik.methods.hand_first.hand_fit import (
     PalmAndHand,
     fit_jacobian,
@@ -22,7 +23,6 @@ from casadi_ik.methods.hand_first.hand_fit import (
 )
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
-from casadi_ik.methods.hand_first.whole_fit import whole_jacobian, whole_residual
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.contacts.kinds import usual
 from casadi_ik.problem.contacts.rows import ContactRows, chord, within_tolerance

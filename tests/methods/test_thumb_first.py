@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from itertools import pairwise
 
 import numpy as np
@@ -105,6 +106,35 @@ def test_trace_of_a_solve(robot, method, rng):
     assert rejected > 0
 
 
+def test_the_nearest_of_what_is_seen(robot, rng):
+    """It moved as far as without a start, and from some solved nothing."""
+    q, q0 = robot.random(rng, 400), robot.random(rng, 400)
+    solver, targets = ik.Solver(robot, "thumb-first"), robot.contacts(q)
+    near = solver.solve_batch(*targets, q0=q0)
+    far = solver.solve_batch(*targets, q0=q0, prefer="limits")
+    assert near.success.all()
+    assert far.success.all()
+    np.testing.assert_array_equal(far.q, solver.solve_batch(*targets).q)
+    ranges = robot.upper - robot.lower
+    moved = [np.linalg.norm((batch.q - q0) / ranges, axis=1) for batch in (near, far)]
+    assert (moved[0] <= moved[1]).mean() > 0.9
+    close = np.clip(q + rng.uniform(-0.02, 0.02, q.shape) * ranges, robot.lower, robot.upper)
+    followed = solver.solve_batch(*targets, q0=close)
+    assert followed.success.all()
+    assert np.median(np.abs((followed.q - close) / ranges).max(axis=1)) < 0.05
+
+
+def test_contacts_that_contradict_each_other_a_little_are_balanced(robot, rng):
+    """71 % of them were solved."""
+    points, normals = robot.contacts(robot.random(rng, 500))
+    points = points + rng.normal(0, 4e-3, points.shape)
+    normals = normals + rng.normal(0, np.radians(2), normals.shape)
+    batch = ik.Solver(robot, "thumb-first").solve_batch(points, normals)
+    assert batch.success.mean() > 0.94
+    assert batch.phases["balance"].any()
+    assert batch.limits_ok.all()
+
+
 def test_out_of_reach_the_best_is_kept(robot, method, rng):
     asked = problems(robot, robot.random(rng, 10))
     far = Problems(asked.points + np.array([3.0, 0, 0]), asked.normals, PAPER, True)
@@ -149,15 +179,16 @@ def test_locked_actuators_stay(robot, method, rng):
 def test_the_start_chooses_between_hands(robot, once, rng):
     """Of several hands for the same contacts, the one near q0 is begun with."""
     q = robot.random(rng, 200)
-    asked = problems(robot, q)
-    batches = [Engine(robot, once).solve(asked, Run(q0)) for q0 in (robot.home, q)]
+    asked = dataclasses.replace(problems(robot, q), prefer="q0")
+    around = np.clip(q + rng.normal(0, 0.3, q.shape), robot.lower, robot.upper)
+    batches = [Engine(robot, once).solve(asked, Run(q0)) for q0 in (robot.home, around)]
     hand = list(once.step.robot.hand_actuators)
     from_home, from_truth = (np.abs(batch.q - q)[:, hand].max(axis=1) for batch in batches)
     assert np.median(from_truth) < np.median(from_home)
 
 
 def test_an_arm_without_a_closed_form(tmp_path_factory):
-    robot = derived_robot(tmp_path_factory.mktemp("offset"), elbow_offset=0.045)
+    robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
     other = ThumbFirstMethod(robot.description, ThumbFirstParameters())
     assert other.step.arm is None
     batch = solve(robot, other, problems(robot, robot.random(np.random.default_rng(5), 200)))

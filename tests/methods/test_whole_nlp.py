@@ -9,7 +9,7 @@ from toy_robots import replace, write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError
-from casadi_ik.methods.hand_first.whole_fit import whole_residual
+from casadi_ik.methods.common.whole_contacts import whole_residual
 from casadi_ik.methods.ipopt.contacts import LENGTH
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.watch import EXACT

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import casadi as ca
 
-from casadi_ik.methods.common.balance import CLOSER, Balanced, balance_step
-from casadi_ik.methods.common.bounded_step import Bounded
+from casadi_ik.methods.common.balance import CLOSER
 from casadi_ik.methods.common.contact_fit import fresh_fit
+from casadi_ik.methods.common.whole_contacts import whole_balance
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
-from casadi_ik.methods.hand_first.whole_fit import whole_jacobian, whole_residual
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
 
 
@@ -21,7 +19,7 @@ def balance_stage(layouts: HandFirstLayouts) -> ca.Function:
     """
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
-    balanced = _step(layouts, s, p)
+    balanced = whole_balance(layouts.robot, layouts.contacts, s, p)
     failed = ca.logic_and(balanced.over, ca.logic_not(balanced.within))
     fit = {
         name: ca.if_else(failed, fresh_fit().get(name, 0.0), balanced.fit[name])
@@ -43,15 +41,3 @@ def balance_stage(layouts: HandFirstLayouts) -> ca.Function:
         s, p, s["q"], Phase.BALANCE, status, balanced.tried, accepted=balanced.accepted
     )
     return ca.Function("balance", [state, parameters], shared(after, record, status))
-
-
-def _step(layouts: HandFirstLayouts, s: dict[str, Expr], p: dict[str, Expr]) -> Balanced:
-    robot = layouts.robot
-    return balance_step(
-        lambda q: whole_residual(robot, layouts.contacts, q, p),
-        whole_jacobian(robot, layouts.contacts, s["q"], p),
-        Bounded(s["q"], p["lower"], p["upper"], first=0),
-        layouts.contacts,
-        s,
-        p,
-    )

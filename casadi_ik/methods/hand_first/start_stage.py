@@ -5,8 +5,8 @@ from __future__ import annotations
 import casadi as ca
 
 from casadi_ik.methods.common.contact_fit import Tried
+from casadi_ik.methods.common.whole_contacts import whole_residual
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
-from casadi_ik.methods.hand_first.whole_fit import whole_residual
 from casadi_ik.problem.contacts.rows import chord, within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.smooth import Expr

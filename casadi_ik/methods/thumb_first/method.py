@@ -9,7 +9,6 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Counts
-from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import StepGraph
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.common.posture_table import PostureTable
@@ -21,10 +20,13 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.target import target_values
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
+from casadi_ik.symbolic.closed_arms.recognise import arm_form
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
+
+NEAREST = "q0"
+"""The preference for what is near the start."""
 
 
 class ThumbFirstMethod(LoopedMethod):
@@ -35,9 +37,11 @@ class ThumbFirstMethod(LoopedMethod):
 
     Attributes:
         step: Its step for this robot; in the virtual machine if it is ProxQP's.
+        preferences: What it can prefer.
     """
 
     name = "thumb-first"
+    preferences = ("limits", NEAREST)
     follows_closed_chain = True
     takes_free_contacts = True
     takes_fixed_actuators = True
@@ -54,7 +58,7 @@ class ThumbFirstMethod(LoopedMethod):
         self.options: ThumbFirstParameters = options
         self.rounds = 1 if options.starts == 1 else 2
         self._kinds = kinds or usual(len(robot.fingers))
-        self.step = ThumbFirstStep(robot, options, self._kinds, _closed_form(robot))
+        self.step = ThumbFirstStep(robot, options, self._kinds, arm_form(robot))
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""
@@ -85,14 +89,15 @@ class ThumbFirstMethod(LoopedMethod):
     def begin(
         self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
     ) -> Start:
-        """Start from the palm estimates of the round; of hands that look alike, q0's is nearest."""
-        starts = self.options.starts if number else 1
-        count, step = len(problems), self.step
+        """Start where the robot is, if its nearest is wanted, and from estimates of the palm."""
+        count, step, most = len(problems), self.step, self.options.starts
         lower, upper = problems.bounds(self.robot, UNBOUNDED)
         hand = list(self.robot.hand_actuators)
-        found = self.table.nearest(problems.points, problems.normals, starts, q0[:, hand])
-        postures = np.zeros((count, self.options.starts, len(hand)))
-        postures[:, :starts] = found
+        here = np.clip(q0, lower, upper)
+        nearest = problems.prefer == NEAREST
+        found = self._hands(problems, here[:, hand], nearest, most if number else 1)[:, :most]
+        postures = np.zeros((count, most, len(hand)))
+        postures[:, : found.shape[1]] = found
         known = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
         values = {
             **target_values(problems),
@@ -104,7 +109,9 @@ class ThumbFirstMethod(LoopedMethod):
             "lower": lower,
             "upper": upper,
             "postures": np.clip(postures, lower[hand], upper[hand]),
-            "given": starts,
+            "given": found.shape[1],
+            "here": here,
+            "nearest": float(nearest),
             "first_damping": self.options.damping,
             "step_cap": self.options.step_cap,
         }
@@ -114,13 +121,41 @@ class ThumbFirstMethod(LoopedMethod):
             states[:, step.state.slice("phase")] = Phase.CANDIDATE
             return states, parameters
         first = {item.name: np.zeros(item.shape) for item in step.state} | {
-            "q": q0,
+            "q": here if nearest else q0,
             "passed": -1.0,
-            "phase": Phase.CANDIDATE,
+            "phase": Phase.HAND_ALIGNMENT if nearest else Phase.CANDIDATE,
+            "start": -float(nearest),
+            "damping": self.options.damping,
             "best_q": q0,
             "best_cost": np.finfo(float).max,
         }
         return step.state.pack_rows(first, count), parameters
+
+    def _hands(self, problems: Problems, own: Array, nearest: bool, count: int) -> Array:
+        """Hands (k, c, hand) to begin with: of those that look alike, the nearest is first.
+
+        Args:
+            problems: k targets.
+            own: (k, hand) the robot's own.
+            nearest: Whether what is near to that is wanted, not what is near to its home.
+            count: How many of the table.
+        """
+        targets = problems.points, problems.normals
+        home = np.tile(self._home, (len(own), 1))
+        if not nearest:
+            return self.table.nearest(*targets, count, home)
+        found = self.table.nearest(*targets, 1, own)
+        if count > 1:
+            # What is near was a dead end: from here on as if nothing was preferred.
+            found = np.concatenate([found, self.table.nearest(*targets, count, home)], axis=1)
+        # A hand without an arm has begun there already.
+        if not self.robot.arm_actuators:
+            return found
+        return np.concatenate([own[:, None], found], axis=1)
+
+    @cached_property
+    def _home(self) -> Array:
+        return ArmHand(self.robot).home[list(self.robot.hand_actuators)]
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """The step counts them."""
@@ -131,11 +166,4 @@ class ThumbFirstMethod(LoopedMethod):
     def restarts(self, states: Array) -> Counts:
         """Palm estimates begun from but the first."""
         start = states[:, self.step.state.slice("start").start].astype(np.int64)
-        return np.minimum(start, self.options.starts - 1)
-
-
-def _closed_form(robot: RobotDescription) -> SrsArm | None:
-    try:
-        return srs_arm(robot)
-    except UnsupportedError:
-        return None
+        return np.clip(start, 0, self.options.starts - 1)

@@ -31,7 +31,7 @@ from casadi_ik.problem.trace import (
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr
 
-STAGES = (Phase.HAND_ALIGNMENT, Phase.CANDIDATE, Phase.ARM_PLACEMENT)
+STAGES = (Phase.HAND_ALIGNMENT, Phase.CANDIDATE, Phase.ARM_PLACEMENT, Phase.BALANCE)
 """What an iteration may be, the most frequent first."""
 
 NOTHING = float("nan")
@@ -67,12 +67,14 @@ class ThumbFirstLayouts:
                 Field("palm_origin", (3,), unit="m"),
                 Field("passed", doc="how far the last arm of the table was from the palm wanted"),
                 Field("phase"),
-                Field("start", doc="number of the palm estimate begun from"),
+                Field("start", doc="number of the palm estimate begun from; -1: as the robot is"),
                 Field("damping"),
                 Field("growth", doc="placement: factor of the damping if the next step is vain"),
                 Field("cost", doc="placement: squared distance from the palm pose"),
                 Field("waited", doc="iterations in a row that gained little"),
                 Field("spent", doc="iterations in this phase"),
+                Field("power", doc="powers done while the contacts are balanced"),
+                Field("balanced", doc="cost at which contacts were last balanced, 0: never"),
                 Field("best_cost", doc="smallest summed squares of the contacts so far"),
                 Field("best_q", (n,), doc="the configuration it belongs to"),
                 Field("counts", (len(STAGES),), doc="iterations by stage, in the order of STAGES"),
@@ -93,6 +95,8 @@ class ThumbFirstLayouts:
                 Field("upper", (n,), doc="upper bounds of q"),
                 Field("postures", (self.options.starts, hand), doc="hands to begin with"),
                 Field("given", doc="how many of them are there"),
+                Field("here", (n,), doc="where the robot is, within bounds"),
+                Field("nearest", doc="1 if a solution near to that is wanted"),
                 Field("first_damping"),
                 Field("step_cap"),
             )
@@ -116,6 +120,20 @@ class ThumbFirstLayouts:
             PHASE.of(robot),
             STATUS.of(robot),
         )
+
+    def after(
+        self, s: dict[str, Expr], stage: Phase, fit: dict[str, Expr], **changed: Expr
+    ) -> Expr:
+        """The state (size, 1) with one more iteration spent in a stage, and with what it changed.
+
+        Args:
+            s: State before it.
+            stage: What it was.
+            fit: Counters and damping.
+            changed: Other fields, and those of `fit` that are otherwise.
+        """
+        one = ca.DM([float(stage == other) for other in STAGES])
+        return self.state.pack(s | {"counts": s["counts"] + one} | fit | changed)
 
     def row(
         self,
@@ -147,7 +165,7 @@ class ThumbFirstLayouts:
             "step_size": NOTHING,
             "active_mask": ca.DM.zeros(LIMIT_MASK.of(self.robot).size, 1),
             "limit_mask": bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
-            "restart": s["start"],
+            "restart": ca.fmax(s["start"], 0.0),
             "accepted": 0.0,
             "phase": float(phase),
             "status": status,

@@ -8,7 +8,12 @@ candidate  take the next hand posture, the palm pose that brings it closest to t
            the arm for that palm (in closed form, or the nearest of a table);
 placement  arms without a closed form only: a damped step towards that palm pose;
 alignment  one Gauss-Newton step of the other fingers along the closed chain, limits kept; taken
-           if it lowers the summed squares of all contacts, else tried again with more damping.
+           if it lowers the summed squares of all contacts, else tried again with more damping;
+balance    one step of all motors towards the smallest largest error, where the contacts are
+           missed by little.
+
+If a solution near to where the robot is is wanted, the first start is the robot as it is, the
+second its hand with the arm nearest to its own.
 """
 
 from __future__ import annotations
@@ -19,11 +24,13 @@ import casadi as ca
 
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
-from casadi_ik.methods.common.arm_placement import place_arm
+from casadi_ik.methods.common.balance import NEAR, differs
 from casadi_ik.methods.common.contact_fit import DAMPING_START, fresh_fit, judge
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.methods.common.numeric_arm import nearest_start, pose_step
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
+from casadi_ik.methods.thumb_first.arm_start import arm_start
+from casadi_ik.methods.thumb_first.balance_stage import balance_stage
 from casadi_ik.methods.thumb_first.closed_chain_step import (
     STEP_SOLVERS,
     Linear,
@@ -36,9 +43,9 @@ from casadi_ik.problem.contacts.kinds import suffix
 from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.actuated import motor_scales
+from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
 
 EASED, TIGHTENED = 1 / 3, 4.0
@@ -52,6 +59,10 @@ GAIN, PATIENCE, BUDGET = 0.9, 12, 100
 and after BUDGET iterations in any case."""
 
 
+AS_IT_IS = 0.5
+"""Summed squares up to which the robot as it is, or its hand, is worth a start."""
+
+
 @dataclass(frozen=True, eq=False)
 class ThumbFirstStep(ThumbFirstLayouts):
     """Builds the step graph for one robot.
@@ -59,10 +70,10 @@ class ThumbFirstStep(ThumbFirstLayouts):
     Without an arm the palm is fixed: the same step then moves the fingers alone.
 
     Attributes:
-        arm: Constants of an S-R-S arm, or None: then the arm's start is found numerically.
+        arm: The arm in closed form, or None: then its start is found numerically.
     """
 
-    arm: SrsArm | None
+    arm: ArmForm | None
 
     def graph(self) -> StepGraph:
         """The whole iteration; compilable unless the step is ProxQP's."""
@@ -88,6 +99,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         # Only arms without a closed form are placed step by step; nobody else gets there.
         numeric = self.arm is None and self.robot.arm_actuators
         stages[Phase.ARM_PLACEMENT] = self._placement() if numeric else stages[Phase.CANDIDATE]
+        stages[Phase.BALANCE] = balance_stage(self)
         cases = [stages[phase] for phase in STAGES]
         stage = sum(
             (
@@ -112,8 +124,8 @@ class ThumbFirstStep(ThumbFirstLayouts):
         columns = list(self.robot.arm_actuators)
         arm, passed = s["q"][columns], s["passed"]
         if self.arm is not None:
-            lower, upper = p["lower"][columns], p["upper"][columns]
-            arm, _ = place_arm(self.arm, Pose(rotation, origin), lower, upper, ca.MX(0))
+            given = (p[name][columns] for name in ("here", "lower", "upper"))
+            arm = arm_start(self.robot, self.arm)(p["nearest"], rotation, origin, *given)
         elif columns:
             # Another start gets another arm as well: the next nearest of the table.
             arm, passed = nearest_start(self.robot)(rotation, origin, passed)
@@ -142,21 +154,24 @@ class ThumbFirstStep(ThumbFirstLayouts):
         )
         rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
         passed = ca.SX.sym("passed")
+        numeric = self.arm is None and self.robot.arm_actuators
+        columns = list(self.robot.arm_actuators)
+        # An arm that is found step by step begins as it is, for the first hand and for another.
+        as_it_is = ca.logic_and(p["nearest"], s["start"] <= 1) if numeric else ca.SX(0)
         started = ca.SX.zeros(s["q"].numel(), 1)
         started[list(self.robot.hand_actuators)] = hand
-        started[list(self.robot.arm_actuators)] = arm
+        started[columns] = ca.if_else(as_it_is, p["here"][columns], arm)
         started = ca.fmin(ca.fmax(started, p["lower"]), p["upper"])
         exhausted = s["start"] >= p["given"]
         q = ca.if_else(exhausted, s["best_q"], started)
-        numeric = self.arm is None and self.robot.arm_actuators
-        after = self._next(
+        after = self.after(
             s,
             Phase.CANDIDATE,
             fresh_fit(),
             q=q,
             palm_rotation=rotation,
             palm_origin=origin,
-            passed=passed,
+            passed=ca.if_else(as_it_is, s["passed"], passed),
             phase=float(Phase.ARM_PLACEMENT if numeric else Phase.HAND_ALIGNMENT),
             damping=DAMPING_START if numeric else p["first_damping"],
         )
@@ -174,7 +189,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         judged = judge(s, tried, within=ca.SX(0), exact=ca.SX(0))
         q = ca.SX(s["q"])
         q[columns] = ca.if_else(judged.accepted, tried.reached, s["q"][columns])
-        after = self._next(
+        after = self.after(
             s,
             Phase.ARM_PLACEMENT,
             judged.fit,
@@ -227,7 +242,10 @@ class ThumbFirstStep(ThumbFirstLayouts):
         )
         tried = ca.fmin(ca.fmax(s["q"] + capped, p["lower"]), p["upper"])
         before, there = (merit(self.robot, self.contacts, q, p) for q in (s["q"], tried))
-        accepted = there.cost < before.cost
+        # What meets the contacts stays; what begins too far away is not worth a start.
+        met, skipped = self._met(before, p), self._skipped(before, s, p)
+        stays = ca.logic_or(met, skipped)
+        accepted = ca.logic_and(there.cost < before.cost, ca.logic_not(stays))
         q = ca.if_else(accepted, tried, s["q"])
         left = Merit(
             ca.if_else(accepted, there.positions, before.positions),
@@ -235,24 +253,29 @@ class ThumbFirstStep(ThumbFirstLayouts):
             ca.if_else(accepted, there.cost, before.cost),
         )
         cost = left.cost
-        solved = within_tolerance(
-            left.positions, left.angles, p["position_tolerance"], p["angle_tolerance"]
-        )
+        solved = self._met(left, p)
         waited = ca.if_else(cost > GAIN * before.cost, s["waited"] + 1, 0.0)
         stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > DAMPING_CEILING)
         over = ca.logic_or(waited >= PATIENCE, s["spent"] + 1 >= BUDGET)
-        over = ca.logic_or(over, stuck)
+        over = ca.logic_or(ca.logic_or(over, stuck), skipped)
+        near = ca.logic_and(self._met(left, p, NEAR), differs(cost, s["balanced"]))
+        near = ca.logic_and(ca.logic_and(near, over), ca.logic_not(solved))
+        failed = ca.logic_and(over, ca.logic_not(ca.logic_or(solved, near)))
+        following = ca.if_else(over, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT))
+        eased = ca.fmax(s["damping"] * ca.if_else(accepted, EASED, TIGHTENED), DAMPING_FLOOR)
         better = cost < s["best_cost"]
-        after = self._next(
+        after = self.after(
             s,
             Phase.HAND_ALIGNMENT,
             {},
             q=q,
-            phase=ca.if_else(over, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT)),
-            start=s["start"] + ca.if_else(ca.logic_and(over, ca.logic_not(solved)), 1.0, 0.0),
-            damping=ca.fmax(s["damping"] * ca.if_else(accepted, EASED, TIGHTENED), DAMPING_FLOOR),
+            phase=ca.if_else(near, float(Phase.BALANCE), following),
+            start=s["start"] + failed,
+            damping=ca.if_else(near, DAMPING_START, eased),
             waited=waited,
-            spent=s["spent"] + 1,
+            spent=ca.if_else(near, 0.0, s["spent"] + 1),
+            power=0.0,
+            balanced=ca.if_else(near, cost, s["balanced"]),
             best_cost=ca.if_else(better, cost, s["best_cost"]),
             best_q=ca.if_else(better, q, s["best_q"]),
         )
@@ -272,8 +295,14 @@ class ThumbFirstStep(ThumbFirstLayouts):
         inputs = [state, parameters, step, held]
         return ca.Function("take", inputs, shared(after, record, status))
 
-    def _next(
-        self, s: dict[str, Expr], stage: Phase, fit: dict[str, Expr], **changed: Expr
-    ) -> Expr:
-        one = ca.DM([float(stage == other) for other in STAGES])
-        return self.state.pack(s | {"counts": s["counts"] + one} | fit | changed)
+    def _met(self, there: Merit, p: dict[str, Expr], times: float = 1.0) -> Expr:
+        """Whether every contact is within so many times its tolerance."""
+        tolerances = p["position_tolerance"], p["angle_tolerance"]
+        return within_tolerance(there.positions / times, there.angles / times, *tolerances)
+
+    def _skipped(self, before: Merit, s: dict[str, Expr], p: dict[str, Expr]) -> Expr:
+        """Whether the robot or its hand, as it is, is too far away to begin with."""
+        if not self.robot.arm_actuators:
+            return ca.SX(0)
+        begins = ca.logic_and(s["spent"] < 1, s["start"] <= 0)
+        return ca.logic_and(ca.logic_and(p["nearest"], begins), before.cost > AS_IT_IS)

@@ -19,10 +19,12 @@ from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.preference import preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
-from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
+from casadi_ik.solving.alternatives.branches import ArmBranch, Branches, best_arm
+from casadi_ik.solving.alternatives.form_branches import branches_of
 from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.measures import manipulability
+from casadi_ik.symbolic.srs_arm import SrsArm
 
 DISTINCT = 0.05
 """Hands and arms that are searched count as different if a motor differs by this part of its
@@ -46,7 +48,7 @@ class Alternative:
         q: (n,) actuator positions [rad or m], within limits unless they are ignored.
         contacts: Verdict by finger; all are met.
         posture: Number of the hand posture, the same for all solutions that share it.
-        branch: How the arm is bent and how far its elbow may swing; None for an arm without a
+        branch: How the arm is bent and how far it may be varied; None for an arm without a
             closed form, and for a hand without an arm.
         swivel: The swivel [rad] of q within `branch.swivel`, or None.
         margin: Smallest distance of any actuator from its limits as a part of half its range: 1
@@ -89,9 +91,9 @@ class AlternativeFinder:
         self._hand = list(robot.description.hand_actuators)
 
     @cached_property
-    def _branches(self) -> ArmBranches | None:
+    def _branches(self) -> Branches | None:
         arm = self._trials.method.step.arm
-        return None if arm is None else ArmBranches(arm, self._compiled)
+        return None if arm is None else branches_of(arm, self._compiled)
 
     @cached_property
     def _manipulability(self) -> FunctionKernel:
@@ -205,11 +207,23 @@ class AlternativeFinder:
 
         found = []
         for branch in self._branches.find(palm, lower, upper):
-            arm, swivel = self._branches.best(
-                palm, branch, lambda arms: self._score(with_arm(arms), q0, prefer, self._arm)
+            arm, swivel = best_arm(
+                self._branches,
+                palm,
+                branch,
+                lambda arms: self._score(with_arm(arms), q0, prefer, self._arm),
             )
             found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
-        return found or [_Found(q, posture)]
+        return self._exact(problems, found) or [_Found(q, posture)]
+
+    def _exact(self, problems: Problems, found: list[_Found]) -> list[_Found]:
+        """Arms that are only nearly of their form are brought to the contacts."""
+        form = self._trials.method.step.arm
+        if not found or form is None or isinstance(form, SrsArm) or form.exact:
+            return found
+        starts = np.stack([item.q for item in found])
+        ends = Descent(self._trials, problems).run(np.zeros(len(found), np.intp), starts)
+        return [replace(item, q=end) for item, end in zip(found, ends, strict=True)]
 
     def _searched(self, problems: Problems, q: Array, seed: int) -> list[Array]:
         """Different arms found from random ones, the hand starting as in q."""
