@@ -163,3 +163,17 @@ def test_generated_code_has_no_symbol_of_its_own(robot):
     ]
     assert heads == []
     assert "static int casadi_whole(" in text
+
+
+def test_kernels_compiled_ahead_with_progress(capsys):
+    assert main(["compile", "kuka_lwr_barrett"]) == 0
+    said = capsys.readouterr()
+    assert "COMPILED  1 robot in" in said.out
+    lines = [line for line in said.err.splitlines() if "kuka_lwr_barrett" in line]
+    assert [line.split()[3] for line in lines] == [f"{i}/6:" for i in range(1, 7)]
+
+
+def test_without_a_compiler_nothing_is_compiled_ahead(monkeypatch, capsys):
+    monkeypatch.setenv("CC", "none")
+    assert main(["compile", "kuka_lwr_barrett"]) == 2
+    assert "there is no C compiler" in capsys.readouterr().err
