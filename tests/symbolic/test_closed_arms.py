@@ -21,15 +21,15 @@ from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.srs_arm import SrsArm
 
 KINDS = {
-    "panda": "7 joints, spherical shoulder, joint 7 swept",
-    "fr3": "7 joints, spherical shoulder, joint 7 swept",
-    "xarm7": "7 joints, spherical shoulder, joint 7 swept",
-    "kinova_gen3": "7 joints, spherical wrist, joint 1 swept",
-    "puma560": "6 joints, spherical wrist",
-    "viperx_300s": "6 joints, spherical wrist",
-    "jaco2": "6 joints, spherical wrist",
-    "irb140": "6 joints, spherical wrist, parallel elbow",
-    **{f"ur{name}": "6 joints, three parallel" for name in ("3e", "5e", "10e", "16e", "5", "10")},
+    "panda": "spherical shoulder, joint 7 swept",
+    "fr3": "spherical shoulder, joint 7 swept",
+    "xarm7": "spherical shoulder, joint 7 swept",
+    "kinova_gen3": "spherical wrist, joint 1 swept",
+    "puma560": "spherical wrist",
+    "viperx_300s": "spherical wrist",
+    "jaco2": "spherical wrist",
+    "irb140": "spherical wrist",
+    **{f"ur{name}": "three parallel axes" for name in ("3e", "5e", "10e", "16e", "5", "10")},
 }
 """What the arms of the catalogue are, by their makers' drawings."""
 

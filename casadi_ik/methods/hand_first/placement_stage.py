@@ -6,6 +6,7 @@ import casadi as ca
 
 from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, place_arm
 from casadi_ik.methods.common.form_search import PLACEMENT, THOROUGH, place_form, trials
+from casadi_ik.methods.common.nearly_closed import brought_to
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.closed_arms.recognise import ArmForm
@@ -24,14 +25,18 @@ def placement_stage(layouts: HandFirstLayouts, form: ArmForm) -> ca.Function:
     lower, upper = p["lower"][columns], p["upper"][columns]
     if isinstance(form, SrsArm):
         arm, margin = place_arm(form, palm, lower, upper, s["spent"])
+        hits = ca.MX(1)
         most = ITERATIONS, ITERATIONS
         place, swivel = _placed(layouts, most, exact=True), s["swivel"]
     else:
         found = place_form(form, palm, lower, upper, s["spent"], s["swivel"])
         arm, margin, swivel = found
+        hits = ca.MX(1)
+        if not form.exact:
+            arm, hits = brought_to(layouts.robot, arm, palm, p["lower"], p["upper"])
         most = trials(form, PLACEMENT), trials(form, THOROUGH)
         place = _placed(layouts, most, form.exact)
-    outputs = place(state, parameters, arm, margin, swivel)
+    outputs = place(state, parameters, arm, margin, swivel, hits)
     return ca.Function("placement", [state, parameters], list(outputs))
 
 
@@ -41,8 +46,8 @@ def _placed(layouts: HandFirstLayouts, most: tuple[int, int], exact: bool) -> ca
     Args:
         layouts: Of the robot.
         most: Trials of the stage, in the first round and in those after it.
-        exact: Whether the arm brings the palm where it was asked for. One of an arm that is only
-            nearly of its form is refined.
+        exact: Whether the arm brings the palm where it was asked for in any case; else the last
+            input says it.
     """
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
@@ -58,7 +63,9 @@ def _placed(layouts: HandFirstLayouts, most: tuple[int, int], exact: bool) -> ca
     q = with_rows(s["q"], columns, best)
     q = ca.fmin(ca.fmax(q, p["lower"]), p["upper"])
     # The last candidate is placed even if its hand does not fit.
-    solved = ca.logic_and(allowed, s["fits"] > 0) if exact else ca.SX(0)
+    hits = ca.SX.sym("hits")
+    solved = ca.logic_and(allowed, s["fits"] > 0)
+    solved = solved if exact else ca.logic_and(solved, hits)
     leave = ca.logic_or(allowed, over)
     after = layouts.state.pack(
         layouts.counted(s, Phase.ARM_PLACEMENT)
@@ -73,5 +80,5 @@ def _placed(layouts: HandFirstLayouts, most: tuple[int, int], exact: bool) -> ca
     )
     status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
     record = layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
-    inputs = [state, parameters, arm, margin, swivel]
+    inputs = [state, parameters, arm, margin, swivel, hits]
     return ca.Function("place", inputs, shared(after, record, status))

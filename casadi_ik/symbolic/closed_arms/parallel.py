@@ -38,7 +38,7 @@ class ParallelTriple(ClosedForm):
     @property
     def kind(self) -> str:
         """What the arm is."""
-        return f"{len(self.screws)} joints, three parallel"
+        return "three parallel axes"
 
     @property
     def parts(self) -> tuple[str, str, str]:

@@ -50,11 +50,10 @@ def form_in_words(robot: RobotDescription) -> str:
         return "no arm"
     form = arm_form(robot)
     if form is None:
-        return "none: the arm is searched"
+        return "none, searched"
     if isinstance(form, SrsArm):
-        return "7 joints, spherical shoulder and wrist, elbow swings"
-    near = "" if form.exact else f", nearly ({1e3 * form.off:.2g} mm or mrad off)"
-    return form.kind + near
+        return "spherical shoulder and wrist"
+    return form.kind if form.exact else f"nearly {form.kind}"
 
 
 def closed_form(robot: RobotDescription) -> ClosedForm:

@@ -34,8 +34,10 @@ class SphericalArm(ClosedForm):
     end: SphericalEnd
 
     @property
-    def _sphere(self) -> str:
-        return "shoulder" if self.screws.reverse else "wrist"
+    def kind(self) -> str:
+        """Where the sphere is, and which joint is swept."""
+        sphere = f"spherical {'shoulder' if self.screws.reverse else 'wrist'}"
+        return f"{sphere}, joint {self.screws.joints[0] + 1} swept" if self.swept else sphere
 
     def _base(self, joints: dict[int, Expr], turns: list[Turn], motion: Pose, slack: Expr) -> Bend:
         """A bend of the first three screws, and what they leave to the sphere."""
@@ -79,14 +81,6 @@ class MeetingAxes(SphericalArm):
     """
 
     shoulder: Array
-
-    @property
-    def kind(self) -> str:
-        """What the arm is."""
-        count = len(self.screws)
-        if not self.swept:
-            return f"{count} joints, spherical {self._sphere}"
-        return f"{count} joints, spherical {self._sphere}, joint {self.screws.joints[0] + 1} swept"
 
     @property
     def parts(self) -> tuple[str, str, str]:
@@ -147,14 +141,6 @@ class ParallelPair(SphericalArm):
 
     The first one sets how far the sphere's point is aside of that plane.
     """
-
-    @property
-    def kind(self) -> str:
-        """What the arm is."""
-        count = len(self.screws)
-        if not self.swept:
-            return f"{count} joints, spherical {self._sphere}, parallel elbow"
-        return f"{count} joints, spherical {self._sphere}, joint {self.screws.joints[0] + 1} swept"
 
     @property
     def parts(self) -> tuple[str, str, str]:
