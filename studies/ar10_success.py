@@ -23,10 +23,8 @@ from casadi_ik.arrays import Array
 # (robot, rng, count) -> (count, n) configurations within limits.
 Configurations = Callable[[ik.ArmHand, np.random.Generator, int], Array]
 FINGERS = ("thumb", "index", "middle")
-TOLERANCES = {
-    "5 mm, 3 deg": ik.Tolerance(),
-    "1e-6 m, 1e-6 rad": ik.Tolerance(1e-6, 1e-6),
-}
+TOLERANCES = (5e-3, np.deg2rad(3)), (1e-6, 1e-6)
+"""Of a contact's place [m] and direction [rad], if not asked otherwise."""
 NEAR = 0.01
 """Near a limit: within this part of the range."""
 
@@ -72,11 +70,26 @@ def contacts(robot: ik.ArmHand, q: Array, fingers: Sequence[str]) -> tuple[Array
     return points, normals
 
 
+def tolerance_name(position: float, angle: float) -> str:
+    """A tolerance [m, rad] in the units in which it is a plain number."""
+    if position < 1e-4:
+        return f"{position:.2g} m, {angle:.2g} rad".replace("e-0", "e-")
+    return f"{1e3 * position:g} mm, {np.rad2deg(angle):.4g} deg"
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Solve, print the table and, if asked, write it."""
     parser = argparse.ArgumentParser(description="Success of hand-first on the AR10.")
     parser.add_argument("--count", type=int, default=1000, help="targets per set")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        nargs=2,
+        action="append",
+        metavar=("METRES", "RADIANS"),
+        help="of a contact's place and direction; may be given several times",
+    )
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder of report.md")
     options = parser.parse_args(arguments)
@@ -87,8 +100,9 @@ def main(arguments: list[str] | None = None) -> None:
     misses: list[str] = []
     for name in ("baxter_ar10", "ar10"):
         robot = ik.load_robot(name)
-        for label, tolerance in TOLERANCES.items():
-            solver = ik.Solver(robot, "hand-first", tolerance)
+        for position, angle in options.tolerance or TOLERANCES:
+            label = tolerance_name(position, angle)
+            solver = ik.Solver(robot, "hand-first", ik.Tolerance(position, angle))
             for index, (key, (made, fingers)) in enumerate(SETS.items()):
                 if made is pinches and not robot.description.arm_actuators:
                     continue  # without an arm they are six targets only

@@ -26,6 +26,10 @@ from casadi_ik.calibration import (
     HandModel,
     hand_parameters,
 )
+from casadi_ik.errors import InputError
+
+OUTLIERS = 0.1, 0.25
+"""Parts of the poses that are outliers, beside none, if not asked otherwise."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -44,23 +48,34 @@ def main(arguments: list[str] | None = None) -> None:
         help="standard deviation of a measured coordinate and angle",
     )
     parser.add_argument(
+        "--outliers",
+        type=float,
+        nargs=2,
+        default=OUTLIERS,
+        metavar=("FEW", "MANY"),
+        help="shares of outliers beside none; all but the first table are of the first",
+    )
+    parser.add_argument(
         "--out", type=Path, default=Path(__file__).parent / "results" / "calibration"
     )
     options = parser.parse_args(arguments)
+    few, many = options.outliers
+    if not 0 < few < many < 1:
+        raise InputError(f"--outliers: found {few:g} {many:g}, expected 0 < FEW < MANY < 1")
     options.out.mkdir(parents=True, exist_ok=True)
     robot = ik.load_robot(options.robot).description
     model = HandModel(robot, hand_parameters(robot, [FINGER]))
     hands, seed, poses, noise = options.hands, options.seed, options.poses, tuple(options.noise)
     results = {
         (loss, outliers): trials(model, hands, seed, loss, outliers, poses, noise)
-        for outliers in (0.0, 0.1, 0.25)
+        for outliers in (0.0, few, many)
         for loss in LOSSES
     }
     sizes = {
-        part: trials(model, hands, seed, "cauchy", 0.1, part, noise)
+        part: trials(model, hands, seed, "cauchy", few, part, noise)
         for part in (poses // 4, poses // 2, 2 * poses)
     }
-    sizes[poses] = results["cauchy", 0.1]
+    sizes[poses] = results["cauchy", few]
     sizes = dict(sorted(sizes.items()))
     text = REPORT.format(
         command=command(__file__, arguments),
@@ -69,16 +84,18 @@ def main(arguments: list[str] | None = None) -> None:
         poses=poses,
         position=1e3 * noise[0],
         angle=math.degrees(noise[1]),
-        described=np.median(results["cauchy", 0.1].described),
+        few=100 * few,
+        many=100 * many,
+        described=np.median(results["cauchy", few].described),
         losses=loss_table(results),
         sizes=size_table(sizes),
-        groups=group_table(results["cauchy", 0.1]),
+        groups=group_table(results["cauchy", few]),
         unknown=results["cauchy", 0.0].last.unknown_directions,
         weak=len(results["cauchy", 0.0].last.unidentified()),
         directions=direction_table(results["cauchy", 0.0].last),
     )
     (options.out / "report.md").write_text(text, encoding="utf-8")
-    draw_bars(results, options.out / "error_bars.png")
+    draw_bars(results, few, options.out / "error_bars.png")
     draw_spectrum(results["cauchy", 0.0].last, options.out / "singular_values.png")
 
 
@@ -99,19 +116,19 @@ estimated from the true tip at 100 new postures, median / 90th percentile over h
 {losses}
 The 95 % intervals hold what they say with every loss, outliers or not: the covariance counts the
 scatter that there is. What robust losses gain is the size of the intervals and of the errors. The
-noise is estimated with the rest, from medians, which a quarter of outliers moves a little.
+noise is estimated with the rest, from medians, which {many:g} % of outliers move a little.
 
 ![Coverage of the intervals, and the distribution of the errors](error_bars.png)
 
 ## How many poses
 
-With 10 % outliers and the Cauchy loss:
+With {few:g} % outliers and the Cauchy loss:
 
 {sizes}
 ## What is learned
 
-By kind of number, 10 % outliers: the part of the prior's variance that the data took away, and how
-many of the true numbers the 95 % intervals hold.
+By kind of number, {few:g} % outliers: the part of the prior's variance that the data took
+away, and how many of the true numbers the 95 % intervals hold.
 
 {groups}
 ## What the data cannot know

@@ -15,6 +15,7 @@ def derived_robot(
     heights: dict[str, float] | None = None,
     mount: tuple[list[float], list[float]] | None = None,
     elbow_offset: float = 0.0,
+    wrist_offset: float = 0.0,
 ) -> ik.ArmHand:
     """The shipped arm-hand with changes.
 
@@ -23,6 +24,7 @@ def derived_robot(
         heights: z of a joint's origin [m], by the joint's number "1" to "7".
         mount: xyz [m] and rpy [rad] of the hand on the flange.
         elbow_offset: By how much axis 4 is moved off the links [m]: no S-R-S arm any more.
+        wrist_offset: The same of axis 6: no closed form at all.
     """
     path = copy_shipped_robot(folder)
     arm = yaml.safe_load((folder / "arm.yaml").read_text())
@@ -33,6 +35,9 @@ def derived_robot(
             joint["origin"]["xyz"] = [0, 0, z]
         if number in "45" and elbow_offset:
             x = elbow_offset if number == "4" else -elbow_offset
+            joint["origin"]["xyz"] = [x, 0, joint["origin"]["xyz"][2]]
+        if number in "67" and wrist_offset:
+            x = wrist_offset if number == "6" else -wrist_offset
             joint["origin"]["xyz"] = [x, 0, joint["origin"]["xyz"][2]]
     (folder / "arm.yaml").write_text(yaml.safe_dump(arm))
     if mount is not None:

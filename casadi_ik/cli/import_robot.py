@@ -23,9 +23,15 @@ from casadi_ik.importing.check import largest_difference
 from casadi_ik.importing.imported import Imported
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.robots.part import PREFIX
+from casadi_ik.symbolic.closed_arms.recognise import arm_form, form_in_words
 
 SAMPLES = 20
 """Postures in which kinematics are compared."""
+
+SEARCHED = (
+    "  the arm has no known closed form: it is searched, and a solve takes several times as long"
+)
+"""Said of an arm whose axes are those of no family."""
 
 SAME = 1e-9
 """Poses that differ by no more [m, or in their axes] are the same."""
@@ -151,6 +157,8 @@ def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> l
         pairs["tip"] = f"{lines.arm.end}: {lines.arm.how}"
         pairs["mount"] = lines.mount_how
     pairs["palm"] = f"{lines.hand.end}: {lines.hand.how}"
+    if arm:
+        pairs["closed form"] = form_in_words(description)
     pairs["thumb"] = f"{lines.thumb[0]}: {lines.thumb[1]}"
     for line in filter(None, (lines.arm, lines.hand)):
         if line.limits:
@@ -162,9 +170,12 @@ def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> l
         pairs[f"check {name}"] = f"{verdict}: poses differ by at most {value:.1e}"
     rows = table("finger", "pad on link", "joints", "point [mm]", "normal", right=("joints",))
     for branch, pad in zip(found.branches, found.pads, strict=True):
-        point = " ".join(f"{1e3 * value:.1f}" for value in pad.point)
+        # What is rounded to -0.0 is zero.
+        point = " ".join(f"{round(1e3 * value, 1) + 0.0:.1f}" for value in pad.point)
         normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal.tolist())
         rows.add_row(branch.name, pad.link, str(len(branch.chain)), point, normal)
     notes: list[RenderableType] = [Text(f"  {note}", "yellow") for note in lines.notes]
+    if description.arm_actuators and arm_form(description) is None:
+        notes.append(Text(SEARCHED, "yellow"))
     guessed = Text("  pads, thumb, palm and home are guesses: see the lines marked GUESS", "yellow")
     return [headline(True, "IMPORTED", what), fields(pairs), rows, *notes, guessed]

@@ -14,6 +14,7 @@ from casadi_ik.grasps.load import GraspFile
 from casadi_ik.methods.registry import METHODS, method_summary
 from casadi_ik.robots import load_description
 from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile
+from casadi_ik.symbolic.closed_arms.recognise import form_in_words
 
 
 def robots() -> Answer:
@@ -32,6 +33,8 @@ def robots() -> Answer:
             "fingers": f"{len(robot.fingers)}: {', '.join(fingers)}",
             "actuators": f"{len(robot.actuators)}: {', '.join(robot.actuator_names)}",
         }
+        if robot.arm_actuators:
+            pairs["arm"] = f"closed form: {form_in_words(robot)}"
         description = convert(read_yaml(path), ArmHandFile, path).description
         parts += [Text(name, "bold"), Text(f"  {description}"), fields(pairs)]
     return Answer(Group(*parts, *_catalogue()))
@@ -39,12 +42,14 @@ def robots() -> Answer:
 
 def _catalogue() -> list[RenderableType]:
     """The arms and hands that are put together by their names."""
-    arms = table("arm", "joints", "what it is", right=("joints",))
+    arms = table("arm", "joints", "closed form", "what it is", right=("joints",))
+    some_hand = shipped_names("hands")[0]
     for name in shipped_names("arms"):
         path = resolve(name, "arms")
         arm = convert(read_yaml(path), ArmFile, path)
         count = sum(joint.type != "fixed" for joint in arm.joints)
-        arms.add_row(name, str(count), _short(arm.description))
+        form = form_in_words(load_description(f"{name}+{some_hand}"))
+        arms.add_row(name, str(count), form, _short(arm.description))
     hands = table("hand", "motors", "fingers", "what it is", right=("motors", "fingers"))
     for name in shipped_names("hands"):
         path = resolve(name, "hands")

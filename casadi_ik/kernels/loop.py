@@ -18,8 +18,15 @@ from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, row_major
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
-from casadi_ik.kernels.loop_job import FIRST_MARK, SLOTS, CompiledBatch, SingleSolve
-from casadi_ik.kernels.loop_result import CODE_LIMIT, FAILED, NON_FINITE, REPEATED, LoopResult
+from casadi_ik.kernels.loop_job import FIRST_MARK, SLOTS, CompiledBatch
+from casadi_ik.kernels.loop_result import (
+    CODE_LIMIT,
+    FAILED,
+    FIRST_ROWS,
+    NON_FINITE,
+    REPEATED,
+    LoopResult,
+)
 from casadi_ik.kernels.loop_vm import run_vm
 from casadi_ik.kernels.machine_lanes import machine_lanes
 from casadi_ik.kernels.rows import row_driver
@@ -36,6 +43,12 @@ FEWEST = 4
 WORTH = 64
 """Solves from which on a compiler is waited for, if no library that makes them side by side is at
 hand. One by one they take a millisecond or two, and the compiler the better part of a minute."""
+
+SPARE = 1.25
+"""How much more room a trace begins with than the last one needed."""
+
+ROOM_BYTES = 2**24
+"""What it begins with at most [bytes]."""
 
 
 class LoopKernel:
@@ -64,10 +77,11 @@ class LoopKernel:
         library = self._load() if compiled and step.compilable else None
         self.compiled = library is not None
         self.entry: Any = None if library is None else library[SYMBOL]
+        self._rows_each = 0.0
 
     def _load(self) -> ctypes.CDLL | None:
         return load_library(
-            self.step.name, lambda: self._function, self._driver("loop"), SYMBOL, self.step.recipe
+            self.step.name, lambda: self.function, self._driver("loop"), SYMBOL, self.step.recipe
         )
 
     @property
@@ -104,7 +118,7 @@ class LoopKernel:
         try:
             library = load_library(
                 f"{self.step.name}_lanes{lanes}",
-                lambda: self._function,
+                lambda: self.function,
                 self._driver("loop_lanes"),
                 SYMBOL_LANES,
                 f"{self.step.recipe} lanes {lanes}" if self.step.recipe else "",
@@ -119,9 +133,10 @@ class LoopKernel:
             return None
         return None if library is None else library[SYMBOL_LANES]
 
-    def _driver(self, name: str) -> str:
-        """C text of one of the two drivers, with its constants."""
-        constants = {
+    @property
+    def constants(self) -> dict[str, int]:
+        """What the drivers expect, but what `row_driver` defines."""
+        return {
             "N_STATE": self.step.state.size,
             "N_PARAMETERS": self.step.parameters.size,
             "RUNNING": RUNNING,
@@ -133,11 +148,15 @@ class LoopKernel:
             "FIRST_MARK": FIRST_MARK,
             "STAGE": self.step.stage_place,
         }
+
+    def _driver(self, name: str) -> str:
+        """C text of one of the two drivers, with its constants."""
         job = driver_text("loop_job") + driver_text("marks")
-        return define(constants) + row_driver(self.step.record) + job + driver_text(name)
+        return define(self.constants) + row_driver(self.step.record) + job + driver_text(name)
 
     @cached_property
-    def _function(self) -> ca.Function:
+    def function(self) -> ca.Function:
+        """The step, row-major."""
         return row_major(self.step.function)
 
     def run(
@@ -183,19 +202,27 @@ class LoopKernel:
             iterations=np.zeros(count, dtype=np.int64),
             status=np.full(count, RUNNING, dtype=np.int32),
             time=np.zeros(count),
-            rows=np.empty(0, dtype=self.step.record.dtype) if trace else None,
+            rows=np.empty(self._room(count), dtype=self.step.record.dtype) if trace else None,
         )
         if not self.compiled:
-            run_vm(self.step, self._function, result, given, max_iterations)
+            run_vm(self.step, self.function, result, given, max_iterations)
             return result
         batch = CompiledBatch(self.step, result, given, max_iterations)
         several = self._for(count) if max_iterations > 0 else None
         if several is not None:
-            batch.run_side_by_side(several)
+            result = batch.run_side_by_side(several)
         else:
             batch.run(self.entry)
+        if count and result.rows is not None:
+            self._rows_each = len(result.rows) / count
         return result
 
-    def single(self) -> SingleSolve:
-        """One solve with memory of its own, to be made again and again; of compiled loops only."""
-        return SingleSolve(self.step, self.entry)
+    def _room(self, count: int) -> int:
+        """Rows to begin a trace of so many solves with, by what the last one came to.
+
+        To make room on the way costs more than to write the rows: it is cleared each time.
+        """
+        if not self.compiled:
+            return 0
+        rows = int(SPARE * self._rows_each * count) + FIRST_ROWS
+        return min(rows, max(ROOM_BYTES // max(self.step.record.dtype.itemsize, 1), FIRST_ROWS))

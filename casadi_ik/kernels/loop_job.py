@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import ctypes
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
-from casadi_ik.kernels.loop_result import FIRST_ROWS, LoopResult
+from casadi_ik.kernels.loop_result import LoopResult
 from casadi_ik.kernels.rows import opaque
-from casadi_ik.kernels.step_graph import RUNNING, StepGraph
+from casadi_ik.kernels.step_graph import StepGraph
 
 SLOTS = 32
 """Solves under way at once, of which four or eight have the lanes."""
@@ -90,23 +91,30 @@ class CompiledBatch:
         """
         self._run(loop)
 
-    def run_side_by_side(self, loop: Any) -> None:
+    def run_side_by_side(self, loop: Any) -> LoopResult:
         """As many solves at a time as there are lanes.
 
         Args:
             loop: `casadi_ik_loop_lanes` of a library.
+
+        Returns:
+            The result, its rows solve by solve.
 
         Raises:
             KernelError: No work memory, or the step failed.
         """
         slots = np.full(SLOTS, -1, dtype=np.int64)
         self.job.slots = memory(slots)
-        self._run(loop)
         if self.result.rows is not None:
-            self._put_in_order(self.result.rows)
+            self._places = np.empty((len(self.result.rows), 2), dtype=np.int64)
+        self._run(loop)
+        if self.result.rows is None:
+            return self.result
+        return replace(self.result, rows=self._in_order(self.result.rows))
 
     def _run(self, loop: Any) -> None:
-        self._rows_to(FIRST_ROWS)
+        if self.result.rows is not None:
+            self._rows_to(len(self.result.rows))
         while (code := loop(ctypes.byref(self.job))) != DriverCode.DONE:
             check(self.name, code)
             if code == DriverCode.ROWS_FULL:
@@ -122,42 +130,11 @@ class CompiledBatch:
             self.job.rows, self.job.places = memory(rows), memory(self._places)
             self.job.capacity = count
 
-    def _put_in_order(self, rows: NDArray[Any]) -> None:
+    def _in_order(self, rows: NDArray[Any]) -> NDArray[Any]:
         """Rows solve by solve, from the order in which they were made."""
         iterations = self.result.iterations
         first = np.cumsum(iterations) - iterations
         solve, iteration = self._places.T
-        opaque(rows)[first[solve] + iteration] = opaque(rows.copy())
-
-
-class SingleSolve:
-    """One compiled solve on fixed arrays, without a trace; not to be shared by threads.
-
-    Attributes:
-        parameters: (np,) write into it.
-        result: Of a batch of one; write the first state into `states`, a call overwrites all.
-    """
-
-    def __init__(self, step: StepGraph, loop: Any) -> None:
-        self.parameters = np.zeros(step.parameters.size)
-        self.result = LoopResult(
-            states=np.zeros((1, step.state.size)),
-            iterations=np.zeros(1, dtype=np.int64),
-            status=np.zeros(1, dtype=np.int32),
-            time=np.zeros(1),
-        )
-        self._loop = loop
-        self._batch = CompiledBatch(step, self.result, self.parameters, 0)
-        self._reference = ctypes.byref(self._batch.job)
-
-    def __call__(self, max_iterations: int) -> None:
-        """Solve, as `LoopKernel.run` does.
-
-        Raises:
-            KernelError: No work memory.
-        """
-        result, job = self.result, self._batch.job
-        result.iterations[0], result.status[0], result.time[0] = 0, RUNNING, 0.0
-        job.solve, job.max_iterations = 0, max_iterations
-        while (code := self._loop(self._reference)) != DriverCode.DONE:
-            check(self._batch.name, code)
+        ordered = np.empty_like(rows)
+        opaque(ordered)[first[solve] + iteration] = opaque(rows)
+        return ordered

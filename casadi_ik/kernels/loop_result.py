@@ -21,7 +21,7 @@ REPEATED = -3
 """Status of a solve that came back to an earlier state bit for bit, and so would for ever."""
 
 FIRST_ROWS = 256
-"""Rows a trace starts with; it doubles when they are full."""
+"""Rows a trace starts with at least; it doubles when they are full."""
 
 CODE_LIMIT = 2**31 - 1
 """A status has to be smaller than this (it is kept as int32)."""

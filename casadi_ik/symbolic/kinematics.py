@@ -29,7 +29,7 @@ class Pose:
 
     def rotate(self, vector: Array) -> ca.SX:
         """A constant (3,) direction of this frame in the base frame, (3, 1)."""
-        return self.rotation @ _sparse(np.asarray(vector, dtype=float).reshape(3, 1))
+        return self.rotation @ sparse(np.asarray(vector, dtype=float).reshape(3, 1))
 
     def inverse_apply(self, point: ca.SX) -> ca.SX:
         """A point of the base frame in this frame, (3, 1) [m]."""
@@ -134,7 +134,7 @@ def axis_rotation(axis: Array, angle: ca.SX) -> ca.SX:
     cross = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
     c, s = ca.cos(angle), ca.sin(angle)
     # Entry by entry: the sum of constant, cosine and sine parts keeps exact zeros and ones.
-    return ca.SX(_sparse(outer)) + ca.SX(_sparse(np.eye(3) - outer)) * c + ca.SX(_sparse(cross)) * s
+    return ca.SX(sparse(outer)) + ca.SX(sparse(np.eye(3) - outer)) * c + ca.SX(sparse(cross)) * s
 
 
 def number(value: ca.SX) -> Array:
@@ -143,10 +143,11 @@ def number(value: ca.SX) -> Array:
 
 
 def _constants(placement: Array) -> tuple[ca.DM, ca.DM]:
-    return _sparse(placement[:3, :3]), _sparse(placement[:3, 3:])
+    return sparse(placement[:3, :3]), sparse(placement[:3, 3:])
 
 
-def _sparse(array: Array) -> ca.DM:
+def sparse(array: Array) -> ca.DM:
+    """A constant without what is zero but for rounding."""
     exact = np.where(np.abs(array) < ROUNDING, 0.0, array)
     # Rotations by quarter turns come out of cosines as 1 - 1e-16; make them exact as well.
     near = np.round(exact)

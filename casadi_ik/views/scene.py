@@ -179,6 +179,8 @@ def _bent(found: Alternative) -> str:
         return f"hand posture {found.posture}"
     pairs = (("shoulder", branch.shoulder), ("elbow", branch.elbow), ("wrist", branch.wrist))
     signs = ", ".join(f"{name} {'+' if sign > 0 else '−'}" for name, sign in pairs)
+    if branch.swivel is None:
+        return signs
     start, end = branch.swivel
     return f"{signs}\nelbow swings {np.rad2deg(end - start):.0f}°"
 

@@ -19,13 +19,13 @@ NORMAL = np.array([0.6745, 0.8416, 1.0364, 1.2816, 1.6449, 1.96, 2.5758])
 """Half widths in standard deviations that hold so much of a normal variable."""
 
 
-def draw_bars(results: dict[tuple[str, float], Trials], path: Path) -> None:
-    """How far the coverage is from its level, and the errors over their standard deviations."""
+def draw_bars(results: dict[tuple[str, float], Trials], share: float, path: Path) -> None:
+    """Coverage against its level, and errors over deviations, without and with `share` outliers."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     levels, errors = figure.subplots(1, 2)
     colors = dict(zip(LOSSES, ("#2f6db3", "#1f9d55", "#e08a2e"), strict=True))
     for (loss, outliers), result in results.items():
-        if outliers == 0.25:
+        if outliers not in (0.0, share):
             continue
         off = [result.coverage(width) for width in NORMAL] - 100 * LEVELS
         style, fill = ("-", colors[loss]) if outliers else ("--", "white")
@@ -39,11 +39,11 @@ def draw_bars(results: dict[tuple[str, float], Trials], path: Path) -> None:
     levels.set_ylim(low, high + 0.55 * (high - low))  # room for the legend
     levels.legend(frameon=False, fontsize=8, ncols=2, loc="upper left")
     grid = np.linspace(-4, 4, 81)
-    pooled = results["cauchy", 0.1].deviations.ravel()
+    pooled = results["cauchy", share].deviations.ravel()
     errors.hist(pooled, bins=grid, density=True, color="#9fc3e6", label="all hands and numbers")
     normal = np.exp(-0.5 * grid**2) / math.sqrt(2 * math.pi)
     errors.plot(grid, normal, color="black", lw=1, label="what the intervals assume: normal")
-    errors.set_title("Errors, Cauchy loss, 10 % outliers", size=10, loc="left")
+    errors.set_title(f"Errors, Cauchy loss, {100 * share:g} % outliers", size=10, loc="left")
     errors.set(xlabel="error / its estimated standard deviation", ylabel="density", ylim=(0, 0.55))
     errors.legend(frameon=False, fontsize=8, loc="upper left")
     figure.savefig(path, dpi=110)

@@ -105,6 +105,18 @@ def test_guessed_pads_are_on_the_skin_of_the_closing_side(run: Command, tmp_path
         np.testing.assert_allclose(pad["xyz"], [0, side * 0.008, 0.032], atol=1e-6)
 
 
+def test_what_rounds_to_nothing_has_no_sign(run: Command, tmp_path: Path) -> None:
+    path = hand(tmp_path)
+    path.write_text(
+        path.read_text().replace('<origin xyz="0 0 0.02"/>', '<origin xyz="-1e-5 0 0.02"/>')
+    )
+    done = run("import", path, "--out", tmp_path / "mine.yaml")
+    pad = yaml.safe_load((tmp_path / "mine.yaml").read_text())["fingers"]["index"]
+    assert -5e-5 < pad["xyz"][0] < 0
+    assert "0.0 8.0 32.0" in done.out
+    assert "-0.0" not in done.out
+
+
 def test_without_shapes_the_pad_is_guessed_from_the_joints(run: Command, tmp_path: Path) -> None:
     done = run("import", hand(tmp_path, shapes=False), "--out", tmp_path / "mine.yaml")
     assert done.exit == 0

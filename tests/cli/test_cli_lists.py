@@ -39,6 +39,9 @@ def test_robots(run: Command, robot: ik.ArmHand) -> None:
     words = done.out.replace(",", " ").split()
     for name in (robot.name, *robot.fingers, *robot.actuators, "Kermani"):
         assert name in words
+    # How an arm is solved: an S-R-S arm, a swept one, one of three parallel axes, and one searched.
+    for word in ("shoulder", "swept", "parallel", "searched"):
+        assert word in words
 
 
 def test_methods(run: Command) -> None:

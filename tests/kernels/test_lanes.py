@@ -22,7 +22,7 @@ from casadi_ik.kernels import (
 )
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
-from casadi_ik.kernels.loop import FEWEST, WORTH
+from casadi_ik.kernels.loop import FEWEST, ROOM_BYTES, WORTH
 from casadi_ik.kernels.loop_job import SLOTS
 from casadi_ik.kernels.machine_lanes import machine_lanes
 
@@ -244,6 +244,19 @@ def test_unforeseen_code_is_refused_and_runs_one_by_one() -> None:
     assert kernel.lanes == 1
     result = kernel.run(np.full((9, 1), 0.1), [0.0], 1)
     np.testing.assert_array_equal(result.states, np.sinh(0.1))
+
+
+def test_traces_of_other_lengths_than_the_last_one() -> None:
+    """Room is made for as much as the last one needed: too much, too little, none at all."""
+    kernel = LoopKernel(counting_step("lengths"))
+    assert kernel.lanes > 1
+    for count, ends in ((40, 3), (40, 700), (9, 2), (FEWEST - 1, 900), (2, 0), (70, 5)):
+        ran = kernel.run(np.zeros((count, 1)), np.full((count, 1), ends), ends, trace=True)
+        assert ran.rows is not None
+        assert ran.rows.base is None
+        assert ran.rows["count"].tolist() == [*range(1, ends + 1)] * count
+        room = kernel._room(count) * ran.rows.dtype.itemsize
+        assert len(ran.rows) * ran.rows.dtype.itemsize <= room <= ROOM_BYTES
 
 
 def test_few_solves_wait_for_no_compiler(

@@ -211,7 +211,7 @@ def test_robots_with_other_links_and_mounts(tmp_path, seed):
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_an_arm_without_a_closed_form(tmp_path_factory, tolerance):
-    robot = derived_robot(tmp_path_factory.mktemp("offset"), elbow_offset=0.045)
+    robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
     other = HandFirstMethod(robot.description, HandFirstParameters())
     assert other.step.arm is None
     q = robot.random(np.random.default_rng(5), 300)

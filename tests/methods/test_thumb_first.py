@@ -188,7 +188,7 @@ def test_the_start_chooses_between_hands(robot, once, rng):
 
 
 def test_an_arm_without_a_closed_form(tmp_path_factory):
-    robot = derived_robot(tmp_path_factory.mktemp("offset"), elbow_offset=0.045)
+    robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
     other = ThumbFirstMethod(robot.description, ThumbFirstParameters())
     assert other.step.arm is None
     batch = solve(robot, other, problems(robot, robot.random(np.random.default_rng(5), 200)))

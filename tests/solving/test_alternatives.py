@@ -202,7 +202,7 @@ def test_a_held_elbow_leaves_single_swivels(robot, solver):
 
 
 def test_an_arm_without_a_closed_form(tmp_path_factory):
-    robot = derived_robot(tmp_path_factory.mktemp("offset"), elbow_offset=0.045)
+    robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
     q = robot.random(np.random.default_rng(5), 1)[0]
     found = ik.Solver(robot).solve_all(grasp(robot, q), seed=1)
     assert len(found) > 1

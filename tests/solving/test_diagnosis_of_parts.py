@@ -21,7 +21,7 @@ def cup(robot: ik.ArmHand) -> tuple[Array, Array]:
 @pytest.fixture(scope="module")
 def bent(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
     """The arm with its elbow off the links: no closed form."""
-    return derived_robot(tmp_path_factory.mktemp("bent"), elbow_offset=0.045)
+    return derived_robot(tmp_path_factory.mktemp("bent"), wrist_offset=0.045)
 
 
 def diagnosed(

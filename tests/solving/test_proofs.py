@@ -136,7 +136,7 @@ def test_ignored_limits_and_tiny_tolerances_are_never_unreachable(robot: ik.ArmH
 def test_coupled_mechanisms_and_other_arms(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Chains of couplings, a prismatic thumb, an arm without a closed form."""
     coupled = ik.load_robot(write_coupled_robot(tmp_path_factory.mktemp("coupled")))
-    bent = derived_robot(tmp_path_factory.mktemp("bent"), elbow_offset=0.045)
+    bent = derived_robot(tmp_path_factory.mktemp("bent"), wrist_offset=0.045)
     for robot in (coupled, bent):
         rng, prover = np.random.default_rng(5), Prover(robot.description)
         q = robot.random(rng, 200)

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 STUDIES = Path(__file__).parents[2] / "studies"
+MORE = ("--outliers", "0.2", "0.4")
 
 
 def coverages(report: str) -> list[float]:
@@ -18,14 +19,18 @@ def coverages(report: str) -> list[float]:
 
 def test_the_study_runs(tmp_path):
     run = subprocess.run(
-        [sys.executable, STUDIES / "calibration.py", "--hands", "2", "--out", tmp_path],
+        [sys.executable, STUDIES / "calibration.py", "--hands", "2", *MORE, "--out", tmp_path],
         capture_output=True,
         text=True,
     )
     assert run.returncode == 0, run.stderr
     written = {path.name for path in tmp_path.iterdir()}
     assert written == {"report.md", "error_bars.png", "singular_values.png"}
-    assert len(coverages((tmp_path / "report.md").read_text())) == 9
+    report = (tmp_path / "report.md").read_text()
+    assert len(coverages(report)) == 9
+    assert [line[:6] for line in report.splitlines() if line.startswith("| 4")] == ["| 40 %"] * 3
+    assert "With 20 % outliers and the Cauchy loss" in report
+    assert "which 40 % of outliers" in report
 
 
 def test_the_committed_report_is_of_many_hands_and_its_bars_are_true():

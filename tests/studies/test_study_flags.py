@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import ar10_success
+import calibration
 import closed_chain_singularities
 import closed_chain_workspace
 import numpy as np
+import proofs
 import pytest
 import virtual_joint_range
 from ar10 import tip_poses
@@ -52,3 +55,30 @@ def test_gains_and_resolution_of_the_sliders(tmp_path: Path) -> None:
     assert "| 0.3 |  |  |" in text  # the paper has no such gain
     assert "| 1 | -0.60, -0.71 | 0.93 |" in text
     assert within(robot, 0.5) == pytest.approx((robot.lower + robot.upper) / 2)
+
+
+def test_tolerances_of_the_sliders(tmp_path: Path) -> None:
+    names = [ar10_success.tolerance_name(*each) for each in ar10_success.TOLERANCES]
+    assert names == ["5 mm, 3 deg", "1e-6 m, 1e-6 rad"]
+    given = ["--count", "6", "--tolerance", "2e-3", "0.02", "--out", str(tmp_path)]
+    ar10_success.main(given)
+    text = (tmp_path / "report.md").read_text()
+    rows = [line for line in text.splitlines() if line.startswith(("| ar10", "| baxter"))]
+    assert len(rows) == 2 * len(ar10_success.SETS) - 1
+    assert all("| 2 mm, 1.146 deg |" in row for row in rows)
+
+
+def test_parts_of_outliers(tmp_path: Path) -> None:
+    for wrong in (["0.3", "0.2"], ["0", "0.2"], ["0.1", "1"]):
+        with pytest.raises(InputError, match=r"--outliers: found .*, expected 0 < FEW < MANY < 1"):
+            calibration.main(["--outliers", *wrong, "--out", str(tmp_path)])
+
+
+def test_how_far_impossible_is_beyond(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(proofs, "CLASSES", proofs.CLASSES[:3])  # one of them for this hand
+    given = ["--robot", "ar10", "--count", "0", "--impossible", "2", "--out", str(tmp_path)]
+    report = tmp_path / "report"
+    proofs.main([*given, "--report", str(report), "--beyond", "40", "15"])
+    text = " ".join((report / "report.md").read_text().split())
+    assert "does not solve with 40 mm and 15 deg more than the usual 5 mm and 3 deg" in text
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["beyond 40 mm 15 deg", "report"]

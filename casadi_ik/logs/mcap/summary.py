@@ -65,16 +65,22 @@ class Summary:
     def beginning(
         self, profile: str, library: str, metadata: Metadata, attachments: Sequence[Attachment]
     ) -> bytes:
-        """The first bytes of a file, up to the first chunk."""
+        """The first bytes of a file, up to the first chunk.
+
+        Raises:
+            LogError: A record is larger than what is read.
+        """
         builder = RecordBuilder()
         builder.write(MAGIC)
         Header(profile, library).write(builder)
         offset = builder.count
         metadata.write(builder)
+        check_size("the metadata", builder.count - offset)
         self.metadata.append(MetadataIndex(offset, builder.count - offset, metadata.name))
         for item in attachments:
             offset = builder.count
             item.write(builder)
+            check_size(f"attachment {item.name!r}", builder.count - offset)
             self.attachments.append(attachment_index(item, offset, builder.count - offset))
         return builder.end()
 

@@ -12,6 +12,7 @@ from casadi_ik.errors import LogError
 from casadi_ik.logs.mcap.chunk import Run, chunk_bytes, definitions
 from casadi_ik.logs.mcap.file import McapFile
 from casadi_ik.logs.mcap.message_bytes import fill
+from casadi_ik.logs.mcap.records import check_size
 from casadi_ik.logs.mcap.summary import Summary
 from casadi_ik.logs.write.topic_messages import Messages
 
@@ -56,6 +57,23 @@ class ChunkStream:
         self._summary.channels[channel.id] = channel
         self._new[0].append(schema)
         self._new[1].append(channel)
+
+    def check(self, parts: Sequence[Messages], where: str, first: int) -> None:
+        """See that every solve fits into a chunk that can be read, whatever waits before it.
+
+        Args:
+            parts: Messages of the same solves on several channels.
+            where: File and method, for messages.
+            first: Number of the first of the solves.
+
+        Raises:
+            LogError: One is too large.
+        """
+        ends = np.sum([part.ends * part.size for part in parts], axis=0)
+        sizes = np.diff(ends, prepend=0)
+        worst = int(sizes.argmax())
+        # Beside it there is room for what waits, and for what compression may add.
+        check_size(f"{where}, solve {first + worst}", int(sizes[worst]) + 2 * CHUNK_SIZE)
 
     def add(self, parts: Sequence[Messages]) -> None:
         """Take messages of the same solves on several channels.

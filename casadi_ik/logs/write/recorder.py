@@ -91,8 +91,8 @@ class McapRecorder:
             clock: Rule of the log times.
 
         Raises:
-            LogError: The path cannot be written, somebody is writing it, or the compression is
-                unknown.
+            LogError: The path cannot be written, somebody is writing it, the compression is
+                unknown, or URDF or parameters are larger than what a reader takes.
         """
         if compression not in COMPRESSORS:
             raise LogError(f"compression {compression!r}: expected one of {', '.join(COMPRESSORS)}")
@@ -114,21 +114,21 @@ class McapRecorder:
         if urdf is not None:
             data = urdf.encode()
             attached.append(Attachment(now, now, URDF_ATTACHMENT, "application/xml", data))
-        file, summary = McapFile(self.path), Summary()
-        beginning = summary.beginning(
-            "ros2",
-            f"casadi_ik {metadata['code_version']}",
-            Metadata(METADATA_NAME, metadata),
-            attached,
-        )
-        self._chunks = ChunkStream(file, summary, beginning, compression)
+        summary, library = Summary(), f"casadi_ik {metadata['code_version']}"
+        record = Metadata(METADATA_NAME, metadata)
+        try:
+            beginning = summary.beginning("ros2", library, record, attached)
+        except LogError as error:
+            raise LogError(f"{self.path}: {error}") from None
+        self._chunks = ChunkStream(McapFile(self.path), summary, beginning, compression)
 
     def record(self, block: SolveBlock) -> None:
         """Write solves: their totals, and of those that are kept their iterations and events.
 
         Raises:
-            LogError: The block contradicts itself or an earlier one (the log stays usable), or it
-                could not be written (the log ends with the chunk before).
+            LogError: The block contradicts itself or an earlier one, or a solve of it is larger
+                than what a reader takes (the log stays usable), or it could not be written (the
+                log ends with the chunk before).
         """
         if len(block) == 0:
             return
@@ -144,8 +144,10 @@ class McapRecorder:
         solves = solve_rows(block, tally, method.formats["solve"].layout)
         singular = tally[:, list(SINGULAR)].sum(axis=1) > 0
         solves["kept"] = self.keep(block.first, block.batch.success, singular)
+        messages = block_messages(block, events, solves, method.channels, self.clock)
+        self._chunks.check(messages, f"{self.path}: method {block.method!r}", block.first)
         self._note(block)
-        self._chunks.add(block_messages(block, events, solves, method.channels, self.clock))
+        self._chunks.add(messages)
 
     def close(self) -> None:
         """Finish the file; a second call does nothing.

@@ -1,9 +1,10 @@
-"""An S-R-S arm over its whole swivel: every branch at an angle, and where joints meet limits."""
+"""Every branch of an arm: over its whole swivel or swept joint, and where joints meet limits."""
 
 from __future__ import annotations
 
 import casadi as ca
 
+from casadi_ik.symbolic.closed_arms.form import ClosedForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.srs_arm import SrsArm, at_angle, euler_angles, limit_roots, swivel
 from casadi_ik.symbolic.subexpressions import shared
@@ -46,6 +47,20 @@ def arm_edges(arm: SrsArm) -> ca.Function:
         limit_roots(arm.wrist_joints, chain.wrist, lower[4:], upper[4:]),
     )
     return ca.Function("arm_edges", [*inputs, lower, upper], shared(roots))
+
+
+def form_at(form: ClosedForm) -> ca.Function:
+    """The eight arms at a position of the swept joint.
+
+    Returns:
+        (rotation (3, 3), origin (3, 1) [m], position [rad]) -> configurations (8, n) [rad], a row
+        for each of `closed_arms.form.SIGNS`, and the slack (8, 1) of each: >= 0 within reach.
+    """
+    inputs, palm, position = _inputs()
+    bends = form.bends(palm, position)
+    arms = ca.horzcat(*(arm for bend in bends for arm in bend.arms())).T
+    slack = ca.vertcat(*(bend.slack for bend in bends for _ in bend.ends))
+    return ca.Function("form_at", inputs, shared(arms, slack))
 
 
 def _inputs() -> tuple[list[ca.SX], Pose, ca.SX]:

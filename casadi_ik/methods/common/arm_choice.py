@@ -38,7 +38,7 @@ STEP = 2 * np.pi / SAMPLES
 
 @dataclass(frozen=True, eq=False)
 class Wanted:
-    """What an arm is chosen by; (7, 1) each.
+    """What an arm is chosen by; (n, 1) each.
 
     Attributes:
         near: The given arm [rad].
@@ -53,7 +53,7 @@ class Wanted:
     upper: Expr
     scales: ca.DM
 
-    def part(self, rows: slice) -> Wanted:
+    def part(self, rows: slice | list[int]) -> Wanted:
         """Of some of the joints."""
         return Wanted(self.near[rows], self.lower[rows], self.upper[rows], self.scales[rows])
 

@@ -191,6 +191,8 @@ class LoopedMethod(ABC):
         for number in range(self.rounds):
             if number:
                 left = np.flatnonzero(status != Status.SOLVED)
+                if not len(left):
+                    break
                 left = left[self.hopeful(states[left], number)]
                 if not len(left):
                     continue

@@ -17,6 +17,9 @@ from casadi_ik.methods.common.palm_fit import HandContacts, hand_contacts
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.problem.contacts.conditions import LENGTH, Vectors
 from casadi_ik.problem.contacts.rows import ContactRows
+from casadi_ik.symbolic.closed_arms.form import ClosedForm
+from casadi_ik.symbolic.closed_arms.recognise import ArmForm
+from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import compose, exp_se3
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 from casadi_ik.symbolic.so3 import skew
@@ -79,13 +82,15 @@ def _seen(goals: list[Vectors], x: PalmAndHand) -> list[Vectors]:
 
 
 def reach_row(
-    arm: SrsArm, columns: Sequence[int], x: PalmAndHand, p: dict[str, Expr]
+    arm: ArmForm, columns: Sequence[int], x: PalmAndHand, p: dict[str, Expr]
 ) -> tuple[Expr, Expr]:
     """How far the wrist is out of the arm's reach, by `LENGTH`, and its slope (1, 6).
 
     Where contacts leave the hand a freedom (three parallel fingers), it is spent on bringing the
     wrist where the elbow can follow. Zero, with slope zero, within reach.
     """
+    if not isinstance(arm, SrsArm):
+        return _form_row(arm, columns, x, p)
     near, far = reach(arm, p["lower"][columns[3]], p["upper"][columns[3]])
     wrist = ca.DM(arm.wrist_in_palm)
     line = x.origin + x.rotation @ wrist - ca.DM(arm.shoulder)
@@ -96,9 +101,26 @@ def reach_row(
     return p["reach"] * beyond / LENGTH, p["reach"] * slope / LENGTH
 
 
+def _form_row(
+    form: ClosedForm, columns: Sequence[int], x: PalmAndHand, p: dict[str, Expr]
+) -> tuple[Expr, Expr]:
+    """The same for other arms in closed form."""
+    shift, turn = ca.SX.sym("shift", 3), ca.SX.sym("turn", 3)
+    moved = Pose(
+        x.rotation @ (ca.SX.eye(3) + skew(turn)),
+        x.origin + x.rotation @ shift,
+    )
+    bounds = p["lower"][list(columns)], p["upper"][list(columns)]
+    beyond = form.beyond(moved, *bounds)
+    motion = ca.vertcat(shift, turn)
+    slope = ca.jacobian(beyond, motion)
+    here = ca.substitute([beyond, slope], [motion], [ca.SX.zeros(6, 1)])
+    return p["reach"] * here[0] / LENGTH, p["reach"] * here[1] / LENGTH
+
+
 def fit_step(
     layouts: HandFirstLayouts,
-    arm: SrsArm | None,
+    arm: ArmForm | None,
     x: PalmAndHand,
     damping: Expr,
     p: dict[str, Expr],
@@ -129,7 +151,7 @@ def fit_step(
 
 
 def _rows(
-    layouts: HandFirstLayouts, arm: SrsArm | None, x: PalmAndHand, p: dict[str, Expr]
+    layouts: HandFirstLayouts, arm: ArmForm | None, x: PalmAndHand, p: dict[str, Expr]
 ) -> tuple[Expr, Expr]:
     """Residual and Jacobian of contacts and reach."""
     contacts = hand_contacts(layouts.robot, x.hand, layouts.robot.hand_actuators)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array, Counts
-from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.methods.common.contact_fit import fresh_fit
@@ -32,7 +31,7 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
+from casadi_ik.symbolic.closed_arms.recognise import arm_form
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
@@ -69,7 +68,7 @@ class HandFirstMethod(LoopedMethod):
         self.options: HandFirstParameters = options
         self.rounds = options.rounds + LATER
         self._kinds = kinds or usual(len(robot.fingers))
-        self.step = HandFirstStep(robot, _closed_form(robot), options.candidates, self._kinds)
+        self.step = HandFirstStep(robot, arm_form(robot), options.candidates, self._kinds)
         self._ready: dict[bool, list[OneTarget]] = {True: [], False: []}
         self._kept: tuple[Any, Array] | None = None
 
@@ -275,10 +274,3 @@ class HandFirstMethod(LoopedMethod):
     def first(self) -> FunctionKernel:
         """Makes first state and parameters of a round."""
         return FunctionKernel(beginning(self.step.layouts), self._compiled)
-
-
-def _closed_form(robot: RobotDescription) -> SrsArm | None:
-    try:
-        return srs_arm(robot)
-    except UnsupportedError:
-        return None

@@ -21,7 +21,7 @@ import casadi as ca
 
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
-from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, NO_MARGIN, place_arm
+from casadi_ik.methods.common.arm_placement import NO_MARGIN
 from casadi_ik.methods.common.balance import differs, near_tolerance
 from casadi_ik.methods.common.contact_fit import (
     Judged,
@@ -34,15 +34,15 @@ from casadi_ik.methods.hand_first.balance_stage import balance_stage
 from casadi_ik.methods.hand_first.choice_stage import choice_stage
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
+from casadi_ik.methods.hand_first.placement_stage import placement_stage
 from casadi_ik.methods.hand_first.start_stage import at_start, start_stage
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_rows
 from casadi_ik.methods.hand_first.whole_fit import whole_step
 from casadi_ik.problem.contacts.kinds import Kinds, suffix
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
 
 OWN_HAND = 0.5
@@ -57,13 +57,13 @@ class HandFirstStep:
     """
 
     def __init__(
-        self, robot: RobotDescription, arm: SrsArm | None, candidates: int, kinds: Kinds
+        self, robot: RobotDescription, arm: ArmForm | None, candidates: int, kinds: Kinds
     ) -> None:
         """Remember what the graph is made of.
 
         Args:
             robot: The description.
-            arm: Constants of an S-R-S arm, or None: then refinement does the arm's work.
+            arm: Its arm in closed form, or None: then the arm is searched.
             candidates: Hand postures a solve may start from.
             kinds: Of the contacts, by finger.
         """
@@ -99,7 +99,9 @@ class HandFirstStep:
         }
         if self.robot.arm_actuators:
             stages[Phase.HAND_FIT] = self._hand_fit()
-            stages[Phase.ARM_PLACEMENT] = self._placement() if self.arm else numeric_stage(layouts)
+            stages[Phase.ARM_PLACEMENT] = (
+                placement_stage(layouts, self.arm) if self.arm else numeric_stage(layouts)
+            )
         if self.arm is not None:
             stages[Phase.ARM_CHOICE] = choice_stage(layouts, self.arm)
         phases = [phase for phase in STAGES if phase in stages]
@@ -212,46 +214,6 @@ class HandFirstStep:
             return ca.SX(float(Phase.ARM_PLACEMENT))
         return ca.if_else(p["nearest"], float(Phase.ARM_CHOICE), float(Phase.ARM_PLACEMENT))
 
-    def _placement(self) -> ca.Function:
-        state = ca.MX.sym("state", self.layouts.state.size)
-        parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
-        s, p = self.layouts.state.unpack(state), self.layouts.parameters.unpack(parameters)
-        arm = list(self.robot.arm_actuators)
-        assert self.arm is not None
-        palm = Pose(s["palm_rotation"], s["palm_origin"])
-        found = place_arm(self.arm, palm, p["lower"][arm], p["upper"][arm], s["spent"])
-        outputs = self._place()(state, parameters, *found)
-        return ca.Function("placement", [state, parameters], list(outputs))
-
-    def _place(self) -> ca.Function:
-        """Keep the best arm so far; take it if it is within limits."""
-        state, parameters, s, p = self._inputs()
-        n = len(self.robot.arm_actuators)
-        arm, margin = ca.SX.sym("arm", n), ca.SX.sym("margin")
-        better = margin > s["margin"]
-        best, best_margin = ca.if_else(better, arm, s["arm"]), ca.fmax(margin, s["margin"])
-        allowed = best_margin >= ALLOWED
-        spent = s["spent"] + 1
-        over = spent >= ITERATIONS
-        q = self._with_arm(s["q"], best)
-        q = ca.fmin(ca.fmax(q, p["lower"]), p["upper"])
-        # The last candidate is placed even if its hand does not fit.
-        solved = ca.logic_and(allowed, s["fits"] > 0)
-        leave = ca.logic_or(allowed, over)
-        after = self.layouts.state.pack(
-            self.layouts.counted(s, Phase.ARM_PLACEMENT)
-            | {
-                "q": ca.if_else(leave, q, s["q"]),
-                "phase": ca.if_else(leave, float(Phase.REFINEMENT), float(Phase.ARM_PLACEMENT)),
-                "spent": ca.if_else(leave, 0.0, spent),
-                "margin": best_margin,
-                "arm": best,
-            }
-        )
-        status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
-        record = self.layouts.row(s, p, q, Phase.ARM_PLACEMENT, status, margin=best_margin)
-        return ca.Function("place", [state, parameters, arm, margin], shared(after, record, status))
-
     def _start_or_refinement(self) -> ca.Function:
         state = ca.MX.sym("state", self.layouts.state.size)
         parameters = ca.MX.sym("parameters", self.layouts.parameters.size)
@@ -303,6 +265,3 @@ class HandFirstStep:
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
         return with_rows(q, self.robot.hand_actuators, hand)
-
-    def _with_arm(self, q: Expr, arm: Expr) -> Expr:
-        return with_rows(q, self.robot.arm_actuators, arm)

@@ -9,7 +9,6 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Counts
-from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels import StepGraph
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.common.posture_table import PostureTable
@@ -21,7 +20,7 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.target import target_values
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
+from casadi_ik.symbolic.closed_arms.recognise import arm_form
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
@@ -59,7 +58,7 @@ class ThumbFirstMethod(LoopedMethod):
         self.options: ThumbFirstParameters = options
         self.rounds = 1 if options.starts == 1 else 2
         self._kinds = kinds or usual(len(robot.fingers))
-        self.step = ThumbFirstStep(robot, options, self._kinds, _closed_form(robot))
+        self.step = ThumbFirstStep(robot, options, self._kinds, arm_form(robot))
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""
@@ -168,10 +167,3 @@ class ThumbFirstMethod(LoopedMethod):
         """Palm estimates begun from but the first."""
         start = states[:, self.step.state.slice("start").start].astype(np.int64)
         return np.clip(start, 0, self.options.starts - 1)
-
-
-def _closed_form(robot: RobotDescription) -> SrsArm | None:
-    try:
-        return srs_arm(robot)
-    except UnsupportedError:
-        return None

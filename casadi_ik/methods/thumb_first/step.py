@@ -43,9 +43,9 @@ from casadi_ik.problem.contacts.kinds import suffix
 from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.actuated import motor_scales
+from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
 
 EASED, TIGHTENED = 1 / 3, 4.0
@@ -70,10 +70,10 @@ class ThumbFirstStep(ThumbFirstLayouts):
     Without an arm the palm is fixed: the same step then moves the fingers alone.
 
     Attributes:
-        arm: Constants of an S-R-S arm, or None: then the arm's start is found numerically.
+        arm: The arm in closed form, or None: then its start is found numerically.
     """
 
-    arm: SrsArm | None
+    arm: ArmForm | None
 
     def graph(self) -> StepGraph:
         """The whole iteration; compilable unless the step is ProxQP's."""

@@ -1,9 +1,15 @@
-"""All arms for a palm pose: the branches of an S-R-S arm and the swivels each of them allows."""
+"""All arms for a palm pose: its branches, and how far each of them may be varied.
+
+What an arm in closed form offers, whatever its form: `find` gives every branch
+within bounds with the exact interval of its one freedom, if it has one; `arms` the configurations
+of a branch at values of the freedom; `best_arm` is the one that scores highest.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,25 +31,45 @@ ZOOMS = 2
 
 @dataclass(frozen=True)
 class ArmBranch:
-    """One way to bend an S-R-S arm, and how far its elbow may swing.
+    """One way to bend an arm, and how far it may be varied.
 
     Attributes:
-        shoulder: Sign of joint 2 from where axes 1 and 3 are aligned, +1 or -1.
-        elbow: Sign of joint 4 from the stretched arm.
-        wrist: Sign of joint 6 from where axes 5 and 7 are aligned.
-        swivel: (start, end) [rad] of an interval of swivels within limits, start <= end; a whole
-            turn if none of them is out. The swivel turns the elbow about the line from shoulder
-            to wrist.
+        shoulder: +1 or -1. Of an arm with a spherical shoulder, elbow and spherical wrist (S-R-S):
+            sign of joint 2 from where axes 1 and 3 are aligned.
+        elbow: +1 or -1; S-R-S: sign of joint 4 from the stretched arm.
+        wrist: +1 or -1; S-R-S: sign of joint 6 from where axes 5 and 7 are aligned.
+        swivel: (start, end) [rad] of an interval of the arm's freedom within limits, start <= end;
+            None for an arm without one. S-R-S: the angle of the elbow about the line from shoulder
+            to wrist, a whole turn if none is out. Other arms of seven joints: the position of the
+            joint that is swept, see `ClosedForm.swept_joint`.
     """
 
     shoulder: int
     elbow: int
     wrist: int
-    swivel: tuple[float, float]
+    swivel: tuple[float, float] | None
+
+
+class Branches(Protocol):
+    """Enumerates the arms of one robot."""
+
+    def find(self, palm: Array, lower: Array, upper: Array) -> list[ArmBranch]:
+        """Every interval of every branch.
+
+        Args:
+            palm: (4, 4) pose of the palm, base frame.
+            lower: (n,) bounds [rad].
+            upper: (n,).
+        """
+        ...
+
+    def arms(self, palm: Array, branch: ArmBranch, swivels: Array) -> Array:
+        """Configurations (k, n) [rad] of a branch at values (k,) of its freedom."""
+        ...
 
 
 class ArmBranches:
-    """Enumerates the arms of one robot."""
+    """Enumerates the arms of an S-R-S arm."""
 
     def __init__(self, arm: SrsArm, compiled: bool = True) -> None:
         """Compile the functions of the arm or load them from the cache."""
@@ -84,27 +110,29 @@ class ArmBranches:
         arms, _ = self._at(palm[:3, :3], palm[:3, 3], float(branch.elbow), swivels)
         return arms[:, SIDES.index((branch.shoulder, branch.wrist))]
 
-    def best(
-        self, palm: Array, branch: ArmBranch, score: Callable[[Array], Array]
-    ) -> tuple[Array, float]:
-        """The arm of a branch with the highest score, and its swivel.
 
-        Args:
-            palm: (4, 4).
-            branch: With its interval.
-            score: Of configurations (k, 7) -> (k,).
-        """
-        first, last = branch.swivel
-        swivels = np.linspace(first, last, SAMPLES)
-        for _ in range(ZOOMS):
-            i = int(np.argmax(score(self.arms(palm, branch, swivels))))
-            step = swivels[1] - swivels[0]
-            swivels = np.linspace(
-                max(first, swivels[i] - step), min(last, swivels[i] + step), SAMPLES
-            )
-        arms = self.arms(palm, branch, swivels)
-        i = int(np.argmax(score(arms)))
-        return arms[i], float(swivels[i])
+def best_arm(
+    branches: Branches, palm: Array, branch: ArmBranch, score: Callable[[Array], Array]
+) -> tuple[Array, float | None]:
+    """The arm of a branch with the highest score, and its swivel.
+
+    Args:
+        branches: Of the arm.
+        palm: (4, 4).
+        branch: With its interval.
+        score: Of configurations (k, n) -> (k,).
+    """
+    if branch.swivel is None:
+        return branches.arms(palm, branch, np.zeros(1))[0], None
+    first, last = branch.swivel
+    swivels = np.linspace(first, last, SAMPLES)
+    for _ in range(ZOOMS):
+        i = int(np.argmax(score(branches.arms(palm, branch, swivels))))
+        step = swivels[1] - swivels[0]
+        swivels = np.linspace(max(first, swivels[i] - step), min(last, swivels[i] + step), SAMPLES)
+    arms = branches.arms(palm, branch, swivels)
+    i = int(np.argmax(score(arms)))
+    return arms[i], float(swivels[i])
 
 
 def _intervals(

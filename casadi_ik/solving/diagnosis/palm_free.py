@@ -84,7 +84,8 @@ class PalmFree:
     def __init__(self, trials: Trials) -> None:
         """Ask the loop's hand stage."""
         self._trials = trials
-        self._arm = trials.method.step.arm
+        arm = trials.method.step.arm
+        self._arm = arm if isinstance(arm, SrsArm) else None
 
     @cached_property
     def _palm(self) -> Array:

@@ -1,0 +1,1 @@
+"""Arms whose joints follow from a palm pose in closed form, recognised from their axes."""

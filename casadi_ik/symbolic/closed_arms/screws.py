@@ -1,0 +1,118 @@
+"""An arm as the screws of its joints, and what two or three of their axes have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.kinematics import Pose, forward, number
+from casadi_ik.symbolic.smooth import Expr
+
+
+@dataclass(frozen=True, eq=False)
+class Screws:
+    """The axes of an arm's joints at q = 0, base frame, in the order of the chain.
+
+    The arm moves its palm by ``e_1(q_1) ... e_n(q_n)``, each a rotation about an axis that stands
+    still. Seen from the palm the chain is the same with its screws in the opposite order and its
+    axes the other way round.
+
+    Attributes:
+        joints: Number of the joint that each screw belongs to.
+        axes: (n, 3) unit.
+        points: (n, 3) a point of each axis [m].
+        lower: (n,) joint limits [rad].
+        upper: (n,) joint limits [rad].
+        rotation: (3, 3) of the palm at q = 0.
+        origin: (3,) of the palm at q = 0 [m].
+        reverse: Whether the chain is seen from the palm.
+    """
+
+    joints: tuple[int, ...]
+    axes: Array
+    points: Array
+    lower: Array
+    upper: Array
+    rotation: Array
+    origin: Array
+    reverse: bool = False
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def reversed(self) -> Screws:
+        """The same arm seen from its other end."""
+        return replace(
+            self,
+            joints=self.joints[::-1],
+            axes=-self.axes[::-1],
+            points=self.points[::-1],
+            lower=self.lower[::-1],
+            upper=self.upper[::-1],
+            reverse=not self.reverse,
+        )
+
+    def motion(self, palm: Pose) -> Pose:
+        """What the chain must move by for the palm to be at a pose."""
+        turn = palm.rotation @ ca.DM(self.rotation.T)
+        shift = palm.origin - turn @ ca.DM(self.origin)
+        return Pose(turn.T, -(turn.T @ shift)) if self.reverse else Pose(turn, shift)
+
+    def centred(self, place: int, angle: Expr) -> Expr:
+        """An angle moved into the turn centred on its joint's range [rad]."""
+        middle = float(self.lower[place] + self.upper[place]) / 2
+        away = angle - middle
+        return middle + away - 2 * np.pi * ca.floor((away + np.pi) / (2 * np.pi))
+
+
+def arm_screws(robot: RobotDescription) -> Screws:
+    """The screws of a robot's arm.
+
+    Raises:
+        UnsupportedError: A joint of the arm slides, or does not have a motor of its own.
+    """
+    where = f"robot {robot.name!r}: the arm has no closed form"
+    motors = [robot.actuator_names[i] for i in robot.arm_actuators]
+    joints = [joint for joint in robot.movable if joint.part == "arm"]
+    if [joint.name for joint in joints] != motors:
+        raise UnsupportedError(f"{where}: expected a motor for every joint")
+    if any(joint.type != "revolute" for joint in joints):
+        raise UnsupportedError(f"{where}: expected revolute joints only")
+    kinematics = forward(robot, ca.SX.zeros(len(robot.movable), 1))
+    return Screws(
+        tuple(range(len(joints))),
+        np.array([number(kinematics.axes[joint.name]) for joint in joints]).reshape(-1, 3),
+        np.array([number(kinematics.links[j.child].origin) for j in joints]).reshape(-1, 3),
+        np.array([joint.lower for joint in joints]),
+        np.array([joint.upper for joint in joints]),
+        np.array(ca.evalf(ca.densify(kinematics.palm.rotation))),
+        number(kinematics.palm.origin),
+    )
+
+
+def meeting_point(screws: Screws, places: Sequence[int]) -> tuple[Array, float]:
+    """The point (3,) nearest to some axes [m], and how far the farthest of them passes it [m]."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for i in places:
+        across = np.eye(3) - np.outer(screws.axes[i], screws.axes[i])
+        normal += across
+        right += across @ screws.points[i]
+    point: Array = np.linalg.lstsq(normal, right, rcond=None)[0].astype(float)
+    passes = [np.cross(point - screws.points[i], screws.axes[i]) for i in places]
+    return point, float(np.linalg.norm(passes, axis=1).max())
+
+
+def obliqueness(screws: Screws, one: int, other: int) -> float:
+    """Sine of the angle that two axes lack to a right one, or have too much."""
+    return abs(float(screws.axes[one] @ screws.axes[other]))
+
+
+def divergence(screws: Screws, one: int, other: int) -> float:
+    """Sine of the angle between two axes, whichever way they point."""
+    return float(np.linalg.norm(np.cross(screws.axes[one], screws.axes[other])))

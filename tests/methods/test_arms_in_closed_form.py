@@ -1,0 +1,151 @@
+"""hand-first on arms beyond S-R-S: every target solved, by the arm in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from targets import near_limits
+
+import casadi_ik as ik
+from casadi_ik.kernels.lanes import lanes_source
+from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.problem.problems import Problems, target_arrays
+from casadi_ik.problem.status import Phase
+from casadi_ik.solving.alternatives.form_branches import FormBranches
+from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
+from casadi_ik.symbolic.closed_arms.recognise import closed_form
+
+EXACT = ik.Tolerance(1e-6, 1e-6)
+
+SINGLE = ("ur5e", "puma560", "irb140")
+
+
+def robot_of(arm: str) -> ik.ArmHand:
+    return ik.load_robot(f"{arm}+barrett_bh8_280")
+
+
+@pytest.fixture(scope="module")
+def panda() -> ik.ArmHand:
+    return robot_of("panda")
+
+
+@pytest.fixture(scope="module")
+def solver(panda) -> ik.Solver:
+    return ik.Solver(panda, tolerance=EXACT)
+
+
+@pytest.mark.parametrize("arm", [*SINGLE, "kinova_gen3"])
+def test_the_arm_follows_at_once(arm):
+    """Six joints in one evaluation; an arm that is only nearly of its form is refined."""
+    robot = robot_of(arm)
+    method = HandFirstMethod(robot.description, HandFirstParameters(), compiled=False)
+    q = robot.random(np.random.default_rng(7), 12)
+    asked = Problems(*target_arrays(*robot.contacts(q), len(robot.fingers)), EXACT, True)
+    batch = Engine(robot, method).solve(asked, Run())
+    assert batch.success.all()
+    assert batch.phases[Phase.ARM_PLACEMENT.label].all()
+    if arm in SINGLE:
+        assert (batch.phases[Phase.REFINEMENT.label] == 0).mean() > 0.9
+
+
+def test_every_target_of_a_panda_is_solved(panda, solver):
+    rng = np.random.default_rng(2026)
+    q = np.concatenate([panda.random(rng, 1000), near_limits(panda, rng, 500)])
+    batch = solver.solve_batch(*panda.contacts(q))
+    assert np.flatnonzero(~batch.success).tolist() == []
+    assert (batch.q >= panda.lower).all()
+    assert (batch.q <= panda.upper).all()
+    # Nearly all by the arm in closed form.
+    assert (batch.phases["refinement"][:1000] == 0).mean() > 0.97
+
+
+def test_targets_of_a_panda_with_a_joint_next_to_its_limit(panda, solver):
+    """Stretches of the swept joint of a few thousandths of a degree, for one joint or another."""
+    rng = np.random.default_rng(3)
+    q = panda.random(rng, 400)
+    joint, side = rng.integers(0, 7, len(q)), rng.integers(0, 2, len(q)).astype(bool)
+    rows, near = np.arange(len(q)), np.radians(0.003)
+    q[rows, joint] = np.where(side, panda.lower[joint] + near, panda.upper[joint] - near)
+    assert solver.solve_batch(*panda.contacts(q)).success.all()
+
+
+def test_what_is_near_a_panda_is_found(panda, solver):
+    q = panda.random(np.random.default_rng(4), 200)
+    start = np.clip(
+        q + np.random.default_rng(5).normal(scale=0.3, size=q.shape), panda.lower, panda.upper
+    )
+    contacts = panda.contacts(q)
+    near = solver.solve_batch(*contacts, q0=start, prefer="q0")
+    far = solver.solve_batch(*contacts)
+    assert near.success.all()
+    near_by, far_by = (np.abs(each.q - start)[:, :7].max(axis=1) for each in (near, far))
+    assert np.median(near_by) < 0.5 * np.median(far_by)
+
+
+def test_all_its_stages_go_side_by_side(panda):
+    method = HandFirstMethod(panda.description, HandFirstParameters())
+    assert "lanes_one_by_one(&alone" not in lanes_source(method.graph.function, "", 4)
+
+
+@pytest.mark.parametrize("arm", ["panda", "kinova_gen3", "xarm7"])
+def test_the_stretches_of_the_swept_joint_are_all_that_is_allowed(arm):
+    """Against a scan of the whole range, a branch at a time."""
+    robot = robot_of(arm)
+    form = closed_form(robot.description)
+    branches = FormBranches(form, compiled=False)
+    columns = list(robot.description.arm_actuators)
+    lower, upper = robot.lower[columns], robot.upper[columns]
+    joint = form.swept_joint
+    middle = (lower + upper)[joint] / 2
+    half = min((upper - lower)[joint] / 2, np.pi)
+    scan = np.linspace(middle - half, middle + half, 500)[1:-1]
+    for palm in robot.palm(robot.random(np.random.default_rng(1), 2)):
+        found = branches.find(palm, lower, upper)
+        assert found
+        for side in range(8):
+            kind = branches._branch(side, (0.0, 0.0))
+            of_kind = [
+                b.swivel
+                for b in found
+                if (b.shoulder, b.elbow, b.wrist) == (kind.shoulder, kind.elbow, kind.wrist)
+            ]
+            allowed = branches._margins(palm, scan, lower, upper)[:, side] >= 0
+            inside = np.any([(scan >= a) & (scan <= b) for a, b in of_kind] or [scan > 1e9], axis=0)
+            np.testing.assert_array_equal(inside, allowed)
+        # The ends are where something is at a limit, or where the arm is stretched out.
+        for branch in found:
+            ends = branches.arms(palm, branch, np.array(branch.swivel))
+            assert (np.minimum(ends - lower, upper - ends).min(axis=1) > -1e-6).all()
+
+
+@pytest.mark.parametrize("arm", SINGLE)
+def test_an_arm_of_six_joints_has_single_branches(arm):
+    robot = robot_of(arm)
+    branches = FormBranches(closed_form(robot.description), compiled=False)
+    columns = list(robot.description.arm_actuators)
+    for q in robot.random(np.random.default_rng(2), 5):
+        palm = robot.palm(q)
+        found = branches.find(palm, robot.lower[columns], robot.upper[columns])
+        assert all(branch.swivel is None for branch in found)
+        arms = [branches.arms(palm, branch, np.zeros(1))[0] for branch in found]
+        apart = [np.abs(np.angle(np.exp(1j * (a - q[columns])))).max() for a in arms]
+        assert min(apart) < 1e-6
+
+
+def test_all_solutions_of_a_panda(panda, solver):
+    q = panda.random(np.random.default_rng(6), 1)[0]
+    points, normals = panda.contacts(q)
+    grasp = ik.Grasp(
+        {name: ik.Contact(points[i], normals[i]) for i, name in enumerate(panda.fingers)}
+    )
+    found = solver.solve_all(grasp, limit=100, apart=0)
+    assert len(found) > 1
+    for one in found:
+        assert all(contact.ok for contact in one.contacts.values())
+        assert one.branch is not None
+        assert one.branch.swivel is not None
+        start, end = one.branch.swivel
+        assert start - 1e-9 <= one.swivel <= end + 1e-9
+    assert len({(one.posture, one.branch) for one in found}) == len(found)
