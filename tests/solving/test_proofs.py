@@ -380,5 +380,6 @@ def test_what_is_missed_by_little_gets_few_boxes(
 
 def test_codes_of_the_log_stay() -> None:
     assert [status.name for status in sorted(ik.Status)] == [
-        *("INVALID", "RUNNING", "SOLVED", "STALLED", "ITERATION_LIMIT", "UNREACHABLE", "NOT_FOUND")
+        *("INVALID", "RUNNING", "SOLVED", "STALLED", "ITERATION_LIMIT", "UNREACHABLE", "NOT_FOUND"),
+        "COLLISION",
     ]
