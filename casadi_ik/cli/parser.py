@@ -8,6 +8,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from casadi_ik.cli.calibrate_parser import add_calibrate
+from casadi_ik.cli.export_parser import add_export
 from casadi_ik.cli.import_parser import add_import
 from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.say import PROGRAM
@@ -105,6 +106,7 @@ def build_parser() -> Parser:
     _add_solve(commands)
     _add_batch(commands)
     add_import(commands)
+    add_export(commands)
     add_calibrate(commands)
     for name, run, text in (
         ("robots", _robots, "list the shipped robots: fingers and actuators"),

@@ -114,12 +114,17 @@ class FunctionKernel:
         self._singles: list[SingleCall] = []
 
     def _load(self) -> ctypes.CDLL | None:
-        counts = {"N_IN": len(self.input_shapes), "N_OUT": len(self.output_shapes)}
-        driver = define(counts) + driver_text("map_job") + driver_text("map")
-        return load_library(self.name, lambda: self._function, driver, SYMBOL, self._graph.recipe)
+        driver = define(self.constants) + driver_text("map_job") + driver_text("map")
+        return load_library(self.name, lambda: self.function, driver, SYMBOL, self._graph.recipe)
+
+    @property
+    def constants(self) -> dict[str, int]:
+        """What the driver expects."""
+        return {"N_IN": len(self.input_shapes), "N_OUT": len(self.output_shapes)}
 
     @cached_property
-    def _function(self) -> ca.Function:
+    def function(self) -> ca.Function:
+        """The function, row-major."""
         return row_major(self._graph.function)
 
     def __call__(self, *inputs: Any) -> tuple[NDArray[np.float64], ...]:
@@ -148,23 +153,13 @@ class FunctionKernel:
         run(arrays, steps, outputs, 1 if count is None else count)
         return outputs
 
-    def single(
-        self,
-        inputs: Sequence[NDArray[np.float64]] | None = None,
-        outputs: Sequence[NDArray[np.float64]] | None = None,
-    ) -> SingleCall:
-        """One call with memory of its own, to be made again and again.
-
-        Args:
-            inputs: Contiguous arrays to read from, of one sample's shapes; None: new ones.
-            outputs: The same for what is written.
-        """
-        return SingleCall(
-            self.name,
-            self.entry,
-            inputs or [np.zeros(shape) for shape in self.input_shapes],
-            outputs or [np.zeros(shape) for shape in self.output_shapes],
+    def _single(self) -> SingleCall:
+        """One call with memory of its own, to be made again and again."""
+        inputs, outputs = (
+            [np.zeros(shape) for shape in shapes]
+            for shapes in (self.input_shapes, self.output_shapes)
         )
+        return SingleCall(self.name, self.entry, inputs, outputs)
 
     def _is_one_sample(self, inputs: Sequence[Any]) -> bool:
         """Whether nothing has to be checked or converted: that takes longer than a call."""
@@ -180,7 +175,7 @@ class FunctionKernel:
         try:
             single = self._singles.pop()
         except IndexError:
-            single = self.single()
+            single = self._single()
         for kept, array in zip(single.inputs, arrays, strict=True):
             kept[...] = array
         single()
@@ -260,7 +255,7 @@ class FunctionKernel:
         outputs: tuple[NDArray[np.float64], ...],
         count: int,
     ) -> None:
-        call = BufferedFunction(self._function)
+        call = BufferedFunction(self.function)
         sources = [array.reshape(-1) for array in arrays]
         targets = [output.reshape(-1) for output in outputs]
         for sample in range(count):

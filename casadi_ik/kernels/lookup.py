@@ -50,39 +50,6 @@ class _Job(ctypes.Structure):
     )
 
 
-class SingleLookup:
-    """One compiled lookup on fixed arrays; not to be shared by threads.
-
-    Attributes:
-        inputs: Arrays of the inputs' shapes; write into them.
-        found: (1, count) rows, nearest first; a call overwrites them.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        run: Any,
-        inputs: Sequence[NDArray[np.float64]],
-        found: NDArray[np.int64],
-        job: _Job,
-        kept: Any,
-    ) -> None:
-        self.inputs = tuple(inputs)
-        self.found = found
-        self._name = name
-        self._run = run
-        self._job = job
-        self._kept = kept
-        self._reference = ctypes.byref(job)
-
-    def __call__(self) -> None:
-        """Look up."""
-        self._job.next = 0
-        code = self._run(self._reference)
-        if code != DriverCode.DONE:
-            check(self._name, code)
-
-
 class LookupKernel:
     """Finds the nearest rows of one table; several threads may ask at once.
 
@@ -120,18 +87,22 @@ class LookupKernel:
         self.entry: Any = None if library is None else library[SYMBOL]
 
     def _load(self, graph: FunctionGraph) -> ctypes.CDLL | None:
-        constants = {
+        texts = map(driver_text, ("registers", "lookup_job", "lookup"))
+        driver = define(self.constants) + "".join(texts)
+        return load_library(
+            graph.name, lambda: row_major(graph.function), driver, SYMBOL, graph.recipe
+        )
+
+    @property
+    def constants(self) -> dict[str, int]:
+        """What the driver expects."""
+        return {
             "N_IN": len(self.key.input_shapes),
             "N_KEY": self._keys.shape[1],
             "TILE": TILE,
             "STEPS": STEPS,
             "LARGEST": LARGEST,
         }
-        texts = map(driver_text, ("registers", "lookup_job", "lookup"))
-        driver = define(constants) + "".join(texts)
-        return load_library(
-            graph.name, lambda: row_major(graph.function), driver, SYMBOL, graph.recipe
-        )
 
     def __call__(self, count: int, *inputs: Any) -> NDArray[np.int64]:
         """Find the nearest rows.
@@ -153,16 +124,6 @@ class LookupKernel:
         else:
             self._run_numpy(arrays, found)
         return found
-
-    def single(self, count: int, inputs: Sequence[NDArray[np.float64]]) -> SingleLookup:
-        """One lookup to be made again and again; of compiled ones only.
-
-        Args:
-            count: How many rows.
-            inputs: Contiguous arrays to read from, of one sample's shapes.
-        """
-        found = np.zeros((1, count), dtype=np.int64)
-        return SingleLookup(self.key.name, self.entry, inputs, found, *self._job(inputs, found))
 
     def _run_compiled(
         self, arrays: list[NDArray[np.float64]], steps: list[int], found: NDArray[np.int64]

@@ -18,7 +18,7 @@ from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, row_major
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
-from casadi_ik.kernels.loop_job import FIRST_MARK, SLOTS, CompiledBatch, SingleSolve
+from casadi_ik.kernels.loop_job import FIRST_MARK, SLOTS, CompiledBatch
 from casadi_ik.kernels.loop_result import (
     CODE_LIMIT,
     FAILED,
@@ -81,7 +81,7 @@ class LoopKernel:
 
     def _load(self) -> ctypes.CDLL | None:
         return load_library(
-            self.step.name, lambda: self._function, self._driver("loop"), SYMBOL, self.step.recipe
+            self.step.name, lambda: self.function, self._driver("loop"), SYMBOL, self.step.recipe
         )
 
     @property
@@ -118,7 +118,7 @@ class LoopKernel:
         try:
             library = load_library(
                 f"{self.step.name}_lanes{lanes}",
-                lambda: self._function,
+                lambda: self.function,
                 self._driver("loop_lanes"),
                 SYMBOL_LANES,
                 f"{self.step.recipe} lanes {lanes}" if self.step.recipe else "",
@@ -133,9 +133,10 @@ class LoopKernel:
             return None
         return None if library is None else library[SYMBOL_LANES]
 
-    def _driver(self, name: str) -> str:
-        """C text of one of the two drivers, with its constants."""
-        constants = {
+    @property
+    def constants(self) -> dict[str, int]:
+        """What the drivers expect, but what `row_driver` defines."""
+        return {
             "N_STATE": self.step.state.size,
             "N_PARAMETERS": self.step.parameters.size,
             "RUNNING": RUNNING,
@@ -147,11 +148,15 @@ class LoopKernel:
             "FIRST_MARK": FIRST_MARK,
             "STAGE": self.step.stage_place,
         }
+
+    def _driver(self, name: str) -> str:
+        """C text of one of the two drivers, with its constants."""
         job = driver_text("loop_job") + driver_text("marks")
-        return define(constants) + row_driver(self.step.record) + job + driver_text(name)
+        return define(self.constants) + row_driver(self.step.record) + job + driver_text(name)
 
     @cached_property
-    def _function(self) -> ca.Function:
+    def function(self) -> ca.Function:
+        """The step, row-major."""
         return row_major(self.step.function)
 
     def run(
@@ -200,7 +205,7 @@ class LoopKernel:
             rows=np.empty(self._room(count), dtype=self.step.record.dtype) if trace else None,
         )
         if not self.compiled:
-            run_vm(self.step, self._function, result, given, max_iterations)
+            run_vm(self.step, self.function, result, given, max_iterations)
             return result
         batch = CompiledBatch(self.step, result, given, max_iterations)
         several = self._for(count) if max_iterations > 0 else None
@@ -221,7 +226,3 @@ class LoopKernel:
             return 0
         rows = int(SPARE * self._rows_each * count) + FIRST_ROWS
         return min(rows, max(ROOM_BYTES // max(self.step.record.dtype.itemsize, 1), FIRST_ROWS))
-
-    def single(self) -> SingleSolve:
-        """One solve with memory of its own, to be made again and again; of compiled loops only."""
-        return SingleSolve(self.step, self.entry)

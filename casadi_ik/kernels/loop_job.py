@@ -16,7 +16,7 @@ from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
 from casadi_ik.kernels.loop_result import LoopResult
 from casadi_ik.kernels.rows import opaque
-from casadi_ik.kernels.step_graph import RUNNING, StepGraph
+from casadi_ik.kernels.step_graph import StepGraph
 
 SLOTS = 32
 """Solves under way at once, of which four or eight have the lanes."""
@@ -138,36 +138,3 @@ class CompiledBatch:
         ordered = np.empty_like(rows)
         opaque(ordered)[first[solve] + iteration] = opaque(rows)
         return ordered
-
-
-class SingleSolve:
-    """One compiled solve on fixed arrays, without a trace; not to be shared by threads.
-
-    Attributes:
-        parameters: (np,) write into it.
-        result: Of a batch of one; write the first state into `states`, a call overwrites all.
-    """
-
-    def __init__(self, step: StepGraph, loop: Any) -> None:
-        self.parameters = np.zeros(step.parameters.size)
-        self.result = LoopResult(
-            states=np.zeros((1, step.state.size)),
-            iterations=np.zeros(1, dtype=np.int64),
-            status=np.zeros(1, dtype=np.int32),
-            time=np.zeros(1),
-        )
-        self._loop = loop
-        self._batch = CompiledBatch(step, self.result, self.parameters, 0)
-        self._reference = ctypes.byref(self._batch.job)
-
-    def __call__(self, max_iterations: int) -> None:
-        """Solve, as `LoopKernel.run` does.
-
-        Raises:
-            KernelError: No work memory.
-        """
-        result, job = self.result, self._batch.job
-        result.iterations[0], result.status[0], result.time[0] = 0, RUNNING, 0.0
-        job.solve, job.max_iterations = 0, max_iterations
-        while (code := self._loop(self._reference)) != DriverCode.DONE:
-            check(self._batch.name, code)

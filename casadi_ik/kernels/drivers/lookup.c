@@ -15,9 +15,9 @@ typedef struct {
 
 /* Only gcc needs to be told that loops over a tile are one instruction. */
 #if defined(__clang__)
-#define UNROLLED static inline __attribute__((always_inline))
+#define UNROLLED static inline __attribute__((always_inline, unused))
 #else
-#define UNROLLED static inline __attribute__((always_inline, optimize("O3")))
+#define UNROLLED static inline __attribute__((always_inline, unused, optimize("O3")))
 #endif
 
 static void ask(const double *key, asked *pairs) {
@@ -79,13 +79,7 @@ typedef void look_up(const lookup_job *, const asked *, int32_t *, int32_t *, in
 #define FORM static __attribute__((optimize("O3")))
 #endif
 
-FORM void anywhere(
-    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
-  measure(job, pairs, distance);
-  choose(job, distance, nearest, found);
-}
-
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(FREESTANDING)
 #include <immintrin.h>
 
 #define PAIR_OF(numbers) \
@@ -147,10 +141,69 @@ __attribute__((target("avx512f,avx512bw"))) FORM void with_avx512(
 }
 #endif
 
+#if defined(FREESTANDING) && (defined(__SSE2__) || defined(__wasm_simd128__))
+#if defined(__SSE2__)
+#include <emmintrin.h>
+typedef __m128i eight;
+#define LOADED(from) _mm_loadu_si128((const __m128i *) (const void *) (from))
+#define STORED(to, x) _mm_storeu_si128((__m128i *) (void *) (to), x)
+#define TWICE(x) _mm_set1_epi32(x)
+#define REST(a, twice, kept) _mm_and_si128(_mm_sub_epi16(a, twice), kept)
+#define SUM(sum, a, rest) _mm_add_epi32(sum, _mm_madd_epi16(a, rest))
+#else
+#include <wasm_simd128.h>
+typedef v128_t eight;
+#define LOADED(from) wasm_v128_load(from)
+#define STORED(to, x) wasm_v128_store(to, x)
+#define TWICE(x) wasm_i32x4_splat(x)
+#define REST(a, twice, kept) wasm_v128_and(wasm_i16x8_sub(a, twice), kept)
+#define SUM(sum, a, rest) wasm_i32x4_add(sum, wasm_i32x4_dot_i16x8(a, rest))
+#endif
+
+#define PAIR_OF(numbers) \
+  ((int32_t) ((uint32_t) (uint16_t) (numbers)[0] | (uint32_t) (uint16_t) (numbers)[1] << 16))
+
+/* What every machine of the kind has. */
+static void measure_eight(const lookup_job *job, const asked *pairs, int32_t *distance) {
+  eight twice[PAIRS], kept[PAIRS];
+  int64_t tile, tiles = (job->rows + TILE - 1) / TILE;
+  int i, part;
+  for (i = 0; i < PAIRS; ++i) {
+    twice[i] = TWICE(PAIR_OF(pairs[i].twice));
+    kept[i] = TWICE(PAIR_OF(pairs[i].kept));
+  }
+  for (tile = 0; tile < tiles; ++tile) {
+    const int16_t *row = job->tiles + tile * PAIRS * TILE * 2;
+    for (part = 0; part < TILE / 4; ++part) {
+      eight sum = TWICE(0);
+      for (i = 0; i < PAIRS; ++i) {
+        const eight a = LOADED(row + (i * TILE + part * 4) * 2);
+        sum = SUM(sum, a, REST(a, twice[i], kept[i]));
+      }
+      STORED(distance + tile * TILE + part * 4, sum);
+    }
+  }
+}
+
+FORM void with_eight(
+    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
+  measure_eight(job, pairs, distance);
+  choose(job, distance, nearest, found);
+}
+#define PLAIN with_eight
+#else
+FORM void anywhere(
+    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
+  measure(job, pairs, distance);
+  choose(job, distance, nearest, found);
+}
+#define PLAIN anywhere
+#endif
+
 /* Asked once: in a virtual machine the question takes longer than a lookup. Threads that ask at the
  * same time get the same answer. */
 static look_up *best_form(void) {
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(FREESTANDING)
   static int known;
   int bits = __atomic_load_n(&known, __ATOMIC_RELAXED);
   if (!bits) {
@@ -160,7 +213,7 @@ static look_up *best_form(void) {
   if (bits == 512) return with_avx512;
   if (bits == 256) return with_avx2;
 #endif
-  return anywhere;
+  return PLAIN;
 }
 
 EXPORT int casadi_ik_lookup(lookup_job *job) {

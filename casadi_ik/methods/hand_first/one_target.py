@@ -13,9 +13,9 @@ from casadi_ik.errors import KernelError
 from casadi_ik.kernels import FunctionKernel, LookupKernel, LoopKernel
 from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.codegen import driver_text
+from casadi_ik.kernels.codegen import define, driver_text
 from casadi_ik.kernels.driver_code import DriverCode, check
-from casadi_ik.methods.hand_first.rounds import RoundsPlan
+from casadi_ik.methods.hand_first.rounds import RoundsPlan, source_text
 from casadi_ik.methods.hand_first.state import STAGE_LABELS
 from casadi_ik.problem.method import Quick
 
@@ -146,7 +146,10 @@ def _driver(plan: RoundsPlan) -> str:
             *jobs,
             f"#define OWN_FIELDS \\\n{fields}{calls}",
             "#define TILES(table) (job->tiles[table])\n",
-            plan.text(),
+            define(plan.sizes),
+            source_text("rounds_job"),
+            plan.constants(),
+            source_text("rounds"),
             driver_text("rounds_call"),
         )
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 
 import numpy as np
@@ -32,6 +33,13 @@ DIMENSIONS = (
 
 STATE = ("q", "phase", "candidate", "earlier", "returns", "best_cost", "best_q")
 """What rounds.c reads and writes of a state."""
+
+
+@cache
+def source_text(name: str) -> str:
+    """The text of "rounds_job" (the memory) or "rounds" (what is done in it)."""
+    source = resources.files("casadi_ik.methods.hand_first") / f"{name}.c"
+    return source.read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,16 +82,11 @@ class RoundsPlan:
         )
         return dict(zip(DIMENSIONS, values, strict=True))
 
-    def text(self) -> str:
-        """The constants and rounds.c itself; what calls of kernels mean has to stand before."""
-        source = resources.files("casadi_ik.methods.hand_first") / "rounds.c"
-        return self._constants() + source.read_text(encoding="utf-8")
-
-    def _constants(self) -> str:
-        sizes = self.sizes | self._whole_numbers()
+    def constants(self) -> str:
+        """All of them but the `sizes`, as C text."""
         reals = {name: number(value) for name, value in self._real_numbers().items()}
         lines = (f"#define {name} {value}\n" for name, value in reals.items())
-        return define(sizes) + "".join(lines) + define_arrays(self._arrays())
+        return define(self._whole_numbers()) + "".join(lines) + define_arrays(self._arrays())
 
     def _whole_numbers(self) -> dict[str, int]:
         layouts = self.layouts

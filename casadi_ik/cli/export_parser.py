@@ -1,0 +1,84 @@
+"""What can be said behind `casadi-ik export` and `casadi-ik compile`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from casadi_ik.cli.values import one_of
+
+if TYPE_CHECKING:
+    from casadi_ik.cli.answer import Answer
+
+_EXPORT = """\
+examples:
+  casadi-ik export kuka_lwr_barrett --out solver && make -C solver test
+  casadi-ik export my_robot.yaml --out page --target wasm
+
+DIR becomes a project that needs nothing but a C compiler (--target wasm: a browser or node):
+library, header, example, a test of 1,000 stored targets, a benchmark, README. It solves one target
+at a time, in doubles; its answers are bit for bit those of this package. An earlier export in DIR
+is replaced; any other folder that is not empty is refused.
+
+exit codes: 0 written, 2 bad input (nothing is written)
+"""
+
+_COMPILE = """\
+example:
+  casadi-ik compile kuka_lwr_barrett panda+allegro_right
+
+Makes what solving, batches and logs of a robot compile when first used, so that nothing has to be
+compiled later; also for a machine without a compiler that shares CASADI_IK_CACHE.
+
+exit codes: 0 done, 2 bad input
+"""
+
+
+def add_export(commands: Any) -> None:
+    """Add `export` and `compile` to the commands."""
+    parser = commands.add_parser(
+        "export",
+        help="write a robot's solver as plain C or WebAssembly",
+        description="Write a robot's solver as source code that needs this package no more.",
+        epilog=_EXPORT,
+    )
+    parser.add_argument("robot", metavar="ROBOT", help="a shipped name or a YAML file")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    parser.add_argument(
+        "--method", metavar="M", default="hand-first", help="default, and only one: hand-first"
+    )
+    parser.add_argument(
+        "--prefix", metavar="NAME", help="what all names begin with (default: the robot's name)"
+    )
+    parser.add_argument(
+        "--target",
+        metavar="c|wasm",
+        type=one_of("c", "wasm"),
+        default="c",
+        help="plain C (default), or a WebAssembly module for JavaScript (needs "
+        "casadi-ik[compiler])",
+    )
+    parser.set_defaults(run=_export)
+    parser = commands.add_parser(
+        "compile",
+        help="compile robots' kernels ahead of use",
+        description="Compile what solving, batches and logs of robots need, ahead of use.",
+        epilog=_COMPILE,
+    )
+    parser.add_argument(
+        "robots", metavar="ROBOT", nargs="+", help="a shipped name, ARM+HAND, or a YAML file"
+    )
+    parser.set_defaults(run=_compile)
+
+
+def _export(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.export import export
+
+    return export(arguments)
+
+
+def _compile(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.export import compile_ahead
+
+    return compile_ahead(arguments)

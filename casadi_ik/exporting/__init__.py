@@ -1,0 +1,1 @@
+"""Solvers as source code of their own: plain C, and WebAssembly for a page."""

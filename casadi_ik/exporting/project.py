@@ -1,0 +1,167 @@
+"""A folder with a solver in it: built beside its place, and put there when it is whole."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from casadi_ik.api import Solver
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.exporting.solver import SolverSources, hand_first
+from casadi_ik.exporting.targets import COUNT, Example, example, targets_header, written
+from casadi_ik.exporting.template import filled
+
+MARK = ".casadi_ik_export"
+"""A file by which a folder is known as an export."""
+
+EXPORTED = ("hand-first",)
+"""The methods that can be exported."""
+
+IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+def checked_prefix(prefix: str | None, robot: str) -> str:
+    """What names begin with; of the robot's name if it is not said.
+
+    Raises:
+        InputError: No name of C.
+    """
+    if prefix is None:
+        made = re.sub(r"\W+", "_", robot, flags=re.ASCII).strip("_").lower()
+        return made if IDENTIFIER.fullmatch(made) else f"robot_{made}"
+    if not IDENTIFIER.fullmatch(prefix):
+        raise InputError(f"--prefix: found {prefix!r}, expected letters, digits and underscores")
+    return prefix
+
+
+def check_method(method: str) -> None:
+    """Whether it can be exported.
+
+    Raises:
+        UnsupportedError: It cannot.
+    """
+    if method not in EXPORTED:
+        raise UnsupportedError(
+            f"--method: {method!r} cannot be exported, expected one of {', '.join(EXPORTED)}"
+        )
+
+
+def check_folder(out: Path) -> None:
+    """Whether a folder may be written: it is not there, empty, or an export.
+
+    Raises:
+        InputError: Something else is there.
+    """
+    try:
+        if out.is_symlink() or (out.exists() and not out.is_dir()):
+            raise InputError(f"--out: {out} is no folder, expected a new one, or an earlier export")
+        if out.is_dir() and any(out.iterdir()) and not (out / MARK).is_file():
+            raise InputError(f"--out: {out} is not empty, and no earlier export; nothing written")
+    except OSError as error:
+        raise InputError(f"--out: {out}: {error.strerror}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """A robot's solver on its way out.
+
+    Attributes:
+        solver: Its answers are those of the export.
+        example: What the example solves.
+        marks: What stands for the marks of the templates.
+        sources: Headers and C files by path.
+    """
+
+    solver: Solver
+    example: Example
+    marks: dict[str, str]
+    sources: dict[str, str]
+
+
+def exported(robot: ArmHand, prefix: str) -> Exported:
+    """The solver of a robot as source code.
+
+    Raises:
+        UnsupportedError: It cannot be exported.
+    """
+    method, solver = hand_first(robot), Solver(robot)
+    if not method.kernel.compiled:
+        raise UnsupportedError(
+            "export: its test needs answers from compiled code, and there is no C compiler here; "
+            "pip install 'casadi-ik[compiler]' brings one"
+        )
+    sources = SolverSources(robot, method, prefix, next(iter(solver.tolerances.values())))
+    shown = example(robot)
+    marks = sources.substitutes | {
+        "EXAMPLE_WHAT": shown.what,
+        "EXAMPLE_POINTS": written(shown.points),
+        "EXAMPLE_NORMALS": written(shown.normals),
+        "TARGETS": str(COUNT),
+        "ROUNDS_COUNT": str(sources.plan.rounds),
+    }
+    files = {
+        f"include/{prefix}.h": filled("solver.h", marks),
+        f"src/{prefix}_parts.h": filled("parts.h", marks),
+        f"src/{prefix}_solver.c": filled("solver.c", marks),
+        f"src/{prefix}_tables.c": sources.tables(),
+        **{f"src/{prefix}_{part.name}.c": part.text for part in sources.parts},
+    }
+    return Exported(solver, shown, marks, files)
+
+
+def c_project(robot: ArmHand, prefix: str) -> dict[str, str | bytes]:
+    """The files of a project in C, by path.
+
+    Raises:
+        UnsupportedError: The robot's solver cannot be exported.
+    """
+    project = exported(robot, prefix)
+    files = {
+        f"include/{prefix}.hpp": "solver.hpp",
+        "example/main.c": "main.c",
+        "test/test.c": "test.c",
+        "bench/bench.c": "bench.c",
+        "CMakeLists.txt": "CMakeLists.txt",
+        "Makefile": "Makefile",
+        "README.md": "README.md",
+    }
+    return {
+        **project.sources,
+        **{path: filled(name, project.marks) for path, name in files.items()},
+        "test/targets.h": targets_header(project.solver),
+    }
+
+
+def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
+    """Write a folder as a whole; an earlier export is replaced.
+
+    Raises:
+        InputError: It cannot be written; nothing is left of it.
+    """
+    check_folder(out)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        try:
+            for name, content in files.items():
+                path = made / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                data = content.encode() if isinstance(content, str) else content
+                path.write_bytes(data)
+            (made / MARK).write_text("casadi-ik export wrote this folder and may replace it.\n")
+            made.chmod(0o755)
+            old = made.with_name(made.name + ".old")
+            if out.exists():
+                out.rename(old)
+            made.rename(out)
+            shutil.rmtree(old, ignore_errors=True)
+        except BaseException:
+            shutil.rmtree(made, ignore_errors=True)
+            raise
+    except OSError as error:
+        raise InputError(f"--out: {out}: cannot be written: {error.strerror}") from error

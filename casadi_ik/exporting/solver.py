@@ -1,0 +1,196 @@
+"""The sources of a solver: each kernel of hand-first in a file of its own, and what drives them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.exporting.generated import standing_alone
+from casadi_ik.exporting.template import filled
+from casadi_ik.kernels import FunctionKernel, LoopKernel
+from casadi_ik.kernels.codegen import define, driver_text
+from casadi_ik.kernels.constants import define_arrays
+from casadi_ik.kernels.lookup import TILE
+from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.methods.hand_first.rounds import RoundsPlan, source_text
+from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.problems import Problems, Tolerance
+
+SIGNATURE = re.compile(r"EXPORT int casadi_ik_\w+\((\w+) \*job\)")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A kernel.
+
+    Attributes:
+        name: Of its file and function.
+        job: What it works on.
+        text: Its file.
+        work: Numbers of each kind of memory: doubles, inputs, outputs, whole numbers.
+    """
+
+    name: str
+    job: str
+    text: str
+    work: tuple[int, int, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class SolverSources:
+    """The sources of a solver.
+
+    Attributes:
+        robot: The robot.
+        method: Hand-first for it.
+        prefix: What every name in it begins with.
+        tolerance: When a contact counts as reached, unless set otherwise.
+    """
+
+    robot: ArmHand
+    method: HandFirstMethod
+    prefix: str
+    tolerance: Tolerance
+
+    @cached_property
+    def plan(self) -> RoundsPlan:
+        """All rounds of one target."""
+        return self.method.rounds_plan(enforce_limits=True)
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """The kernels."""
+        plan = self.plan
+        lookup, n_state = plan.hands.table.lookup, plan.layouts.state.size
+        rows = max(spread.count for spread in plan.hands.spreads[:2])
+        # The record of an iteration is never asked for.
+        loop = define(plan.solve.constants | {"N_RECORD": 0, "ROW_BYTES": 0})
+        loop += "#define store_row(record, row) ((void) (record), (void) (row))\n"
+        return (
+            self._part("look_up", "lookup", lookup.key, define(lookup.constants), rows + TILE),
+            self._part("begin", "map", plan.begin),
+            self._part("solve", "loop", plan.solve, loop, 2 * n_state),
+            self._part("contacts", "map", plan.contacts),
+            self._part("valley", "map", plan.hands.valley),
+            self._part("judge", "map", plan.judge),
+        )
+
+    def _part(
+        self,
+        name: str,
+        driver: str,
+        kernel: FunctionKernel | LoopKernel,
+        constants: str = "",
+        extra: int = 0,
+    ) -> Part:
+        function: Any = kernel.function
+        if driver == "map":
+            constants = define(kernel.constants)
+        if driver == "lookup":
+            extra += function.numel_out(0)
+        text = driver_text("marks") if driver == "loop" else ""
+        text += driver_text(driver)
+        # In Python a driver has its memory from the heap; here it is handed to it.
+        own = f"int {self.prefix}_{name}_kernel(\\1 *job, {self.prefix}_memory *memory)"
+        text, count = SIGNATURE.subn(own, text)
+        assert count == 1, driver
+        body = "".join(
+            (
+                f'#include "{self.prefix}_parts.h"\n\n',
+                standing_alone(function),
+                driver_text("freestanding"),
+                define({"N_W": function.sz_w()}),
+                filled("take.c", {"PREFIX": self.prefix}),
+                constants,
+                text,
+            )
+        )
+        work = (function.sz_w() + extra, function.sz_arg(), function.sz_res(), function.sz_iw())
+        return Part(name, f"{driver}_job", body, work)
+
+    @property
+    def substitutes(self) -> dict[str, str]:
+        """What stands for the marks of the templates."""
+        robot, sizes = self.robot, self.plan.sizes
+        w, arg, res, iw = (max(sizes) for sizes in zip(*(p.work for p in self.parts), strict=True))
+        jobs = "".join(driver_text(f"{name}_job") for name in ("loop", "map", "lookup"))
+        parts = "".join(
+            f"int {self.prefix}_{p.name}_kernel({p.job} *job, {self.prefix}_memory *memory);\n"
+            for p in self.parts
+        )
+        calls = "".join(
+            f"#define {p.name.upper()}(work) {self.prefix}_{p.name}_kernel(work, &job->memory)\n"
+            for p in self.parts
+        )
+        return {
+            "PREFIX": self.prefix,
+            "GUARD": self.prefix.upper(),
+            "ROBOT": robot.name,
+            "FINGERS": str(len(robot.fingers)),
+            "MOTORS": str(len(robot.actuators)),
+            "FINGER_LIST": ", ".join(robot.fingers),
+            "MOTOR_LIST": ", ".join(robot.actuators),
+            "FINGER_NAMES": _strings(robot.fingers),
+            "MOTOR_NAMES": _strings(robot.actuators),
+            "W": str(w),
+            "ARG": str(arg),
+            "RES": str(res),
+            "IW": str(max(iw, 1)),
+            "STRUCT": self._struct(),
+            "JOBS": jobs,
+            "PARTS": parts,
+            "CALLS": calls,
+            "SIZES": define(sizes),
+            "CONSTANTS": self.plan.constants(),
+            "ROUNDS": source_text("rounds"),
+            "TERMS": define_arrays({"TERMS": self._terms(), "HOME": robot.home}),
+            "LIMITS": define_arrays(
+                {f"{self.prefix}_lower": robot.lower, f"{self.prefix}_upper": robot.upper}, "const"
+            ),
+            "POSITION_TOLERANCE": repr(self.tolerance.position),
+            "ANGLE_TOLERANCE": repr(self.tolerance.angle),
+        }
+
+    def tables(self) -> str:
+        """The file of the lookup tables' keys."""
+        tables = {
+            f"{self.prefix}_table_{i}": np.ascontiguousarray(table.lookup.tiles).reshape(-1)
+            for i, table in enumerate(self.plan.hands.tables(enforce_limits=True))
+        }
+        head = (
+            f'/* Shapes of hand postures, to be compared with targets. */\n#include "{self.prefix}'
+        )
+        return head + '_parts.h"\n\n' + define_arrays(tables, "const")
+
+    def _struct(self) -> str:
+        """The body of the struct that rounds.c works on, with numbers for its macros."""
+        text = source_text("rounds_job")
+        body = text[text.index("typedef struct {") + len("typedef struct {") : text.index("OWN_")]
+        for name, size in self.plan.sizes.items():
+            body = re.sub(rf"\b{name}\b", str(size), body)
+        return body.strip("\n").rstrip()
+
+    def _terms(self) -> Any:
+        f = len(self.robot.fingers)
+        none = np.zeros((1, f, 3))
+        return self.method.terms(Problems(none, none, self.tolerance, True))
+
+
+def hand_first(robot: ArmHand) -> HandFirstMethod:
+    """The method whose solver is exported, compiled."""
+    from casadi_ik.methods.registry import build_method
+
+    method = build_method("hand-first", robot.description, {})
+    assert isinstance(method, HandFirstMethod)
+    assert usual(len(robot.fingers))
+    method.prepare()
+    return method
+
+
+def _strings(names: tuple[str, ...]) -> str:
+    return ", ".join(f'"{name}"' for name in names)

@@ -1,0 +1,71 @@
+/* Time of a solve: random arms and hands within limits, bench [SECONDS] [TARGETS]. The mean of CPU time
+ * is what the solves take whatever else the machine does; all others are by the clock on the wall. */
+#define _POSIX_C_SOURCE 199309L
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "@PREFIX@.h"
+
+enum { SAMPLE = 4096 };
+
+static @PREFIX@_solver solver;
+static uint64_t seed = 88172645463325252u;
+
+static double random_part(void) {
+  seed ^= seed << 13;
+  seed ^= seed >> 7;
+  seed ^= seed << 17;
+  return (double) (seed >> 11) / 9007199254740992.0;
+}
+
+static double now(clockid_t clock) {
+  struct timespec t;
+  clock_gettime(clock, &t);
+  return (double) t.tv_sec * 1e6 + (double) t.tv_nsec * 1e-3;
+}
+
+static int compare(const void *a, const void *b) {
+  const float x = *(const float *) a, y = *(const float *) b;
+  return (x > y) - (x < y);
+}
+
+int main(int count, char **words) {
+  const double seconds = count > 1 ? atof(words[1]) : 10.0, begun = now(CLOCK_MONOTONIC);
+  const long most = count > 2 ? atol(words[2]) : 1000000;
+  float *times = malloc((size_t) most * sizeof *times);
+  double q[@GUARD@_MOTORS], points[3 * @GUARD@_FINGERS], normals[3 * @GUARD@_FINGERS], sum = 0;
+  static double kept[SAMPLE][6 * @GUARD@_FINGERS];
+  double cpu;
+  long n, k, solved = 0;
+  int i;
+  if (!times) return 2;
+  @PREFIX@_init(&solver);
+  for (n = 0; n < most && now(CLOCK_MONOTONIC) - begun < seconds * 1e6; ++n) {
+    double start;
+    for (i = 0; i < @GUARD@_MOTORS; ++i) {
+      q[i] = @PREFIX@_lower[i] + random_part() * (@PREFIX@_upper[i] - @PREFIX@_lower[i]);
+    }
+    @PREFIX@_contacts(&solver, q, points, normals);
+    start = now(CLOCK_MONOTONIC);
+    solved += @PREFIX@_solve(&solver, points, normals, 0) == @GUARD@_SOLVED;
+    times[n] = (float) (now(CLOCK_MONOTONIC) - start);
+    sum += times[n];
+    memcpy(kept[n % SAMPLE], points, sizeof points);
+    memcpy(kept[n % SAMPLE] + 3 * @GUARD@_FINGERS, normals, sizeof normals);
+  }
+  if (!n) return 2;
+  cpu = now(CLOCK_PROCESS_CPUTIME_ID);
+  for (k = 0; k < SAMPLE && k < n; ++k) {
+    @PREFIX@_solve(&solver, kept[k], kept[k] + 3 * @GUARD@_FINGERS, 0);
+  }
+  cpu = (now(CLOCK_PROCESS_CPUTIME_ID) - cpu) / (double) k;
+  qsort(times, (size_t) n, sizeof *times, compare);
+  printf("{\"targets\": %ld, \"solved\": %ld, \"cpu_mean\": %.3f, \"mean\": %.3f, \"median\": %.3f, \"p99\": %.3f, "
+         "\"p99.9\": %.3f, \"max\": %.3f, \"unit\": \"us\", \"solver_bytes\": %ld}\n",
+         n, solved, cpu, sum / (double) n, times[n / 2], times[n * 99 / 100], times[n * 999 / 1000],
+         times[n - 1], (long) sizeof solver);
+  free(times);
+  return 0;
+}

@@ -1,0 +1,15 @@
+/* What the files of this solver share; programs include @PREFIX@.h only. */
+#ifndef @GUARD@_PARTS_H
+#define @GUARD@_PARTS_H
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#include "@PREFIX@.h"
+
+@JOBS@
+@PARTS@
+extern const int16_t @PREFIX@_table_0[], @PREFIX@_table_1[];
+
+#endif

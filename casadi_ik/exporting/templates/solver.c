@@ -1,0 +1,69 @@
+/* The solver itself: all rounds of a target. */
+#include "@PREFIX@_parts.h"
+
+enum { DONE = 0, SLICE_OVER = 1 };
+
+typedef @PREFIX@_solver rounds;
+
+#define TILES(table) ((table) ? @PREFIX@_table_1 : @PREFIX@_table_0)
+@CALLS@
+@SIZES@
+@CONSTANTS@
+@ROUNDS@
+@TERMS@
+@LIMITS@
+const char *const @PREFIX@_finger_names[] = {@FINGER_NAMES@};
+const char *const @PREFIX@_motor_names[] = {@MOTOR_NAMES@};
+
+void @PREFIX@_init(@PREFIX@_solver *solver) {
+  memset(solver, 0, sizeof *solver);
+  memcpy(solver->terms, TERMS, sizeof TERMS);
+  solver->rounds = ROUNDS;
+  solver->status = @GUARD@_BAD_INPUT;
+}
+
+void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, double position, double angle) {
+  int i;
+  for (i = 0; i < N_FINGERS; ++i) {
+    if (finger >= 0 && i != finger) continue;
+    solver->terms[i] = position;
+    solver->terms[N_FINGERS + i] = angle;
+  }
+}
+
+void @PREFIX@_set_range(@PREFIX@_solver *solver, int motor, double lower, double upper) {
+  solver->terms[TERMS_LOWER + motor] = lower;
+  solver->terms[TERMS_UPPER + motor] = upper;
+}
+
+int @PREFIX@_begin(@PREFIX@_solver *solver, const double *points, const double *normals,
+                   const double *q0) {
+  memcpy(solver->points, points, sizeof solver->points);
+  memcpy(solver->normals, normals, sizeof solver->normals);
+  memcpy(solver->here, q0 ? q0 : HOME, sizeof solver->here);
+  solver->terms[TERMS_NEAREST] = q0 ? 1.0 : 0.0;
+  if (!rounds_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
+  return (int) solver->status;
+}
+
+int @PREFIX@_run(@PREFIX@_solver *solver, int64_t iterations) {
+  if (rounds_run(solver, iterations) != DONE) solver->status = @GUARD@_INVALID;
+  return (int) solver->status;
+}
+
+int @PREFIX@_solve(@PREFIX@_solver *solver, const double *points, const double *normals,
+                   const double *q0) {
+  int status = @PREFIX@_begin(solver, points, normals, q0);
+  while (status == @GUARD@_RUNNING) status = @PREFIX@_run(solver, BUDGET);
+  return status;
+}
+
+void @PREFIX@_contacts(@PREFIX@_solver *solver, const double *q, double *points, double *normals) {
+  const double *inputs[1];
+  double *outputs[2];
+  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
+  inputs[0] = q;
+  outputs[0] = points;
+  outputs[1] = normals;
+  (void) @PREFIX@_contacts_kernel(&map, &solver->memory);
+}

@@ -1,0 +1,39 @@
+/* Solves the stored targets and compares with the stored answers, bit for bit: at once, and in calls
+ * of a few iterations by a second solver that has another target in between. */
+#include <stdio.h>
+#include <string.h>
+
+#include "@PREFIX@.h"
+#include "targets.h"
+
+static @PREFIX@_solver one, other;
+
+static int is_as_stored(const @PREFIX@_solver *solver, const target *stored) {
+  return solver->status == stored->status && solver->iterations == stored->iterations
+      && solver->restarts == stored->restarts
+      && !memcmp(solver->q, stored->q, sizeof stored->q);
+}
+
+int main(void) {
+  int i, wrong = 0, solved = 0, malformed = 0, calls = 0;
+  double nothing[3 * @GUARD@_FINGERS] = {0};
+  @PREFIX@_init(&one);
+  @PREFIX@_init(&other);
+  for (i = 0; i < TARGETS; ++i) {
+    const target *now = targets + i, *before = targets + (i + TARGETS - 1) % TARGETS;
+    const double *q0 = now->near ? now->q0 : 0;
+    solved += @PREFIX@_solve(&one, now->points, now->normals, q0) == @GUARD@_SOLVED;
+    wrong += !is_as_stored(&one, now);
+    @PREFIX@_begin(&other, now->points, now->normals, q0);
+    @PREFIX@_solve(&one, before->points, before->normals, 0);
+    do ++calls;
+    while (@PREFIX@_run(&other, 3) == @GUARD@_RUNNING);
+    wrong += !is_as_stored(&other, now);
+  }
+  /* Normals of length zero. */
+  malformed = @PREFIX@_solve(&one, nothing, nothing, 0) == @GUARD@_BAD_INPUT;
+  printf("%d targets, %d solved, %d answers in %d calls of 3 iterations; wrong: %d\n", TARGETS,
+         solved, TARGETS, calls, wrong);
+  if (!malformed) printf("a malformed target was not refused\n");
+  return wrong || !malformed;
+}

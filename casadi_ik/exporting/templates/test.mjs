@@ -1,0 +1,43 @@
+// node test.mjs: the stored targets, answers compared bit for bit; then the time of a solve.
+import { readFile } from "node:fs/promises";
+import { Solver, Status } from "./@PREFIX@.js";
+
+const targets = JSON.parse(await readFile(new URL("./targets.json", import.meta.url), "utf8"));
+const solver = await Solver.load();
+const other = await Solver.load();
+
+function differs(answer, target) {
+  return (
+    answer.status !== target.status ||
+    answer.iterations !== target.iterations ||
+    answer.restarts !== target.restarts ||
+    target.q.some((value, i) => !Object.is(value, answer.q[i]))
+  );
+}
+
+let wrong = 0;
+for (const target of targets) {
+  wrong += differs(solver.solve(target.points, target.normals, target.q0 ?? undefined), target);
+  other.begin(target.points, target.normals, target.q0 ?? undefined);
+  let answer;
+  do answer = other.run(3);
+  while (answer.status === Status.RUNNING);
+  wrong += differs(answer, target);
+}
+const zeros = new Float64Array(targets[0].points.length);
+const refused = solver.solve(zeros, zeros).status === Status.BAD_INPUT;
+
+const easy = targets.filter((target) => target.status === Status.SOLVED);
+const times = [];
+for (let i = 0; i < 20000; ++i) {
+  const target = easy[i % easy.length];
+  const begun = performance.now();
+  solver.solve(target.points, target.normals, target.q0 ?? undefined);
+  times.push(1e3 * (performance.now() - begun));
+}
+times.sort((a, b) => a - b);
+const mean = times.reduce((sum, time) => sum + time, 0) / times.length;
+console.log(
+  JSON.stringify({ targets: targets.length, wrong, refused, mean, median: times[10000], unit: "us" }),
+);
+process.exit(wrong || !refused ? 1 : 0);

@@ -1,0 +1,44 @@
+/* What JavaScript calls: one solver, and its numbers by address. */
+#include "@PREFIX@.h"
+
+#define EXPORTED(name) __attribute__((export_name(#name)))
+
+static @PREFIX@_solver solver;
+static double points[3 * @GUARD@_FINGERS], normals[3 * @GUARD@_FINGERS], q0[@GUARD@_MOTORS];
+
+EXPORTED(init) void init(void);
+EXPORTED(points_at) double *points_at(void);
+EXPORTED(normals_at) double *normals_at(void);
+EXPORTED(q0_at) double *q0_at(void);
+EXPORTED(q_at) double *q_at(void);
+EXPORTED(position_error_at) double *position_error_at(void);
+EXPORTED(angle_error_at) double *angle_error_at(void);
+EXPORTED(iterations) int iterations(void);
+EXPORTED(restarts) int restarts(void);
+EXPORTED(begin) int begin(int near);
+EXPORTED(run) int run(int most);
+EXPORTED(solve) int solve(int near);
+EXPORTED(contacts) void contacts(void);
+EXPORTED(set_tolerance) void set_tolerance(int finger, double position, double angle);
+EXPORTED(set_range) void set_range(int motor, double lower, double upper);
+
+void init(void) { @PREFIX@_init(&solver); }
+double *points_at(void) { return points; }
+double *normals_at(void) { return normals; }
+double *q0_at(void) { return q0; }
+double *q_at(void) { return solver.q; }
+double *position_error_at(void) { return solver.position_error; }
+double *angle_error_at(void) { return solver.angle_error; }
+int iterations(void) { return (int) solver.iterations; }
+int restarts(void) { return (int) solver.restarts; }
+int begin(int near) { return @PREFIX@_begin(&solver, points, normals, near ? q0 : 0); }
+int run(int most) { return @PREFIX@_run(&solver, most); }
+int solve(int near) { return @PREFIX@_solve(&solver, points, normals, near ? q0 : 0); }
+/* Of the configuration in q0. */
+void contacts(void) { @PREFIX@_contacts(&solver, q0, points, normals); }
+void set_tolerance(int finger, double position, double angle) {
+  @PREFIX@_set_tolerance(&solver, finger, position, angle);
+}
+void set_range(int motor, double lower, double upper) {
+  @PREFIX@_set_range(&solver, motor, lower, upper);
+}

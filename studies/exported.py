@@ -1,0 +1,203 @@
+"""What does an exported solver take: time, stack, memory, code; and one call in Python beside it?
+
+The shipped robot's solver is exported, built with the machine's compiler, and solves random
+targets one by one; the same from Python by `Solver.fast`, `Solver.solve` and in a batch, all by
+turns; and as WebAssembly in node where that is there::
+
+    python studies/exported.py --report out/exported
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from runner import markdown_table, provenance, write_page
+
+import casadi_ik as ik
+from casadi_ik.exporting.project import c_project, write_folder
+from casadi_ik.exporting.wasm import wasm_project
+
+TURNS = 5
+CALLS = 2000
+"""Calls of a turn."""
+
+STACK = """
+#define _DEFAULT_SOURCE
+#include <pthread.h>
+#include <stdio.h>
+#include <string.h>
+#include "arm.h"
+#include "targets.h"
+static arm_solver solver;
+static unsigned char stack[1 << 20] __attribute__((aligned(4096)));
+static void *work(void *given) {
+  int i;
+  for (i = 0; i < TARGETS; ++i) arm_solve(&solver, targets[i].points, targets[i].normals, 0);
+  return given;
+}
+int main(void) {
+  pthread_attr_t attributes;
+  pthread_t thread;
+  size_t least = 0;
+  memset(stack, 0xa5, sizeof stack);
+  arm_init(&solver);
+  pthread_attr_init(&attributes);
+  pthread_attr_setstack(&attributes, stack, sizeof stack);
+  if (pthread_create(&thread, &attributes, work, 0)) return 1;
+  pthread_join(thread, 0);
+  while (least < sizeof stack && stack[least] == 0xa5) ++least;
+  printf("%zu %zu\\n", sizeof stack - least, sizeof solver);
+  return 0;
+}
+"""
+
+INTRODUCTION = """
+Robot kuka_lwr_barrett, random arms and hands within limits, 5 mm / 3 deg, one target a call. CPU
+time is that of the measured thread alone, the smallest mean of {turns} turns; times by the clock on
+the wall have in them whatever else the machine did (load at the end {load}).
+"""
+
+
+def run(*command: str, folder: Path) -> str:
+    """Run a command; what it prints."""
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)}: {done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def built(robot: ik.ArmHand, folder: Path) -> Path:
+    """The exported project, built."""
+    project = folder / "c"
+    write_folder(project, c_project(robot, "arm"))
+    run("make", folder=project)
+    return project
+
+
+def sizes(project: Path) -> dict[str, int]:
+    """Bytes of code, tables, solver and stack."""
+    table = run("size", "-t", "build/libarm.a", folder=project).splitlines()[1:]
+    texts = {line.split()[5]: int(line.split()[0]) for line in table}
+    tables = sum(size for name, size in texts.items() if "tables" in name)
+    whole = next(size for name, size in texts.items() if name.startswith("(TOTALS)"))
+    (project / "stack.c").write_text(STACK)
+    flags = ["-O2", "-Iinclude", "-Itest", "stack.c", "build/libarm.a", "-lm", "-pthread"]
+    run("cc", *flags, "-o", "build/stack", folder=project)
+    stack, solver = map(int, run("build/stack", folder=project).split())
+    return {
+        "code (and its constants)": whole - tables,
+        "lookup tables (constant)": tables,
+        "a solver's struct": solver,
+        "stack of a solve": stack,
+    }
+
+
+def by_turns(ways: dict[str, Callable[[], float]], turns: int) -> dict[str, float]:
+    """The smallest of several figures of each way."""
+    found: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(turns):
+        for name, measure in ways.items():
+            found[name].append(measure())
+    return {name: min(values) for name, values in found.items()}
+
+
+def timed(call: Callable[[int], object], count: int) -> float:
+    """CPU time of a call [us]."""
+    begun = time.thread_time()
+    for i in range(count):
+        call(i)
+    return 1e6 * (time.thread_time() - begun) / count
+
+
+def python_ways(robot: ik.ArmHand, count: int) -> dict[str, Callable[[], float]]:
+    """CPU time a target [us] of a batch, of `fast` and of `solve`."""
+    solver, rng = ik.Solver(robot), np.random.default_rng(3)
+    points, normals = robot.contacts(robot.random(rng, count))
+    grasps = [
+        ik.Grasp({n: ik.Contact(points[i, f], normals[i, f]) for f, n in enumerate(robot.fingers)})
+        for i in range(count)
+    ]
+    fast = solver.fast()
+    solver.solve_batch(points, normals)
+    solver.solve(grasps[0])
+    return {
+        "Python, batch": lambda: timed(lambda _: solver.solve_batch(points, normals), 1) / count,
+        "Python, Solver.fast": lambda: timed(lambda i: fast(points[i], normals[i]), count),
+        "Python, Solver.solve": lambda: timed(lambda i: solver.solve(grasps[i]), count),
+    }
+
+
+def tail(robot: ik.ArmHand, calls: int) -> list[float]:
+    """Mean, 99.9th percentile and largest time [us] of calls of `fast`, clock on the wall."""
+    fast, rng = ik.Solver(robot).fast(), np.random.default_rng(4)
+    times = []
+    for start in range(0, calls, 50_000):
+        points, normals = robot.contacts(robot.random(rng, min(50_000, calls - start)))
+        for point, normal in zip(points, normals, strict=True):
+            begun = time.perf_counter()
+            fast(point, normal)
+            times.append(time.perf_counter() - begun)
+    us = 1e6 * np.array(times)
+    return [us.mean(), float(np.median(us)), float(np.quantile(us, 0.999)), us.max()]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure and write the report."""
+    parser = argparse.ArgumentParser(description="Time, stack, memory, code of an exported solver.")
+    parser.add_argument("--seconds", type=float, default=60, help="of the C benchmark, at most")
+    parser.add_argument("--calls", type=int, default=1_000_000, help="of fast, for its tail")
+    parser.add_argument("--turns", type=int, default=TURNS)
+    parser.add_argument("--report", type=Path, default=Path("out/exported"), help="folder")
+    options = parser.parse_args(arguments)
+    robot = ik.load_robot("kuka_lwr_barrett")
+    with tempfile.TemporaryDirectory() as place:
+        project = built(robot, Path(place))
+        bytes_of = sizes(project)
+
+        def in_c() -> float:
+            return json.loads(run("build/bench", "2", "20000", folder=project))["cpu_mean"]
+
+        cpu = by_turns({"plain C": in_c, **python_ways(robot, CALLS)}, options.turns)
+        long = json.loads(run("build/bench", f"{options.seconds}", folder=project))
+        if shutil.which("node") and importlib.util.find_spec("ziglang"):
+            write_folder(Path(place) / "wasm", wasm_project(robot, "arm"))
+            runs = [run("node", "test.mjs", folder=Path(place) / "wasm") for _ in range(3)]
+            median = min(json.loads(text)["median"] for text in runs)
+            cpu["WebAssembly in node (median, wall)"] = median
+    walls = [long[key] for key in ("mean", "median", "p99.9", "max")]
+    rows = [["plain C", f"{long['targets']:,}", *(f"{value:.1f}" for value in walls)]]
+    measured = tail(robot, options.calls)
+    calls = [f"{options.calls:,}", *(f"{value:.1f}" for value in measured)]
+    rows.append(["Python, Solver.fast", *calls])
+    batch = cpu["Python, batch"]
+    load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
+    parts = [
+        INTRODUCTION.format(turns=options.turns, load=load),
+        "## CPU time of a solve",
+        markdown_table(
+            ["", "us", "over a batch's"],
+            [[name, f"{value:.1f}", f"{value / batch:.2f}"] for name, value in cpu.items()],
+        ),
+        f"## The tail, by the clock on the wall [us]\n\n{long['solved']:,} of {long['targets']:,} "
+        "solved in C.",
+        markdown_table(["", "targets", "mean", "median", "99.9th percentile", "largest"], rows),
+        "## Bytes",
+        markdown_table(["", "bytes"], [[name, f"{size:,}"] for name, size in bytes_of.items()]),
+        provenance({"casadi_ik": version("casadi-ik")}),
+    ]
+    write_page("An exported solver", parts, options.report)
+
+
+if __name__ == "__main__":
+    main()

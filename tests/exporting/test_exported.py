@@ -1,0 +1,179 @@
+"""Exported solvers: they compile without a word, solve bit for bit, and replace nothing else."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from casadi_ik.cli.main import main
+from casadi_ik.exporting.generated import standing_alone
+from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
+
+STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
+SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+LIBM = {"sin", "cos", "sincos", "pow", "fmod", "fmax", "fmin", "rint", "sqrt", "floor", "hypot"}
+COMPILERS = {"memcpy", "memset", "memcmp", "memmove", "_GLOBAL_OFFSET_TABLE_"}
+"""What every C compiler may call of its own accord, without a C library too."""
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+
+
+@pytest.fixture(scope="module")
+def project(robot, tmp_path_factory) -> Path:
+    """The project of the shipped robot."""
+    out = tmp_path_factory.mktemp("exported") / "solver"
+    write_folder(out, c_project(robot, "arm"))
+    return out
+
+
+def compiled(project: Path, *flags: str) -> None:
+    command = ["gcc", *STRICT, *flags, "-Iinclude", "-Isrc", "-Itest"]
+    done = subprocess.run(command, cwd=project, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[:2000]
+
+
+@needs_gcc
+def test_stored_targets_bit_for_bit_under_sanitizers(project):
+    sources = [str(path.relative_to(project)) for path in sorted(project.glob("src/*.c"))]
+    compiled(project, "-O0", *SANITIZERS, "-c", *sources)
+    objects = [Path(name).with_suffix(".o").name for name in sources]
+    for program, text in (("stored", "test/test.c"), ("shown", "example/main.c")):
+        compiled(project, *SANITIZERS, text, *objects, "-o", program, "-lm")
+    done = subprocess.run([project / "stored"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1000 targets, 990 solved" in done.stdout
+    shown = subprocess.run([project / "shown"], capture_output=True, text=True)
+    assert shown.returncode == 0
+    assert "solved after" in shown.stdout
+
+    listed = subprocess.run(
+        ["nm", "-u", "-P", *objects], cwd=project, capture_output=True, text=True, check=True
+    )
+    wanted = {line.split()[0] for line in listed.stdout.splitlines() if line.endswith(" U")}
+    wanted |= {line.split()[0] for line in listed.stdout.splitlines() if " U " in line}
+    foreign = {name for name in wanted if not name.startswith(("arm_", "__asan", "__ubsan"))}
+    assert "sin" in foreign
+    assert foreign <= LIBM | COMPILERS
+
+
+@needs_gcc
+def test_no_state_outside_the_struct(project):
+    compiled(project, "-O1", "-c", "src/arm_look_up.c", "src/arm_solver.c", "src/arm_valley.c")
+    listed = subprocess.run(
+        ["nm", "-P", "arm_look_up.o", "arm_solver.o", "arm_valley.o"],
+        cwd=project,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    kinds = {line.split()[1]: line.split()[0] for line in listed.stdout.splitlines() if " " in line}
+    assert "T" in kinds
+    assert not set(kinds) & set("bBCsSgG"), kinds
+    # Names of motors and fingers: constants, but with addresses to be filled in.
+    assert "int" in (project / "include/arm.h").read_text()
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
+def test_wrapper_in_cpp(project, tmp_path):
+    text = tmp_path / "use.cpp"
+    text.write_text(
+        '#include "arm.hpp"\n'
+        "int use(arm::Solver &solver, const arm::Vectors &p, const arm::Vectors &n) {\n"
+        "  arm::Configuration q0 = solver.q();\n"
+        "  return solver.solve(p, n, &q0) == arm::Status::solved ? 0 : 1;\n}\n"
+    )
+    flags = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only"]
+    done = subprocess.run(
+        ["g++", *flags, f"-I{project / 'include'}", str(text)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+@pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="no ziglang")
+def test_module_in_node(tmp_path, capsys):
+    out = tmp_path / "page"
+    # A hand alone: a small module compiles in a third of the time.
+    assert main(["export", "ar10", "--out", str(out), "--target", "wasm"]) == 0
+    done = subprocess.run(["node", "test.mjs"], cwd=out, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    said = json.loads(done.stdout)
+    assert (said["targets"], said["wrong"], said["refused"]) == (1000, 0, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--method", "ipopt"], "'ipopt' cannot be exported, expected one of hand-first"),
+        (["--prefix", "2nd arm"], "--prefix: found '2nd arm', expected"),
+        (["--target", "fpga"], "--target: found 'fpga', expected one of c, wasm"),
+    ],
+)
+def test_bad_words_are_refused(tmp_path, capsys, words, complaint):
+    out = tmp_path / "solver"
+    assert main(["export", "kuka_lwr_barrett", "--out", str(out), *words]) == 2
+    assert complaint in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_export_is_left_alone(tmp_path, capsys):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    assert main(["export", "kuka_lwr_barrett", "--out", str(tmp_path)]) == 2
+    assert "is not empty, and no earlier export" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_an_earlier_export_is_replaced_as_a_whole(tmp_path):
+    out = tmp_path / "solver"
+    write_folder(out, {"old.c": "old"})
+    write_folder(out, {"src/new.c": "new"})
+    assert sorted(p.name for p in out.rglob("*") if p.is_file()) == [MARK, "new.c"]
+
+    with pytest.raises(TypeError):
+        write_folder(out, {"src/first.c": "first", "src/second.c": None})
+    assert sorted(p.name for p in out.rglob("*") if p.is_file()) == [MARK, "new.c"]
+    assert [path.name for path in tmp_path.iterdir()] == ["solver"]
+
+
+@pytest.mark.parametrize(
+    ("name", "prefix"),
+    [
+        ("kuka_lwr_barrett", "kuka_lwr_barrett"),
+        ("Panda+Allegro", "panda_allegro"),
+        ("7", "robot_7"),
+    ],
+)
+def test_names_of_robots_become_names_of_c(name, prefix):
+    assert checked_prefix(None, name) == prefix
+
+
+def test_generated_code_has_no_symbol_of_its_own(robot):
+    import casadi as ca
+
+    x = ca.SX.sym("x", 2)
+    text = standing_alone(ca.Function("own", [x], [ca.sin(x) * ca.fmax(x[0], 0)]))
+    heads = [
+        line for line in text.splitlines() if line.startswith(("int ", "casadi_real ", "void "))
+    ]
+    assert heads == []
+    assert "static int casadi_whole(" in text
+
+
+def test_kernels_compiled_ahead_with_progress(capsys):
+    assert main(["compile", "kuka_lwr_barrett"]) == 0
+    said = capsys.readouterr()
+    assert "COMPILED  1 robot in" in said.out
+    lines = [line for line in said.err.splitlines() if "kuka_lwr_barrett" in line]
+    assert [line.split()[3] for line in lines] == [f"{i}/6:" for i in range(1, 7)]
+
+
+def test_without_a_compiler_nothing_is_compiled_ahead(monkeypatch, capsys):
+    monkeypatch.setenv("CC", "none")
+    assert main(["compile", "kuka_lwr_barrett"]) == 2
+    assert "there is no C compiler" in capsys.readouterr().err
