@@ -3,12 +3,14 @@
 from casadi_ik import logs
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
+from casadi_ik.collision.scene import Scene, load_scene
 from casadi_ik.control import ScrewControl
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
 from casadi_ik.methods.registry import METHODS, register_method
 from casadi_ik.methods.screw_control.objectives import ScrewTask
+from casadi_ik.problem.collision_report import CollisionReport
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
 from casadi_ik.problem.solution import BatchSolution, Solution
@@ -25,6 +27,7 @@ __all__ = [
     "ArmHand",
     "BatchSolution",
     "CasadiIKError",
+    "CollisionReport",
     "Contact",
     "ContactVerdict",
     "Diagnosis",
@@ -32,6 +35,7 @@ __all__ = [
     "Jump",
     "Phase",
     "Reason",
+    "Scene",
     "ScrewControl",
     "ScrewTask",
     "Solution",
@@ -42,6 +46,7 @@ __all__ = [
     "Trajectory",
     "load_grasp",
     "load_robot",
+    "load_scene",
     "logs",
     "register_method",
     "shipped_grasps",

@@ -10,12 +10,14 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import InputError
+from casadi_ik.collision.scene import Scene, checked_pose, grasped_in
+from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.write.opening import recorder_of
 from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
+from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
@@ -37,6 +39,7 @@ class Solver:
         tolerances: When a contact counts as reached, by finger.
         limits: "enforce" or "ignore".
         options: What was set of the method's own parameters.
+        scene: What answers must not touch; None: collisions are not checked.
     """
 
     def __init__(
@@ -48,12 +51,13 @@ class Solver:
         finger_step: str | None = None,
         options: Mapping[str, Any] | None = None,
         compiled: bool = True,
+        scene: Scene | None = None,
     ) -> None:
         """Build the solver; its kernel is compiled at the first solve and cached on the machine.
 
         Args:
             robot: From `load_robot`.
-            method: One of `METHODS`, or of those registered with `register_method`.
+            method: One of `METHODS`, or registered with `register_method`.
             tolerance: 5 mm and 3 deg unless said; one for all fingers, or by finger name (a
                 finger left out keeps the default). A contact's own tolerance goes before.
             limits: "enforce": being solved includes that every actuator and joint is within its
@@ -64,26 +68,32 @@ class Solver:
             options: Fields of the method's parameter record (`QiuParameters`), by name.
             compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
                 slower.
+            scene: What stands about the robot (`load_scene`, `Scene`): being solved then includes
+                that nothing, links among themselves, is nearer than the scene's margin.
 
         Raises:
             UnknownNameError: No such method or option.
             InputError: A value that an argument cannot have.
-            UnsupportedError: The robot is not of the kind the method needs.
+            UnsupportedError: The robot is not of the kind the method needs, or has no shapes.
+            DescriptionError: The scene does not fit the robot.
         """
         if not isinstance(robot, ArmHand):
             raise InputError(f"robot: found {robot!r}, expected what load_robot returns")
         if limits not in LIMITS:
             raise InputError(f"limits: found {limits!r}, expected one of {', '.join(LIMITS)}")
-        self._asked = (robot, method, tolerance, limits, finger_step, options, compiled)
+        if scene is not None and not isinstance(scene, Scene):
+            raise InputError(f"scene: found {scene!r}, expected a Scene, or None")
+        self._asked = (robot, method, tolerance, limits, finger_step, options, compiled, scene)
         self.robot = robot
         self.method = method
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
         self.limits = limits
         self.options = with_finger_step(method, options or {}, finger_step)
         self._questions = Questions(robot, self.tolerances, limits == "enforce")
-        self._engine = Engine(
-            robot, build_method(method, robot.description, self.options, compiled), compiled
-        )
+        self.scene = scene
+        check = None if scene is None else SceneCheck(robot, scene, compiled)
+        built = build_method(method, robot.description, self.options, compiled)
+        self._engine = Engine(robot, built, compiled, check=check)
 
     def __reduce__(self) -> tuple[type[Solver], tuple[Any, ...]]:
         """What it was made from; a copy finds the compiled kernels on the machine it comes to."""
@@ -100,7 +110,7 @@ class Solver:
             "tolerance": {name: dataclasses.asdict(one) for name, one in self.tolerances.items()},
             "limits": self.limits,
             "options": dict(self._engine.method.parameters),
-        }
+        } | ({} if self.scene is None else {"scene": self.scene.name})
 
     def solve(
         self,
@@ -123,7 +133,7 @@ class Solver:
             fixed: Positions of actuators that are not to move, by name [rad or m].
             prefer: Which of several solutions: "q0" (near it, motions as parts of motors' ranges;
                 what solves is not moved), "limits" (far from them), "manipulability" (of the arm).
-                None: "q0" if q0 is given, else "limits".
+                "clearance" (from what may be hit). None: "q0" if q0 is given, else "limits".
 
         Returns:
             The solution; not converging is its status, never an exception.
@@ -156,6 +166,7 @@ class Solver:
         keep: Keep | None = None,
         compression: Compression = "zstd",
         prefer: str | None = None,
+        object_pose: ArrayLike | None = None,
         **more: ArrayLike | None,
     ) -> BatchSolution:
         """Solve k targets.
@@ -165,32 +176,31 @@ class Solver:
                 NaN marks a free finger.
             normals: (k, f, 3) outward pad normals, base frame; NaN marks a free normal.
             q0: (n,) or (k, n) start; None is `robot.home`.
-            seed: Of all random numbers, an integer >= 0.
+            seed: As for `solve`.
             jobs: Threads, at least 1.
             log: Path of an MCAP file to write every iteration to; or an open recorder, which
                 stays open, for several batches in one log.
-            diagnose: Whether to find out why, for every target that is not solved
-                (`BatchSolution.diagnoses`).
-            fixed: Positions of actuators that are not to move, by name [rad or m].
+            diagnose: Whether to find out why, for every target that is not solved.
+            fixed: As for `solve`.
             keep: Which solves keep their iterations in the log; None: all.
             compression: Of the log: "zstd" (level 1), "lz4" or "none".
             prefer: As for `solve`.
+            object_pose: (4, 4) or (k, 4, 4) where what the scene calls grasped is, base frame.
             more: (k, f, 3) by name, NaN where free: "tangents" (second axes of
                 `ArmHand.contact_frames`), "lines", "planes" (anywhere on that through the point),
                 "directions" (a fingertip without a point faces this way).
 
         Returns:
-            The same fields as a `Solution`, as arrays.
+            The fields of a `Solution`, as arrays.
 
         Raises:
-            InputError: Bad shapes or values; the message names row and finger.
-            UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
-            LogError: The log cannot be written.
+            InputError: Bad shapes or values; the message names row and finger. Else as `solve`.
         """
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
         problems = self._questions.of_arrays(points, normals, held, more=more, prefer=preferred)
+        if object_pose is not None:
+            problems = problems.holding(grasped_in(self.scene), checked_pose(object_pose))
         with recorder_of(self, log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 
@@ -226,10 +236,7 @@ class Solver:
             The blocks, solved.
 
         Raises:
-            InputError: Bad q0, seed or jobs, or a block of the wrong shape.
-            UnknownNameError: A fixed actuator that the robot does not have.
-            UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
-            LogError: The log cannot be written.
+            InputError: Bad q0, seed or jobs, or a block of the wrong shape; else as `solve_batch`.
         """
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
@@ -262,10 +269,10 @@ class Solver:
             grasp: A contact per finger; its fingers must be the robot's.
             limit: How many at most.
             prefer: What comes first: "limits" (far from its limits), "manipulability" (of the
-                arm), or "q0" (close to it).
+                arm), "clearance", or "q0" (close to it).
             q0: (n,) where the robot is [rad or m]; None is `robot.home`.
-            seed: Of all random numbers, an integer >= 0.
-            fixed: Positions of actuators that are not to move, by name [rad or m].
+            seed: As for `solve`.
+            fixed: As for `solve`.
             apart: How different they are: of any two, at least one actuator differs by this part
                 of its range, 0 to 1. 0: all that are found.
 
@@ -274,11 +281,11 @@ class Solver:
 
         Raises:
             InputError: Bad limit, preference, distance or q0, or a grasp the robot cannot take.
-            UnsupportedError: The method is not hand-first.
         """
         problems = self._questions.of_grasps([grasp], fixed)
         finder = self._engine.kinds_of(problems).finder
-        return finder.find(problems, self._questions.start(q0), seed, limit, prefer, apart)
+        start, around = self._questions.start(q0), self._engine.around(problems)
+        return finder.find(problems, start, seed, limit, prefer, apart, around)
 
     def track(
         self,
@@ -301,13 +308,15 @@ class Solver:
             period: Time from one grasp to the next [s]; then the motors' velocity limits are kept,
                 and a grasp that moves too fast is followed as well as they allow.
             velocity: Other velocity limits, (n,) or a number [rad/s or m/s].
-            seed: Of all random numbers, an integer >= 0.
-            fixed: Positions of actuators that are not to move, by name [rad or m].
+            seed: As for `solve`.
+            fixed: As for `solve`.
 
         Raises:
             InputError: No grasp, bad q0, period or velocity, or a grasp the robot cannot take.
-            UnsupportedError: The method is not hand-first.
+            UnsupportedError: The method is not hand-first, or the solver has a scene.
         """
+        if self.scene is not None:
+            raise UnsupportedError("track: knows no scenes, expected a solver without one")
         if not grasps:
             raise InputError("grasps: found none, expected at least one")
         problems = self._questions.of_grasps(grasps, fixed)
@@ -335,6 +344,6 @@ class Solver:
         """Solve for loops that cannot wait: see `FastSolver`.
 
         Raises:
-            UnsupportedError: The method is not hand-first.
+            UnsupportedError: The method is not hand-first, or the solver has a scene.
         """
         return FastSolver(self._engine, self._questions)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from casadi_ik.errors import InputError
 
-PREFERENCES = ("limits", "manipulability", "q0")
-"""What may be preferred: distance from the limits, manipulability of the arm, closeness to q0."""
+CLEARANCE = "clearance"
+"""The preference for what is far from everything; for solvers with a scene."""
+
+PREFERENCES = ("limits", "manipulability", "q0", CLEARANCE)
+"""What may be preferred: distance from the limits, manipulability of the arm, closeness to q0,
+clearance."""
 
 NO_PREFERENCE = "none"
 """That of methods that cannot choose: they take the solution they come to."""

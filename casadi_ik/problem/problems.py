@@ -34,6 +34,8 @@ class Problems:
             "planes"), NaN where free; nothing that is free everywhere.
         picked: (k,) numbers of the targets where they are not one after the other.
         prefer: Which of several solutions is wanted, one of `PREFERENCES`, or `NO_PREFERENCE`.
+        object: Name of what is grasped, for collisions; "": not said.
+        object_pose: (k, 4, 4) where it is in the base frame; None: where the scene has it.
     """
 
     points: Array
@@ -45,6 +47,8 @@ class Problems:
     more: Mapping[str, Array] = field(default_factory=dict)
     picked: NDArray[np.intp] | None = None
     prefer: str = "limits"
+    object: str = ""
+    object_pose: Array | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -87,9 +91,23 @@ class Problems:
         points, normals = self.points[rows], self.normals[rows]
         more = {name: array[rows] for name, array in self.more.items()} if self.more else self.more
         picked = None if self.picked is None else self.picked[rows]
+        pose = None if self.object_pose is None else self.object_pose[rows]
         return replace(
-            self, points=points, normals=normals, first_row=first_row, more=more, picked=picked
+            self,
+            points=points,
+            normals=normals,
+            first_row=first_row,
+            more=more,
+            picked=picked,
+            object_pose=pose,
         )
+
+    def holding(self, name: str, poses: Array) -> Problems:
+        """The same targets, which grasp an object at poses (4, 4) or (k, 4, 4)."""
+        if poses.ndim == 3 and len(poses) != len(self):
+            raise InputError(f"object_pose: found {len(poses)} for {len(self)} targets")
+        every = np.broadcast_to(poses, (len(self), 4, 4))
+        return replace(self, object=name, object_pose=every)
 
     def number(self, row: int) -> int:
         """Number of a target in the whole batch."""

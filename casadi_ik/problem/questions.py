@@ -122,6 +122,8 @@ class Questions:
             fixed=self.held(fixed) if fixed else None,
             more=_stacked(more, len(fingers)) if any(more) else {},
             prefer=prefer,
+            object=grasps[0].object,
+            object_pose=_object_poses(grasps),
         )
 
     @cached_property
@@ -143,6 +145,14 @@ class Questions:
         if start.ndim != 1:
             raise InputError(f"q0: found shape {start.shape}, expected ({len(start[0])},)")
         return start
+
+
+def _object_poses(grasps: Sequence[Grasp]) -> Array | None:
+    """(k, 4, 4) where grasps have their object; None unless all say it, of the same object."""
+    if len({grasp.object for grasp in grasps}) > 1:
+        return None
+    poses = [grasp.object_pose for grasp in grasps if grasp.object_pose is not None]
+    return np.stack(poses) if poses and len(poses) == len(grasps) else None
 
 
 def _stacked(parts: Sequence[Mapping[str, Array]], f: int) -> dict[str, Array]:

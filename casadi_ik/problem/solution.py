@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Tolerance
+from casadi_ik.problem.collision_report import CollisionReport, Pair
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.diagnosis import Diagnosis
 from casadi_ik.problem.status import Status
@@ -36,6 +37,11 @@ class Solution:
         robot: Name of the robot.
         actuators: Names of the entries of q.
         diagnosis: Why it is not solved; None if it is, or if no diagnosis was asked for.
+        clearance: Distance of the pair of shapes that is nearest to being too near [m], negative:
+            penetration; None if no scene was given: collisions were not checked.
+        closest: That pair: two links, or a link and a solid of the scene.
+        collision: Why all answers touch something, if that is the status and a diagnosis was asked
+            for.
     """
 
     success: bool
@@ -51,6 +57,9 @@ class Solution:
     robot: str
     actuators: tuple[str, ...]
     diagnosis: Diagnosis | None = None
+    clearance: float | None = None
+    closest: Pair | None = None
+    collision: CollisionReport | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +84,10 @@ class BatchSolution:
         robot: Name of the robot.
         actuators: Names of the columns of q.
         diagnoses: Why each target is not solved (None if it is); empty if not asked for.
+        clearance: (k,) as for `Solution` [m], NaN where there is no finite q; None if no scene was
+            given: collisions were not checked.
+        closest: The pair of each target; empty if no scene was given.
+        collisions: Why all answers touch something, by target; empty if no scene was given.
     """
 
     success: NDArray[np.bool_]
@@ -94,6 +107,9 @@ class BatchSolution:
     robot: str
     actuators: tuple[str, ...]
     diagnoses: tuple[Diagnosis | None, ...] = ()
+    clearance: Array | None = None
+    closest: tuple[Pair | None, ...] = ()
+    collisions: tuple[CollisionReport | None, ...] = ()
 
     @classmethod
     def invalid(
@@ -103,6 +119,7 @@ class BatchSolution:
         robot: ArmHand,
         tolerances: tuple[Tolerance, ...],
         diagnosed: bool,
+        checked: bool = False,
     ) -> BatchSolution:
         """Rows for targets that are malformed: status INVALID, NaN for every number."""
         n, f = len(robot.actuators), len(robot.fingers)
@@ -125,6 +142,9 @@ class BatchSolution:
             robot=robot.name,
             actuators=robot.actuators,
             diagnoses=(None,) * count if diagnosed else (),
+            clearance=np.full(count, np.nan) if checked else None,
+            closest=(None,) * count if checked else (),
+            collisions=(None,) * count if checked else (),
         )
 
     def __len__(self) -> int:
@@ -152,8 +172,11 @@ class BatchSolution:
             )
             for name in names
         }
-        diagnoses = tuple(chain.from_iterable(part.diagnoses for part in parts))
-        return replace(first, **arrays, phases=phases, diagnoses=diagnoses)
+        each = {
+            name: tuple(chain.from_iterable(getattr(part, name) for part in parts))
+            for name in ("diagnoses", "closest", "collisions")
+        }
+        return replace(first, **arrays, phases=phases, **each)
 
     @property
     def status_names(self) -> NDArray[np.str_]:
@@ -187,4 +210,7 @@ class BatchSolution:
             robot=self.robot,
             actuators=self.actuators,
             diagnosis=self.diagnoses[row] if self.diagnoses else None,
+            clearance=None if self.clearance is None else float(self.clearance[row]),
+            closest=self.closest[row] if self.closest else None,
+            collision=self.collisions[row] if self.collisions else None,
         )

@@ -27,6 +27,8 @@ class Status(IntEnum):
     """The contacts cannot be reached: there is a proof, see `Diagnosis.proof`."""
     NOT_FOUND = 5
     """A diagnosis found neither a solution nor a proof that there is none."""
+    COLLISION = 6
+    """Contacts and limits are met, but something touches, see `Solution.collision`."""
 
     @classmethod
     def from_loop(cls, codes: NDArray[np.int32]) -> NDArray[np.int64]:

@@ -10,6 +10,7 @@ import numpy as np
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.robots.checks import check_couplings, known_link, known_source, positive, unique
+from casadi_ik.robots.collision import Shapes, link_shapes
 from casadi_ik.robots.description import Actuator, Joint, frozen
 from casadi_ik.robots.part import HandPart, Part
 from casadi_ik.robots.schema import ActuatorEntry, ArmFile, HandFile, JointEntry
@@ -28,7 +29,18 @@ def arm_part(arm: ArmFile, path: Path) -> Part:
     tip = known_link(arm.tip.link, arm.root, joints, f"{path}: tip.link")
     known_source(arm.tip.source, arm.sources, f"{path}: tip.source")
     pose = frame_matrix(Frame(arm.tip.xyz, arm.tip.rpy))
-    return Part(arm.name, str(path), arm.root, joints, actuators, arm.sources, tip, pose, arm.home)
+    return Part(
+        arm.name,
+        str(path),
+        arm.root,
+        joints,
+        actuators,
+        arm.sources,
+        tip,
+        pose,
+        arm.home,
+        _shapes(arm, joints, path),
+    )
 
 
 def hand_part(hand: HandFile, path: Path) -> HandPart:
@@ -53,10 +65,18 @@ def hand_part(hand: HandFile, path: Path) -> HandPart:
         palm,
         frame_matrix(Frame(hand.palm.xyz, hand.palm.rpy)),
         hand.home,
+        _shapes(hand, joints, path),
         dict(hand.fingers),
         hand.thumb,
         frame_matrix(hand.mount),
     )
+
+
+def _shapes(part: ArmFile | HandFile, joints: list[Joint], path: Path) -> Shapes:
+    if part.collision is not None and part.collision.links:
+        known_source(part.collision.source, part.sources, f"{path}: collision.source")
+    links = (part.root, *(joint.child for joint in joints))
+    return link_shapes(part.collision, links, path)
 
 
 def _joints(

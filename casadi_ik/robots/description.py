@@ -10,6 +10,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnknownNameError, UnsupportedError
+from casadi_ik.robots.collision import NO_SHAPES, Shapes
 from casadi_ik.robots.couplings import Coupling
 from casadi_ik.robots.motor_ranges import motor_ranges
 
@@ -104,6 +105,7 @@ class RobotDescription:
         palm_placement: (4, 4) pose of the palm frame in that link.
         home: (n,) home position of the actuators.
         sources: Where the numbers come from, by tag.
+        shapes: Of its links, for collisions; none where they are not described.
     """
 
     name: str
@@ -116,6 +118,7 @@ class RobotDescription:
     palm_placement: Array
     home: Array
     sources: dict[str, str]
+    shapes: Shapes = NO_SHAPES
 
     @property
     def thumb(self) -> str:

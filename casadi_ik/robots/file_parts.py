@@ -100,7 +100,7 @@ def hand_from_file(
         palm.link,
         frame_matrix(Frame(palm.xyz, palm.rpy)),
         {},
-        pads,
+        pads=pads,
     )
 
 

@@ -20,6 +20,7 @@ from casadi_ik.files.reading import (
 )
 from casadi_ik.files.shipped import resolve, resolve_robot
 from casadi_ik.robots.checks import unique, usable
+from casadi_ik.robots.collision import link_shapes
 from casadi_ik.robots.described_parts import arm_part, hand_part
 from casadi_ik.robots.description import Joint, RobotDescription, frozen
 from casadi_ik.robots.file_parts import arm_from_file, hand_from_file
@@ -74,13 +75,12 @@ def _robot(path: Path) -> RobotDescription:
             raise DescriptionError(f"{path}: arm: found beside 'robot', which has its own")
         hand, fingers = hand_from_file(entry, dict(top.fingers), key, path), list(top.fingers)
     if arm is None and moved:
-        base = Part("base", str(path), "base", [], [], {}, "base", np.eye(4), {})
-        return _joined(
-            top.name, base, mount, hand, fingers, top.thumb, top.home, str(path), units, top.sources
-        )
-    return _joined(
+        arm = Part("base", str(path), "base", [], [], {}, "base", np.eye(4), {})
+    robot = _joined(
         top.name, arm, mount, hand, fingers, top.thumb, top.home, str(path), units, top.sources
     )
+    more = link_shapes(top.collision, robot.links, path)
+    return replace(robot, shapes=robot.shapes + more)
 
 
 def _imports(raw: Any) -> bool:
@@ -161,6 +161,7 @@ def _joined(
         palm_placement=frozen(hand.tip),
         home=the_home(home, units, actuators, joints, where),
         sources=sources,
+        shapes=hand.shapes if arm is None else arm.shapes + hand.shapes,
     )
 
 

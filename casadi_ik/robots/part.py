@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from casadi_ik.arrays import Array
+from casadi_ik.robots.collision import NO_SHAPES, Shapes
 from casadi_ik.robots.description import Actuator, Joint
 from casadi_ik.robots.schema import ContactEntry, PadEntry
 
@@ -29,6 +30,7 @@ class Part:
         tip_link: Link that carries what comes next: an arm's tip, a hand's palm.
         tip: (4, 4) pose of the tip or palm frame in that link.
         home: Positions of some motors.
+        shapes: Of its links, for collisions.
     """
 
     name: str
@@ -40,6 +42,7 @@ class Part:
     tip_link: str
     tip: Array
     home: dict[str, float]
+    shapes: Shapes = NO_SHAPES
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,7 @@ def told_apart(hand: HandPart, arm: Part) -> HandPart:
         root=link(hand.root),
         joints=joints,
         actuators=[replace(one, name=mover(one.name)) for one in hand.actuators],
+        shapes=hand.shapes.renamed({name: link(name) for name in theirs_links}),
         tip_link=link(hand.tip_link),
         home={mover(name): value for name, value in hand.home.items()},
         pads={

@@ -6,6 +6,7 @@ import msgspec
 
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, Vector
 from casadi_ik.files.units import AnyValue, JointRate, JointValue
+from casadi_ik.robots.collision import CollisionEntry
 from casadi_ik.robots.couplings import Coupling
 
 
@@ -67,6 +68,7 @@ class ArmFile(Struct, frozen=True):
     sources: dict[str, str]
     description: str = ""
     home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    collision: CollisionEntry | None = None
 
 
 class HandFile(Struct, frozen=True):
@@ -87,6 +89,7 @@ class HandFile(Struct, frozen=True):
     thumb: str | None = None
     mount: Frame = Frame()
     home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    collision: CollisionEntry | None = None
 
 
 class ArmFromFile(Struct, frozen=True):
@@ -137,6 +140,7 @@ class ArmHandFile(Struct, frozen=True):
     home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     sources: dict[str, str] = msgspec.field(default_factory=dict)
     description: str = ""
+    collision: CollisionEntry | None = None
 
 
 class ImportedFile(Struct, frozen=True):
@@ -155,3 +159,4 @@ class ImportedFile(Struct, frozen=True):
     home: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     sources: dict[str, str] = msgspec.field(default_factory=dict)
     description: str = ""
+    collision: CollisionEntry | None = None

@@ -16,20 +16,23 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.problem.clearance import SceneCheck, Surroundings
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
 from casadi_ik.problem.method import Method, Outcome, PreferringMethod, QuickMethod
-from casadi_ik.problem.preference import NO_PREFERENCE, preference
+from casadi_ik.problem.preference import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
+from casadi_ik.solving.alternatives.free import FreeFinder
 from casadi_ik.solving.alternatives.tracking import Tracker
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
+from casadi_ik.solving.freeing import freed
 from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.solved_part import SolvedPart, judged
@@ -48,12 +51,14 @@ class Engine:
         method: The method, built for this robot.
         compiled: Whether the additional graphs of a diagnosis run in compiled code.
         kinds: Of the contacts, by finger; None: point and normal.
+        check: The scene about the robot; None: collisions are not checked.
     """
 
     robot: ArmHand
     method: Method
     compiled: bool = True
     kinds: Kinds | None = None
+    check: SceneCheck | None = None
 
     def of_kinds(self, kinds: Kinds) -> Engine:
         """The engine for targets whose contacts are of these kinds."""
@@ -117,6 +122,19 @@ class Engine:
         return AlternativeFinder(self.robot, self._hand_first, self.compiled)
 
     @cached_property
+    def freer(self) -> FreeFinder:
+        """Finds answers that touch nothing.
+
+        Raises:
+            UnsupportedError: The method is not hand-first.
+        """
+        return FreeFinder(self.finder, self.compiled)
+
+    def around(self, problems: Problems) -> Surroundings | None:
+        """What targets are checked against; None: nothing."""
+        return None if self.check is None else self.check.around(problems)
+
+    @cached_property
     def tracker(self) -> Tracker:
         """Follows moving grasps.
 
@@ -133,6 +151,8 @@ class Engine:
             UnsupportedError: The method does not know it.
         """
         asked, method = preference(prefer, started), self.method
+        if asked == CLEARANCE and self.check is None:
+            raise InputError(f"prefer: found {asked!r}, which needs a solver with a scene")
         if self._preferences:
             if asked in self._preferences:
                 return asked
@@ -161,7 +181,7 @@ class Engine:
             if other is not self:
                 return other.quick(problems, run)
         method, robot = self._quick, self.robot
-        if method is None or problems.prefer == MANIPULABILITY:
+        if method is None or problems.prefer in (MANIPULABILITY, CLEARANCE):
             return None
         start = run.start(robot)
         if start.ndim != 1:
@@ -178,6 +198,12 @@ class Engine:
             verdict = judge_errors(problems, *found.errors)
         if verdict is None:
             return None
+        distance = closest = None
+        if (around := self.around(problems)) is not None:
+            clear = around.check(found.q[None])
+            if not clear.free[0]:
+                return None
+            distance, closest = float(clear.distance[0]), clear.pair(0)
         return Solution(
             success=True,
             status=Status.SOLVED,
@@ -191,6 +217,8 @@ class Engine:
             method=self.method.name,
             robot=robot.name,
             actuators=robot.actuators,
+            clearance=distance,
+            closest=closest,
         )
 
     def solve(self, problems: Problems, run: Run) -> BatchSolution:
@@ -228,9 +256,13 @@ class Engine:
             outcome = run_by_kinds(method, asked, starts[rows], run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
-            if problems.prefer == MANIPULABILITY:
+            around = self.around(asked)
+            if around is None and problems.prefer == MANIPULABILITY:
                 outcome = self._most_manipulable(asked, starts[rows], run.seed, outcome)
-            batch = judged(self.robot, self.method.name, asked, outcome)
+            batch = judged(self.robot, self.method.name, asked, outcome, around)
+            if around is not None and isinstance(self.method, HandFirstMethod):
+                batch = freed(self.kinds_of, asked, around, starts[rows], run.seed, outcome, batch)
+                outcome = replace(outcome, q=batch.q, time=batch.time)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
             return SolvedPart(asked, starts[rows], started, outcome, batch)
@@ -238,9 +270,10 @@ class Engine:
         if diagnose:
             for kinds, _, _ in by_kinds(problems):
                 _ = self.of_kinds(kinds).diagnostician
-        if problems.prefer == MANIPULABILITY:
+        if problems.prefer == MANIPULABILITY or self.check is not None:
             for kinds, _, _ in by_kinds(problems):
-                _ = self.of_kinds(kinds).finder
+                if isinstance(self.method, HandFirstMethod):
+                    _ = self.of_kinds(kinds).finder
         if jobs == 1 and not trace:
             yield solve(slice(0, len(problems)))
             return
@@ -279,7 +312,10 @@ class Engine:
             return replace(batch, diagnoses=(None,) * len(batch))
         own = isinstance(self.method, HandFirstMethod)
         q, seconds = outcome.q.copy(), outcome.time.copy()
-        rows = np.flatnonzero(~batch.success)
+        touching = batch.status == Status.COLLISION
+        rows = np.flatnonzero(~batch.success & ~touching)
+        if not len(rows):
+            return replace(batch, diagnoses=(None,) * len(batch))
         unbiased = replace(problems.rows(rows), prefer="limits")
         found: dict[int, Diagnosis] = {}
         for kinds, of_kinds, some in by_kinds(unbiased):
@@ -292,9 +328,13 @@ class Engine:
             if own and why.reason is Reason.REACHABLE:
                 q[row] = why.q
                 seconds[row] += why.time
-        batch = judged(self.robot, self.method.name, problems, replace(outcome, q=q, time=seconds))
+        reports, around = batch.collisions, self.around(problems)
+        ended = replace(outcome, q=q, time=seconds)
+        batch = replace(
+            judged(self.robot, self.method.name, problems, ended, around), collisions=reports
+        )
         diagnoses = tuple(
-            None if solved else found[row] for row, solved in enumerate(batch.success)
+            None if solved else found.get(row) for row, solved in enumerate(batch.success)
         )
         status = batch.status.copy()
         for row, why in enumerate(diagnoses):

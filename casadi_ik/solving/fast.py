@@ -38,8 +38,10 @@ class FastSolver:
         """Compile what is not compiled yet, and lay the arrays out.
 
         Raises:
-            UnsupportedError: The method is not hand-first.
+            UnsupportedError: The method is not hand-first, or there is a scene.
         """
+        if engine.check is not None:
+            raise UnsupportedError("fast: checks no collisions, expected a solver without a scene")
         method = engine.method
         if not isinstance(method, HandFirstMethod):
             raise UnsupportedError(f"fast: expected method 'hand-first', found {method.name!r}")

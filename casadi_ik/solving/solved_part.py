@@ -8,6 +8,7 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.recorder import Recorder, SolveBlock
@@ -54,15 +55,35 @@ class SolvedPart:
         recorder.record(block)
 
 
-def judged(robot: ArmHand, method: str, problems: Problems, outcome: Outcome) -> BatchSolution:
-    """An outcome with the verdict on it, which has the last word on what is solved."""
+def judged(
+    robot: ArmHand,
+    method: str,
+    problems: Problems,
+    outcome: Outcome,
+    around: Surroundings | None = None,
+) -> BatchSolution:
+    """An outcome with the verdict on it, which has the last word on what is solved.
+
+    Args:
+        robot: The robot.
+        method: Name of the method.
+        problems: The targets.
+        outcome: What the method came to.
+        around: What the answers must not touch; None: nothing is checked.
+    """
     verdict = judge(robot, problems, outcome.q)
     success = verdict.solved(problems.enforce_limits)
+    clear = None if around is None else around.check(outcome.q)
+    touching = None if clear is None else success & ~clear.free
+    if clear is not None:
+        success = success & clear.free
     status, content = outcome.status, outcome.status == Status.SOLVED
     if (content != success).any():
         # A method that is content with what the verdict refuses has come to a standstill.
         status = np.where(content, int(Status.STALLED), status)
         status[success] = Status.SOLVED
+        if touching is not None:
+            status[touching] = Status.COLLISION
     return BatchSolution(
         success=success,
         status=status,
@@ -80,4 +101,7 @@ def judged(robot: ArmHand, method: str, problems: Problems, outcome: Outcome) ->
         method=method,
         robot=robot.name,
         actuators=robot.actuators,
+        clearance=None if clear is None else clear.distance,
+        closest=() if clear is None else tuple(map(clear.pair, range(len(outcome.q)))),
+        collisions=() if clear is None else (None,) * len(outcome.q),
     )

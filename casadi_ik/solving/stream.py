@@ -93,7 +93,12 @@ class Stream:
                 row = error.row - first_row
                 faults[error.row] = str(error)
                 parts[row] = BatchSolution.invalid(
-                    1, engine.method.name, engine.robot, self.tolerances, self.run.diagnose
+                    1,
+                    engine.method.name,
+                    engine.robot,
+                    self.tolerances,
+                    self.run.diagnose,
+                    engine.check is not None,
                 )
                 waiting += [part for part in ((row + 1, stop), (start, row)) if part[0] < part[1]]
         solution = BatchSolution.joined([parts[start] for start in sorted(parts)])

@@ -15,8 +15,9 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.contact_verdict import ContactVerdict
-from casadi_ik.problem.preference import preference
+from casadi_ik.problem.preference import CLEARANCE, preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, Branches, best_arm
@@ -35,6 +36,9 @@ APART = 0.25
 
 ARMS = 64
 """Random arms that an arm without a closed form is solved from."""
+
+BLOCKED = 1e6
+"""Taken off the score of what is not free: more than any score."""
 
 CLOSE = 1e-7
 """Tolerance [m, rad] that hand postures are brought to first, so that equals are seen as equal."""
@@ -80,19 +84,21 @@ class AlternativeFinder:
 
     Attributes:
         robot: The robot.
+        trials: The loop of hand-first.
+        hand: Positions in q of the hand's actuators.
     """
 
     def __init__(self, robot: ArmHand, method: HandFirstMethod, compiled: bool = True) -> None:
         """Take the robot and hand-first on it."""
         self.robot = robot
-        self._trials = Trials(robot, method)
+        self.trials = Trials(robot, method)
         self._compiled = compiled
         self._arm = list(robot.description.arm_actuators)
-        self._hand = list(robot.description.hand_actuators)
+        self.hand = list(robot.description.hand_actuators)
 
     @cached_property
     def _branches(self) -> Branches | None:
-        arm = self._trials.method.step.arm
+        arm = self.trials.method.step.arm
         return None if arm is None else branches_of(arm, self._compiled)
 
     @cached_property
@@ -110,6 +116,7 @@ class AlternativeFinder:
         limit: int,
         prefer: str,
         apart: float = APART,
+        around: Surroundings | None = None,
     ) -> tuple[Alternative, ...]:
         """Different solutions of one target, best first.
 
@@ -125,6 +132,8 @@ class AlternativeFinder:
                 a hand that may close as it likes, and elbows that may swing a little further,
                 would else fill the list with what is hardly to be told apart.
 
+            around: What solutions must not touch; None: nothing is checked.
+
         Raises:
             InputError: Bad limit, preference or distance.
         """
@@ -132,15 +141,17 @@ class AlternativeFinder:
             raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
         preference(prefer, started=True)
         apart = _distance(apart)
-        limits = self._trials.limits(problems)
+        limits = self.trials.limits(problems)
         found: list[_Found] = []
         for number, q in enumerate(self._postures(problems, q0, limits)):
-            found += self._arms(problems, q, number, limits, q0, seed, prefer)
+            found += self._arms(problems, q, number, limits, q0, seed, prefer, around)
         if not found:
             return ()
         q = np.stack([item.q for item in found])
-        solved = self._trials.solved(problems, q, problems.enforce_limits)
-        keys = np.stack([self._score(q, q0, prefer), self._margins(q, self._arm)])
+        solved = self.trials.solved(problems, q, problems.enforce_limits)
+        if around is not None:
+            solved &= around.free(q)
+        keys = np.stack([self._valued(q, q0, prefer, around), self._margins(q, self._arm)])
         order = [int(i) for i in np.lexsort(-keys[::-1]) if solved[i]]
         parts = self._parts(q[order], list(range(q.shape[1])))
         kept = _distinct(parts, apart, limit)
@@ -156,16 +167,16 @@ class AlternativeFinder:
             seed: Of the starts of arms without a closed form.
             prefer: One of `PREFERENCES`.
         """
-        limits = self._trials.limits(problems)
+        limits = self.trials.limits(problems)
         found = self._arms(problems, q, 0, limits, q0, seed, prefer)
         every = np.stack([q, *(item.q for item in found)])
-        solved = self._trials.solved(problems, every, problems.enforce_limits)
+        solved = self.trials.solved(problems, every, problems.enforce_limits)
         every = every[solved] if solved.any() else q[None]
-        return every[int(np.argmax(self._score(every, q0, prefer)))]
+        return every[int(np.argmax(self.score(every, q0, prefer)))]
 
     def _postures(self, problems: Problems, q0: Array, limits: Bounds) -> list[Array]:
         """Solutions (n,) with different hands, from every candidate of every round."""
-        trials, method = self._trials, self._trials.method
+        trials, method = self.trials, self.trials.method
         rounds = range(method.options.rounds)
         postures = np.concatenate([method.postures(problems, number)[0] for number in rounds])
         starts = np.tile(limits.clip(q0), (len(postures), 1))
@@ -180,7 +191,7 @@ class AlternativeFinder:
             # Reachable thanks to the tolerances only, if at all.
             q = np.concatenate([q, trials.run(states, loose)])
             kept = q[trials.solved(problems, q, problems.enforce_limits)]
-        return [kept[i] for i in _distinct(self._parts(kept, self._hand), DISTINCT)]
+        return [kept[i] for i in _distinct(self._parts(kept, self.hand), DISTINCT)]
 
     def _arms(
         self,
@@ -191,6 +202,7 @@ class AlternativeFinder:
         q0: Array,
         seed: int,
         prefer: str,
+        around: Surroundings | None = None,
     ) -> list[_Found]:
         """Every arm that brings the hand of q where it is."""
         if not self._arm:
@@ -211,29 +223,29 @@ class AlternativeFinder:
                 self._branches,
                 palm,
                 branch,
-                lambda arms: self._score(with_arm(arms), q0, prefer, self._arm),
+                lambda arms: self._valued(with_arm(arms), q0, prefer, around, True),
             )
             found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
         return self._exact(problems, found) or [_Found(q, posture)]
 
     def _exact(self, problems: Problems, found: list[_Found]) -> list[_Found]:
         """Arms that are only nearly of their form are brought to the contacts."""
-        form = self._trials.method.step.arm
+        form = self.trials.method.step.arm
         if not found or form is None or isinstance(form, SrsArm) or form.exact:
             return found
         starts = np.stack([item.q for item in found])
-        ends = Descent(self._trials, problems).run(np.zeros(len(found), np.intp), starts)
+        ends = Descent(self.trials, problems).run(np.zeros(len(found), np.intp), starts)
         return [replace(item, q=end) for item, end in zip(found, ends, strict=True)]
 
     def _searched(self, problems: Problems, q: Array, seed: int) -> list[Array]:
         """Different arms found from random ones, the hand starting as in q."""
         starts = self.robot.random(np.random.default_rng(seed), ARMS)
-        starts[:, self._hand] = q[self._hand]
+        starts[:, self.hand] = q[self.hand]
         starts[0] = q
-        ends = Descent(self._trials, problems).run(np.zeros(ARMS, np.intp), starts)
+        ends = Descent(self.trials, problems).run(np.zeros(ARMS, np.intp), starts)
         ends = np.concatenate([q[None], ends])
-        same = (np.abs(self._parts(ends - q, self._hand)) < DISTINCT).all(axis=1)
-        kept = ends[same & self._trials.solved(problems, ends, problems.enforce_limits)]
+        same = (np.abs(self._parts(ends - q, self.hand)) < DISTINCT).all(axis=1)
+        kept = ends[same & self.trials.solved(problems, ends, problems.enforce_limits)]
         return [kept[i] for i in _distinct(self._parts(kept, self._arm), DISTINCT)]
 
     def _parts(self, q: Array, columns: list[int]) -> Array:
@@ -245,7 +257,23 @@ class AlternativeFinder:
         inside = np.minimum(q - self.robot.lower, self.robot.upper - q)[:, columns] / half
         return inside.min(axis=1) if columns else np.ones(len(q))
 
-    def _score(self, q: Array, q0: Array, prefer: str, columns: list[int] | None = None) -> Array:
+    def _valued(
+        self,
+        q: Array,
+        q0: Array,
+        prefer: str,
+        around: Surroundings | None,
+        arm_only: bool = False,
+    ) -> Array:
+        """(k,) `score`, of margins over the arm only if asked; what is not free comes last."""
+        columns = self._arm if arm_only else None
+        if around is None:
+            return self.score(q, q0, prefer, columns)
+        room = around.check(q).room
+        score = room if prefer == CLEARANCE else self.score(q, q0, prefer, columns)
+        return np.where(room >= 0, score, room - BLOCKED)
+
+    def score(self, q: Array, q0: Array, prefer: str, columns: list[int] | None = None) -> Array:
         """(k,) what is preferred, higher is better; margins over some actuators only."""
         every = list(range(q.shape[1]))
         if prefer == "limits":
@@ -275,9 +303,9 @@ class AlternativeFinder:
             posture=found.posture,
             branch=found.branch,
             swivel=found.swivel,
-            margin=float(self._score(q, q0, "limits")[0]),
+            margin=float(self.score(q, q0, "limits")[0]),
             manipulability=float(self._measured(q)[0]),
-            distance=float(-self._score(q, q0, "q0")[0]),
+            distance=float(-self.score(q, q0, "q0")[0]),
         )
 
 

@@ -1,0 +1,84 @@
+"""Convex hulls of meshes, by coal, which comes with pinocchio."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.collision.solids import Solid, convex
+from casadi_ik.errors import DescriptionError, MissingExtraError
+
+THIN = 1e-9
+"""A hull of less volume [m^3] than this is none."""
+
+
+def hull(points: Array, where: str) -> Solid:
+    """The convex hull of points (k, 3) [m].
+
+    Args:
+        points: The points.
+        where: File and key, for the message.
+
+    Raises:
+        DescriptionError: The points are too few, not finite, or in a plane.
+        MissingExtraError: coal is not installed.
+    """
+    if points.ndim != 2 or len(points) < 4:
+        raise DescriptionError(f"{where}: found {len(points)} points, expected at least 4")
+    if not np.isfinite(points).all():
+        raise DescriptionError(f"{where}: holds NaN or infinity, expected finite numbers")
+    if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-9) < 3:
+        raise DescriptionError(f"{where}: all points are in a plane, expected a body")
+    coal = _coal(where)
+    model: Any = coal.BVHModelOBBRSS()
+    model.beginModel(0, len(points))
+    model.addVertices(points)
+    model.endModel()
+    model.buildConvexHull(True, "Qt")
+    shape = model.convex
+    corners = np.array([shape.point(i) for i in range(shape.num_points)])
+    faces = [shape.polygons(i) for i in range(shape.num_polygons)]
+    triangles = np.array([[face[0], face[1], face[2]] for face in faces])
+    a, b, c = (corners[triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1)
+    kept = areas > 1e-12
+    normals, middles = normals[kept], ((a + b + c) / 3)[kept]
+    # Whichever way a triangle winds, outward is away from the hull's middle.
+    outward = np.sum(normals * (middles - corners.mean(axis=0)), axis=1)
+    normals *= np.where(outward < 0, -1.0, 1.0)[:, None]
+    if float(np.abs(outward).sum()) < THIN:
+        raise DescriptionError(f"{where}: encloses no volume, expected a body")
+    return convex(points, normals)
+
+
+def mesh_points(path: Path, where: str) -> Array:
+    """(k, 3) corners of a mesh's file.
+
+    Raises:
+        DescriptionError: There is no such file, or no mesh in it.
+        MissingExtraError: coal is not installed.
+    """
+    if not path.is_file():
+        raise DescriptionError(f"{where}: no such file {str(path)!r}")
+    coal = _coal(where)
+    try:
+        model = coal.MeshLoader().load(str(path), np.ones(3))
+    except (RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise DescriptionError(f"{where}: {path.name} cannot be read: {reason}") from error
+    points = np.array(model.vertices(), dtype=float).reshape(-1, 3)
+    if not len(points):
+        raise DescriptionError(f"{where}: {path.name} is an empty mesh, expected triangles")
+    return points
+
+
+def _coal(where: str) -> Any:
+    try:
+        import coal
+    except ImportError as error:
+        raise MissingExtraError(f"{where}: convex hulls need coal: pip install pin") from error
+    return coal

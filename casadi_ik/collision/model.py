@@ -1,0 +1,189 @@
+"""The shapes of a robot, and which of them are checked against each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array
+from casadi_ik.collision.solids import Solid, box, cylinder
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.robots.collision import LinkCapsule, Shapes, Touching
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.kinematics import Pose
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionModel:
+    """A robot's capsules.
+
+    Attributes:
+        robot: The description.
+        capsules: Its capsules.
+        bodies: By link the link it is fixed to that moves, or the root.
+        pairs: (p, 2) what is checked against each other: a capsule; another, or a solid of the
+            robot, counted on behind the capsules.
+        excluded: Links that are not, and why.
+        allowed: Links that are, but may overlap a little, and why.
+    """
+
+    robot: RobotDescription
+    capsules: tuple[LinkCapsule, ...]
+    bodies: dict[str, str]
+    pairs: NDArray[np.int32]
+    excluded: tuple[Touching, ...]
+    allowed: tuple[Touching, ...] = ()
+
+    @property
+    def radii(self) -> Array:
+        """(s,) radii [m]."""
+        return np.array([one.radius for one in self.capsules])
+
+    @property
+    def halves(self) -> Array:
+        """(s,) half lengths of the segments [m]."""
+        return np.array([float(np.linalg.norm(one.half)) for one in self.capsules])
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """(s,) the link of each capsule."""
+        return tuple(one.link for one in self.capsules)
+
+    def names(self, i: int, j: int) -> tuple[str, str]:
+        """The links of a pair."""
+        return self.capsules[i].link, _link(self.robot.shapes, j)
+
+    def is_fixed(self, link: str) -> bool:
+        """Whether a link cannot move."""
+        return self.bodies[link] == self.bodies[self.robot.root]
+
+    def without(self, more: Iterable[Touching]) -> CollisionModel:
+        """The same with more links that may touch."""
+        added = tuple(more)
+        names = {frozenset(one.links) for one in added}
+        kept = [frozenset(self.names(i, j)) not in names for i, j in self.pairs.tolist()]
+        return CollisionModel(
+            self.robot,
+            self.capsules,
+            self.bodies,
+            self.pairs[np.array(kept, dtype=bool)],
+            self.excluded + added,
+            self.allowed,
+        )
+
+    @property
+    def offsets(self) -> Array:
+        """(p,) what is added to what a pair has to be apart: minus what it may overlap [m]."""
+        depths = {frozenset(one.links): one.depth for one in self.allowed}
+        return np.array([-depths.get(frozenset(self.names(i, j)), 0.0) for i, j in self.pairs])
+
+
+def collision_model(robot: RobotDescription) -> CollisionModel:
+    """The model of a robot: all pairs but those of one body, of neighbours, and that may touch.
+
+    Raises:
+        UnsupportedError: The arm or the hand has no shapes.
+    """
+    capsules = robot.shapes.capsules
+    part = {joint.child: joint.part for joint in robot.joints}
+    described = {part.get(one.link, "base") for one in capsules}
+    for name in sorted({joint.part for joint in robot.movable}):
+        if name not in described:
+            raise UnsupportedError(
+                f"robot {robot.name!r}: its {name} has no shapes, which a scene needs; write "
+                "'collision:' in its description (docs/collision.md)"
+            )
+    bodies = {robot.root: robot.root}
+    neighbours: set[frozenset[str]] = set()
+    for joint in robot.joints:
+        parent = bodies[joint.parent]
+        bodies[joint.child] = parent if joint.type == "fixed" else joint.child
+        neighbours.add(frozenset((parent, bodies[joint.child])))
+    excluded: dict[frozenset[str], Touching] = {
+        frozenset(one.links): one for one in robot.shapes.touching if math.isinf(one.depth)
+    }
+
+    def checked(one: str, other: str) -> bool:
+        names = frozenset((one, other))
+        if bodies[one] == bodies[other]:
+            return False
+        if names not in excluded and frozenset((bodies[one], bodies[other])) in neighbours:
+            excluded[names] = Touching((one, other), "a joint holds them together")
+        return names not in excluded
+
+    found = [
+        pair
+        for pair in _pairs(robot.shapes)
+        if checked(capsules[pair[0]].link, _link(robot.shapes, pair[1]))
+    ]
+    pairs = np.array(found, dtype=np.int32).reshape(-1, 2)
+    allowed = tuple(one for one in robot.shapes.touching if not math.isinf(one.depth))
+    return CollisionModel(robot, capsules, bodies, pairs, tuple(excluded.values()), allowed)
+
+
+def _pairs(shapes: Shapes) -> Iterator[tuple[int, int]]:
+    """All pairs of shapes: capsule and capsule, capsule and solid; of two solids one's capsules."""
+    count = len(shapes.capsules)
+    itself = [i for i, one in enumerate(shapes.capsules) if one.covers < 0]
+    yield from combinations(itself, 2)
+    for k in range(len(shapes.solids)):
+        for i in itself:
+            yield i, count + k
+        for i, one in enumerate(shapes.capsules):
+            if one.covers > k:
+                yield i, count + k
+
+
+def _link(shapes: Shapes, number: int) -> str:
+    """The link of a capsule, or of a solid behind them."""
+    count = len(shapes.capsules)
+    return shapes.capsules[number].link if number < count else shapes.solids[number - count].link
+
+
+def placed(robot: RobotDescription, q: ca.SX) -> ca.SX:
+    """Where the shapes are, base frame [m], one below the other.
+
+    Six numbers for each capsule: middle and half of its segment; then twelve for each solid: its
+    rotation row by row and its origin.
+    """
+    links = actuated(robot, q).kinematics.links
+    holders = {joint.child: joint for joint in robot.joints if joint.type == "fixed"}
+
+    def held(link: str) -> tuple[Pose, Array]:
+        place = np.eye(4)
+        while link in holders:  # constants fold before the graph is made
+            place = holders[link].placement @ place
+            link = holders[link].parent
+        return links[link], place
+
+    rows = []
+    for one in robot.shapes.capsules:
+        pose, place = held(one.link)
+        center = place[:3, :3] @ one.center + place[:3, 3]
+        rows += [pose.origin + pose.rotate(center), pose.rotate(place[:3, :3] @ one.half)]
+    for solid in robot.shapes.solids:
+        pose, place = held(solid.link)
+        whole = pose.at(place @ solid.pose)
+        rows += [ca.vec(whole.rotation.T), whole.origin]
+    return ca.densify(ca.vertcat(ca.SX(0, 1), *rows))
+
+
+def size_of(robot: RobotDescription) -> int:
+    """How many numbers `placed` gives."""
+    return 6 * len(robot.shapes.capsules) + 12 * len(robot.shapes.solids)
+
+
+def own_solids(robot: RobotDescription) -> tuple[Solid, ...]:
+    """The robot's boxes and cylinders."""
+    found = []
+    for one in robot.shapes.solids:
+        x, y, z = one.size.tolist()
+        found.append(box((x, y, z)) if one.kind == "box" else cylinder(x, y))
+    return tuple(found)

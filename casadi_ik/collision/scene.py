@@ -1,0 +1,336 @@
+"""Scenes: solids with poses and names, margins, and what may be touched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from casadi_ik.arrays import Array
+from casadi_ik.collision.hulls import hull, mesh_points
+from casadi_ik.collision.solids import Solid, box, capsule, cylinder, half_space, of_object
+from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
+from casadi_ik.files.reading import (
+    Angles,
+    Frame,
+    Point,
+    Struct,
+    convert,
+    frame_matrix,
+    read,
+    read_yaml,
+    refuse_non_finite,
+)
+from casadi_ik.files.shipped import resolve
+from casadi_ik.files.units import Length, in_si
+from casadi_ik.grasps.objects import load_object
+from casadi_ik.robots.collision import Touching, TouchingEntry
+
+
+class _Entry(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", kw_only=True
+):
+    xyz: Point = (0.0, 0.0, 0.0)
+    rpy: Angles = (0.0, 0.0, 0.0)
+    margin: Length | None = None
+
+
+class BoxEntry(_Entry, frozen=True, tag="box", kw_only=True):
+    """A box about its pose's origin."""
+
+    size: tuple[Length, Length, Length]
+
+
+class SphereEntry(_Entry, frozen=True, tag="sphere", kw_only=True):
+    """A ball."""
+
+    radius: Length
+
+
+class CylinderEntry(_Entry, frozen=True, tag="cylinder", kw_only=True):
+    """A cylinder along z."""
+
+    radius: Length
+    length: Length
+
+
+class CapsuleEntry(_Entry, frozen=True, tag="capsule", kw_only=True):
+    """A capsule along z; ``length`` is that of its segment, without the caps."""
+
+    radius: Length
+    length: Length
+
+
+class HalfSpaceEntry(_Entry, frozen=True, tag="half-space", kw_only=True):
+    """All below the plane z = 0 of its pose."""
+
+
+class MeshEntry(_Entry, frozen=True, tag="mesh", kw_only=True):
+    """The convex hull of a mesh."""
+
+    file: str
+    scale: float = 1.0
+
+
+class ConvexEntry(_Entry, frozen=True, tag="convex", kw_only=True):
+    """The convex hull of points."""
+
+    points: list[Point]
+
+
+class ObjectEntry(_Entry, frozen=True, tag="object", kw_only=True):
+    """An object by its shipped name or the path of its file."""
+
+    object: str
+
+
+SolidEntry = (
+    BoxEntry
+    | SphereEntry
+    | CylinderEntry
+    | CapsuleEntry
+    | HalfSpaceEntry
+    | MeshEntry
+    | ConvexEntry
+    | ObjectEntry
+)
+
+
+class SceneFile(Struct, frozen=True):
+    """``models/scenes/*.yaml``."""
+
+    solids: dict[str, SolidEntry] = msgspec.field(default_factory=dict)
+    margin: Length = 0.0
+    grasped: str | None = None
+    touching: list[TouchingEntry] = msgspec.field(default_factory=list)
+    name: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Item:
+    """Something that stands in a scene.
+
+    Attributes:
+        name: Its name.
+        parts: Its solids, each with its (4, 4) pose in the item's frame.
+        pose: (4, 4) of the item in the robot's base frame.
+        margin: Distance to keep from it [m]; None: the scene's.
+    """
+
+    name: str
+    parts: tuple[tuple[Solid, Array], ...]
+    pose: Array
+    margin: float | None = None
+
+
+class Scene:
+    """What stands about a robot, in its base frame.
+
+    Attributes:
+        items: What stands there, by name.
+        margin: Distance to keep, also between links [m].
+        grasped: Name of the item that is grasped: links with a contact may touch it.
+        touching: Links that may touch an item or each other, and why.
+        name: What it is called.
+    """
+
+    def __init__(
+        self,
+        solids: Mapping[str, Any] | None = None,
+        margin: float = 0.0,
+        grasped: str | None = None,
+        touching: Sequence[Mapping[str, Any]] = (),
+        name: str = "scene",
+    ) -> None:
+        """Make a scene; without solids the robot is checked against itself.
+
+        Args:
+            solids: By name what stands there, as in a scene file: ``{"table": {"kind": "box",
+                "size": [1, 1, 0.04], "xyz": [0.6, 0, -0.02]}}``.
+            margin: Distance to keep [m].
+            grasped: Name of the solid that is grasped.
+            touching: ``{"links": [LINK, SOLID], "reason": TEXT}`` each.
+            name: What to call it.
+
+        Raises:
+            DescriptionError: One line that names the key, what was found and what was expected.
+        """
+        data = {
+            "solids": {key: _plain(value) for key, value in (solids or {}).items()},
+            "margin": margin,
+            "grasped": grasped,
+            "touching": [_plain(one) for one in touching],
+        }
+        where = Path(name)
+        raw = in_si(data)
+        refuse_non_finite(raw, where)
+        self._take(convert(raw, SceneFile, where), where)
+        self.name = name
+
+    @classmethod
+    def _of_file(cls, path: Path) -> Scene:
+        refuse_non_finite(read_yaml(path), path)
+        entry, _ = read(path, SceneFile)
+        scene = cls.__new__(cls)
+        scene._take(entry, path)
+        scene.name = entry.name or path.stem
+        return scene
+
+    def _take(self, entry: SceneFile, path: Path) -> None:
+        if not entry.margin >= 0:
+            raise DescriptionError(f"{path}: margin: found {entry.margin:g}, expected >= 0 m")
+        self.margin = entry.margin
+        self.items: dict[str, Item] = {}
+        for name, solid in entry.solids.items():
+            where = f"{path}: solids.{name}"
+            if solid.margin is not None and not solid.margin >= 0:
+                raise DescriptionError(f"{where}.margin: found {solid.margin:g}, expected >= 0 m")
+            parts = tuple(_parts(solid, where, path))
+            pose = frame_matrix(Frame(solid.xyz, solid.rpy))
+            self.items[name] = Item(name, parts, pose, solid.margin)
+        self.grasped = entry.grasped
+        if entry.grasped is not None and entry.grasped not in self.items:
+            known = ", ".join(self.items) or "none"
+            raise DescriptionError(
+                f"{path}: grasped: unknown solid {entry.grasped!r}; the scene's: {known}"
+            )
+        self.touching = tuple(Touching(one.links, one.reason) for one in entry.touching)
+
+    def __repr__(self) -> str:
+        return f"<Scene {self.name}: {', '.join(self.items) or 'empty'}, margin {self.margin:g} m>"
+
+    def moved(self, name: str, pose: ArrayLike) -> Scene:
+        """The scene with an item at another (4, 4) pose.
+
+        Raises:
+            UnknownNameError: There is no such item.
+            InputError: No pose.
+        """
+        if name not in self.items:
+            known = ", ".join(self.items) or "none"
+            raise UnknownNameError(
+                f"scene {self.name!r} has no solid {name!r}; its solids: {known}"
+            )
+        return self._with(replace(self.items[name], pose=checked_pose(pose, f"pose of {name!r}")))
+
+    def holding(self, name: str, pose: ArrayLike) -> Scene:
+        """The scene with an object that is grasped at a (4, 4) pose.
+
+        Args:
+            name: Of an item of the scene, or of a shipped object.
+            pose: Of its frame in the base frame.
+
+        Raises:
+            UnknownNameError: Neither.
+            InputError: No pose.
+        """
+        place = checked_pose(pose, f"pose of {name!r}")
+        known = self.items.get(name)
+        parts = known.parts if known else tuple(of_object(load_object(name).shape))
+        scene = self._with(Item(name, parts, place, known.margin if known else None))
+        scene.grasped = name
+        return scene
+
+    def _with(self, item: Item) -> Scene:
+        scene = Scene.__new__(Scene)
+        scene.__dict__.update(self.__dict__)
+        scene.items = self.items | {item.name: item}
+        return scene
+
+
+def load_scene(name_or_path: str | Path) -> Scene:
+    """Load a scene.
+
+    Args:
+        name_or_path: A shipped name (`shipped_names("scenes")`) or the path of a YAML file.
+
+    Raises:
+        UnknownNameError: No shipped scene has that name.
+        DescriptionError: The file is missing or malformed; the message names file and key.
+        MissingExtraError: It has a mesh, and what builds hulls is not installed.
+    """
+    return Scene._of_file(resolve(name_or_path, "scenes"))
+
+
+def grasped_in(scene: Scene | None) -> str:
+    """Name of what is grasped in a scene.
+
+    Raises:
+        InputError: There is no scene, or it does not say.
+    """
+    if scene is None or scene.grasped is None:
+        raise InputError("object_pose: found one, expected a scene that says what is 'grasped'")
+    return scene.grasped
+
+
+def checked_pose(pose: ArrayLike, name: str = "object_pose") -> Array:
+    """A pose (4, 4), or (k, 4, 4), as an array.
+
+    Raises:
+        InputError: A wrong shape, a number that is not finite, or no rotation.
+    """
+    try:
+        array = np.asarray(pose, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected an array of numbers: {error}") from error
+    if array.ndim not in (2, 3) or array.shape[-2:] != (4, 4):
+        raise InputError(f"{name}: found shape {array.shape}, expected (4, 4)")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name}: holds NaN or infinity, expected finite numbers")
+    rotation = array[..., :3, :3]
+    product = rotation @ np.swapaxes(rotation, -1, -2)
+    if not (np.abs(product - np.eye(3)).max() < 1e-6 and (np.linalg.det(rotation) > 0).all()):
+        raise InputError(f"{name}: its first three columns are no rotation")
+    return array
+
+
+def _parts(entry: SolidEntry, where: str, path: Path) -> list[tuple[Solid, Array]]:
+    here = np.eye(4)
+    for key in ("size", "radius", "length", "scale"):
+        value = getattr(entry, key, 1.0)
+        least = min(value) if isinstance(value, tuple) else value
+        if not 0 < least < math.inf and not (isinstance(entry, CapsuleEntry) and key == "length"):
+            raise DescriptionError(f"{where}.{key}: found {value}, expected > 0")
+    match entry:
+        case BoxEntry():
+            return [(box(entry.size), here)]
+        case SphereEntry():
+            return [(capsule(entry.radius, 0.0), here)]
+        case CylinderEntry():
+            return [(cylinder(entry.radius, entry.length), here)]
+        case CapsuleEntry():
+            if not entry.length >= 0:
+                raise DescriptionError(f"{where}.length: found {entry.length}, expected >= 0")
+            return [(capsule(entry.radius, entry.length / 2), here)]
+        case HalfSpaceEntry():
+            return [(half_space(), here)]
+        case ConvexEntry():
+            return [(hull(np.array(entry.points, dtype=float), f"{where}.points"), here)]
+        case MeshEntry():
+            file = Path(entry.file).expanduser()
+            file = file if file.is_absolute() else path.parent / file
+            points = mesh_points(file, f"{where}.file")
+            return [(hull(entry.scale * points, f"{where}.file"), here)]
+        case ObjectEntry():
+            try:
+                return of_object(load_object(entry.object).shape)
+            except (UnknownNameError, DescriptionError) as error:
+                raise DescriptionError(f"{where}.object: {error}") from error
+
+
+def _plain(value: Any) -> Any:
+    """Nested data with arrays as lists, so that it is read like a file."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value

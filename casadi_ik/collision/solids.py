@@ -1,0 +1,150 @@
+"""Solids of a scene as numbers: what the distance kernel knows of a shape that stands about.
+
+A solid lies in its own frame. A half-space is all below z = 0; a box, a cylinder (along z) and a
+capsule (along z) are about the origin; a convex body is all that is below its planes. Of what is
+round but no ball nor cylinder the planes touch it from outside, so that the body of the planes
+holds it: distances are never larger than the true ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import pairwise
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.grasps.shapes import BentCapsule, Box, Cylinder, EllipticCylinder, Shape, Sphere
+
+DIRECTIONS = 512
+"""Planes that round a convex body off, besides those of its faces: between two of them a corner
+stands out by at most 2 % of the distance from it."""
+
+LINKS = 5
+"""Capsules that a bent one is made of."""
+
+
+class Kind(IntEnum):
+    """Which shape; the numbers are those of the driver."""
+
+    HALF_SPACE = 0
+    CAPSULE = 1
+    BOX = 2
+    CYLINDER = 3
+    CONVEX = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A shape in its own frame.
+
+    Attributes:
+        kind: Which.
+        size: (3,) [m]: of a box half its edges; of a cylinder radius and half its length; of a
+            capsule radius and half its segment; else nothing.
+        reach: Radius of the ball about the origin that holds it [m]; infinite for a half-space.
+        planes: (m, 4) outward unit normals and offsets [m] of a convex body.
+    """
+
+    kind: Kind
+    size: Array
+    reach: float
+    planes: Array
+
+
+NO_PLANES = np.zeros((0, 4))
+
+
+def half_space() -> Solid:
+    """All below z = 0."""
+    return Solid(Kind.HALF_SPACE, np.zeros(3), math.inf, NO_PLANES)
+
+
+def capsule(radius: float, half: float) -> Solid:
+    """All within a radius of a segment along z of twice that half; a ball if it is zero."""
+    return Solid(Kind.CAPSULE, np.array([radius, half, 0.0]), radius + half, NO_PLANES)
+
+
+def box(size: tuple[float, float, float]) -> Solid:
+    """A box of these edges."""
+    half = np.array(size) / 2
+    return Solid(Kind.BOX, half, float(np.linalg.norm(half)), NO_PLANES)
+
+
+def cylinder(radius: float, length: float) -> Solid:
+    """A cylinder along z."""
+    half = length / 2
+    return Solid(Kind.CYLINDER, np.array([radius, half, 0.0]), math.hypot(radius, half), NO_PLANES)
+
+
+def convex(points: Array, normals: Array) -> Solid:
+    """The convex hull of points (k, 3) whose faces have these normals (m, 3)."""
+    planes = _planes(normals, lambda ways: (ways @ points.T).max(axis=1))
+    return Solid(Kind.CONVEX, np.zeros(3), float(np.linalg.norm(points, axis=1).max()), planes)
+
+
+def of_object(shape: Shape) -> list[tuple[Solid, Array]]:
+    """The solids that an object's shape consists of, each with its (4, 4) pose in its frame."""
+    here = np.eye(4)
+    if isinstance(shape, Sphere):
+        return [(capsule(shape.diameter / 2, 0.0), here)]
+    if isinstance(shape, Cylinder):
+        return [(cylinder(shape.diameter / 2, shape.height), here)]
+    if isinstance(shape, Box):
+        return [(box(shape.size), here)]
+    if isinstance(shape, EllipticCylinder):
+        return [(_elliptic(shape), here)]
+    return _bent(shape)
+
+
+def _elliptic(shape: EllipticCylinder) -> Solid:
+    half = np.array([shape.width, shape.depth, shape.height]) / 2
+    turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    around = np.column_stack([np.cos(turns), np.sin(turns), np.zeros(64)])
+    faces = np.concatenate([around, [[0, 0, 1.0], [0, 0, -1.0]]])
+
+    def support(ways: Array) -> Array:
+        return np.hypot(ways[:, 0] * half[0], ways[:, 1] * half[1]) + np.abs(ways[:, 2]) * half[2]
+
+    reach = math.hypot(max(half[0], half[1]), half[2])
+    return Solid(Kind.CONVEX, np.zeros(3), reach, _planes(faces, support))
+
+
+def _bent(shape: BentCapsule) -> list[tuple[Solid, Array]]:
+    """Straight capsules along the arc, each wider by how far its arc leaves its chord."""
+    angles = np.linspace(-shape.half_angle, shape.half_angle, LINKS + 1)
+    points = shape.centreline(angles)
+    sagitta = shape.radius * (1 - math.cos(shape.half_angle / LINKS))
+    found = []
+    for one, other in pairwise(points):
+        along = (other - one) / np.linalg.norm(other - one)
+        side = np.array([0.0, 0.0, 1.0])
+        pose = np.eye(4)
+        pose[:3, :3] = np.column_stack([side, np.cross(along, side), along])
+        pose[:3, 3] = (one + other) / 2
+        half = float(np.linalg.norm(other - one)) / 2
+        found.append((capsule(shape.diameter / 2 + sagitta, half), pose))
+    return found
+
+
+def _planes(normals: Array, support: Callable[[Array], Array]) -> Array:
+    """(m, 4) planes that touch a body, with these normals and evenly spread ones."""
+    ways = np.concatenate([_distinct(normals), _sphere(DIRECTIONS)])
+    return np.column_stack([ways, support(ways)])
+
+
+def _distinct(normals: Array) -> Array:
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    _, first = np.unique(np.round(unit, 6), axis=0, return_index=True)
+    return unit[np.sort(first)]
+
+
+def _sphere(count: int) -> Array:
+    """(count, 3) unit vectors spread evenly, along a spiral."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - math.sqrt(5)) * np.arange(count)
+    flat = np.sqrt(1 - z * z)
+    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])

@@ -1,0 +1,92 @@
+"""Which distances are asked for, as arrays: capsules of a robot, solids of a scene, their pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array
+from casadi_ik.collision.scene import Item
+from casadi_ik.collision.solids import Kind, Solid
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """What a distance kernel works on.
+
+    Attributes:
+        radii: (s,) radii of the robot's capsules [m].
+        halves: (s,) half lengths of their segments [m].
+        pairs: (p, 2) a capsule; another, or s + a solid.
+        own: How many solids are the robot's own; they come first.
+        offsets: (p,) how much farther than the scene's margin a pair has to be apart [m].
+        solids: The solids.
+        places: Pose (4, 4) of every other solid in its item's frame.
+        items: Name of the item of every other solid.
+        names: (p, 2) what each pair is called: links, or a link and an item.
+    """
+
+    radii: Array
+    halves: Array
+    pairs: NDArray[np.int32]
+    offsets: Array
+    own: int
+    solids: tuple[Solid, ...]
+    places: tuple[Array, ...]
+    items: tuple[str, ...]
+    names: tuple[tuple[str, str], ...]
+
+    def poses(
+        self, items: dict[str, Item], moved: str | None = None, to: Array | None = None
+    ) -> Array:
+        """(n, 12) rotation row by row and origin of every solid of a scene, or (k, n, 12).
+
+        Args:
+            items: Where things are, by name.
+            moved: The item that is elsewhere in every row.
+            to: (k, 4, 4) where it is.
+        """
+        found: list[Array] = []
+        for place, name in zip(self.places, self.items, strict=True):
+            pose = to if name == moved and to is not None else items[name].pose
+            whole = pose @ place
+            flat = np.concatenate(
+                [whole[..., :3, :3].reshape(*whole.shape[:-2], 9), whole[..., :3, 3]], axis=-1
+            )
+            found.append(flat)
+        if not found:
+            return np.zeros((0, 12))
+        return np.stack(np.broadcast_arrays(*found), axis=-2)
+
+    def only(self, rows: NDArray[np.bool_]) -> Table:
+        """The same with some of the pairs."""
+        names = tuple(name for name, kept in zip(self.names, rows.tolist(), strict=True) if kept)
+        return Table(
+            self.radii,
+            self.halves,
+            np.ascontiguousarray(self.pairs[rows]),
+            self.offsets[rows],
+            self.own,
+            self.solids,
+            self.places,
+            self.items,
+            names,
+        )
+
+
+def driver_rows(solids: Sequence[Solid]) -> tuple[Array, Array]:
+    """The solids (n, 7 of 8 bytes) and the planes (m, 4) as the driver has them."""
+    form = np.dtype(
+        [("kind", "<i8"), ("size", "<f8", 3), ("reach", "<f8"), ("first", "<i8"), ("planes", "<i8")]
+    )
+    rows = np.zeros(len(solids), dtype=form)
+    first = 0
+    for row, solid in zip(rows, solids, strict=True):
+        row["kind"], row["size"], row["reach"] = int(solid.kind), solid.size, solid.reach
+        row["first"], row["planes"] = first, len(solid.planes)
+        first += len(solid.planes)
+    planes = [solid.planes for solid in solids if solid.kind is Kind.CONVEX]
+    return rows, np.concatenate([np.zeros((0, 4)), *planes])

@@ -1,0 +1,209 @@
+"""Least distances of a robot's shapes for batches of configurations, some at a time."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import math
+from functools import cached_property, partial
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array
+from casadi_ik.collision.distances import nearest
+from casadi_ik.collision.model import placed, size_of
+from casadi_ik.collision.table import Table, driver_rows
+from casadi_ik.kernels.buffered import doubles, memory
+from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
+from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.function_kernel import FunctionKernel
+from casadi_ik.kernels.lanes import lanes_source
+from casadi_ik.kernels.lanes_lines import UnsuitedError
+from casadi_ik.kernels.machine_lanes import machine_lanes
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.robots import RobotDescription
+
+logger = logging.getLogger(__name__)
+
+SYMBOL = "casadi_ik_clearance"
+
+BLOCK = 1024
+"""Configurations that numpy works on at a time where there is no compiled driver."""
+
+
+class ClearanceJob(ctypes.Structure):
+    """`clearance_job` of drivers/clearance.c."""
+
+    _fields_ = (
+        ("q", ctypes.c_void_p),
+        ("poses", ctypes.c_void_p),
+        ("pose_step", ctypes.c_int64),
+        ("n_solids", ctypes.c_int64),
+        ("solids", ctypes.c_void_p),
+        ("planes", ctypes.c_void_p),
+        ("radii", ctypes.c_void_p),
+        ("halves", ctypes.c_void_p),
+        ("pairs", ctypes.c_void_p),
+        ("offsets", ctypes.c_void_p),
+        ("n_pairs", ctypes.c_int64),
+        ("most", ctypes.c_double),
+        ("least", ctypes.c_void_p),
+        ("closest", ctypes.c_void_p),
+        ("every", ctypes.c_void_p),
+        ("count", ctypes.c_int64),
+        ("next", ctypes.c_int64),
+        ("slice", ctypes.c_double),
+    )
+
+
+class ClearanceKernel:
+    """Distances of one robot's capsules; tables and poses are parameters, threads may share it."""
+
+    def __init__(self, robot: RobotDescription, compiled: bool = True) -> None:
+        """Compile the placing of the capsules with the driver, or load them from the cache.
+
+        Args:
+            robot: With shapes.
+            compiled: False keeps to the virtual machine and numpy.
+        """
+        n, size = len(robot.actuators), size_of(robot)
+        name = ca.Function.fix_name(f"{robot.name}_shapes")
+
+        def build() -> ca.Function:
+            q = ca.SX.sym("q", n)
+            return ca.Function(name, [q], [placed(robot, q)], ["q"], ["shapes"])
+
+        known = recipe(name, robot)
+        self._graph = FunctionGraph(name, build, {"q": (n, 1)}, ((size, 1),), known)
+        self._n, self._size = n, size
+        self._robot = robot
+        self._compiled = compiled
+        self._run = self._load() if compiled else None
+
+    def _load(self) -> Any:
+        lanes = machine_lanes()
+        if not lanes:
+            return None
+        shapes = self._robot.shapes
+        constants = {"N_Q": self._n, "N_CAPSULES": len(shapes.capsules)}
+        constants["N_OWN"] = len(shapes.solids)
+        try:
+            library = load_library(
+                f"{self._graph.name}_lanes{lanes}",
+                lambda: row_major(self._graph.function),
+                define(constants) + driver_text("clearance"),
+                SYMBOL,
+                f"{self._graph.recipe} lanes {lanes}",
+                partial(lanes_source, lanes=lanes),
+            )
+        except UnsuitedError as error:
+            logger.info("%s: distances by numpy: %s", self._graph.name, error)
+            return None
+        return None if library is None else library[SYMBOL]
+
+    @cached_property
+    def placed(self) -> FunctionKernel:
+        """Where the shapes are for q, see `collision.model.placed`."""
+        return FunctionKernel(self._graph, self._compiled)
+
+    @cached_property
+    def pulled(self) -> FunctionKernel:
+        """(n,) what forces on the numbers of `placed` do to q: the Jacobian's transpose."""
+        n, size, robot = self._n, self._size, self._robot
+        name = ca.Function.fix_name(f"{robot.name}_shapes_pulled")
+
+        def build() -> ca.Function:
+            q, forces = ca.SX.sym("q", n), ca.SX.sym("forces", size)
+            back = ca.jtimes(placed(robot, q), q, forces, True)
+            return ca.Function(name, [q, forces], [ca.densify(back)], ["q", "forces"], ["pulled"])
+
+        inputs = {"q": (n, 1), "forces": (size, 1)}
+        graph = FunctionGraph(name, build, inputs, ((n, 1),), recipe(name, robot))
+        return FunctionKernel(graph, self._compiled)
+
+    def least(
+        self, q: Array, poses: Array, table: Table, most: float = math.inf
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """The smallest distance of each configuration.
+
+        Args:
+            q: (k, n).
+            poses: (m, 12) of the scene's solids, or (k, m, 12).
+            table: The pairs.
+            most: Distances above it are not told apart: they are `most`.
+
+        Returns:
+            (k,) [m], offsets taken off, and (k,) the pair; -1 where none is below `most`.
+        """
+        return self._distances(q, poses, table, most, None)
+
+    def every(self, q: Array, poses: Array, table: Table) -> Array:
+        """(k, p) distances of all pairs [m], see `least`."""
+        found = np.empty((len(q), len(table.pairs)))
+        self._distances(q, poses, table, math.inf, found)
+        return found
+
+    def _distances(
+        self, q: Array, poses: Array, table: Table, most: float, every: Array | None
+    ) -> tuple[Array, NDArray[np.int64]]:
+        given = doubles(q)
+        least, closest = np.full(len(given), most), np.full(len(given), -1, dtype=np.int64)
+        if not len(given) or not len(table.pairs):
+            return least, closest
+        if self._run is None:
+            self._by_numpy(given, poses, table, least, closest, every)
+            return least, closest
+        solids, planes = driver_rows(table.solids)
+        places = doubles(poses)
+        moving = places.ndim == 3
+        radii, halves, offsets = map(doubles, (table.radii, table.halves, table.offsets))
+        job = ClearanceJob(
+            memory(given),
+            places.ctypes.data,
+            places[0].size if moving else 0,
+            len(solids) - table.own,
+            solids.ctypes.data,
+            planes.ctypes.data,
+            memory(radii),
+            memory(halves),
+            table.pairs.ctypes.data,
+            memory(offsets),
+            len(table.pairs),
+            most,
+            memory(least),
+            memory(closest),
+            None if every is None else memory(every),
+            len(given),
+            0,
+            SLICE,
+        )
+        while (code := self._run(ctypes.byref(job))) != DriverCode.DONE:
+            check(self._graph.name, code)
+        return least, closest
+
+    def _by_numpy(
+        self,
+        q: Array,
+        poses: Array,
+        table: Table,
+        least: Array,
+        closest: NDArray[np.int64],
+        every: Array | None,
+    ) -> None:
+        for first in range(0, len(q), BLOCK):
+            rows = slice(first, first + BLOCK)
+            (where,) = self.placed(q[rows])
+            places = poses[rows] if poses.ndim == 3 else poses
+            distance = nearest(where, places, table).distance
+            if every is not None:
+                every[rows] = distance
+            which = distance.argmin(axis=1)
+            found = distance[np.arange(len(which)), which]
+            below = found < least[rows]
+            least[rows] = np.where(below, found, least[rows])
+            closest[rows] = np.where(below, which, -1)

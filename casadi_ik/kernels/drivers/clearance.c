@@ -1,0 +1,251 @@
+/* Distances of capsules that a step places, from each other and from solids, LANES configurations
+ * side by side. The step maps q to the middles and halves of the capsules' segments, and to the
+ * poses of the robot's own solids.
+ *
+ * Of two capsules the distance is exact. Of a capsule and a solid it is that of its segment's point
+ * nearest to the solid (deepest inside it), never more than the true one: the signed distance from
+ * a convex solid is convex along the segment, and what is given is where two of its tangents meet.
+ *
+ * Expects the macros N_Q, N_CAPSULES and N_OWN (solids of the robot).
+ */
+enum { HALF_SPACE, CAPSULE, BOX, CYLINDER, CONVEX };
+enum { MOST_CUTS = 40 };
+
+/* Where tangents and function agree to this [m], the least is found. */
+#define CLOSE 1e-7
+#define TINY 1e-30
+
+typedef struct {
+  int64_t kind;
+  double size[3];
+  double reach;                /* of the ball about its origin that holds it */
+  int64_t first, planes;       /* rows of the table of planes */
+} solid;
+
+typedef struct {
+  const double *q;             /* count rows of N_Q */
+  const double *poses;         /* of the scene's solids: rotation row by row, then the origin */
+  int64_t pose_step;           /* doubles from one configuration to the next, 0: the same for all */
+  int64_t n_solids;            /* of the scene; they come behind the robot's own */
+  const solid *solids;
+  const double *planes;
+  const double *radii, *halves;
+  const int32_t *pairs;        /* capsule; another, or N_CAPSULES + solid */
+  const double *offsets;       /* taken off each pair's distance */
+  int64_t n_pairs;
+  double most;                 /* distances above this are not told apart */
+  double *least;
+  int64_t *closest;            /* pair of the least; -1: none below `most` */
+  double *every;               /* count rows of n_pairs, or NULL */
+  int64_t count, next;
+  double slice;
+} clearance_job;
+
+typedef struct { lanes x, y, z; } vector;
+typedef struct { lanes value, slope; } along;
+
+LANES_INLINE lanes smaller(lanes a, lanes b) { return lanes_select(a < b, a, b); }
+LANES_INLINE lanes larger(lanes a, lanes b) { return lanes_select(a > b, a, b); }
+LANES_INLINE lanes within(lanes t) { return larger(smaller(t, SPREAD(1.0)), SPREAD(-1.0)); }
+LANES_INLINE lanes dot(vector a, vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+LANES_INLINE vector minus(vector a, vector b) {
+  return (vector) {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+LANES_INLINE vector at(vector c, vector h, lanes t) {
+  return (vector) {c.x + t * h.x, c.y + t * h.y, c.z + t * h.z};
+}
+LANES_INLINE vector load(const lanes *from) { return (vector) {from[0], from[1], from[2]}; }
+
+/* Least distance of two segments whose middles are apart by r; a, b: squares of the half lengths. */
+LANES_INLINE lanes between(vector r, vector g, vector h, double a, double b) {
+  const lanes both = dot(g, h), d = dot(g, r), f = dot(h, r);
+  const lanes det = SPREAD(a * b) - both * both;
+  const double over_a = a > 0 ? 1 / a : 0, over_b = b > 0 ? 1 / b : 0;
+  lanes t = within((both * f - b * d) / larger(det, SPREAD(TINY)));
+  lanes s = within((both * t + f) * over_b);
+  t = within((both * s - d) * over_a);
+  r = minus(at(r, g, t), (vector) {s * h.x, s * h.y, s * h.z});
+  return lanes_sqrt(dot(r, r));
+}
+
+LANES_INLINE along of_box(const solid *one, vector p, vector h) {
+  const lanes zero = SPREAD(0.0);
+  const lanes x = lanes_fabs(p.x) - one->size[0], y = lanes_fabs(p.y) - one->size[1];
+  const lanes z = lanes_fabs(p.z) - one->size[2];
+  const lanes gx = lanes_select(p.x < zero, -h.x, h.x), gy = lanes_select(p.y < zero, -h.y, h.y);
+  const lanes gz = lanes_select(p.z < zero, -h.z, h.z);
+  const lanes ox = larger(x, zero), oy = larger(y, zero), oz = larger(z, zero);
+  const lanes out = lanes_sqrt(ox * ox + oy * oy + oz * oz);
+  const lanes deep = larger(larger(x, y), z);
+  const lanes inner = lanes_select(x >= deep, gx, lanes_select(y >= deep, gy, gz));
+  const lane_mask outside = out > zero;
+  const lanes outer = (ox * gx + oy * gy + oz * gz) / lanes_select(outside, out, SPREAD(1.0));
+  return (along) {lanes_select(outside, out, deep), lanes_select(outside, outer, inner)};
+}
+
+LANES_INLINE along of_cylinder(const solid *one, vector p, vector h) {
+  const lanes zero = SPREAD(0.0);
+  const lanes from_axis = lanes_sqrt(p.x * p.x + p.y * p.y);
+  const lanes around = (p.x * h.x + p.y * h.y) / larger(from_axis, SPREAD(TINY));
+  const lanes up = lanes_select(p.z < zero, -h.z, h.z);
+  const lanes a = from_axis - one->size[0], b = lanes_fabs(p.z) - one->size[1];
+  const lanes oa = larger(a, zero), ob = larger(b, zero);
+  const lanes out = lanes_sqrt(oa * oa + ob * ob);
+  const lane_mask outside = out > zero;
+  const lanes outer = (oa * around + ob * up) / lanes_select(outside, out, SPREAD(1.0));
+  const lanes inner = lanes_select(a > b, around, up);
+  return (along) {lanes_select(outside, out, larger(a, b)), lanes_select(outside, outer, inner)};
+}
+
+LANES_INLINE along of_planes(const double *plane, int64_t count, vector p, vector h) {
+  along found = {SPREAD(-INFINITY), SPREAD(0.0)};
+  for (; count--; plane += 4) {
+    const lanes value = p.x * plane[0] + p.y * plane[1] + p.z * plane[2] - plane[3];
+    const lane_mask higher = value > found.value;
+    const lanes slope = h.x * plane[0] + h.y * plane[1] + h.z * plane[2];
+    found.value = lanes_select(higher, value, found.value);
+    found.slope = lanes_select(higher, slope, found.slope);
+  }
+  return found;
+}
+
+static LANES_TARGET along from_solid(const clearance_job *job, const solid *one, vector c, vector h,
+                                     lanes t) {
+  const vector p = at(c, h, t);
+  if (one->kind == BOX) return of_box(one, p, h);
+  if (one->kind == CYLINDER) return of_cylinder(one, p, h);
+  return of_planes(job->planes + 4 * one->first, one->planes, p, h);
+}
+
+/* Lower bound of the least of the convex distance along a segment in the solid's frame. */
+static LANES_TARGET lanes lowest(const clearance_job *job, const solid *one, vector c, vector h) {
+  const lanes zero = SPREAD(0.0);
+  lanes low = SPREAD(-1.0), high = SPREAD(1.0), best, bound;
+  along left = from_solid(job, one, c, h, low), right = from_solid(job, one, c, h, high);
+  const lane_mask falls = left.slope < zero, rises = right.slope > zero;
+  const lanes ends = lanes_select(falls, right.value, left.value);
+  const lane_mask inner = falls & rises;
+  int cut;
+  best = smaller(left.value, right.value);
+  for (cut = 0;; ++cut) {
+    const lanes steep = lanes_select(inner, left.slope - right.slope, SPREAD(-1.0));
+    const lanes meet =
+        (right.value - left.value + left.slope * low - right.slope * high) / steep;
+    lanes t;
+    lane_mask left_side;
+    along here;
+    bound = left.value + left.slope * (meet - low);
+    if (cut == MOST_CUTS || lanes_all(~inner | (best - bound < SPREAD(CLOSE)))) break;
+    /* Where the tangents meet; every third time the middle, since flat ends creep. */
+    t = cut % 3 == 2 ? (low + high) * 0.5 : smaller(larger(meet, low), high);
+    here = from_solid(job, one, c, h, t);
+    best = smaller(best, here.value);
+    left_side = here.slope < zero;
+    low = lanes_select(left_side, t, low);
+    left.value = lanes_select(left_side, here.value, left.value);
+    left.slope = lanes_select(left_side, here.slope, left.slope);
+    high = lanes_select(left_side, high, t);
+    right.value = lanes_select(left_side, right.value, here.value);
+    right.slope = lanes_select(left_side, right.slope, here.slope);
+  }
+  return lanes_select(inner, smaller(bound, best), ends);
+}
+
+/* Distance of a capsule's segment from a solid, less `radius`; where the least distances are below
+ * what this can be at all, anything above them. */
+static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, const lanes *pose,
+                                    vector c, vector h, double half, double radius, lanes least) {
+  const vector x = load(pose), y = load(pose + 3), z = load(pose + 6);
+  const vector r = minus(c, load(pose + 9));
+  vector place, way;
+  lanes sure;
+  if (one->kind == HALF_SPACE) {
+    const vector up = {x.z, y.z, z.z};
+    return dot(up, r) - lanes_fabs(dot(up, h)) - radius;
+  }
+  sure = least + (one->reach + half + radius);
+  if (lanes_all((dot(r, r) >= sure * sure) | (sure < SPREAD(0.0)))) return SPREAD(INFINITY);
+  if (one->kind == CAPSULE) {
+    const double other = one->size[1];
+    const vector axis = {x.z * other, y.z * other, z.z * other};
+    return between(r, h, axis, half * half, other * other) - (radius + one->size[0]);
+  }
+  /* The rotation's columns are the solid's axes. */
+  place.x = x.x * r.x + y.x * r.y + z.x * r.z;
+  place.y = x.y * r.x + y.y * r.y + z.y * r.z;
+  place.z = x.z * r.x + y.z * r.y + z.z * r.z;
+  way.x = x.x * h.x + y.x * h.y + z.x * h.z;
+  way.y = x.y * h.x + y.y * h.y + z.y * h.z;
+  way.z = x.z * h.x + y.z * h.y + z.z * h.z;
+  sure = from_solid(job, one, place, way, SPREAD(0.0)).value - (half + radius);
+  if (lanes_all(sure >= least) || half == 0) return sure;
+  return lowest(job, one, place, way) - radius;
+}
+
+EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
+  workspace space;
+  lanes *q, *placed, *poses;
+  int64_t ticks = 0, k, pair;
+  double limit;
+  int lane, outcome = set_up(&space, N_Q + 6 * N_CAPSULES + 12 * (N_OWN + (size_t) job->n_solids));
+  if (outcome != DONE) return outcome;
+  q = space.extra;
+  placed = q + N_Q;
+  poses = placed + 6 * N_CAPSULES + 12 * N_OWN;
+  limit = monotonic() + job->slice;
+  for (k = 0; k < 12 * job->n_solids; ++k) poses[k] = SPREAD(job->poses[k]);
+  for (; job->next < job->count; job->next += LANES) {
+    lanes least = SPREAD(job->most), who = SPREAD(-1.0);
+    if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {
+      outcome = SLICE_OVER;
+      break;
+    }
+    for (lane = 0; lane < LANES; ++lane) {
+      const int64_t row = job->next + lane < job->count ? job->next + lane : job->count - 1;
+      for (k = 0; k < N_Q; ++k) ((double *) q)[k * LANES + lane] = job->q[row * N_Q + k];
+      if (!job->pose_step) continue;
+      for (k = 0; k < 12 * job->n_solids; ++k) {
+        ((double *) poses)[k * LANES + lane] = job->poses[row * job->pose_step + k];
+      }
+    }
+    space.arg[0] = q;
+    space.res[0] = placed;
+    if (STEP(space.arg, space.res, space.iw, space.w, (1 << LANES) - 1)) {
+      outcome = STEP_FAILED;
+      break;
+    }
+    for (pair = 0; pair < job->n_pairs; ++pair) {
+      const int i = job->pairs[2 * pair], j = job->pairs[2 * pair + 1];
+      const vector c = load(placed + 6 * i), h = load(placed + 6 * i + 3);
+      const double radius = job->radii[i] + job->offsets[pair], half = job->halves[i];
+      const lanes enough = job->every ? SPREAD(INFINITY) : least;
+      lanes distance;
+      lane_mask nearer;
+      if (j < N_CAPSULES) {
+        const double reach = radius + job->radii[j], other = job->halves[j];
+        const vector r = minus(c, load(placed + 6 * j));
+        const lanes sure = enough + (reach + half + other);
+        if (lanes_all((dot(r, r) >= sure * sure) | (sure < SPREAD(0.0)))) continue;
+        distance = between(r, h, load(placed + 6 * j + 3), half * half, other * other) - reach;
+      } else {
+        const int64_t number = j - N_CAPSULES;
+        distance = off_solid(job, job->solids + number, placed + 6 * N_CAPSULES + 12 * number, c, h,
+                             half, radius, enough);
+      }
+      if (job->every) {
+        for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
+          job->every[(job->next + lane) * job->n_pairs + pair] = distance[lane];
+        }
+      }
+      nearer = distance < least;
+      least = lanes_select(nearer, distance, least);
+      who = lanes_select(nearer, SPREAD((double) pair), who);
+    }
+    for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
+      job->least[job->next + lane] = least[lane];
+      job->closest[job->next + lane] = (int64_t) who[lane];
+    }
+  }
+  give_back(&space);
+  return outcome;
+}

@@ -1,0 +1,261 @@
+"""Whether a robot in a configuration is clear of itself and of a scene, and by how much."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.collision.distances import nearest
+from casadi_ik.collision.model import CollisionModel, collision_model
+from casadi_ik.collision.scene import Item, Scene
+from casadi_ik.collision.scene_pairs import check_base, pair_table
+from casadi_ik.collision.table import Table
+from casadi_ik.kernels.clearance_kernel import ClearanceKernel
+from casadi_ik.problem.problems import Problems
+from casadi_ik.robots.collision import Touching
+
+SAMPLES = 256
+"""Random configurations (seed 0) in all of which links touch that are said to touch always."""
+
+SLACK = 0.5e-3
+"""How much more than at home shapes may overlap that overlap there [m]."""
+
+ROUNDING = 1e-9
+"""What a distance may be below the margin [m]."""
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Clearances:
+    """What was found for k configurations.
+
+    Attributes:
+        distance: (k,) of the pair that is nearest to being too near [m], counted from what shapes
+            may overlap; negative: penetration; infinite where there is nothing to hit; NaN for
+            NaN.
+        free: (k,) whether every pair is as far apart as it has to be.
+        pairs: (k,) number of that pair in `names`, -1: none.
+        names: What pairs are called.
+        room: (k,) what the distance has to spare beyond what is asked of its pair [m].
+    """
+
+    distance: Array
+    free: NDArray[np.bool_]
+    pairs: NDArray[np.int64]
+    names: tuple[Pair, ...]
+    room: Array
+
+    def pair(self, row: int) -> Pair | None:
+        """The nearest pair of a configuration."""
+        number = int(self.pairs[row])
+        return None if number < 0 else self.names[number]
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What k targets are checked against.
+
+    Attributes:
+        kernel: Distances of the robot's capsules.
+        table: The pairs.
+        poses: (n, 12) of the solids, or (k, n, 12).
+        margin: Distance to keep [m].
+    """
+
+    kernel: ClearanceKernel
+    table: Table
+    poses: Array
+    margin: float
+
+    def rows(self, rows: NDArray[np.intp]) -> Surroundings:
+        """Those of some targets, which may be there several times."""
+        if self.poses.ndim == 2:
+            return self
+        return Surroundings(self.kernel, self.table, self.poses[rows], self.margin)
+
+    def only(self, pairs: NDArray[np.bool_]) -> Surroundings:
+        """With some of the pairs."""
+        return Surroundings(self.kernel, self.table.only(pairs), self.poses, self.margin)
+
+    def check(self, q: Array) -> Clearances:
+        """Clearances of configurations (k, n)."""
+        room, pairs = self.kernel.least(q, self.poses, self.table)
+        offsets = np.append(self.table.offsets, 0.0)[pairs]
+        unknown = ~np.isfinite(q).all(axis=1)
+        room = np.where(unknown, np.nan, room - self.margin)
+        free = room >= -ROUNDING
+        return Clearances(
+            room + self.margin + np.maximum(offsets, 0.0), free, pairs, self.table.names, room
+        )
+
+    def free(self, q: Array) -> NDArray[np.bool_]:
+        """(k,) whether configurations (k, n) are free; quicker than `check`."""
+        least, _ = self.kernel.least(q, self.poses, self.table, self.margin)
+        return (least >= self.margin - ROUNDING) & np.isfinite(q).all(axis=1)
+
+    def gradient(self, q: Array) -> tuple[Array, Array]:
+        """The smallest room of configurations and how it grows.
+
+        Args:
+            q: (k, n).
+
+        Returns:
+            (k,) `Clearances.room` [m] and (k, n) its derivative [m per rad or m], that of the pair
+            which has least.
+        """
+        (where,) = self.kernel.placed(q)
+        found = nearest(where, self.poses, self.table)
+        rows, which = np.arange(len(q)), found.distance.argmin(axis=1)
+        first, second = self.table.pairs[which].T.astype(np.intp)
+        way, count = found.way[rows, which], len(self.table.radii)
+        forces = np.zeros_like(where)
+        _push(forces, rows, first, found.first[rows, which], way)
+        other = second < count
+        along = found.second[rows, which]
+        _push(forces, rows[other], second[other], along[other], -way[other])
+        own = ~other & (second < count + self.table.own)
+        if own.any():
+            point = _on_segment(where, rows[own], first[own], found.first[rows, which][own])
+            _carry(
+                forces, where, rows[own], 6 * count + 12 * (second[own] - count), point, way[own]
+            )
+        (pulled,) = self.kernel.pulled(q, forces)
+        return found.distance[rows, which] - self.margin, pulled
+
+
+def _push(
+    forces: Array, rows: NDArray[np.intp], capsules: NDArray[np.intp], along: Array, way: Array
+) -> None:
+    """Forces on middles and halves of capsules that pull a point of each one's segment."""
+    columns = 6 * capsules[:, None] + np.arange(3)
+    forces[rows[:, None], columns] += way
+    forces[rows[:, None], columns + 3] += along[:, None] * way
+
+
+def _on_segment(
+    where: Array, rows: NDArray[np.intp], capsules: NDArray[np.intp], along: Array
+) -> Array:
+    columns = 6 * capsules[:, None] + np.arange(3)
+    middle, half = where[rows[:, None], columns], where[rows[:, None], columns + 3]
+    return middle + along[:, None] * half
+
+
+def _carry(
+    forces: Array,
+    where: Array,
+    rows: NDArray[np.intp],
+    places: NDArray[np.intp],
+    point: Array,
+    way: Array,
+) -> None:
+    """Forces on the poses of the robot's solids that push the point they carry against `way`."""
+    turn = places[:, None] + np.arange(9)
+    rotation = where[rows[:, None], turn].reshape(-1, 3, 3)
+    origin = where[rows[:, None], places[:, None] + np.arange(9, 12)]
+    inside = np.einsum("kji,kj->ki", rotation, point - origin)
+    forces[rows[:, None], turn] -= (way[:, :, None] * inside[:, None]).reshape(-1, 9)
+    forces[rows[:, None], places[:, None] + np.arange(9, 12)] -= way
+
+
+class SceneCheck:
+    """A scene about a robot; may be shared by threads.
+
+    Attributes:
+        robot: The robot.
+        scene: The scene.
+        model: The robot's shapes and their pairs.
+    """
+
+    def __init__(self, robot: ArmHand, scene: Scene, compiled: bool = True) -> None:
+        """Find the pairs and compile the placing of the shapes.
+
+        Args:
+            robot: With shapes.
+            scene: What stands about it.
+            compiled: False keeps to the virtual machine and numpy.
+
+        Raises:
+            UnsupportedError: The arm or the hand has no shapes.
+            DescriptionError: The scene does not fit the robot.
+        """
+        self.robot = robot
+        self.scene = scene
+        self.kernel = ClearanceKernel(robot.description, compiled)
+        self.model = self._as_it_stands(collision_model(robot.description))
+        self._tables: dict[tuple[str, frozenset[str]], tuple[Table, dict[str, Item]]] = {}
+        (placed,) = self.kernel.placed(robot.home)
+        check_base(self.model, scene, placed)
+        self._table(scene, frozenset())
+
+    def _as_it_stands(self, model: CollisionModel) -> CollisionModel:
+        """Without links that touch always; those that touch at home may overlap as much as there.
+
+        Shapes are larger than what they hold: where fingers lie side by side they overlap though
+        the fingers do not.
+        """
+        table = pair_table(model, Scene(), ())
+        drawn = self.robot.random(np.random.default_rng(0), SAMPLES)
+        q = np.concatenate([self.robot.home[None], drawn])
+        distances = self.kernel.every(q, np.zeros((0, 12)), table)
+        nearest_of: dict[Pair, Array] = {}
+        for i, names in enumerate(table.names):
+            known = nearest_of.get(names)
+            here = distances[:, i]
+            nearest_of[names] = here if known is None else np.minimum(known, here)
+        why = f"their shapes touch in all of {SAMPLES} random configurations, seed 0"
+        always = [Touching(names, why) for names, d in nearest_of.items() if (d < 0).all()]
+        why = "their shapes overlap at home, where the robot is taken to be free"
+        given = {frozenset(one.links): one.depth for one in model.allowed}
+        home = [
+            Touching(names, why, SLACK - float(d[0]) + given.get(frozenset(names), 0.0))
+            for names, d in nearest_of.items()
+            if d[0] < 0
+        ]
+        kept = model.without(always)
+        return replace(kept, allowed=kept.allowed + tuple(home))
+
+    @cached_property
+    def bodies_of_fingers(self) -> dict[str, frozenset[str]]:
+        """By finger the links that may touch what it grasps: all that are fixed to its pad's."""
+        bodies = self.model.bodies
+        return {
+            finger.name: frozenset(k for k, v in bodies.items() if v == bodies[finger.link])
+            for finger in self.robot.description.fingers
+        }
+
+    def around(self, problems: Problems) -> Surroundings:
+        """What targets are checked against.
+
+        Raises:
+            UnknownNameError: They grasp an object that there is not.
+        """
+        scene, name = self.scene, problems.object or self.scene.grasped
+        pose = problems.object_pose
+        if name is not None and name not in scene.items and pose is not None:
+            scene = scene.holding(name, pose[0])
+        elif name != scene.grasped and name in scene.items:
+            scene = scene.holding(name, scene.items[name].pose)
+        fingers = ~np.isnan(problems.points[..., 0]).all(axis=0)
+        named = zip(self.robot.fingers, fingers.tolist(), strict=True)
+        touched = frozenset().union(*(self.bodies_of_fingers[f] for f, on in named if on))
+        table, items = self._table(scene, touched)
+        moved = name if pose is not None else None
+        return Surroundings(self.kernel, table, table.poses(items, moved, pose), scene.margin)
+
+    def _table(self, scene: Scene, touched: frozenset[str]) -> tuple[Table, dict[str, Item]]:
+        key = scene.grasped or "", touched
+        if key not in self._tables:
+            table = pair_table(self.model, scene, sorted(touched))
+            self._tables[key] = table, scene.items
+        return self._tables[key]
+
+
+NOTHING = math.inf
+"""Clearance where there is nothing to hit."""

@@ -1,0 +1,301 @@
+"""Shapes of links: what stands in a description, and the capsules it becomes.
+
+A capsule is all that is within its radius of a segment; one without length is a sphere. Boxes and
+cylinders stay what they are, and have capsules beside that hold them: where two of them, or one of
+them and a solid of a scene, are apart, the capsules stand for one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import DescriptionError
+from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix
+from casadi_ik.files.units import Length
+from casadi_ik.robots.robot_files.srdf_file import srdf_pairs
+
+MOST_AROUND = 4
+"""Capsules across a side of a box or a cylinder, at the most."""
+
+
+class _Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
+    """A shape; ``excess`` says by how much it is larger than the mesh it holds."""
+
+
+class SphereEntry(_Shape, frozen=True, tag="sphere", kw_only=True):
+    """A ball about a point of the link."""
+
+    radius: Length
+    center: Point = (0.0, 0.0, 0.0)
+    excess: Length = 0.0
+
+
+class CapsuleEntry(_Shape, frozen=True, tag="capsule", kw_only=True):
+    """All within the radius of the segment between two points of the link."""
+
+    ends: tuple[Point, Point]
+    radius: Length
+    excess: Length = 0.0
+
+
+class BoxEntry(_Shape, frozen=True, tag="box", kw_only=True):
+    """A box about its own frame's origin."""
+
+    size: tuple[Length, Length, Length]
+    xyz: Point = (0.0, 0.0, 0.0)
+    rpy: Angles = (0.0, 0.0, 0.0)
+    excess: Length = 0.0
+
+
+class CylinderEntry(_Shape, frozen=True, tag="cylinder", kw_only=True):
+    """A cylinder along z about its own frame's origin."""
+
+    radius: Length
+    length: Length
+    xyz: Point = (0.0, 0.0, 0.0)
+    rpy: Angles = (0.0, 0.0, 0.0)
+    excess: Length = 0.0
+
+
+ShapeEntry = SphereEntry | CapsuleEntry | BoxEntry | CylinderEntry
+
+
+class TouchingEntry(Struct, frozen=True):
+    """Two links that may touch, and why; with ``depth`` by no more than that."""
+
+    links: tuple[str, str]
+    reason: str
+    depth: Length | None = None
+
+
+class CollisionEntry(Struct, frozen=True):
+    """The key ``collision`` of a description; ``srdf`` names a file with pairs that may touch."""
+
+    links: dict[str, list[ShapeEntry]] = msgspec.field(default_factory=dict)
+    touching: list[TouchingEntry] = msgspec.field(default_factory=list)
+    source: str = ""
+    srdf: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LinkCapsule:
+    """A shape of the robot.
+
+    Attributes:
+        link: The link it moves with.
+        center: (3,) middle of its segment in the link's frame [m].
+        half: (3,) from there to the segment's end [m]; zero for a sphere.
+        radius: [m].
+        covers: Number of the solid of the robot that it helps to hold; -1: it is a shape itself.
+    """
+
+    link: str
+    center: Array
+    half: Array
+    radius: float
+    covers: int = -1
+
+
+@dataclass(frozen=True, eq=False)
+class LinkSolid:
+    """A box or a cylinder of the robot.
+
+    Attributes:
+        link: The link it moves with.
+        kind: "box" or "cylinder".
+        size: (3,) [m]: edges; or radius, length and nothing.
+        pose: (4, 4) in the link's frame.
+    """
+
+    link: str
+    kind: str
+    size: Array
+    pose: Array
+
+
+@dataclass(frozen=True)
+class Touching:
+    """Two links whose shapes may touch.
+
+    Attributes:
+        links: Their names.
+        reason: Why.
+        depth: By how much they may overlap [m].
+    """
+
+    links: tuple[str, str]
+    reason: str
+    depth: float = math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """The shapes of an arm, a hand or a robot."""
+
+    capsules: tuple[LinkCapsule, ...] = ()
+    solids: tuple[LinkSolid, ...] = ()
+    touching: tuple[Touching, ...] = ()
+
+    def renamed(self, names: Mapping[str, str]) -> Shapes:
+        """The same, of links with other names."""
+        return Shapes(
+            tuple(replace(one, link=names.get(one.link, one.link)) for one in self.capsules),
+            tuple(replace(one, link=names.get(one.link, one.link)) for one in self.solids),
+            tuple(
+                replace(one, links=tuple(names.get(link, link) for link in one.links))
+                for one in self.touching
+            ),
+        )
+
+    def __add__(self, other: Shapes) -> Shapes:
+        shift = len(self.solids)
+        theirs = tuple(
+            replace(one, covers=one.covers + shift) if one.covers >= 0 else one
+            for one in other.capsules
+        )
+        return Shapes(
+            self.capsules + theirs, self.solids + other.solids, self.touching + other.touching
+        )
+
+
+NO_SHAPES = Shapes()
+
+
+def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) -> Shapes:
+    """The shapes of a description, checked.
+
+    Args:
+        entry: What it says; None: nothing.
+        links: Its links.
+        path: Its file, from whose folder that of an SRDF counts.
+
+    Raises:
+        DescriptionError: With file, key, what was found and what was expected.
+    """
+    if entry is None:
+        return NO_SHAPES
+    known, where = list(links), str(path)
+    capsules: list[LinkCapsule] = []
+    solids: list[LinkSolid] = []
+    for link, shapes in entry.links.items():
+        _known(link, known, f"{where}: collision.links.{link}")
+        for i, shape in enumerate(shapes):
+            problem = _fault(shape)
+            if problem:
+                raise DescriptionError(f"{where}: collision.links.{link}[{i}].{problem}")
+            covers = -1
+            if isinstance(shape, BoxEntry | CylinderEntry):
+                covers = len(solids)
+                solids.append(_solid(link, shape))
+            capsules += [LinkCapsule(link, *one, covers) for one in capsules_of(shape)]
+    touching: list[Touching] = []
+    for i, pair in enumerate(entry.touching):
+        key = f"{where}: collision.touching[{i}]"
+        for link in pair.links:
+            _known(link, known, f"{key}.links")
+        if not pair.reason.strip():
+            raise DescriptionError(f"{key}.reason: is empty, expected why they may touch")
+        if pair.depth is not None and not pair.depth > 0:
+            raise DescriptionError(f"{key}.depth: found {pair.depth:g}, expected > 0 m")
+        touching.append(Touching(pair.links, pair.reason, pair.depth or math.inf))
+    if entry.srdf is not None:
+        place = Path(entry.srdf).expanduser()
+        place = place if place.is_absolute() else path.parent / place
+        pairs = srdf_pairs(place)
+        # Such a file may speak of more than this robot has.
+        touching += [Touching(*one) for one in pairs if set(one[0]) <= set(known)]
+    return Shapes(tuple(capsules), tuple(solids), tuple(touching))
+
+
+def _solid(link: str, shape: BoxEntry | CylinderEntry) -> LinkSolid:
+    pose = frame_matrix(Frame(shape.xyz, shape.rpy))
+    pose.flags.writeable = False
+    if isinstance(shape, BoxEntry):
+        return LinkSolid(link, "box", _frozen(shape.size), pose)
+    return LinkSolid(link, "cylinder", _frozen((shape.radius, shape.length, 0.0)), pose)
+
+
+def capsules_of(shape: ShapeEntry) -> list[tuple[Array, Array, float]]:
+    """Middles, halves and radii of capsules that hold a shape, in the link's frame.
+
+    Spheres and capsules are themselves. A box is cut across its two shorter sides into up to
+    `MOST_AROUND` bars each, as square as may be; each bar's capsule goes through its corners. A
+    cylinder longer than wide becomes one capsule that holds its rims, a flat one is taken as its
+    box.
+    """
+    if isinstance(shape, SphereEntry):
+        return [(_frozen(shape.center), _frozen(np.zeros(3)), shape.radius)]
+    if isinstance(shape, CapsuleEntry):
+        one, other = np.array(shape.ends[0]), np.array(shape.ends[1])
+        return [(_frozen((one + other) / 2), _frozen((other - one) / 2), shape.radius)]
+    pose = frame_matrix(Frame(shape.xyz, shape.rpy))
+    if isinstance(shape, CylinderEntry):
+        if shape.length < 2 * shape.radius:
+            size = np.array([2 * shape.radius, 2 * shape.radius, shape.length])
+            return _bars(size, pose)
+        return [_bar(np.zeros(3), np.array([0, 0, 1.0]), shape.length / 2, shape.radius, pose)]
+    return _bars(np.array(shape.size), pose)
+
+
+def _bars(size: Array, pose: Array) -> list[tuple[Array, Array, float]]:
+    order = np.argsort(size, kind="stable")
+    thin, middle, long = (int(i) for i in order)
+    # Bars about as wide as the box is thick; where it is a plate, as many as there may be.
+    count = min(MOST_AROUND, max(1, math.ceil(size[middle] / max(size[thin], 1e-9) - 1e-9)))
+    width = size[middle] / count
+    axis = np.eye(3)[long]
+    found = []
+    for i in range(count):
+        center = np.zeros(3)
+        center[middle] = (i + 0.5) * width - size[middle] / 2
+        reach = math.hypot(width, size[thin]) / 2
+        found.append(_bar(center, axis, size[long] / 2, reach, pose))
+    return found
+
+
+def _bar(
+    center: Array, axis: Array, half: float, reach: float, pose: Array
+) -> tuple[Array, Array, float]:
+    """The capsule through the ends of a bar whose corners are `reach` from its axis.
+
+    A wider capsule ends earlier: of all that hold the bar, the one of the least volume among some.
+    """
+    best = (math.inf, half, reach)
+    for grown in np.linspace(1.0, 1.5, 26) * reach:
+        inside = max(half - math.sqrt(max(grown * grown - reach * reach, 0.0)), 0.0)
+        radius = math.hypot(half, reach) if inside == 0.0 else float(grown)
+        volume = math.pi * radius * radius * (2 * inside + 4 / 3 * radius)
+        best = min(best, (volume, inside, radius))
+    _, inside, radius = best
+    rotation = pose[:3, :3]
+    return _frozen(rotation @ center + pose[:3, 3]), _frozen(rotation @ axis * inside), radius
+
+
+def _fault(shape: ShapeEntry) -> str:
+    """What is wrong with a shape, as "key: found, expected", or ""."""
+    for name in shape.__struct_fields__:
+        value = getattr(shape, name)
+        numbers = np.atleast_1d(np.asarray(value, dtype=float))
+        if not np.isfinite(numbers).all():
+            return f"{name}: found {numbers.ravel().tolist()}, expected finite numbers"
+        if name in ("radius", "length", "size") and not (numbers > 0).all():
+            return f"{name}: found {value}, expected > 0"
+    return ""
+
+
+def _known(link: str, known: list[str], where: str) -> None:
+    if link not in known:
+        raise DescriptionError(f"{where}: unknown link {link!r}; known: {', '.join(known)}")
+
+
+def _frozen(values: Point | Array) -> Array:
+    array = np.array(values, dtype=float)
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,75 @@
+"""The same shapes and pairs by coal, from poses by the compiled forward kinematics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import coal
+import numpy as np
+from capsule_arm import SCENE
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.files.reading import Frame, frame_matrix
+
+
+def described(robot: ArmHand) -> list[tuple[str, Any, Array]]:
+    """Link, shape and (4, 4) pose in the link of every shape as it is described."""
+    shapes = robot.description.shapes
+    found: list[tuple[str, Any, Array]] = []
+    for one in shapes.capsules:
+        if one.covers < 0:
+            length = float(np.linalg.norm(one.half))
+            pose = np.eye(4)
+            pose[:3, 3] = one.center
+            if length:
+                pose[:3, :3] = along(one.half / length)
+            found.append((one.link, coal.Capsule(one.radius, 2 * length), pose))
+    for solid in shapes.solids:
+        x, y, z = solid.size.tolist()
+        shape = coal.Box(x, y, z) if solid.kind == "box" else coal.Cylinder(x, y)
+        found.append((solid.link, shape, solid.pose))
+    return found
+
+
+def along(axis: Array) -> Array:
+    """(3, 3) rotation whose z is an axis."""
+    side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
+    side /= np.linalg.norm(side)
+    return np.column_stack([side, np.cross(axis, side), axis])
+
+
+def in_scene() -> dict[str, tuple[Any, Array]]:
+    """The scene's shapes with their poses."""
+    found: dict[str, tuple[Any, Array]] = {}
+    for name, entry in SCENE.items():
+        pose = frame_matrix(Frame(tuple(entry["xyz"]), tuple(entry.get("rpy", (0, 0, 0)))))
+        match entry["kind"]:
+            case "box":
+                shape = coal.Box(*entry["size"])
+            case "sphere":
+                shape = coal.Sphere(entry["radius"])
+            case "cylinder":
+                shape = coal.Cylinder(entry["radius"], entry["length"])
+            case "capsule":
+                shape = coal.Capsule(entry["radius"], entry["length"])
+            case "half-space":
+                shape = coal.Halfspace(np.array([0, 0, 1.0]), 0.0)
+            case _:
+                model = coal.BVHModelOBBRSS()
+                points = np.array(entry["points"])
+                model.beginModel(0, len(points))
+                model.addVertices(points)
+                model.endModel()
+                model.buildConvexHull(True, "Qt")
+                shape = model.convex
+        found[name] = shape, pose
+    return found
+
+
+def distance(one: Any, at_one: Array, other: Any, at_other: Array) -> float:
+    """Signed distance [m]."""
+    request, result = coal.DistanceRequest(True), coal.DistanceResult()
+    places = (coal.Transform3s(pose[:3, :3], pose[:3, 3]) for pose in (at_one, at_other))
+    first, second = places
+    return float(coal.distance(one, first, other, second, request, result))

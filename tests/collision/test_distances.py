@@ -1,0 +1,118 @@
+"""Distances against coal: nothing is called free that coal calls penetrating."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from capsule_arm import SCENE, write_robot
+from coal_oracle import described, distance, in_scene
+
+import casadi_ik as ik
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.problem.clearance import SceneCheck, Surroundings
+
+MICROMETRE = 1e-6
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> ArmHand:
+    return ik.load_robot(write_robot(tmp_path_factory.mktemp("three")))
+
+
+def surroundings(robot: ArmHand, scene: ik.Scene, compiled: bool = True) -> Surroundings:
+    check = SceneCheck(robot, scene, compiled)
+    points, normals = robot.contacts(robot.home)
+    return check.around(ik.Solver(robot)._questions.of_arrays(points[None], normals[None], None))
+
+
+def by_coal(robot: ArmHand, q: np.ndarray, names: set[frozenset[str]]) -> np.ndarray:
+    """(k, pairs) the smallest signed distance of each pair of names."""
+    shapes, scene = described(robot), in_scene()
+    links = robot.links(q)
+    found = {name: np.full(len(q), np.inf) for name in names}
+    for i, (link, shape, pose) in enumerate(shapes):
+        others = [(n, s, None, p) for n, (s, p) in scene.items()]
+        others += [(n, s, p, None) for n, s, p in shapes[i + 1 :]]
+        for name, other, place, fixed in others:
+            key = frozenset((link, name))
+            if key not in found:
+                continue
+            for row in range(len(q)):
+                there = fixed if place is None else links[name][row] @ place
+                apart = distance(shape, links[link][row] @ pose, other, there)
+                found[key][row] = min(found[key][row], apart)
+    return found
+
+
+def test_distances_are_those_of_coal_and_never_larger(robot, rng):
+    around = surroundings(robot, ik.Scene(SCENE))
+    q = robot.random(rng, 300)
+    names = [frozenset(pair) for pair in around.table.names]
+    every = around.kernel.every(q, around.poses, around.table)
+    theirs = by_coal(robot, q, set(names))
+    solids = {"palm", "l2", "base"}  # described as boxes and a cylinder
+    for name in set(names):
+        ours = every[:, [i for i, other in enumerate(names) if other == name]].min(axis=1)
+        coals = theirs[name]
+        apart = coals > 0
+        # Conservative wherever coal sees a gap, and whatever penetrates for coal does for us.
+        assert (ours[apart] <= coals[apart] + MICROMETRE).all(), name
+        assert (ours[~apart] <= MICROMETRE).all(), name
+        if not (name & solids) and "block" not in name:
+            np.testing.assert_allclose(ours[apart], coals[apart], atol=2e-6, err_msg=str(name))
+        if len(name & solids) == 1 and not (name & set(SCENE)):
+            # A capsule against a box or a cylinder of the robot itself is exact too.
+            np.testing.assert_allclose(ours[apart], coals[apart], atol=2e-6, err_msg=str(name))
+
+
+def test_planes_round_a_hull_off_by_little(robot, rng):
+    around = surroundings(robot, ik.Scene({"block": SCENE["block"]}))
+    q = robot.random(rng, 200)
+    rows = np.array([{"l3", "block"} == set(pair) for pair in around.table.names])
+    ours = around.kernel.every(q, around.poses, around.table)[:, rows].min(axis=1)
+    coals = by_coal(robot, q, {frozenset(("l3", "block"))})[frozenset(("l3", "block"))]
+    near = (coals > 0) & (coals < 0.2)
+    assert near.sum() > 15
+    assert (coals - ours)[near].max() < 0.02 * 0.24
+
+
+def test_the_virtual_machine_gives_the_same(robot, rng):
+    compiled = surroundings(robot, ik.Scene(SCENE))
+    plain = surroundings(robot, ik.Scene(SCENE), compiled=False)
+    q = robot.random(rng, 100)
+    tables = compiled.table, plain.table
+    assert tables[0].names == tables[1].names
+    every = [one.kernel.every(q, one.poses, one.table) for one in (compiled, plain)]
+    np.testing.assert_allclose(every[0], every[1], atol=3e-7)
+    least, which = compiled.kernel.least(q, compiled.poses, compiled.table)
+    np.testing.assert_array_equal(least, every[0].min(axis=1))
+    np.testing.assert_array_equal(which, every[0].argmin(axis=1))
+
+
+def test_the_gradient_is_that_of_differences(robot, rng):
+    around = surroundings(robot, ik.Scene(SCENE))
+    q = robot.random(rng, 60)
+    room, slope = around.gradient(q)
+    np.testing.assert_allclose(room, around.check(q).room, atol=3e-7)
+    step = 1e-5
+    checked = 0
+    for column in range(q.shape[1]):
+        ahead, behind = q.copy(), q.copy()
+        ahead[:, column] += step
+        behind[:, column] -= step
+        one, other = around.check(ahead), around.check(behind)
+        same = (one.pairs == other.pairs) & (np.abs(room) > 1e-3)
+        differences = (one.room - other.room) / (2 * step)
+        smooth = same & (np.abs(differences - slope[:, column]) < 0.5)
+        # Where the nearest point jumps from an edge to another there is no gradient.
+        assert smooth[same].mean() > 0.9
+        np.testing.assert_allclose(slope[smooth, column], differences[smooth], atol=0.02)
+        checked += int(smooth.sum())
+    assert checked > 200
+
+
+def test_nan_is_not_free(robot):
+    around = surroundings(robot, ik.Scene(SCENE))
+    q = np.full((1, len(robot.actuators)), np.nan)
+    assert not around.check(q).free[0]
+    assert not around.free(q)[0]

@@ -1,0 +1,86 @@
+"""Scenes: read, moved, and refused in one line."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from capsule_arm import SCENE, write_robot
+
+import casadi_ik as ik
+from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
+
+BOX = {"kind": "box", "size": [1, 1, 1]}
+
+
+@pytest.mark.parametrize(
+    ("solids", "message"),
+    [
+        ({"a": {"kind": "box", "size": [1, float("nan"), 1]}}, r"solids.a.size\[1\]: found nan"),
+        ({"a": {"kind": "box", "size": [1, 0, 1]}}, "solids.a.size: found .* expected > 0"),
+        ({"a": {"kind": "ball", "radius": 1}}, "solids.a.kind: .*'ball'"),
+        ({"a": {"kind": "sphere", "radius": "3 stone"}}, "solids.a.radius: found '3 stone'"),
+        ({"a": {"kind": "object", "object": "teapot"}}, "solids.a.object: no shipped object"),
+        ({"a": {"kind": "mesh", "file": "no.stl"}}, "solids.a.file: no such file"),
+        ({"a": {"kind": "convex", "points": [[0, 0, 0]] * 3}}, "found 3 points, expected at least"),
+        (
+            {"a": {"kind": "convex", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]}},
+            "in a plane",
+        ),
+    ],
+)
+def test_bad_solids_are_named(solids, message):
+    with pytest.raises(DescriptionError, match=message) as caught:
+        ik.Scene(solids)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_empty_mesh_is_refused(tmp_path):
+    path = tmp_path / "empty.stl"
+    path.write_text("solid empty\nendsolid empty\n")
+    with pytest.raises(DescriptionError, match="empty"):
+        ik.Scene({"a": {"kind": "mesh", "file": str(path)}})
+
+
+def test_what_is_grasped_has_to_be_there():
+    with pytest.raises(DescriptionError, match="grasped: unknown solid 'cup'; the scene's: a"):
+        ik.Scene({"a": BOX}, grasped="cup")
+    with pytest.raises(DescriptionError, match="margin: found -1, expected >= 0"):
+        ik.Scene(margin=-1)
+
+
+def test_shipped_and_unknown_scenes():
+    assert list(ik.load_scene("table").items) == ["table"]
+    with pytest.raises(UnknownNameError, match="no shipped scene is called 'moon'; shipped: table"):
+        ik.load_scene("moon")
+
+
+def test_a_file_says_where(tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_text("solids:\n  a: {kind: box, size: [1 m, 1 m, 1 deg]}\n")
+    with pytest.raises(DescriptionError, match=r"scene.yaml: solids.a.size\[2\]: found '1 deg'"):
+        ik.load_scene(path)
+
+
+def test_moving_leaves_the_first_scene_alone():
+    scene = ik.Scene({"a": BOX}, margin=0.01)
+    pose = np.eye(4)
+    pose[:3, 3] = [1, 2, 3]
+    moved = scene.moved("a", pose)
+    np.testing.assert_array_equal(moved.items["a"].pose, pose)
+    np.testing.assert_array_equal(scene.items["a"].pose, np.eye(4))
+    assert pickle.loads(pickle.dumps(moved)).margin == 0.01
+    with pytest.raises(UnknownNameError, match="no solid 'b'; its solids: a"):
+        scene.moved("b", pose)
+    with pytest.raises(InputError, match="are no rotation"):
+        scene.moved("a", np.ones((4, 4)))
+
+
+def test_nothing_may_stand_in_the_base(tmp_path):
+    robot = ik.load_robot(write_robot(tmp_path))
+    inside = {"post": {"kind": "box", "size": [0.1, 0.1, 0.1], "xyz": [0, 0, 0.1]}}
+    with pytest.raises(DescriptionError, match=r"solids.post: stands .* mm inside 'base'"):
+        ik.Solver(robot, scene=ik.Scene(inside))
+    with pytest.raises(DescriptionError, match=r"touching.*unknown 'moon'"):
+        ik.Solver(robot, scene=ik.Scene(SCENE, touching=[{"links": ["moon", "l1"], "reason": "x"}]))
