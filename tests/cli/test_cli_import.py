@@ -90,6 +90,20 @@ def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.G
     assert "SOLVED" in solved.out
 
 
+def test_the_arm_s_closed_form_is_said_and_its_lack_warned_of(run: Command, tmp_path: Path) -> None:
+    path, out = arm(tmp_path), tmp_path / "mine.yaml"
+    done = run("import", path, hand(tmp_path), "--out", out)
+    assert (done.exit, done.err) == (0, "")
+    assert "spherical wrist" in done.out
+    assert "no known closed form" not in done.out
+    out.unlink()
+    # The last axis moved aside: no three of them meet any more.
+    path.write_text(path.read_text().replace("0.08 0 0", "0.08 0 0.06"))
+    done = run("import", path, hand(tmp_path), "--out", out)
+    assert (done.exit, done.err) == (0, "")
+    assert "no known closed form" in " ".join(done.out.split())
+
+
 def test_guessed_pads_are_on_the_skin_of_the_closing_side(run: Command, tmp_path: Path) -> None:
     done = run("import", hand(tmp_path), "--out", tmp_path / "mine.yaml")
     assert (done.exit, done.err) == (0, "")

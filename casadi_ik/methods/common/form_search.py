@@ -35,10 +35,12 @@ class Look:
         around: Whether around the best so far, else all over the range.
         by: Width [steps of the first trial] if around the best, else how far the positions are
             moved from those of the first trial [such steps].
+        window: Whether it keeps to a part of the range, see `WINDOWS`.
     """
 
     around: bool
     by: float
+    window: bool = False
 
 
 PLACEMENT = (
@@ -49,15 +51,17 @@ PLACEMENT = (
 """Looks for an arm within limits: of 20,000 random poses of a Panda 2,427 need more than the first,
 369 more than two, 6 more than all."""
 
-DENSE = 32
-"""Looks that together lie so many times as dense as the first."""
+WINDOWS = 8
+"""Parts of the range that are searched one after the other."""
 
 THOROUGH = (
     *PLACEMENT,
-    *(Look(False, (i + 0.5) / DENSE - 0.5) for i in range(DENSE)),
-    *(Look(True, 1 / DENSE), Look(True, 1 / (6 * DENSE)), Look(True, 1 / (36 * DENSE))),
+    *(Look(False, part / 5, window=True) for part in (0, 1, -1, 2, -2)),
+    *(Look(True, 1 / 5**power, window=True) for power in (1, 2, 3, 4, 5)),
 )
-"""The same for poses that were given up before: short stretches beside the best hill."""
+"""The same for poses that were given up before, and then in one part of the range alone: what is
+best of all may be short of the limits everywhere, and what is worse lead to where an arm stands
+with several joints at theirs."""
 
 CHOICE = (
     *(Look(False, 0.0), Look(False, 1 / 3), Look(False, -1 / 3)),
@@ -72,7 +76,13 @@ def trials(form: ClosedForm, looks: tuple[Look, ...]) -> int:
 
 
 def place_form(
-    form: ClosedForm, palm: Pose, lower: Expr, upper: Expr, trial: Expr, around: Expr
+    form: ClosedForm,
+    palm: Pose,
+    lower: Expr,
+    upper: Expr,
+    trial: Expr,
+    around: Expr,
+    window: Expr,
 ) -> tuple[Expr, Expr, Expr]:
     """One trial of the search for an arm far from its limits.
 
@@ -83,6 +93,7 @@ def place_form(
         upper: (n, 1).
         trial: Its number, from 0.
         around: Best position of the swept joint so far [rad].
+        window: Number of the part of the range that late looks keep to, below `WINDOWS`.
 
     Returns:
         The best arm (n, 1) [rad] of the trial, its margin (the smallest distance of a joint from
@@ -98,9 +109,8 @@ def place_form(
         best = _better(best, (ca.fmin(ca.fmax(*margins), common), arm))
     margin, arm = best
     at = ca.Function("place_at", symbols.at, shared(arm, margin))
-    return _looked(form, "place", at, THOROUGH, (palm.rotation, palm.origin, lower, upper))(
-        trial, around
-    )
+    looked = _looked(form, "place", at, THOROUGH, (palm.rotation, palm.origin, lower, upper))
+    return looked(trial, around, window)
 
 
 def choose_form(
@@ -133,7 +143,7 @@ def choose_form(
     most, arm = best
     at = ca.Function("choose_at", [*symbols.at, near], shared(arm, most))
     given = (palm.rotation, palm.origin, wanted.lower, wanted.upper, wanted.near)
-    return _looked(form, "choose", at, CHOICE, given)(trial, around)
+    return _looked(form, "choose", at, CHOICE, given)(trial, around, 0.0)
 
 
 class _Symbols:
@@ -150,7 +160,7 @@ class _Symbols:
 
 def _looked(
     form: ClosedForm, name: str, at: ca.Function, looks: tuple[Look, ...], given: tuple[Expr, ...]
-) -> Callable[[Expr, Expr], tuple[Expr, Expr, Expr]]:
+) -> Callable[[Expr, Expr, Expr], tuple[Expr, Expr, Expr]]:
     """A trial: the best of the arms at its positions, its score, and its position.
 
     One function that is called for each position: written out, they would be most of the code.
@@ -163,14 +173,14 @@ def _looked(
         given: Palm, bounds and what else `at` asks for.
     """
 
-    def look(trial: Expr, around: Expr) -> tuple[Expr, Expr, Expr]:
+    def look(trial: Expr, around: Expr, window: Expr) -> tuple[Expr, Expr, Expr]:
         joint = form.swept_joint
         if joint is None:
             arm, score = at(0.0, *given)
             return arm, score, around
-        symbols = [ca.SX.sym(word) for word in ("lower", "upper", "trial", "around")]
+        symbols = [ca.SX.sym(word) for word in ("lower", "upper", "trial", "around", "window")]
         spread = ca.Function(f"{name}_positions", symbols, shared(*_positions(looks, *symbols)))
-        positions = spread(given[2][joint], given[3][joint], trial, around)
+        positions = spread(given[2][joint], given[3][joint], trial, around, window)
         found = [(*at(position, *given), position) for position in positions]
         count = len(form.screws)
         tried = [(ca.SX.sym("arm", count), ca.SX.sym("score"), ca.SX.sym("at")) for _ in found]
@@ -187,19 +197,21 @@ def _looked(
 
 
 def _positions(
-    looks: tuple[Look, ...], lower: Expr, upper: Expr, trial: Expr, around: Expr
-) -> Expr:
-    """Positions (SAMPLES, 1) of the swept joint that a trial looks at."""
+    looks: tuple[Look, ...], lower: Expr, upper: Expr, trial: Expr, around: Expr, window: Expr
+) -> list[Expr]:
+    """Positions of the swept joint that a trial looks at."""
     middle, half = (lower + upper) / 2, ca.fmin((upper - lower) / 2, np.pi)
-    step = 2 * half / SAMPLES
+    part = middle + half * ((2 * window + 1) / WINDOWS - 1), half / WINDOWS
     centre, width = middle, half
     for i, look in enumerate(looks):
-        at = around if look.around else middle + look.by * step
-        wide = look.by * step / 2 if look.around else half
+        inside, reach = part if look.window else (middle, half)
+        step = 2 * reach / SAMPLES
+        at = around if look.around else inside + look.by * step
+        wide = look.by * step / 2 if look.around else reach
         centre = ca.if_else(trial == i, at, centre)
         width = ca.if_else(trial == i, wide, width)
     parts = ((2 * np.arange(SAMPLES) + 1) / SAMPLES - 1).tolist()
-    return [ca.fmin(ca.fmax(centre + width * part, middle - half), middle + half) for part in parts]
+    return [ca.fmin(ca.fmax(centre + width * p, middle - half), middle + half) for p in parts]
 
 
 def _nearest_turns(form: ClosedForm, bend: Bend, wanted: Wanted) -> Bend:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 
-from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, place_arm
-from casadi_ik.methods.common.form_search import PLACEMENT, THOROUGH, place_form, trials
+from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, NO_MARGIN, place_arm
+from casadi_ik.methods.common.form_search import PLACEMENT, THOROUGH, WINDOWS, place_form, trials
 from casadi_ik.methods.common.nearly_closed import brought_to
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
@@ -29,7 +29,8 @@ def placement_stage(layouts: HandFirstLayouts, form: ArmForm) -> ca.Function:
         most = ITERATIONS, ITERATIONS
         place, swivel = _placed(layouts, most, exact=True), s["swivel"]
     else:
-        found = place_form(form, palm, lower, upper, s["spent"], s["swivel"])
+        window = ca.fmod(s["candidate"] + s["earlier"] / layouts.candidates, WINDOWS)
+        found = place_form(form, palm, lower, upper, s["spent"], s["swivel"], window)
         arm, margin, swivel = found
         hits = ca.MX(1)
         if not form.exact:
@@ -53,8 +54,12 @@ def _placed(layouts: HandFirstLayouts, most: tuple[int, int], exact: bool) -> ca
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
     columns = layouts.robot.arm_actuators
     arm, margin, swivel = ca.SX.sym("arm", len(columns)), ca.SX.sym("margin"), ca.SX.sym("swivel")
-    better = margin > s["margin"]
-    best, best_margin = ca.if_else(better, arm, s["arm"]), ca.fmax(margin, s["margin"])
+    # What is looked for in a part of the range is not compared with what was found before.
+    former = s["margin"]
+    if most[0] < most[1]:
+        former = ca.if_else(s["spent"] == most[0], NO_MARGIN, former)
+    better = margin > former
+    best, best_margin = ca.if_else(better, arm, s["arm"]), ca.fmax(margin, former)
     allowed = best_margin >= ALLOWED
     spent = s["spent"] + 1
     over = spent >= (

@@ -38,7 +38,7 @@ def arm_start(robot: RobotDescription, arm: ArmForm) -> ca.Function:
         far, *_ = place_arm(arm, palm, lower, upper, first)
     else:
         near, *_ = choose_form(arm, palm, wanted, first, first)
-        far, *_ = place_form(arm, palm, lower, upper, first, first)
+        far, *_ = place_form(arm, palm, lower, upper, first, first, first)
     return ca.Function.if_else(
         "arm_start", ca.Function("near", inputs, [near]), ca.Function("far", inputs, [far])
     )

@@ -1,0 +1,64 @@
+"""What every method promises on arms and hands of the catalogue, without a compiler's time."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+from pinocchio_oracle import PinocchioRobot, verdict
+
+import casadi_ik as ik
+from casadi_ik.errors import UnsupportedError
+
+PAIRS = (
+    "panda+allegro_right",
+    "ur5e+shadow",
+    "iiwa14+leap",
+    "kinova_gen3+robotiq_3f",
+    "xarm7+trifinger",
+    "irb140+barrett_bh8_280",
+)
+
+PLANAR = ("irb140+barrett_bh8_280", "xarm7+trifinger")
+"""Those with the planar fingers that the paper's subproblem is made for."""
+
+FINDING = ("hand-first", "thumb-first", "ipopt", "enhanced-dls", "enhanced-sdls")
+"""The hierarchies of all contacts at once seldom end within tolerance."""
+
+
+@pytest.fixture(scope="module", params=PAIRS)
+def robot(request) -> ik.ArmHand:
+    return ik.load_robot(request.param)
+
+
+@pytest.fixture(scope="module")
+def oracle(robot) -> PinocchioRobot:
+    return PinocchioRobot(robot)
+
+
+@pytest.mark.parametrize("method", ik.METHODS)
+def test_verdict_on_targets_near_home(robot, oracle, method):
+    rng = np.random.default_rng(11)
+    reach = 0.05 * (robot.upper - robot.lower)
+    q = robot.home + rng.uniform(-1, 1, (2, len(reach))) * reach
+    points, normals = robot.contacts(np.clip(q, robot.lower, robot.upper))
+    if method.startswith("enhanced") and robot.name not in PLANAR:
+        with pytest.raises(UnsupportedError, match=rf"'{re.escape(robot.name)}': finger .* planar"):
+            ik.Solver(robot, method, compiled=False)
+        return
+    solver = ik.Solver(robot, method, compiled=False)
+    batch = solver.solve_batch(points, normals)
+    for row, found in enumerate(batch.q):
+        position, angle = verdict(oracle, found, points[row], normals[row])
+        np.testing.assert_allclose(batch.position_error[row], position, atol=1e-11)
+        np.testing.assert_allclose(batch.angle_error[row], angle, atol=1e-11)
+        theta = oracle.configuration(found)
+        inside = np.all(theta >= oracle.model.lowerPositionLimit - 1e-9)
+        inside &= np.all(theta <= oracle.model.upperPositionLimit + 1e-9)
+        inside &= np.all(found >= robot.lower - 1e-9) and np.all(found <= robot.upper + 1e-9)
+        met = np.all(position <= 5e-3) and np.all(angle <= math.radians(3))
+        assert batch.success[row] == (met and inside)
+    if method in FINDING:
+        assert batch.success.all(), batch.status_names
