@@ -27,7 +27,8 @@ import numpy as np
 from diagnosis import moved
 from hard_targets import close_to_limits, corners, random_hands, singular_arms
 from impossible_targets import CLASSES, impossible
-from missed import ROBOTS, load
+from missed import ROBOTS as SHIPPED_AND_MADE
+from missed import load
 from rich.console import Console
 from rich.progress import Progress
 from runner import (
@@ -45,6 +46,8 @@ import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.problem.problems import Problems
 from casadi_ik.solving.diagnosis.prover import Prover
+
+ROBOTS = (*SHIPPED_AND_MADE, "ur5e+shadow")
 
 BLOCK = 2000
 """Reachable targets that are made with one seed."""

@@ -158,7 +158,12 @@ def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
             old = made.with_name(made.name + ".old")
             if out.exists():
                 out.rename(old)
-            made.rename(out)
+            try:
+                made.rename(out)
+            except OSError:
+                if old.exists():
+                    old.rename(out)
+                raise
             shutil.rmtree(old, ignore_errors=True)
         except BaseException:
             shutil.rmtree(made, ignore_errors=True)

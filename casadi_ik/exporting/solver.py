@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +19,7 @@ from casadi_ik.kernels.constants import define_arrays
 from casadi_ik.kernels.lookup import TILE
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.rounds import RoundsPlan, source_text
-from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.methods.registry import build_method
 from casadi_ik.problem.problems import Problems, Tolerance
 
 SIGNATURE = re.compile(r"EXPORT int casadi_ik_\w+\((\w+) \*job\)")
@@ -130,11 +131,11 @@ class SolverSources:
         return {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
-            "ROBOT": robot.name,
+            "ROBOT": plain(robot.name),
             "FINGERS": str(len(robot.fingers)),
             "MOTORS": str(len(robot.actuators)),
-            "FINGER_LIST": ", ".join(robot.fingers),
-            "MOTOR_LIST": ", ".join(robot.actuators),
+            "FINGER_LIST": ", ".join(map(plain, robot.fingers)),
+            "MOTOR_LIST": ", ".join(map(plain, robot.actuators)),
             "FINGER_NAMES": _strings(robot.fingers),
             "MOTOR_NAMES": _strings(robot.actuators),
             "W": str(w),
@@ -183,14 +184,17 @@ class SolverSources:
 
 def hand_first(robot: ArmHand) -> HandFirstMethod:
     """The method whose solver is exported, compiled."""
-    from casadi_ik.methods.registry import build_method
-
     method = build_method("hand-first", robot.description, {})
     assert isinstance(method, HandFirstMethod)
-    assert usual(len(robot.fingers))
     method.prepare()
     return method
 
 
+def plain(name: str) -> str:
+    """A name as it may stand in a comment of any language: names may come from any file."""
+    return re.sub(r"[^\w .+-]", "_", name)
+
+
 def _strings(names: tuple[str, ...]) -> str:
-    return ", ".join(f'"{name}"' for name in names)
+    """String literals, of C and JavaScript alike."""
+    return ", ".join(json.dumps(name, ensure_ascii=False) for name in names)

@@ -25,6 +25,11 @@ class Balls:
         angle: (k, f) how far the normals can be turned from there [rad].
         moved: (k, f, h) what each motor adds to the radius [m].
         swung: (k, f, h) what it adds to the angle [rad].
+        slopes: (k, f, m, 3) how a joint carries the point over half its range [m], joints of all
+            fingers in turn.
+        turns: (k, f, m, 3) how it carries the normal.
+        bend: (k, f) what the slopes leave out of the point [m].
+        curl: (k, f) what they leave out of the normal.
         empty: (k,) whether joint limits leave nothing.
     """
 
@@ -34,6 +39,10 @@ class Balls:
     angle: Array
     moved: Array
     swung: Array
+    slopes: Array
+    turns: Array
+    bend: Array
+    curl: Array
     empty: Bools
 
     def rows(self, rows: Rows) -> Balls:
@@ -80,22 +89,32 @@ def balls(
     middles = {name: middle for name, (middle, _) in ranges.items()}
     frames = link_frames(robot, middles, count, chain)
     kinds = {joint.name: joint for joint in robot.movable}
-    points, normals, radius, angle = [], [], [], []
+    points, normals, radius, angle, bend, curl = [], [], [], [], [], []
+    carried = np.zeros((2, count, len(fingers), len(wanted), 3))
     shares = np.zeros((2, count, len(fingers), len(motors)))
     for place, i in enumerate(fingers):
         finger = robot.fingers[i]
         rotation, point = placed(frames[finger.link], finger.placement)
         normal = rotation @ finger.normal
-        far, turned = np.zeros(count), np.zeros(count)
+        far, turned, left_out = np.zeros(count), np.zeros(count), np.zeros(count)
+        nearer = sum((ranges[name][1] for name in finger.joints), np.zeros(count))
         for name in reversed(finger.joints):
             joint, half = kinds[name], ranges[name][1]
             frame, origin = frames[joint.child]
-            sine = np.sin(np.minimum(half, np.pi) / 2)
+            sine, axis = np.sin(np.minimum(half, np.pi) / 2), frame @ joint.axis
             if joint.type == "prismatic":
+                slope, turn, lever = axis, np.zeros((count, 3)), np.ones(count)
                 moved, swung = half, np.zeros(count)
             else:
-                lever = np.linalg.norm(np.cross(frame @ joint.axis, point - origin), axis=1)
-                moved, swung = 2 * sine * (lever + far), half
+                slope, turn = np.cross(axis, point - origin), np.cross(axis, normal)
+                lever = np.linalg.norm(slope, axis=1) + far
+                moved, swung = 2 * sine * lever, half
+            # A second derivative by two joints is no longer than the lever of the outer one.
+            nearer = nearer - half
+            left_out = left_out + lever * half * (half / 2 + nearer)
+            m = wanted.index(name)
+            carried[0, :, place, m] = slope * half[:, None]
+            carried[1, :, place, m] = turn * half[:, None]
             far, turned = far + moved, turned + swung
             k = list(motors).index(_motor(robot, name))
             shares[0, :, place, k] += moved
@@ -104,12 +123,25 @@ def balls(
             palm, centre = placed(frames[robot.palm_link], robot.palm_placement)
             point = np.einsum("kji,kj->ki", palm, point - centre)
             normal = np.einsum("kji,kj->ki", palm, normal)
+            carried[:, :, place] = np.einsum("kji,akmj->akmi", palm, carried[:, :, place])
         points.append(point)
         normals.append(normal)
         radius.append(far)
         angle.append(turned)
-    stacked = (np.stack(part, axis=1) for part in (points, normals, radius, angle))
-    return Balls(*stacked, moved=shares[0], swung=shares[1], empty=empty)
+        bend.append(left_out)
+        curl.append(turned * turned / 2)
+    parts = points, normals, radius, angle
+    stacked = (np.stack(part, axis=1) for part in parts)
+    return Balls(
+        *stacked,
+        moved=shares[0],
+        swung=shares[1],
+        slopes=carried[0],
+        turns=carried[1],
+        bend=np.stack(bend, axis=1),
+        curl=np.stack(curl, axis=1),
+        empty=empty,
+    )
 
 
 def _motor(robot: RobotDescription, name: str) -> str:

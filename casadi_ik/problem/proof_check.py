@@ -28,6 +28,7 @@ from casadi_ik.problem.hand_motors import (
     motor_box,
     motor_ends,
 )
+from casadi_ik.problem.palm_view import seen_distances
 from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import reach, srs_arm
@@ -214,7 +215,10 @@ class _Search:
         out |= away + arm + radius < near
         centre, give = self._carried(found, radius, wrist, 1)
         distance = np.linalg.norm(centre - shoulder, axis=1)
-        return out.any(axis=1) | (distance - give > far) | (distance + give < near)
+        out = out.any(axis=1) | (distance - give > far) | (distance + give < near)
+        loose = self.loose + SLACK, 2 * np.sin(np.minimum(self.turned, np.pi) / 2) + SLACK
+        least, most = seen_distances(found, (self.points, self.normals), loose, shoulder, wrist)
+        return out | (least > far) | (most < near)
 
     def _carried(self, found: Balls, radius: Array, palm: Array, whole: int) -> tuple[Array, Array]:
         """A ball (k, 3), (k,) that holds a point of the palm (whole 1) or a direction (0).

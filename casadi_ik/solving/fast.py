@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
+from casadi_ik.grasps.arrays import real_array
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.one_target import OneTarget
 from casadi_ik.problem.preference import preference
@@ -86,13 +87,14 @@ class FastSolver:
         one = self._one
         if one is None:
             return self._slowly(points, normals, q0)
-        start = self._home if q0 is None else q0
-        shapes = np.shape(points), np.shape(normals), np.shape(start)
-        if shapes != self._shapes:
+        try:
+            p, n = _numbers(points), _numbers(normals)
+            here = self._home if q0 is None else _numbers(q0)
+        except (TypeError, ValueError):
             return self._slowly(points, normals, q0)
-        self._points[...] = points
-        self._normals[...] = normals
-        self._here[...] = start
+        if (p.shape, n.shape, here.shape) != self._shapes:
+            return self._slowly(points, normals, q0)
+        self._points[...], self._normals[...], self._here[...] = p, n, here
         self._terms[-1] = q0 is not None
         status = one()
         if status is None:
@@ -116,3 +118,15 @@ class FastSolver:
         self.position_error[...] = [verdict.position_error for verdict in verdicts]
         self.angle_error[...] = [verdict.angle_error for verdict in verdicts]
         return solution.q, solution.status
+
+
+def _numbers(value: ArrayLike) -> Array:
+    """Real numbers as an array.
+
+    Raises:
+        TypeError: Something else.
+        ValueError: The same.
+    """
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
+    return real_array(value)

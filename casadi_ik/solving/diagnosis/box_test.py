@@ -23,6 +23,7 @@ from casadi_ik.solving.diagnosis.pair_rows import Row, pair_angles, pair_rows
 from casadi_ik.solving.diagnosis.rigid_bound import rigid_excess
 from casadi_ik.solving.diagnosis.wrist_bound import Carrier, Wrist, wrist_excess
 from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.subexpressions import shared
 
 LENGTH = 0.1
 """A length that counts as much as one radian [m]."""
@@ -65,7 +66,7 @@ class BoxTest:
 
         def build() -> ca.Function:
             symbols = {key: ca.SX.sym(key, *shape) for key, shape in shapes.items()}
-            outputs = [ca.densify(output) for output in self._outputs(symbols)]
+            outputs = shared(*map(ca.densify, self._outputs(symbols)))
             return ca.Function(
                 name, list(symbols.values()), outputs, list(shapes), ["refuted", "scores"]
             )
@@ -92,18 +93,22 @@ class BoxTest:
                 hand += pair_angles(a, b)
             hand += [ca.fabs(row.value) - row.width for row in rows]
             hand.append(rigid_excess(contacts))
-            reach += self._reach(contacts, self.wrist, p)
+            tests, reached = self._reach(contacts, self.wrist, p)
+            reach, rows = reach + tests, rows + reached
         refuted = ca.vertcat(ca.mmax(ca.vertcat(*hand)), ca.mmax(ca.vertcat(*reach)))
         return refuted, self._scores(contacts, rows, p["asked"])
 
-    def _reach(self, contacts: list[BoxContact], wrist: Wrist, p: dict[str, ca.SX]) -> list[Expr]:
+    def _reach(
+        self, contacts: list[BoxContact], wrist: Wrist, p: dict[str, ca.SX]
+    ) -> tuple[list[Expr], list[Row]]:
+        """Tests of the arm, and rows of what decides most of them."""
         carrier = Carrier(contacts)
         ball = carrier.point(ca.SX(ca.DM(wrist.wrist)))
-        found = wrist_excess(contacts, wrist, p["span"], ball)
+        found, rows = wrist_excess(contacts, wrist, p["span"], ball)
         if self.cones is not None:
             last = carrier.direction(ca.SX(ca.DM(self.cones.last)))
             found.append(cone_excess(self.cones, ball, last, p["span"], p["cosines"]))
-        return found
+        return found, rows
 
     def _scores(self, contacts: list[BoxContact], rows: list[Row], asked: Expr) -> Expr:
         """By coordinate what it leaves open: most of all in rows that are nearly broken."""

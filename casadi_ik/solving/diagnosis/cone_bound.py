@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.problem.arm_cones import ArmCones
+from casadi_ik.solving.diagnosis.wrist_bound import Ball
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 
 ROUNDING = 1e-7
@@ -21,9 +22,7 @@ FLAT = 1e-6
 """Where the elbow's circle changes a cosine by less than this nothing is said of the arc."""
 
 
-def cone_excess(
-    arm: ArmCones, wrist: tuple[Expr, Expr], last: tuple[Expr, Expr], span: Expr, cosines: Expr
-) -> Expr:
+def cone_excess(arm: ArmCones, wrist: Ball, last: Ball, span: Expr, cosines: Expr) -> Expr:
     """> 0 if no elbow is within both cones.
 
     Args:
@@ -34,7 +33,7 @@ def cone_excess(
         cosines: (2, 1) of the half angles.
     """
     a, b = arm.lengths
-    reach, loose = wrist[0] - ca.DM(arm.shoulder), wrist[1] + ROUNDING
+    reach, loose = wrist.centre - ca.DM(arm.shoulder), wrist.radius + ROUNDING
     length = safe_norm(reach)
     known = ca.logic_and(loose < length, span[1] > 0)
     line = reach / length
@@ -44,11 +43,11 @@ def cone_excess(
     # The elbow's circle, seen from the shoulder and from the wrist: its angles to the line.
     upper, upper_give = _opening(a, b, near, far)
     fore, fore_give = _opening(b, a, near, far)
-    first, axis = ca.SX(ca.DM(arm.first)), last[0]
+    first, axis = ca.SX(ca.DM(arm.first)), last.centre
     slack = tilt + ROUNDING
     one = _arc(line, first, upper, cosines[0] - slack - upper_give)
     # Seen from the wrist the circle is on the other side of the line.
-    other = _arc(line, axis, -fore, cosines[1] - slack - fore_give - last[1])
+    other = _arc(line, axis, -fore, cosines[1] - slack - fore_give - last.radius)
     cross = ca.cross(one[0], other[0])
     between = ca.atan2(ca.dot(cross, line), ca.dot(one[0], other[0]))
     apart = ca.fabs(between) - one[1] - other[1] - ROUNDING

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, Counts
 from casadi_ik.grasps import Tolerance
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.diagnosis import (
@@ -26,7 +26,7 @@ from casadi_ik.problem.proof import Proof, ProofKind
 from casadi_ik.problem.verdict import Verdict, deviations, judge
 from casadi_ik.solving.diagnosis.minimax import Closest, closest
 from casadi_ik.solving.diagnosis.palm_free import HandFits, PalmFree
-from casadi_ik.solving.diagnosis.prover import Prover
+from casadi_ik.solving.diagnosis.prover import MOST, Prover
 from casadi_ik.solving.diagnosis.remedies import RemedyFinder
 from casadi_ik.solving.trials import Descent, Rows, Trials
 
@@ -52,6 +52,11 @@ BARELY = 2.0
 
 AT_LIMIT = 1e-6
 """How near to a limit counts as at it [rad or m]."""
+
+CLEARLY, LEAST = 2.5, 5000
+"""A proof may take all its boxes where the tolerances would have to be so many times as large, and
+so many in any case. In between no box is excluded before it is small: what is missed by little is
+hardly ever proved, and took a quarter of a second to be given up."""
 
 REAL = 1e-3
 """How far an arm's reach has to be missed to be the reason [m]."""
@@ -118,9 +123,8 @@ class Diagnostician:
         proofs: list[Proof | None] = [None] * len(every)
         rows = np.flatnonzero(~self._solved(problems, best.fair))
         if len(rows):
-            for row, proof in zip(
-                rows.tolist(), self._prover.prove(problems.rows(rows)), strict=True
-            ):
+            found = self._prover.prove(problems.rows(rows), most=_worth(best.ratio[rows]))
+            for row, proof in zip(rows.tolist(), found, strict=True):
                 proofs[row] = proof
             clock.lap(rows)
         refused = [_refused(*item, proof) for item, proof in zip(evidence, proofs, strict=True)]
@@ -267,6 +271,12 @@ def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) 
     if reach is not None and abs(reach.excess) > REAL:
         return Reason.REACH
     return None
+
+
+def _worth(ratio: Array) -> Counts:
+    """(k,) boxes a proof may take of targets that are missed by a factor (k,)."""
+    share = np.clip((ratio - 1) / (CLEARLY - 1), 0.0, 1.0)
+    return np.maximum(MOST * share, LEAST).astype(np.int64)
 
 
 def _enough(problems: Problems, fair: Verdict) -> list[Tolerance]:

@@ -1,7 +1,12 @@
 """What two contacts keep however the palm is moved: distance, angle, heights, handedness.
 
 Each as a row ``|value| <= width``: the value asked for less that of the middle of the box, and a
-width that holds the tolerances and all that the box lets the contacts move.
+width that holds the tolerances and all that the box lets the contacts move. That is bounded twice,
+and the smaller bound taken: by the balls of the contacts, and by the slopes of the value itself,
+which see only what changes it. What the slopes leave out are the products of two changes, and
+`near` and `close` of the contacts. With unit vectors a, b asked for, a = (n + T u) + r in the frame
+of the palm and |r| <= close: products are split so that one factor is what is asked for, whose
+length is known.
 """
 
 from __future__ import annotations
@@ -30,24 +35,44 @@ class Row:
 def pair_rows(a: BoxContact, b: BoxContact) -> Iterator[Row]:
     """The rows of two contacts; all zero where something of them is not asked for."""
     asked, here = b.target - a.target, b.point - a.point
-    long, far = safe_norm(asked), a.radius + b.radius
-    both = a.placed * b.placed
+    long, short, far = safe_norm(asked), safe_norm(here), a.radius + b.radius
+    both, near = a.placed * b.placed, a.near + b.near
+    apart = b.moves - a.moves
     moved = [one + other for one, other in zip(a.moved, b.moved, strict=True)]
     turned = [one + other for one, other in zip(a.turned, b.turned, strict=True)]
-    yield Row(both * (long - safe_norm(here)), far, moved)
+    drift, swing_a, swing_b = (_lengths(slopes) for slopes in (apart, a.turns, b.turns))
+    line = here / short
+    along = ca.fabs(line.T @ apart)
+    aside = _lengths(apart - line @ (line.T @ apart))
+    most = ca.sqrt((short + ca.sum2(along)) ** 2 + ca.sum2(aside) ** 2) - short
+    yield Row(both * (long - short), ca.fmin(far, most + near), moved)
     faced = both * a.faced * b.faced
     cosine = ca.dot(a.facing, b.facing) - ca.dot(a.normal, b.normal)
-    yield Row(faced * cosine, a.chord + b.chord, turned)
-    for one in (a, b):
+    sloped = _total(b.normal.T @ a.turns + a.normal.T @ b.turns)
+    sloped += ca.sum2(swing_a) * ca.sum2(swing_b) + a.close + b.close + a.close * b.close
+    yield Row(faced * cosine, ca.fmin(a.chord + b.chord, sloped), turned)
+    for one, swing in ((a, swing_a), (b, swing_b)):
         height = ca.dot(one.facing, asked) - ca.dot(one.normal, here)
         shares = [m + t * long for m, t in zip(moved, one.turned, strict=True)]
-        yield Row(both * one.faced * height, far + one.chord * long, shares)
+        sloped = _total(here.T @ one.turns + one.normal.T @ apart)
+        sloped += ca.sum2(swing) * ca.sum2(drift) + one.close * long + (1 + one.close) * near
+        yield Row(both * one.faced * height, ca.fmin(far + one.chord * long, sloped), shares)
     across, there = ca.cross(a.normal, b.normal), ca.cross(a.facing, b.facing)
     yield Row(
         faced * (ca.dot(there, asked) - ca.dot(across, here)),
         far + (a.chord + b.chord) * long,
         [m + t * long for m, t in zip(moved, turned, strict=True)],
     )
+
+
+def _lengths(slopes: Expr) -> Expr:
+    """(1, h) lengths of columns."""
+    return ca.horzcat(*(safe_norm(slopes[:, k]) for k in range(slopes.shape[1])))
+
+
+def _total(slopes: Expr) -> Expr:
+    """How far slopes (1, h) carry a value within the box."""
+    return ca.sum2(ca.fabs(slopes))
 
 
 def pair_angles(a: BoxContact, b: BoxContact) -> Iterator[Expr]:

@@ -29,7 +29,7 @@ from casadi_ik.solving.diagnosis.hand_space import HandSpace
 from casadi_ik.solving.diagnosis.wrist_bound import Wrist
 from casadi_ik.symbolic.joint_ranges import are_bounded
 
-FEW, SOME, MOST = 3000, 3000, 50_000
+FEW, SOME, MOST = 3000, 3000, 80_000
 """Boxes of a target after which a search is given up: the first one with all fingers, those with
 some of them, and the last with all."""
 
@@ -132,7 +132,9 @@ class Prover:
         self._arm = arm_span(robot)
         self._known: dict[tuple[bool, bytes], tuple[Kept, ...]] = {}
 
-    def prove(self, problems: Problems, holding: Array | None = None) -> list[Proof | None]:
+    def prove(
+        self, problems: Problems, holding: Array | None = None, most: Counts | None = None
+    ) -> list[Proof | None]:
         """Proofs of k targets, None where none was found.
 
         No proof says nothing: neither that a target can be reached nor that it cannot.
@@ -142,6 +144,7 @@ class Prover:
             holding: (k, h) coordinates of hands (`HandSpace`) that reach them. Only boxes that
                 hold these are looked at: what comes out as proved would be proved wrongly, and
                 whatever would be proved wrongly comes out, in a fraction of the time.
+            most: (k,) boxes of a target after which it is given up, if not before.
         """
         if not are_bounded(self._robot):
             return [None] * len(problems)
@@ -149,10 +152,13 @@ class Prover:
         for start in range(0, len(problems), TOGETHER):
             some = slice(start, start + TOGETHER)
             known = None if holding is None else holding[some]
-            found += self._together(problems.rows(some), known)
+            bound = np.full(len(problems), MOST)[some] if most is None else most[some]
+            found += self._together(problems.rows(some), known, bound)
         return found
 
-    def _together(self, problems: Problems, holding: Array | None) -> list[Proof | None]:
+    def _together(
+        self, problems: Problems, holding: Array | None, bound: Counts
+    ) -> list[Proof | None]:
         known = ~np.isnan(problems.points[:, :, 0])
         for name in SLIDING & problems.more.keys():
             # Anywhere on a line or a plane: the point itself need not be reached.
@@ -169,7 +175,8 @@ class Prover:
             if not len(rows):
                 continue
             kept = None if holding is None else holding[rows]
-            result = self._search(problems.rows(rows), asked[rows], most, kept)
+            boxes = np.minimum(most, bound[rows])
+            result = self._search(problems.rows(rows), asked[rows], boxes, kept)
             for place in np.flatnonzero(result.proved).tolist():
                 row = int(rows[place])
                 kind = ProofKind.REACH if result.reach[place] else ProofKind.HAND
@@ -212,14 +219,14 @@ class Prover:
         return cones if same and np.allclose(cones.wrist, self._arm.wrist, 0, SAME) else None
 
     def _search(
-        self, problems: Problems, fingers: Bools, most: int, holding: Array | None
+        self, problems: Problems, fingers: Bools, most: Counts, holding: Array | None
     ) -> _Found:
         """Divide the boxes of k targets, some of them a level deeper in each pass.
 
         Args:
             problems: The targets.
             fingers: (k, f) which contacts count.
-            most: Boxes of a target after which it is given up.
+            most: (k,) boxes of a target after which it is given up.
             holding: (k, h) see `prove`.
         """
         count = len(problems)
