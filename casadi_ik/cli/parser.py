@@ -66,6 +66,8 @@ and if wanted, NaN where not:
 OUT.npz then holds:
   q (k, n), success (k,), status (k,), position_error (k, f) [m], angle_error (k, f) [rad],
   iterations, restarts (k,), time (k,) [s]
+and with --scene:
+  clearance (k,) [m]: of the pair of shapes nearest to being too near; negative: penetration
 and with --diagnose, where a target is not solved (else "" and NaN):
   reason (k,), nearest_q (k, n) closest to the contacts, enough_position (k,) [m] and
   enough_angle (k,) [rad]: the tolerances with which it would be solved
@@ -183,8 +185,14 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
         "--prefer",
         metavar="|".join(PREFERENCES),
         type=one_of(*PREFERENCES),
-        help="which of several solutions: far from its limits, with a manipulable arm, or near the "
-        "start (default: q0 if it is given, else limits)",
+        help="which of several solutions: far from its limits, with a manipulable arm, near the "
+        "start, or with --scene far from what may be hit (default: q0 if it is given, else limits)",
+    )
+    parser.add_argument(
+        "--scene",
+        metavar="FILE",
+        help="what answers must not touch: a shipped name or a YAML file (default: nothing is "
+        "checked)",
     )
     parser.add_argument(
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
+from casadi_ik.collision.scene import Scene, load_scene
 from casadi_ik.errors import (
     CasadiIKError,
     DescriptionError,
@@ -84,8 +85,24 @@ def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:
     method = METHODS[0] if arguments.method is None else arguments.method
     if method not in METHODS:
         raise UnknownNameError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
+    scene = the_scene(arguments)
     with located(f"--method {method}", (UnsupportedError,)), located("--finger-step"):
-        return Solver(robot, method, tolerance, arguments.limits, arguments.finger_step)
+        return Solver(
+            robot, method, tolerance, arguments.limits, arguments.finger_step, scene=scene
+        )
+
+
+def the_scene(arguments: argparse.Namespace) -> Scene | None:
+    """The scene that was asked for; None: nothing is checked.
+
+    Raises:
+        UnknownNameError: No shipped scene has that name.
+        DescriptionError: The file is missing or malformed.
+    """
+    if arguments.scene is None:
+        return None
+    with located("--scene", (UnknownNameError, DescriptionError)):
+        return load_scene(arguments.scene)
 
 
 def the_start(arguments: argparse.Namespace, robot: ArmHand) -> list[float] | None:

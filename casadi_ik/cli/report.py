@@ -27,6 +27,7 @@ _MEANING = {
     Status.STALLED: "the method came to a standstill",
     Status.ITERATION_LIMIT: "the budget of iterations is used up",
     Status.UNREACHABLE: "the contacts cannot be reached: there is a proof",
+    Status.COLLISION: "contacts and limits are met, but something touches",
     Status.NOT_FOUND: "neither a solution nor a proof that there is none",
 }
 
@@ -61,7 +62,11 @@ def headline(success: bool, status: str, rest: str) -> Text:
 
 
 def solution_report(
-    name: str, solver: Solver, solution: Solution, written: Iterable[tuple[str, object]]
+    name: str,
+    solver: Solver,
+    solution: Solution,
+    written: Iterable[tuple[str, object]],
+    warning: str = "",
 ) -> Group:
     """The report of `solve`.
 
@@ -70,6 +75,7 @@ def solution_report(
         solver: Who solved.
         solution: The solution.
         written: Kind and path of every file that was written.
+        warning: What else should be known, "": nothing.
     """
     phases = ", ".join(f"{phase} {count}" for phase, count in solution.phases.items())
     effort = f"  {solution.iterations} iterations" + (f" ({phases})" if phases else "")
@@ -82,7 +88,10 @@ def solution_report(
             f"{name}: {solution.method} on {solution.robot}",
         ),
         Text(f"{effort}, {duration(solution.time)}"),
+        Text(f"  {clearance(solution)}"),
     ]
+    if warning:
+        parts.append(_indented(warning, "yellow"))
     if not solution.success:
         parts += [_indented(line, "yellow") for line in reasons(solver, solution)]
     parts += [_contacts(solution), _actuators(solver, solution)]
@@ -90,6 +99,15 @@ def solution_report(
         count = len(_beyond(solver, solution))
         parts.append(_indented(f"limits are ignored; positions beyond them: {count}", "yellow"))
     return Group(*parts, *files(written))
+
+
+def clearance(solution: Solution) -> str:
+    """How far the answer is from touching something, in words."""
+    if solution.clearance is None:
+        return "collision not checked"
+    if solution.closest is None:
+        return "nothing there to touch"
+    return f"clearance {1e3 * solution.clearance:.2f} mm: {' and '.join(solution.closest)}"
 
 
 def reasons(solver: Solver, solution: Solution) -> list[str]:
@@ -117,6 +135,8 @@ def reasons(solver: Solver, solution: Solution) -> list[str]:
         lines.append(f"at a limit: {', '.join(held)}")
     if solution.diagnosis is not None:
         lines += solution.diagnosis.lines
+    if solution.collision is not None:
+        lines += solution.collision.lines[1:]
     return lines
 
 
@@ -132,6 +152,7 @@ def batch_report(
         "time": f"mean {duration(float(times.mean()))}, 99th percentile "
         + duration(float(np.percentile(times, 99))),
     }
+    pairs["collision"] = f"scene {solver.scene.name}" if solver.scene else "not checked"
     if batch.restarts:
         pairs["restarts"] = f"mean {batch.restarts / count:.2f}, most {batch.most_restarts}"
     if solved < count:

@@ -37,6 +37,8 @@ def columns(solved: BatchSolution) -> dict[str, np.ndarray]:
         "restarts": solved.restarts,
         "time": solved.time,
     }
+    if solved.clearance is not None:
+        found["clearance"] = solved.clearance
     if solved.diagnoses:
         found |= _diagnoses(solved.diagnoses, solved.q.shape[1])
     return found

@@ -17,10 +17,13 @@ from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import located, the_fixed, the_grasp, the_robot, the_solver, the_start
 from casadi_ik.cli.report import solution_report
-from casadi_ik.errors import MissingExtraError
+from casadi_ik.collision.scene import Scene
+from casadi_ik.errors import CasadiIKError, MissingExtraError
 from casadi_ik.grasps import Grasp, load_object
+from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.diagnosis import Diagnosis
 from casadi_ik.problem.proof import Proof
+from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.solution import Solution
 
 Draw = Callable[[ArmHand, Solution, Grasp, Path], object]
@@ -60,8 +63,32 @@ def solve(arguments: argparse.Namespace) -> Answer:
     if picture is not None and draw is not None:
         draw(robot, solution, grasp, picture)
     written = [(option.lstrip("-"), file) for option, file in outputs.items() if file is not None]
-    report = solution_report(grasp.name or str(path), solver, solution, written)
+    warning = "" if arguments.scene else penetration(robot, grasp, solution)
+    report = solution_report(grasp.name or str(path), solver, solution, written, warning)
     return Answer(report, Exit.DONE if solution.success else Exit.NOT_SOLVED)
+
+
+def penetration(robot: ArmHand, grasp: Grasp, solution: Solution) -> str:
+    """That an answer penetrates the object it grasps, if it does; "" where that is not known."""
+    shapes = robot.description.shapes.capsules
+    if not (solution.success and grasp.object and grasp.object_pose is not None and shapes):
+        return ""
+    try:
+        check = SceneCheck(robot, Scene(), compiled=False)
+        around = check.around(
+            Questions(robot, tolerances_by_finger(None, robot.fingers), True).of_grasps(
+                [grasp], None
+            )
+        )
+    except CasadiIKError:  # a robot or an object without shapes
+        return ""
+    mine = np.array([grasp.object in names for names in around.table.names], dtype=bool)
+    clear = around.only(mine).check(solution.q[None])
+    pair = clear.pair(0)
+    if clear.free[0] or pair is None:
+        return ""
+    depth = -1e3 * float(clear.distance[0])
+    return f"the shapes of {pair[0]} and {pair[1]} overlap by {depth:.3g} mm; try --scene table"
 
 
 def as_json(solution: Solution) -> dict[str, Any]:
@@ -85,6 +112,15 @@ def as_json(solution: Solution) -> dict[str, Any]:
             for finger, contact in solution.contacts.items()
         },
         "diagnosis": None if solution.diagnosis is None else _diagnosis(solution.diagnosis),
+    } | ({} if solution.clearance is None else _checked(solution, solution.clearance))
+
+
+def _checked(solution: Solution, clearance: float) -> dict[str, Any]:
+    """What there is to say where collisions were checked."""
+    return {
+        "clearance": _finite(clearance),
+        "closest": _plain(solution.closest),
+        "collision": _plain(solution.collision),
     }
 
 

@@ -16,6 +16,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import nearest
 from casadi_ik.collision.model import placed, size_of
 from casadi_ik.collision.table import Table, driver_rows
+from casadi_ik.errors import InputError
 from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text, row_major
@@ -152,6 +153,12 @@ class ClearanceKernel:
         self, q: Array, poses: Array, table: Table, most: float, every: Array | None
     ) -> tuple[Array, NDArray[np.int64]]:
         given = doubles(q)
+        if poses.ndim == 3 and len(poses) == 1:
+            poses = poses[0]
+        if poses.ndim == 3 and len(poses) != len(given):
+            raise InputError(
+                f"{self._graph.name}: {len(poses)} poses for {len(given)} configurations"
+            )
         least, closest = np.full(len(given), most), np.full(len(given), -1, dtype=np.int64)
         if not len(given) or not len(table.pairs):
             return least, closest

@@ -78,6 +78,8 @@ class Surroundings:
         """Those of some targets, which may be there several times."""
         if self.poses.ndim == 2:
             return self
+        if len(self.poses) == 1:
+            return Surroundings(self.kernel, self.table, self.poses[0], self.margin)
         return Surroundings(self.kernel, self.table, self.poses[rows], self.margin)
 
     def only(self, pairs: NDArray[np.bool_]) -> Surroundings:

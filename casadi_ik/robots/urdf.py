@@ -19,7 +19,8 @@ COLOURS = {"arm": "0.93 0.55 0.20 1", "mount": "0.35 0.35 0.38 1", "hand": "0.35
 def to_urdf(robot: RobotDescription) -> str:
     """The robot as URDF text.
 
-    Every link gets simple cylinders from its frame to its children, and every finger a fixed
+    Every link gets simple cylinders from its frame to its children to be seen, its shapes for
+    collisions (a capsule as a cylinder and two spheres), and every finger a fixed
     link ``<finger>_contact`` whose frame is the contact frame. A joint that follows an actuator
     or joint linearly becomes a mimic joint; other couplings have no URDF form:
     their joints stay independent (set them from `ArmHand.joints`), with the coupling as a comment.
@@ -37,6 +38,7 @@ def to_urdf(robot: RobotDescription) -> str:
     for link in robot.links:
         element = ElementTree.SubElement(root, "link", name=link)
         _draw(element, link, robot, part)
+        _solid(element, link, robot)
     for joint in robot.joints:
         element = ElementTree.SubElement(root, "joint", name=joint.name, type=joint.type)
         _origin(element, joint.placement)
@@ -116,6 +118,36 @@ def _draw(
         ElementTree.SubElement(geometry, "cylinder", radius=repr(radius), length=repr(length))
         material = ElementTree.SubElement(visual, "material", name=part[link])
         ElementTree.SubElement(material, "color", rgba=COLOURS[part[link]])
+
+
+def _solid(element: ElementTree.Element, link: str, robot: RobotDescription) -> None:
+    """The link's shapes for collisions; a capsule is a cylinder and two spheres."""
+    for one in robot.shapes.capsules:
+        if one.link != link or one.covers >= 0:
+            continue
+        length = 2 * float(np.linalg.norm(one.half))
+        radius = repr(one.radius)
+        ends = [one.center] if length == 0 else [one.center - one.half, one.center + one.half]
+        for end in ends:
+            pose = np.eye(4)
+            pose[:3, 3] = end
+            _collision(element, pose, "sphere", radius=radius)
+        if length:
+            pose = _along(2 * one.half)
+            pose[:3, 3] = one.center
+            _collision(element, pose, "cylinder", radius=radius, length=repr(length))
+    for solid in robot.shapes.solids:
+        if solid.link == link and solid.kind == "box":
+            _collision(element, solid.pose, "box", size=_numbers(solid.size))
+        elif solid.link == link:
+            sizes = {"radius": repr(float(solid.size[0])), "length": repr(float(solid.size[1]))}
+            _collision(element, solid.pose, "cylinder", **sizes)
+
+
+def _collision(element: ElementTree.Element, pose: Array, kind: str, **sizes: str) -> None:
+    collision = ElementTree.SubElement(element, "collision")
+    _origin(collision, pose)
+    ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), kind, sizes)
 
 
 def _along(end: Array) -> Array:

@@ -1,0 +1,248 @@
+"""The shapes and pairs of a check by coal through pinocchio, and by MuJoCo."""
+
+from __future__ import annotations
+
+from typing import Any
+from xml.etree import ElementTree
+
+import coal
+import mujoco
+import numpy as np
+import pinocchio
+
+import casadi_ik as ik
+from casadi_ik.arrays import Array
+from casadi_ik.collision.solids import Kind
+from casadi_ik.problem.clearance import Surroundings
+
+
+def rotation_to(axis: Array) -> Array:
+    """(3, 3) whose z is an axis."""
+    side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
+    side /= np.linalg.norm(side)
+    return np.column_stack([side, np.cross(axis, side), axis])
+
+
+class CoalOracle:
+    """pinocchio's kinematics with coal's distances."""
+
+    def __init__(self, robot: ik.ArmHand, around: Surroundings) -> None:
+        """Build the geometry model: the table's pairs, shape by shape."""
+        self._model = pinocchio.buildModelFromXML(robot.urdf())
+        self._data = self._model.createData()
+        self._names = [j.name for j in robot.description.movable]
+        self._robot = robot
+        table, geometry = around.table, pinocchio.GeometryModel()
+        ids: list[int] = []
+        for i, one in enumerate(robot.description.shapes.capsules):
+            length = float(np.linalg.norm(one.half))
+            turn = rotation_to(one.half / length) if length else np.eye(3)
+            shape = coal.Capsule(one.radius, 2 * length) if length else coal.Sphere(one.radius)
+            ids.append(self._add(geometry, f"capsule{i}", one.link, turn, one.center, shape))
+        poses = around.poses if around.poses.ndim == 2 else around.poses[0]
+        for k, solid in enumerate(table.solids):
+            x, y, z = solid.size.tolist()
+            match solid.kind:
+                case Kind.BOX:
+                    shape = coal.Box(2 * x, 2 * y, 2 * z)
+                case Kind.CYLINDER:
+                    shape = coal.Cylinder(x, 2 * y)
+                case Kind.CAPSULE:
+                    shape = coal.Capsule(x, 2 * y) if y else coal.Sphere(x)
+                case _:
+                    raise ValueError(f"no oracle for {solid.kind}")
+            if k < table.own:
+                own = robot.description.shapes.solids[k]
+                ids.append(
+                    self._add(
+                        geometry, f"own{k}", own.link, own.pose[:3, :3], own.pose[:3, 3], shape
+                    )
+                )
+            else:
+                flat = poses[k - table.own]
+                ids.append(
+                    self._add(geometry, f"solid{k}", None, flat[:9].reshape(3, 3), flat[9:], shape)
+                )
+        for i, j in table.pairs.tolist():
+            geometry.addCollisionPair(pinocchio.CollisionPair(ids[i], ids[j]))
+        self._geometry, self._offsets = geometry, table.offsets
+        self._places = pinocchio.GeometryData(geometry)
+        self._plain = not robot.description.movable[0].coupling
+
+    def _add(
+        self, geometry: Any, name: str, link: str | None, turn: Array, at: Array, shape: Any
+    ) -> int:
+        place = pinocchio.SE3(turn, np.asarray(at, dtype=float))
+        shape.computeLocalAABB()
+        if link is None:
+            return geometry.addGeometryObject(pinocchio.GeometryObject(name, 0, 0, place, shape))
+        frame = self._model.getFrameId(link)
+        held = self._model.frames[frame]
+        whole = held.placement * place
+        return geometry.addGeometryObject(
+            pinocchio.GeometryObject(name, held.parentJoint, frame, whole, shape)
+        )
+
+    def configurations(self, q: Array) -> Array:
+        """(k, nq) pinocchio's configurations."""
+        joints = self._robot.joints(q)
+        found = np.zeros((len(q), self._model.nq))
+        for name, values in joints.items():
+            if self._model.existJointName(name):
+                joint = self._model.joints[self._model.getJointId(name)]
+                if joint.nq == 1:
+                    found[:, joint.idx_q] = values
+        return found
+
+    def distances(self, q: Array) -> Array:
+        """(k, p) distances of all pairs, offsets taken off."""
+        found = np.empty((len(q), len(self._offsets)))
+        for row, one in enumerate(self.configurations(q)):
+            pinocchio.computeDistances(self._model, self._data, self._geometry, self._places, one)
+            found[row] = [result.min_distance for result in self._places.distanceResults]
+        return found - self._offsets
+
+    def run(self, q: Array) -> None:
+        """Kinematics and collisions of configurations, until the first that is found."""
+        for one in self.configurations(q):
+            pinocchio.computeCollisions(
+                self._model, self._data, self._geometry, self._places, one, True
+            )
+
+    def penetrating(self, q: Array, depth: float) -> Array:
+        """(k,) whether any pair overlaps by more than `depth` [m] beyond what it may."""
+        found = np.zeros(len(q), dtype=bool)
+        configurations = self.configurations(q)
+        loose = (self._offsets != 0).any()
+        for row, one in enumerate(configurations):
+            hit = pinocchio.computeCollisions(
+                self._model, self._data, self._geometry, self._places, one, not loose
+            )
+            if hit and (depth or loose):
+                pinocchio.computeDistances(
+                    self._model, self._data, self._geometry, self._places, one
+                )
+                apart = np.array([r.min_distance for r in self._places.distanceResults])
+                hit = bool((apart - self._offsets < -depth).any())
+            found[row] = hit
+        return found
+
+
+class MuJoCoOracle:
+    """MuJoCo's kinematics and collisions."""
+
+    def __init__(self, robot: ik.ArmHand, around: Surroundings) -> None:
+        """Write the robot and the solids as MJCF."""
+        self._robot = robot
+        description, table = robot.description, around.table
+        top = ElementTree.Element("mujoco")
+        ElementTree.SubElement(top, "compiler", angle="radian", autolimits="true")
+        ElementTree.SubElement(top, "option", gravity="0 0 0")
+        world = ElementTree.SubElement(top, "worldbody")
+        bodies = {description.root: ElementTree.SubElement(world, "body", name=description.root)}
+        for joint in description.joints:
+            body = ElementTree.SubElement(
+                bodies[joint.parent],
+                "body",
+                name=joint.child,
+                pos=_text(joint.placement[:3, 3]),
+                quat=_quaternion(joint.placement[:3, :3]),
+            )
+            bodies[joint.child] = body
+            if joint.type != "fixed":
+                kind = "slide" if joint.type == "prismatic" else "hinge"
+                ElementTree.SubElement(
+                    body, "joint", name=joint.name, type=kind, axis=_text(joint.axis)
+                )
+            ElementTree.SubElement(body, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
+        links: dict[int, str] = {}
+        for i, one in enumerate(description.shapes.capsules):
+            if one.covers >= 0:
+                continue
+            links[i] = one.link
+            a, b = one.center - one.half, one.center + one.half
+            if np.any(one.half):
+                ElementTree.SubElement(
+                    bodies[one.link],
+                    "geom",
+                    type="capsule",
+                    size=repr(one.radius),
+                    fromto=f"{_text(a)} {_text(b)}",
+                )
+            else:
+                ElementTree.SubElement(
+                    bodies[one.link],
+                    "geom",
+                    type="sphere",
+                    size=repr(one.radius),
+                    pos=_text(one.center),
+                )
+        count = len(description.shapes.capsules)
+        poses = around.poses if around.poses.ndim == 2 else around.poses[0]
+        for k, solid in enumerate(table.solids):
+            x, y, z = solid.size.tolist()
+            kinds = {Kind.BOX: ("box", f"{x} {y} {z}"), Kind.CYLINDER: ("cylinder", f"{x} {y}")}
+            kind, size = kinds[solid.kind]
+            if k < table.own:
+                own = description.shapes.solids[k]
+                turn, at, holder = own.pose[:3, :3], own.pose[:3, 3], bodies[own.link]
+                links[count + k] = own.link
+            else:
+                flat = poses[k - table.own]
+                turn, at = flat[:9].reshape(3, 3), flat[9:]
+                holder = ElementTree.SubElement(world, "body", name=f"solid{k}")
+                links[count + k] = f"solid{k}"
+            ElementTree.SubElement(
+                holder, "geom", type=kind, size=size, pos=_text(at), quat=_quaternion(turn)
+            )
+        # What is no pair of the table is excluded; those that may overlap a little are left out.
+        kept = {
+            frozenset((links.get(i, table.names[p][0]), links[j]))
+            for p, (i, j) in enumerate(table.pairs.tolist())
+            if not table.offsets[p]
+        }
+        contact = ElementTree.SubElement(top, "contact")
+        names = sorted(set(links.values()))
+        for a, one in enumerate(names):
+            for other in names[a + 1 :]:
+                if frozenset((one, other)) not in kept:
+                    ElementTree.SubElement(contact, "exclude", body1=one, body2=other)
+        self._model = mujoco.MjModel.from_xml_string(ElementTree.tostring(top, encoding="unicode"))
+        self._data = mujoco.MjData(self._model)
+        self._places = {
+            joint.name: self._model.jnt_qposadr[self._model.joint(joint.name).id]
+            for joint in description.movable
+        }
+
+    def _configurations(self, q: Array) -> Array:
+        found = np.zeros((len(q), self._model.nq))
+        for name, values in self._robot.joints(q).items():
+            found[:, self._places[name]] = values
+        return found
+
+    def run(self, q: Array) -> None:
+        """Kinematics and collisions of configurations."""
+        for one in self._configurations(q):
+            self._data.qpos = one
+            mujoco.mj_kinematics(self._model, self._data)
+            mujoco.mj_collision(self._model, self._data)
+
+    def touching(self, q: Array, depth: float) -> Array:
+        """(k,) whether any pair overlaps by more than `depth` [m]."""
+        found = np.zeros(len(q), dtype=bool)
+        for row, one in enumerate(self._configurations(q)):
+            self._data.qpos = one
+            mujoco.mj_kinematics(self._model, self._data)
+            mujoco.mj_collision(self._model, self._data)
+            found[row] = self._data.ncon > 0 and bool((self._data.contact.dist < -depth).any())
+        return found
+
+
+def _text(values: Array) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _quaternion(rotation: Array) -> str:
+    found = np.empty(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(rotation).ravel())
+    return _text(found)

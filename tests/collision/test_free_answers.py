@@ -1,0 +1,148 @@
+"""Answers in a scene: a free one is chosen; where there is none the verdict says what blocks."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError, UnsupportedError
+
+
+@pytest.fixture(scope="module")
+def robot() -> ik.ArmHand:
+    return ik.load_robot("kuka_lwr_barrett")
+
+
+@pytest.fixture(scope="module")
+def solver(robot) -> ik.Solver:
+    return ik.Solver(robot, scene=ik.load_scene("table"))
+
+
+@pytest.mark.parametrize("name", ik.shipped_grasps("kuka_lwr_barrett"))
+def test_shipped_grasps_have_free_answers_on_the_table(solver, robot, name):
+    grasp = ik.load_grasp(name)
+    solution = solver.solve(grasp)
+    assert solution.status is ik.Status.SOLVED, solution.collision
+    assert solution.clearance >= 0
+    assert solution.closest is not None
+    # The verdict is one on q: asked again from the answer alone.
+    points, normals = grasp.arrays(robot.fingers)
+    position, angle = robot.errors(solution.q, points, normals)
+    assert (position <= 5e-3).all()
+    assert (angle <= np.deg2rad(3)).all()
+
+
+def test_the_choice_finds_what_contacts_alone_miss(solver, robot):
+    """Without a choice some of these answers touch something; with it none does."""
+    grasps = [ik.load_grasp(name) for name in ik.shipped_grasps(robot.name)]
+    blind = ik.Solver(robot)
+    touching = 0
+    for grasp in grasps:
+        problems = solver._questions.of_grasps([grasp], None)
+        around = solver._engine.around(problems)
+        touching += not around.check(blind.solve(grasp).q[None]).free[0]
+    assert touching >= 3
+
+
+def test_a_wall_in_the_way_is_named(robot):
+    cup = ik.load_grasp("cup")
+    wall = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3].tolist()}
+    solution = ik.Solver(robot, scene=ik.Scene({"balloon": wall})).solve(cup)
+    assert solution.status is ik.Status.COLLISION
+    assert not solution.success
+    report = solution.collision
+    assert "balloon" in report.pair
+    assert report.without_scene
+    assert not report.without_self
+    assert report.short > 0
+    assert solution.clearance == pytest.approx(-report.short)
+    assert any("balloon" in line for line in report.lines)
+    assert "solvable without the scene" in report.lines
+
+
+def test_no_scene_checks_nothing(robot):
+    solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
+    assert solution.clearance is None
+    assert solution.closest is None
+    with pytest.raises(InputError, match="'clearance', which needs a solver with a scene"):
+        ik.Solver(robot).solve(ik.load_grasp("cup"), prefer="clearance")
+
+
+def test_what_is_grasped_may_be_touched_by_the_fingers_alone(solver):
+    cup = ik.load_grasp("cup")
+    around = solver._engine.around(solver._questions.of_grasps([cup], None))
+    of_cup = {names[0] for names in around.table.names if names[1] == "cup"}
+    assert "bh_base" in of_cup
+    assert "bh_thumb_link_2" in of_cup
+    assert not of_cup & {"bh_thumb_link_3", "bh_finger_2_link_3", "bh_finger_3_link_3"}
+
+
+def test_clearance_is_preferred_if_asked(solver):
+    grasp = ik.load_grasp("cup")
+    usual, far = solver.solve(grasp), solver.solve(grasp, prefer="clearance")
+    assert far.success
+    assert far.clearance > usual.clearance
+
+
+def test_batches_are_what_single_solves_are(solver, robot):
+    grasps = [ik.load_grasp(name) for name in ("cup", "mug", "banana")]
+    arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
+    points, normals = (np.stack(parts) for parts in zip(*arrays, strict=True))
+    held = ik.Scene(
+        {"cup": {"kind": "object", "object": "cup"}},
+        grasped="cup",
+    )
+    poses = np.stack([grasp.object_pose for grasp in grasps])
+    batch = ik.Solver(robot, scene=held).solve_batch(points, normals, object_pose=poses)
+    assert batch.clearance.shape == (3,)
+    assert (batch.clearance[batch.success] >= 0).all()
+    one = ik.Solver(robot, scene=held).solve_batch(
+        points[1:2], normals[1:2], object_pose=poses[1:2]
+    )
+    np.testing.assert_allclose(one.q[0], batch.q[1], atol=1e-9)
+    with pytest.raises(InputError, match="object_pose: found 2 for 3 targets"):
+        ik.Solver(robot, scene=held).solve_batch(points, normals, object_pose=poses[:2])
+    with pytest.raises(InputError, match="expected a scene that says what is 'grasped'"):
+        solver.solve_batch(points, normals, object_pose=poses)
+
+
+def test_poses_for_other_rows_are_refused(solver):
+    """The driver reads as many poses as there are configurations."""
+    cup = ik.load_grasp("cup")
+    around = solver._engine.around(solver._questions.of_grasps([cup, cup], None))
+    with pytest.raises(InputError, match="2 poses for 3 configurations"):
+        around.check(np.tile(solver.robot.home, (3, 1)))
+    assert around.check(np.tile(solver.robot.home, (2, 1))).free.shape == (2,)
+
+
+def test_all_solutions_are_free(solver):
+    cup = ik.load_grasp("cup")
+    found = solver.solve_all(cup, limit=4)
+    assert found
+    around = solver._engine.around(solver._questions.of_grasps([cup], None))
+    assert around.free(np.stack([one.q for one in found])).all()
+
+
+def test_what_knows_no_scene_says_so(solver):
+    with pytest.raises(UnsupportedError, match="track: knows no scenes"):
+        solver.track([ik.load_grasp("cup")])
+    with pytest.raises(UnsupportedError, match="fast: checks no collisions"):
+        solver.fast()
+
+
+def test_other_methods_are_checked_at_the_end(robot):
+    cup = ik.load_grasp("cup")
+    wall = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3].tolist()}
+    scene = ik.Scene({"balloon": wall})
+    other = ik.Solver(robot, "thumb-first", compiled=False, scene=scene).solve(cup, diagnose=False)
+    assert other.status is ik.Status.COLLISION
+    assert other.clearance < 0
+
+
+def test_a_solver_with_a_scene_can_be_copied(solver):
+    copy = pickle.loads(pickle.dumps(solver))
+    grasp = ik.load_grasp("cup")
+    np.testing.assert_array_equal(copy.solve(grasp).q, solver.solve(grasp).q)
