@@ -261,9 +261,10 @@ class Solver:
     ) -> tuple[Alternative, ...]:
         """Find different solutions of one grasp, best first.
 
-        For every hand posture that meets the contacts: of an S-R-S arm every branch (signs of
-        shoulder, elbow and wrist) with its intervals of swivels, and the preferred swivel of each;
-        of another arm the different configurations that many starts lead to. Of two alike, one.
+        For every hand posture that meets the contacts: of an arm in closed form every branch
+        (signs of shoulder, elbow and wrist) with the intervals of its freedom, see `ArmBranch`,
+        and the preferred arm of each; of another arm the different configurations that many
+        starts lead to. Of two alike, one.
 
         Args:
             grasp: A contact per finger; its fingers must be the robot's.

@@ -60,6 +60,7 @@ CASES = (
     Case("kuka_lwr_barrett", ("thumb", "finger_2", "finger_3")),
     Case("baxter_ar10", ("thumb", "index", "middle")),
     Case("ar10", ("thumb", "index", "middle")),
+    Case("panda+allegro_right", ("thumb", "index", "middle", "ring")),
 )
 
 
@@ -134,6 +135,8 @@ def write_report(
                     *_columns(one),
                 ]
             )
+        if not rows:
+            continue
         heads = ["noise", "targets"]
         for when in ("before", "now"):
             heads += [f"solved % ({when})", f"possible but missed ({when})"]
@@ -178,6 +181,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--starts", type=int, default=50, help="of Ipopt for a target")
     parser.add_argument("--seed", type=int, default=2024)
+    parser.add_argument("--robot", action="append", help="only this one")
     parser.add_argument("--levels", type=float, nargs="+", help="noise of the points [mm]")
     parser.add_argument("--out", type=Path, default=Path("out/noise"), help="folder of the report")
     parser.add_argument("--before", type=Path, help="figures.json of other code, to be set beside")
@@ -187,6 +191,8 @@ def main(arguments: list[str] | None = None) -> None:
     for case in CASES:
         for level in LEVELS:
             if options.levels and level[0] not in options.levels:
+                continue
+            if options.robot and case.robot not in options.robot:
                 continue
             figures = measure(
                 case, level, options.count, options.looked, options.starts, options.seed

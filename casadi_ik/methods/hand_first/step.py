@@ -5,10 +5,10 @@ iteration is one evaluation of whichever stage the solve is in:
 
 candidate   take the next hand posture of the list and the palm pose that suits it best;
 hand fit    one damped step of palm pose and hand posture;
-placement   try some swivels of the arm for that palm pose;
+placement   try some arms for that palm pose;
 refinement  one damped step of all motors, from the least violating arm, where the arm cannot
             follow exactly or has no closed form;
-choice      some swivels of the arm, the nearest to where the robot is, if that is wanted; such a
+choice      some arms in closed form, the nearest to where the robot is, if that is wanted; such a
             solve begins with a refinement of the whole configuration if it nearly solves already,
             and with the hand as it is;
 balance     one step of all motors towards the smallest largest error, where least squares misses
