@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,11 @@ class Table:
         if not found:
             return np.zeros((0, 12))
         return np.stack(np.broadcast_arrays(*found), axis=-2)
+
+    @cached_property
+    def for_driver(self) -> tuple[Array, Array]:
+        """See `driver_rows`; made once."""
+        return driver_rows(self.solids)
 
     def only(self, rows: NDArray[np.bool_]) -> Table:
         """The same with some of the pairs."""

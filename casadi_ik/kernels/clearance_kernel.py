@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import nearest
 from casadi_ik.collision.model import placed, size_of
-from casadi_ik.collision.table import Table, driver_rows
+from casadi_ik.collision.table import Table
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
@@ -165,7 +165,7 @@ class ClearanceKernel:
         if self._run is None:
             self._by_numpy(given, poses, table, least, closest, every)
             return least, closest
-        solids, planes = driver_rows(table.solids)
+        solids, planes = table.for_driver
         places = doubles(poses)
         moving = places.ndim == 3
         radii, halves, offsets = map(doubles, (table.radii, table.halves, table.offsets))

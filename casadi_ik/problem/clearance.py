@@ -191,6 +191,7 @@ class SceneCheck:
         self.scene = scene
         self.kernel = ClearanceKernel(robot.description, compiled)
         self.model = self._as_it_stands(collision_model(robot.description))
+        self._held: dict[str, Scene] = {}
         self._tables: dict[tuple[str, frozenset[str]], tuple[Table, dict[str, Item]]] = {}
         (placed,) = self.kernel.placed(robot.home)
         check_base(self.model, scene, placed)
@@ -241,15 +242,21 @@ class SceneCheck:
         scene, name = self.scene, problems.object or self.scene.grasped
         pose = problems.object_pose
         if name is not None and name not in scene.items and pose is not None:
-            scene = scene.holding(name, pose[0])
+            scene = self._holding(name, pose[0])
         elif name != scene.grasped and name in scene.items:
-            scene = scene.holding(name, scene.items[name].pose)
+            scene = self._holding(name, scene.items[name].pose)
         fingers = ~np.isnan(problems.points[..., 0]).all(axis=0)
         named = zip(self.robot.fingers, fingers.tolist(), strict=True)
         touched = frozenset().union(*(self.bodies_of_fingers[f] for f, on in named if on))
         table, items = self._table(scene, touched)
         moved = name if pose is not None else None
         return Surroundings(self.kernel, table, table.poses(items, moved, pose), scene.margin)
+
+    def _holding(self, name: str, pose: Array) -> Scene:
+        """The scene with an object that is grasped, wherever it was first: its pose goes aside."""
+        if name not in self._held:
+            self._held[name] = self.scene.holding(name, pose)
+        return self._held[name]
 
     def _table(self, scene: Scene, touched: frozenset[str]) -> tuple[Table, dict[str, Item]]:
         key = scene.grasped or "", touched

@@ -33,7 +33,7 @@ class CoalOracle:
         self._names = [j.name for j in robot.description.movable]
         self._robot = robot
         table, geometry = around.table, pinocchio.GeometryModel()
-        ids: list[int] = []
+        ids: list[int | None] = []
         for i, one in enumerate(robot.description.shapes.capsules):
             length = float(np.linalg.norm(one.half))
             turn = rotation_to(one.half / length) if length else np.eye(3)
@@ -49,8 +49,9 @@ class CoalOracle:
                     shape = coal.Cylinder(x, 2 * y)
                 case Kind.CAPSULE:
                     shape = coal.Capsule(x, 2 * y) if y else coal.Sphere(x)
-                case _:
-                    raise ValueError(f"no oracle for {solid.kind}")
+                case _:  # of planes: known to coal by corners only, left out here
+                    ids.append(None)
+                    continue
             if k < table.own:
                 own = robot.description.shapes.solids[k]
                 ids.append(
@@ -63,9 +64,13 @@ class CoalOracle:
                 ids.append(
                     self._add(geometry, f"solid{k}", None, flat[:9].reshape(3, 3), flat[9:], shape)
                 )
-        for i, j in table.pairs.tolist():
-            geometry.addCollisionPair(pinocchio.CollisionPair(ids[i], ids[j]))
-        self._geometry, self._offsets = geometry, table.offsets
+        kept: list[int] = []
+        for number, (i, j) in enumerate(table.pairs.tolist()):
+            first, second = ids[i], ids[j]
+            if first is not None and second is not None:
+                geometry.addCollisionPair(pinocchio.CollisionPair(first, second))
+                kept.append(number)
+        self._geometry, self._offsets = geometry, table.offsets[kept]
         self._places = pinocchio.GeometryData(geometry)
         self._plain = not robot.description.movable[0].coupling
 

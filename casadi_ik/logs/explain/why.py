@@ -264,6 +264,8 @@ def _at_the_end(solve: OneSolve) -> Iterator[str]:
     if at_limit:
         beyond = " or beyond" if solve.asked.limits == "ignore" else ""
         yield f"at its end at{beyond} a limit: {', '.join(at_limit)}"
+    if solve.status == "COLLISION":
+        yield "contacts and limits are met by its answer, but something touches"
     if solve.status == "ITERATION_LIMIT":
         yield _progress(solve)
 
