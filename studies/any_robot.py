@@ -93,7 +93,10 @@ def run(options: argparse.Namespace) -> None:
     with backend(options.jobs, options.dask), Progress(*columns, console=console) as progress:
         task = progress.add_task("pairs", total=len(todo))
         parallel = joblib.Parallel(return_as="generator_unordered")
-        for pair, found in parallel(joblib.delayed(solve)(pair) for pair in todo):
+        calls = (joblib.delayed(solve)(pair) for pair in todo)
+        for done in parallel(calls):
+            assert isinstance(done, tuple)
+            pair, found = done
             path = _path(pair, options.out)
             part = path.with_suffix(".part")
             part.write_text(json.dumps(found), encoding="utf-8")

@@ -63,7 +63,7 @@ class Table:
         return np.stack(np.broadcast_arrays(*found), axis=-2)
 
     @cached_property
-    def for_driver(self) -> tuple[Array, Array]:
+    def for_driver(self) -> tuple[NDArray[np.void], Array]:
         """See `driver_rows`; made once."""
         return driver_rows(self.solids)
 
@@ -83,7 +83,7 @@ class Table:
         )
 
 
-def driver_rows(solids: Sequence[Solid]) -> tuple[Array, Array]:
+def driver_rows(solids: Sequence[Solid]) -> tuple[NDArray[np.void], Array]:
     """The solids (n, 7 of 8 bytes) and the planes (m, 4) as the driver has them."""
     form = np.dtype(
         [("kind", "<i8"), ("size", "<f8", 3), ("reach", "<f8"), ("first", "<i8"), ("planes", "<i8")]

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-
-from casadi_ik.arrays import Array
+from numpy.typing import NDArray
 
 WIDTH = 96
 """Characters of a line of numbers."""
@@ -40,7 +39,7 @@ def numbers(values: Iterable[Any]) -> str:
     return "{\n" + "\n".join([*lines, line.rstrip(",")]) + "}"
 
 
-def define_arrays(arrays: Mapping[str, Array], scope: str = "static const") -> str:
+def define_arrays(arrays: Mapping[str, NDArray[Any]], scope: str = "static const") -> str:
     """Arrays of doubles, of 16-bit or of common whole numbers, by name; none is empty."""
     text = ""
     for name, array in arrays.items():

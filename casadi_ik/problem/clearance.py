@@ -246,8 +246,10 @@ class SceneCheck:
         elif name != scene.grasped and name in scene.items:
             scene = self._holding(name, scene.items[name].pose)
         fingers = ~np.isnan(problems.points[..., 0]).all(axis=0)
-        named = zip(self.robot.fingers, fingers.tolist(), strict=True)
-        touched = frozenset().union(*(self.bodies_of_fingers[f] for f, on in named if on))
+        named = [
+            name for name, on in zip(self.robot.fingers, np.atleast_1d(fingers), strict=True) if on
+        ]
+        touched = frozenset().union(*(self.bodies_of_fingers[name] for name in named))
         table, items = self._table(scene, touched)
         moved = name if pose is not None else None
         return Surroundings(self.kernel, table, table.poses(items, moved, pose), scene.margin)

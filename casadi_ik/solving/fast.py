@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -111,7 +113,8 @@ class FastSolver:
         """
         questions = self._questions
         prefer = preference(None, q0 is not None)
-        problems = questions.of_arrays([points], [normals], None, prefer=prefer)
+        one: Any = [points], [normals]
+        problems = questions.of_arrays(*one, None, prefer=prefer)
         start = questions.start(q0)
         solution = self._engine.solve(problems, Run(start)).solution(0)
         verdicts = solution.contacts.values()

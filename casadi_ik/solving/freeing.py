@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -27,7 +28,7 @@ RANKED = ("manipulability", CLEARANCE)
 class Freeing(Protocol):
     """An engine that has a finder of free answers."""
 
-    @property
+    @cached_property
     def freer(self) -> FreeFinder:
         """Finds them."""
         ...

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 from xml.etree import ElementTree
 
-import coal
-import mujoco
 import numpy as np
-import pinocchio
+from numpy.typing import NDArray
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.collision.solids import Kind
 from casadi_ik.problem.clearance import Surroundings
 
+coal: Any = import_module("coal")
+mujoco: Any = import_module("mujoco")
+pinocchio: Any = import_module("pinocchio")
+
 
 def rotation_to(axis: Array) -> Array:
     """(3, 3) whose z is an axis."""
-    side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
+    side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())]).astype(float)
     side /= np.linalg.norm(side)
     return np.column_stack([side, np.cross(axis, side), axis])
 
@@ -114,7 +117,7 @@ class CoalOracle:
                 self._model, self._data, self._geometry, self._places, one, True
             )
 
-    def penetrating(self, q: Array, depth: float) -> Array:
+    def penetrating(self, q: Array, depth: float) -> NDArray[np.bool_]:
         """(k,) whether any pair overlaps by more than `depth` [m] beyond what it may."""
         found = np.zeros(len(q), dtype=bool)
         configurations = self.configurations(q)
@@ -232,7 +235,7 @@ class MuJoCoOracle:
             mujoco.mj_kinematics(self._model, self._data)
             mujoco.mj_collision(self._model, self._data)
 
-    def touching(self, q: Array, depth: float) -> Array:
+    def touching(self, q: Array, depth: float) -> NDArray[np.bool_]:
         """(k,) whether any pair overlaps by more than `depth` [m]."""
         found = np.zeros(len(q), dtype=bool)
         for row, one in enumerate(self._configurations(q)):

@@ -50,6 +50,7 @@ def placed_targets(
 
 
 def _moved(grasp: ik.Grasp, motion: Array) -> ik.Grasp:
+    assert grasp.object_pose is not None
     turn, shift = motion[:3, :3], motion[:3, 3]
     contacts = {
         name: ik.Contact(

@@ -11,8 +11,8 @@ the fits end somewhere else each time, as with many joints at their limits.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -78,7 +78,8 @@ LATER = VALLEYS + ANYWHERE + RUGGED
 """Rounds after those of the tables, at most."""
 
 
-class Spread(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Spread:
     """How postures of a table are spread.
 
     Attributes:

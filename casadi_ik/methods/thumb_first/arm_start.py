@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
@@ -26,7 +28,9 @@ def arm_start(robot: RobotDescription, arm: ArmForm) -> ca.Function:
         ``(nearest, rotation, origin, here, lower, upper) -> arm``, (n, 1) each but the palm's pose
         and whether it is to be the nearest.
     """
-    rotation, origin = ca.MX.sym("rotation", 3, 3), ca.MX.sym("origin", 3)
+    # A pose is of either kind of symbols, which its annotations do not say.
+    rotation: Any = ca.MX.sym("rotation", 3, 3)
+    origin: Any = ca.MX.sym("origin", 3)
     columns = list(robot.arm_actuators)
     here, lower, upper = (ca.MX.sym(name, len(columns)) for name in ("here", "lower", "upper"))
     inputs, palm = [rotation, origin, here, lower, upper], Pose(rotation, origin)

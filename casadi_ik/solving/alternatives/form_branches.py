@@ -46,8 +46,8 @@ class FormBranches:
             margins = self._margins(palm, np.zeros(1), lower, upper)[0]
             return [self._branch(i, None) for i in np.flatnonzero(margins >= ALLOWED).tolist()]
         middle, half = (lower[joint] + upper[joint]) / 2, (upper[joint] - lower[joint]) / 2
-        ends = middle + min(half, np.pi) * np.array([-1.0, 1.0])
-        grid = np.linspace(*ends, POSITIONS)
+        half = min(half, np.pi)
+        grid = np.linspace(middle - half, middle + half, POSITIONS)
         margins = self._margins(palm, grid, lower, upper)
         found = []
         for side in range(len(SIGNS)):

@@ -277,11 +277,12 @@ class _Search:
         q = np.where(self.free[:, None], self.best, self.nearest)
         reports: list[CollisionReport | None] = [None] * len(q)
         blocked = np.flatnonzero(~self.free)
-        if len(blocked):
-            every = np.concatenate([some for some, _ in self.seen])
-            owner = np.concatenate([rows for _, rows in self.seen])
-            table = self.around.table
-            own = table.pairs[:, 1] < len(table.radii)
+        if not len(blocked):
+            return Freed(q, self.free, tuple(reports))
+        every = np.concatenate([some for some, _ in self.seen])
+        owner = np.concatenate([rows for _, rows in self.seen])
+        table = self.around.table
+        own = table.pairs[:, 1] < len(table.radii)
         for row in blocked.tolist():
             mine = np.flatnonzero(owner == row)
             around = self.around.rows(np.full(len(mine), row))

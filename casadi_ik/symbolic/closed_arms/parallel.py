@@ -137,5 +137,5 @@ def _parts(axis: Array, vector: Array) -> tuple[Array, Array, Array]:
 
 def _perpendicular(axis: Array) -> Array:
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    across = np.cross(axis, helper)
+    across = np.cross(axis, helper).astype(float)
     return across / np.linalg.norm(across)

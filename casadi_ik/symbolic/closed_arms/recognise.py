@@ -154,7 +154,7 @@ def _spherical_end(screws: Screws, swept: bool) -> tuple[Screws, SphericalEnd, f
     z, y, third = screws.axes[list(places)]
     y = _unit(y - z * (z @ y))
     third = _unit(third - y * (y @ third))
-    x = np.cross(y, z)
+    x = np.cross(y, z).astype(float)
     axes = screws.axes.copy()
     axes[list(places)] = z, y, third
     ideal = _through(replace(screws, axes=axes), places, point)

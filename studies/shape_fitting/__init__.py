@@ -1,0 +1,1 @@
+"""Shapes of links from published meshes, for `fit_shapes.py`."""

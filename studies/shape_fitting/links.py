@@ -1,0 +1,131 @@
+"""Which link of a published file is which of ours: by the axes of their joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.importing.posture import Postures
+from casadi_ik.importing.surfaces import Surface, link_surfaces
+from casadi_ik.robots.part import Part
+from casadi_ik.robots.robot_files.read import read_tree
+from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
+
+ALIKE = 2e-4
+"""Axes that differ by less [m, or as unit vectors] are one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A joint's line at zero."""
+
+    joint: str
+    parent: str
+    child: str
+    point: Array
+    way: Array
+
+
+def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, Surface]:
+    """The file's shapes by our link, in its frame."""
+    tree = read_tree(file)
+    theirs = tree_poses(tree)
+    ours = Postures(part).poses({})
+    our_axes = [
+        Axis(j.name, j.parent, j.child, ours[j.child][:3, 3], ours[j.child][:3, :3] @ j.axis)
+        for j in part.joints
+        if j.type != "fixed"
+    ]
+    best: tuple[int, dict[str, TreeJoint], Array] = (-1, {}, np.eye(4))
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    for link in tree.links:
+        for turn in (np.eye(4), half_turn):
+            base = np.asarray(turn @ np.linalg.inv(theirs[link]), dtype=np.float64)
+            matched = match(part, our_axes, tree, theirs, base)
+            if len(matched) > best[0]:
+                best = (len(matched), matched, base)
+    count, matched, base = best
+    if count < len(our_axes):
+        missing = [axis.joint for axis in our_axes if axis.joint not in matched]
+        print(f"  joints not found in {file.name}: {missing}")
+    parents = {joint.name: joint for joint in part.joints}
+    holder = {matched[name].child: parents[name].child for name in matched}
+    # The root's own body: all that is fixed to what the first joints hang on.
+    first = next(j for j in part.joints if j.name in matched)
+    body = rigid(tree, matched[first.name].parent)
+    for link in sorted(body - without):
+        holder.setdefault(link, part.root)
+    changed = True
+    while changed:
+        changed = False
+        for joint in tree.joints:
+            if (
+                joint.type == "fixed"
+                and joint.parent in holder
+                and joint.child not in {*holder, *without}
+            ):
+                holder[joint.child] = holder[joint.parent]
+                changed = True
+    found, missing = link_surfaces(file, list(holder))
+    for line in missing:
+        print("  ", line)
+    parts: dict[str, list[Surface]] = {}
+    for link, surface in found.items():
+        pose = np.linalg.inv(ours[holder[link]]) @ base @ theirs[link]
+        if len(surface.triangles):
+            parts.setdefault(holder[link], []).append(surface.moved(pose))
+    joined = {}
+    for link in ours:
+        if link in parts:
+            points = [one.points for one in parts[link]]
+            starts = np.cumsum([0, *(len(one) for one in points[:-1])])
+            triangles = [one.triangles + n for one, n in zip(parts[link], starts, strict=True)]
+            joined[link] = Surface(np.concatenate(points), np.concatenate(triangles))
+    return joined
+
+
+def rigid(tree: RobotTree, link: str) -> set[str]:
+    """All links of a body."""
+    body, grown = {link}, True
+    while grown:
+        more = {j.child for j in tree.joints if j.type == "fixed" and j.parent in body}
+        more |= {j.parent for j in tree.joints if j.type == "fixed" and j.child in body}
+        grown = not more <= body
+        body |= more
+    return body
+
+
+def tree_poses(tree: RobotTree) -> dict[str, Array]:
+    """Poses of the file's links at zero."""
+    poses = {tree.root: np.eye(4)}
+    for joint in tree.joints:
+        poses[joint.child] = poses[joint.parent] @ joint.placement
+    return poses
+
+
+def match(
+    part: Part, axes: list[Axis], tree: RobotTree, theirs: dict[str, Array], base: Array
+) -> dict[str, TreeJoint]:
+    """By our joint the file's, below that of the joint before."""
+    by_child = {joint.child: joint for joint in part.joints}
+    found: dict[str, TreeJoint] = {}
+    for axis in axes:
+        above: str | None = axis.parent
+        while above in by_child and by_child[above].name not in found:
+            above = by_child[above].parent
+        start = found[by_child[above].name].child if above in by_child else tree.root
+        for joint in tree.below(start):
+            pose = base @ theirs[joint.child]
+            if joint.type == "fixed" or joint in found.values():
+                continue
+            way = pose[:3, :3] @ joint.axis
+            off = axis.point - pose[:3, 3]
+            off = off - (off @ axis.way) * axis.way
+            turned = min(np.abs(way - axis.way).max(), np.abs(way + axis.way).max())
+            if turned < 5e-3 and np.linalg.norm(off) < 20 * ALIKE:
+                found[axis.joint] = joint
+                break
+    return found
