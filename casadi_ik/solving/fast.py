@@ -114,7 +114,7 @@ class FastSolver:
         questions = self._questions
         prefer = preference(None, q0 is not None)
         one: Any = [points], [normals]
-        problems = questions.of_arrays(*one, None, prefer=prefer)
+        problems = questions.of_arrays(one[0], one[1], None, prefer=prefer)
         start = questions.start(q0)
         solution = self._engine.solve(problems, Run(start)).solution(0)
         verdicts = solution.contacts.values()
