@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.collision.scene import Scene, checked_pose, grasped_in
+from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
@@ -200,7 +200,7 @@ class Solver:
         preferred = self._engine.preference(prefer, q0 is not None)
         problems = self._questions.of_arrays(points, normals, held, more=more, prefer=preferred)
         if object_pose is not None:
-            problems = problems.holding(grasped_in(self.scene), checked_pose(object_pose))
+            problems = problems.holding(grasped_in(self.scene), object_pose)
         with recorder_of(self, log, seed, keep, compression) as recorder:
             return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
 

@@ -15,11 +15,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.batch_totals import BatchTotals
 from casadi_ik.cli.outputs import check_outputs
-from casadi_ik.cli.question import the_fixed, the_robot, the_solver, the_start
+from casadi_ik.cli.question import (
+    the_fixed,
+    the_object_pose,
+    the_robot,
+    the_solver,
+    the_start,
+)
 from casadi_ik.cli.report import batch_report
 from casadi_ik.cli.say import say
 from casadi_ik.cli.solution_file import columns, growing_npz
 from casadi_ik.cli.target_file import TargetFile
+from casadi_ik.grasps.pose import moved
 
 BLOCK = 4096
 """Targets in memory at once, at most."""
@@ -71,10 +78,12 @@ def batch(arguments: argparse.Namespace) -> Answer:
     count = targets.check(BLOCK)
     outputs = {"--log": arguments.log, "--out": arguments.out}
     check_outputs(outputs.items(), inputs=[path])
+    pose = the_object_pose(arguments)
     solver = the_solver(arguments, robot)
     pace = Pace(arguments.jobs)
+    asked = targets.blocks(pace.begin)
     blocks = solver.solve_blocks(
-        targets.blocks(pace.begin),
+        asked if pose is None else (moved(block, pose) for block in asked),
         q0,
         arguments.seed,
         arguments.jobs,

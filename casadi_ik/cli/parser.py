@@ -195,6 +195,14 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
         "checked)",
     )
     parser.add_argument(
+        "--object-pose",
+        metavar="X",
+        type=numbers,
+        nargs="+",
+        help="where the object is: x y z [m] roll pitch yaw [rad] in the base frame; contacts move "
+        "with it, and those of a file that does not say where its object is are in its frame",
+    )
+    parser.add_argument(
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"
     )
     parser.add_argument(

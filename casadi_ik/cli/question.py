@@ -10,6 +10,7 @@ from pathlib import Path
 
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
+from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene, load_scene
 from casadi_ik.errors import (
     CasadiIKError,
@@ -18,6 +19,7 @@ from casadi_ik.errors import (
     UnknownNameError,
     UnsupportedError,
 )
+from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.files.shipped import resolve, resolve_robot
 from casadi_ik.grasps import Grasp, load_grasp
 from casadi_ik.methods.registry import METHODS
@@ -47,9 +49,11 @@ def the_grasp(arguments: argparse.Namespace) -> tuple[Path, Grasp]:
     Raises:
         UnknownNameError: No shipped grasp has that name.
         DescriptionError: The file is missing or malformed.
+        InputError: The object's pose is none.
     """
-    path = resolve(arguments.grasp, "grasps")
-    return path, load_grasp(path)
+    path, pose = resolve(arguments.grasp, "grasps"), the_object_pose(arguments)
+    grasp = load_grasp(path)
+    return path, grasp if pose is None else grasp.in_object_frame().at(pose)
 
 
 def the_robot(name: str | None, path: Path | None = None, grasp: Grasp | None = None) -> ArmHand:
@@ -103,6 +107,24 @@ def the_scene(arguments: argparse.Namespace) -> Scene | None:
         return None
     with located("--scene", (UnknownNameError, DescriptionError)):
         return load_scene(arguments.scene)
+
+
+def the_object_pose(arguments: argparse.Namespace) -> Array | None:
+    """(4, 4) where the object is in whose frame targets are; None: they are in the base frame.
+
+    Raises:
+        InputError: Other than six numbers.
+    """
+    if arguments.object_pose is None:
+        return None
+    values = [value for group in arguments.object_pose for value in group]
+    if len(values) != 6:
+        raise InputError(
+            f"--object-pose: found {len(values)} numbers, expected six: x y z [m], "
+            "roll pitch yaw [rad]"
+        )
+    x, y, z, roll, pitch, yaw = values
+    return frame_matrix(Frame((x, y, z), (roll, pitch, yaw)))
 
 
 def the_start(arguments: argparse.Namespace, robot: ArmHand) -> list[float] | None:

@@ -30,6 +30,7 @@ from casadi_ik.files.reading import (
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import Length, in_si
 from casadi_ik.grasps.objects import load_object
+from casadi_ik.grasps.pose import checked_pose
 from casadi_ik.robots.collision import Touching, TouchingEntry
 
 
@@ -268,27 +269,6 @@ def grasped_in(scene: Scene | None) -> str:
     if scene is None or scene.grasped is None:
         raise InputError("object_pose: found one, expected a scene that says what is 'grasped'")
     return scene.grasped
-
-
-def checked_pose(pose: ArrayLike, name: str = "object_pose") -> Array:
-    """A pose (4, 4), or (k, 4, 4), as an array.
-
-    Raises:
-        InputError: A wrong shape, a number that is not finite, or no rotation.
-    """
-    try:
-        array = np.asarray(pose, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected an array of numbers: {error}") from error
-    if array.ndim not in (2, 3) or array.shape[-2:] != (4, 4):
-        raise InputError(f"{name}: found shape {array.shape}, expected (4, 4)")
-    if not np.isfinite(array).all():
-        raise InputError(f"{name}: holds NaN or infinity, expected finite numbers")
-    rotation = array[..., :3, :3]
-    product = rotation @ np.swapaxes(rotation, -1, -2)
-    if not (np.abs(product - np.eye(3)).max() < 1e-6 and (np.linalg.det(rotation) > 0).all()):
-        raise InputError(f"{name}: its first three columns are no rotation")
-    return array
 
 
 def _parts(entry: SolidEntry, where: str, path: Path) -> list[tuple[Solid, Array]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.arrays import real_array, unit_vectors
+from casadi_ik.grasps.pose import inverse, one_pose
 from casadi_ik.grasps.tolerance import Tolerance
 from casadi_ik.grasps.vectors import MORE, fault, squared
 
@@ -85,6 +86,24 @@ class Contact:
         for name, vector in vectors.items():
             object.__setattr__(self, name, vector)
 
+    def at(self, pose: ArrayLike) -> Contact:
+        """The contact that moves with a frame into the base frame.
+
+        Args:
+            pose: (4, 4) where the frame is in which this one is given.
+
+        Raises:
+            InputError: No rigid motion.
+        """
+        motion = one_pose(pose)
+        turn = motion[:3, :3]
+        if not np.isfinite(self.point).all():
+            assert self.normal is not None
+            return Contact(direction=turn @ self.normal, tolerance=self.tolerance)
+        vectors = {name: getattr(self, name) for name in ("normal", *MORE)}
+        turned = {name: turn @ vector for name, vector in vectors.items() if vector is not None}
+        return Contact(turn @ self.point + motion[:3, 3], tolerance=self.tolerance, **turned)
+
 
 @dataclass(frozen=True, eq=False)
 class Grasp:
@@ -123,6 +142,37 @@ class Grasp:
         """Its fields; the mapping that cannot be changed is made anew."""
         held = self.robot, self.name, self.object, self.object_pose, dict(self.posture)
         return type(self), (dict(self.contacts), *held)
+
+    def at(self, pose: ArrayLike) -> Grasp:
+        """The grasp moved as a whole: given in an object's frame, it is placed with the object.
+
+        ``grasp.at(a).at(b)`` is ``grasp.at(b @ a)``.
+
+        Args:
+            pose: (4, 4) where the frame is, in the robot's base frame, in which the contacts are
+                given.
+
+        Returns:
+            The contacts, and the object where there is one, in the base frame.
+
+        Raises:
+            InputError: Another shape, a number that is not finite, or no rigid motion.
+        """
+        motion = one_pose(pose)
+        place = self.object_pose
+        if place is not None:
+            place = motion @ place
+        elif self.object:
+            place = motion
+        contacts = {finger: contact.at(motion) for finger, contact in self.contacts.items()}
+        return replace(self, contacts=contacts, object_pose=place)
+
+    def in_object_frame(self) -> Grasp:
+        """The contacts as the object sees them, to be placed by `at`.
+
+        A grasp that does not say where its object is counts as given in the object's frame.
+        """
+        return self if self.object_pose is None else self.at(inverse(self.object_pose))
 
     def arrays(self, fingers: Sequence[str]) -> tuple[Array, Array]:
         """Points and normals in the order of the given fingers.

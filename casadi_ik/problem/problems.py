@@ -12,6 +12,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.grasps.arrays import real_array, unit_vectors
+from casadi_ik.grasps.pose import checked_pose
 from casadi_ik.robots.description import RobotDescription
 
 LIMITS = ("enforce", "ignore")
@@ -102,8 +103,13 @@ class Problems:
             object_pose=pose,
         )
 
-    def holding(self, name: str, poses: Array) -> Problems:
-        """The same targets, which grasp an object at poses (4, 4) or (k, 4, 4)."""
+    def holding(self, name: str, object_pose: ArrayLike) -> Problems:
+        """The same targets, which grasp an object at poses (4, 4) or (k, 4, 4).
+
+        Raises:
+            InputError: No rigid motion, or another number of them.
+        """
+        poses = checked_pose(object_pose)
         if poses.ndim == 3 and len(poses) != len(self):
             raise InputError(f"object_pose: found {len(poses)} for {len(self)} targets")
         every = np.broadcast_to(poses, (len(self), 4, 4))

@@ -182,3 +182,21 @@ def test_process(run_process: Command, target_file: TargetFile, tmp_path: Path) 
     done = run_process("batch", path, *ROBOT, "--out", out)
     assert "normals: cannot be read: Bad CRC-32" in done.error
     assert [file.name for file in tmp_path.iterdir()] == ["targets.npz"]
+
+
+def test_targets_in_the_frame_of_an_object(
+    run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
+) -> None:
+    out = tmp_path / "solved.npz"
+    pose = ["0.01", "0", "-0.02", "0", "0", "0.1"]
+    done = run("batch", target_file(), *ROBOT, "--out", out, "--object-pose", *pose)
+    assert done.exit == 0
+    with np.load(target_file()) as data, np.load(out) as found:
+        c, s = np.cos(0.1), np.sin(0.1)
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        points, normals = robot.contacts(found["q"])
+        away = points - (data["points"] @ turn + [0.01, 0, -0.02])
+        assert np.linalg.norm(away, axis=-1).max() < ik.Tolerance().position
+        assert (normals * (data["normals"] @ turn)).sum(axis=-1).min() > np.cos(
+            ik.Tolerance().angle
+        )

@@ -249,3 +249,21 @@ def _shown(solver: ik.Solver, solution: ik.Solution) -> str:
     console = Console(file=StringIO(), width=80)
     console.print(solution_report("pinch", solver, solution, []))
     return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_contacts_go_with_the_object(
+    run: Command, grasp_file: GraspFile, robot: ik.ArmHand, tmp_path: Path
+) -> None:
+    """The file says nothing of an object: its contacts are in the frame that is placed."""
+    out = tmp_path / "pinch.json"
+    turn = ["0.0", "0.0", "-0.01", "0", "0", "0.2"]
+    done = run("solve", grasp_file(), *FAST, "--out", out, "--object-pose", *turn)
+    assert done.exit == 0
+    reached, _ = robot.contacts(json.loads(out.read_text())["q"])
+    wanted, _ = robot.contacts(POSTURE)
+    c, s = math.cos(0.2), math.sin(0.2)
+    moved = wanted @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [0, 0, -0.01]
+    assert np.linalg.norm(reached - moved, axis=1).max() < 5e-3
+    done = run("solve", grasp_file(), *FAST, "--object-pose", "1", "2")
+    assert done.exit == 2
+    assert "--object-pose: found 2 numbers, expected six" in done.err

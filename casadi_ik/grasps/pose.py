@@ -1,0 +1,68 @@
+"""Poses that a user gives, and what they move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
+
+
+def checked_pose(pose: ArrayLike, name: str = "object_pose") -> Array:
+    """A pose (4, 4), or (k, 4, 4), as an array.
+
+    Raises:
+        InputError: A wrong shape, a number that is not finite, or no rigid motion.
+    """
+    try:
+        array = np.asarray(pose, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected an array of numbers: {error}") from error
+    if array.ndim not in (2, 3) or array.shape[-2:] != (4, 4):
+        raise InputError(f"{name}: found shape {array.shape}, expected (4, 4)")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name}: holds NaN or infinity, expected finite numbers")
+    rotation = array[..., :3, :3]
+    product = rotation @ np.swapaxes(rotation, -1, -2)
+    if not (np.abs(product - np.eye(3)).max() < 1e-6 and (np.linalg.det(rotation) > 0).all()):
+        raise InputError(f"{name}: its first three columns are no rotation")
+    if not (array[..., 3, :] == [0.0, 0.0, 0.0, 1.0]).all():
+        raise InputError(f"{name}: its last row is not 0 0 0 1")
+    return array
+
+
+def one_pose(pose: ArrayLike, name: str = "pose") -> Array:
+    """A single pose (4, 4), see `checked_pose`.
+
+    Raises:
+        InputError: As there, or there are several.
+    """
+    array = checked_pose(pose, name)
+    if array.ndim != 2:
+        raise InputError(f"{name}: found shape {array.shape}, expected (4, 4)")
+    return array
+
+
+def inverse(pose: Array) -> Array:
+    """Of a pose (4, 4)."""
+    back = np.eye(4)
+    back[:3, :3] = pose[:3, :3].T
+    back[:3, 3] = -back[:3, :3] @ pose[:3, 3]
+    return back
+
+
+def moved(arrays: Mapping[str, Array], pose: Array) -> dict[str, Array]:
+    """Points and directions, (..., 3) each, from a frame at a pose into the base frame.
+
+    Args:
+        arrays: "points" are points, everything else is a direction.
+        pose: (4, 4).
+    """
+    turn = pose[:3, :3].T
+    return {
+        name: array @ turn + pose[:3, 3] if name == "points" else array @ turn
+        for name, array in arrays.items()
+    }

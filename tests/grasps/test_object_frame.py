@@ -1,0 +1,98 @@
+"""Grasps in the frame of an object that stands somewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError
+from casadi_ik.files.reading import Frame, frame_matrix
+from casadi_ik.grasps.pose import inverse
+
+turns = st.floats(-3.1, 3.1)
+shifts = st.floats(-2.0, 2.0)
+poses = st.builds(
+    lambda *numbers: frame_matrix(Frame(numbers[:3], numbers[3:])), *[shifts] * 3, *[turns] * 3
+)
+
+ALL_KINDS = ik.Grasp(
+    {
+        "a": ik.Contact([0.1, 0.2, 0.3], [0, 0, 2], ik.Tolerance(1e-3, 0.1), tangent=[1, 0, 0]),
+        "b": ik.Contact([0.0, 0.1, 0.0], [1, 1, 0], line=[0, 1, 1]),
+        "c": ik.Contact([0.3, 0.0, 0.1], plane=[0, 0, 1]),
+        "d": ik.Contact(direction=[0, 1, 0]),
+    },
+    object="cup",
+)
+FINGERS = ("a", "b", "c", "d", "free")
+
+
+def assert_same(one: ik.Grasp, other: ik.Grasp) -> None:
+    arrays = (*one.arrays(FINGERS), *one.more(FINGERS).values())
+    others = (*other.arrays(FINGERS), *other.more(FINGERS).values())
+    for left, right in zip(arrays, others, strict=True):
+        np.testing.assert_allclose(left, right, atol=1e-12)
+
+
+@given(poses)
+def test_points_and_directions_go_with_the_object(pose):
+    placed = ALL_KINDS.at(pose)
+    np.testing.assert_allclose(
+        placed.contacts["a"].point, (pose @ [0.1, 0.2, 0.3, 1.0])[:3], atol=1e-12
+    )
+    for finger, name, given_as in (
+        ("a", "normal", [0, 0, 1]),
+        ("a", "tangent", [1, 0, 0]),
+        ("b", "line", [0, np.sqrt(0.5), np.sqrt(0.5)]),
+        ("c", "plane", [0, 0, 1]),
+        ("d", "normal", [0, 1, 0]),
+    ):
+        vector = getattr(placed.contacts[finger], name)
+        np.testing.assert_allclose(vector, pose[:3, :3] @ given_as, atol=1e-12)
+    assert placed.contacts["a"].tolerance == ik.Tolerance(1e-3, 0.1)
+    assert placed.contacts["c"].normal is None
+    np.testing.assert_allclose(placed.object_pose, pose)
+
+
+@given(poses, poses)
+def test_one_after_the_other_is_their_product(first, then):
+    assert_same(ALL_KINDS.at(first).at(then), ALL_KINDS.at(then @ first))
+
+
+@given(poses)
+def test_back_where_it_was(pose):
+    assert_same(ALL_KINDS.at(pose).at(inverse(pose)), ALL_KINDS)
+    assert_same(ALL_KINDS.at(pose).in_object_frame(), ALL_KINDS)
+
+
+def test_a_grasp_that_knows_its_object_is_taken_along(robot):
+    grasp = ik.load_grasp("cup")
+    there = np.eye(4)
+    there[:3, 3] = [0.02, -0.03, 0.04]
+    assert grasp.object_pose is not None
+    moved = grasp.in_object_frame().at(there @ grasp.object_pose)
+    assert_same(
+        ik.Grasp(dict(zip(FINGERS, moved.contacts.values(), strict=False))),
+        ik.Grasp(dict(zip(FINGERS, grasp.at(there).contacts.values(), strict=False))),
+    )
+    assert ik.Solver(robot).solve(moved).success
+
+
+@pytest.mark.parametrize(
+    ("pose", "says"),
+    [
+        (np.eye(3), r"pose: found shape \(3, 3\), expected \(4, 4\)"),
+        (np.stack([np.eye(4)] * 2), r"pose: found shape \(2, 4, 4\)"),
+        (np.full((4, 4), np.nan), "pose: holds NaN"),
+        (2 * np.eye(4), "pose: .* no rotation"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "pose: .* no rotation"),
+        ("here", "pose: expected an array"),
+        (np.vstack([np.eye(4)[:3], [0.5, 0, 0, 1]]), "pose: .*last row"),
+    ],
+)
+def test_what_is_no_pose(pose, says):
+    with pytest.raises(InputError, match=says):
+        ALL_KINDS.at(pose)
