@@ -24,8 +24,8 @@ PAIRS = (
 PLANAR = ("irb140+barrett_bh8_280", "xarm7+trifinger")
 """Those with the planar fingers that the paper's subproblem is made for."""
 
-FINDING = ("hand-first", "thumb-first", "ipopt", "enhanced-dls", "enhanced-sdls")
-"""The hierarchies of all contacts at once seldom end within tolerance."""
+FINDING = ("hand-first", "thumb-first", "ipopt")
+"""The paper's methods start once, and not every start ends within tolerance."""
 
 
 @pytest.fixture(scope="module", params=PAIRS)

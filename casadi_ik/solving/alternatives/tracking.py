@@ -278,7 +278,8 @@ def _between(problems: Problems, i: int) -> Problems:
             way -= normals * np.sum(normals * way, axis=2, keepdims=True)
             way /= np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-12)
         more[name] = way
-    return replace(problems, points=mixed(problems.points), normals=normals, more=more)
+    points = mixed(problems.points)
+    return replace(problems, points=points, normals=normals, more=more, object_pose=None)
 
 
 def travel_limits(robot: ArmHand, period: float | None, velocity: Any) -> Array | None:

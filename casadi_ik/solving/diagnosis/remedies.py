@@ -70,6 +70,8 @@ class RemedyFinder:
                     name: np.concatenate([problems.more[name] for _, _, problems in freeings])
                     for name in self.problems.more
                 },
+                picked=None,
+                object_pose=None,  # contacts alone are looked at here
             )
             for i, q in self._solutions(asked, self._limits.tiled(len(asked))).items():
                 part, finger, _ = freeings[i]
