@@ -140,6 +140,21 @@ def test_normal_that_faces_away(
             assert np.linalg.norm((n - normals)[rest], axis=1).max() <= np.deg2rad(3)
 
 
+def test_a_grasp_that_says_where_its_object_is(solver: ik.Solver) -> None:
+    """One pose of the object, several targets to be tried."""
+    grasp = ik.load_grasp("cup")
+    away = grasp.contacts["finger_2"]
+    contacts = {**grasp.contacts, "finger_2": ik.Contact(away.point + [0, 0, 0.15], away.normal)}
+    asked = replace(grasp, contacts=contacts)
+    assert asked.object_pose is not None
+    diagnosis = solver.solve(asked).diagnosis
+    assert diagnosis is not None
+    assert ("finger", "finger_2") in {(item.part, item.finger) for item in diagnosis.freed}
+    up = np.eye(4)
+    up[2, 3] = 0.02
+    assert solver.track([grasp, grasp.at(up)], period=0.1).success.all()
+
+
 def test_one_limit_blocks(solver: ik.Solver, robot: ik.ArmHand) -> None:
     """An actuator 5 deg beyond its limit and all others mid-range; brute force finds no other way.
 
