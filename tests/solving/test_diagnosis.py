@@ -143,14 +143,14 @@ def test_normal_that_faces_away(
 def test_a_grasp_that_says_where_its_object_is(solver: ik.Solver) -> None:
     """One pose of the object, several targets to be tried."""
     grasp = ik.load_grasp("cup")
-    away = grasp.contacts["finger_2"]
-    contacts = {**grasp.contacts, "finger_2": ik.Contact(away.point + [0, 0, 0.15], away.normal)}
+    up = np.eye(4)
+    up[2, 3] = 0.15
+    contacts = {**grasp.contacts, "finger_2": grasp.contacts["finger_2"].at(up)}
     asked = replace(grasp, contacts=contacts)
     assert asked.object_pose is not None
     diagnosis = solver.solve(asked).diagnosis
     assert diagnosis is not None
     assert ("finger", "finger_2") in {(item.part, item.finger) for item in diagnosis.freed}
-    up = np.eye(4)
     up[2, 3] = 0.02
     assert solver.track([grasp, grasp.at(up)], period=0.1).success.all()
 
