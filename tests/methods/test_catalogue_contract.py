@@ -48,7 +48,8 @@ def test_verdict_on_targets_near_home(robot, oracle, method):
         with pytest.raises(UnsupportedError, match=rf"'{re.escape(robot.name)}': finger .* planar"):
             ik.Solver(robot, method, compiled=False)
         return
-    solver = ik.Solver(robot, method, compiled=False)
+    options = {"finger_step": "closed-form"} if method.startswith("enhanced") else {}
+    solver = ik.Solver(robot, method, compiled=False, **options)
     batch = solver.solve_batch(points, normals)
     for row, found in enumerate(batch.q):
         position, angle = verdict(oracle, found, points[row], normals[row])
