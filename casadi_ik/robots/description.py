@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -133,6 +134,10 @@ class RobotDescription:
                 f"in its description, one of {', '.join(self.finger_names)}"
             )
         return self.named_thumb
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Its fields alone: what was worked out of them so far is no part of what it is."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @cached_property
     def movable(self) -> tuple[Joint, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 import yaml
@@ -243,3 +245,13 @@ def test_unknown_names_list_the_known(robot):
         robot.description.actuator_index("x")
     with pytest.raises(ik.CasadiIKError, match="no link 'x'"):
         robot.description.chain("x")
+
+
+def test_what_was_worked_out_of_a_description_is_no_part_of_it() -> None:
+    """Else every solver would have kernels of its own."""
+    description = ik.load_robot("kuka_lwr_barrett").description
+    before = pickle.dumps(description)
+    assert description.movable
+    assert description.arm_actuators
+    assert pickle.dumps(description) == before
+    assert pickle.loads(before).actuator_names == description.actuator_names
