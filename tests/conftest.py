@@ -15,10 +15,6 @@ from toy_robots import copy_shipped_robot, write_coupled_robot
 
 import casadi_ik as ik
 
-# The bits of every kernel are the same (tests/kernels/test_compiler_flags.py), and two thirds of
-# the tests' time would be the compiler's. Tests of the kernels compile as users do.
-os.environ.setdefault("CASADI_IK_CFLAGS", "-O1")
-
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")

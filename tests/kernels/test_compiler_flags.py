@@ -1,8 +1,6 @@
-"""How hard the compiler optimises changes no bit, so tests of all else may spare it the work."""
+"""How hard the compiler optimises changes no bit, so long sources may spare it the work."""
 
 from __future__ import annotations
-
-import os
 
 import numpy as np
 import pytest
@@ -34,7 +32,6 @@ def iterates() -> bytes:
 
 
 def test_optimisation_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "CASADI_IK_CFLAGS" not in os.environ
     usual, flags = iterates(), find_compiler()
     assert len(usual) > 10_000
     monkeypatch.setenv("CASADI_IK_CFLAGS", "-O1")

@@ -40,7 +40,7 @@ STEPS = (0.3, 0.1, 0.03, 0.01)
 
 
 @dataclass(frozen=True, eq=False)
-class Freed:
+class FreeAnswers:
     """What was found for k targets.
 
     Attributes:
@@ -82,7 +82,7 @@ class FreeFinder:
         starts: Array,
         seed: int,
         every: bool = False,
-    ) -> Freed:
+    ) -> FreeAnswers:
         """Free answers of k targets.
 
         Args:
@@ -104,7 +104,7 @@ class FreeFinder:
             search.run(q[rows])
             parts.append(search.found())
         reports = tuple(report for part in parts for report in part.reports)
-        return Freed(
+        return FreeAnswers(
             np.concatenate([part.q for part in parts]),
             np.concatenate([part.free for part in parts]),
             reports,
@@ -272,13 +272,13 @@ class _Search:
             if (self.room[rows] <= before + 1e-6).all():
                 return
 
-    def found(self) -> Freed:
+    def found(self) -> FreeAnswers:
         """What it came to."""
         q = np.where(self.free[:, None], self.best, self.nearest)
         reports: list[CollisionReport | None] = [None] * len(q)
         blocked = np.flatnonzero(~self.free)
         if not len(blocked):
-            return Freed(q, self.free, tuple(reports))
+            return FreeAnswers(q, self.free, tuple(reports))
         every = np.concatenate([some for some, _ in self.seen])
         owner = np.concatenate([rows for _, rows in self.seen])
         table = self.around.table
@@ -293,4 +293,4 @@ class _Search:
                 bool(around.only(kept).free(every[mine]).any()) for kept in (own, ~own)
             )
             reports[row] = CollisionReport(pair, -float(clear.room[0]), len(mine), alone, passing)
-        return Freed(q, self.free, tuple(reports))
+        return FreeAnswers(q, self.free, tuple(reports))
