@@ -47,6 +47,9 @@ ARMS, HANDS = shipped_names("arms"), shipped_names("hands")
 TIMES = 10
 """How much more is asked of a third of the pairs."""
 
+DARK = 4.5
+"""Ratio from which on a cell is so dark that its number is white."""
+
 SHOWN = 40
 """Misses listed in the report."""
 
@@ -186,7 +189,7 @@ def _heat_map(found: dict[Pair, dict[str, Any]], path: Path) -> None:
         ratios[i, j] = entry["cells"][f"all fingers/{KINDS[0]}/{finest}"]["ratio"]
         missed = sum(len(cell["missed"]) for cell in entry["cells"].values())
         text = f"{ratios[i, j]:.1f}" + (f"\n{missed} missed" if missed else "")
-        color = "#c0392b" if missed else "black"
+        color = "#c0392b" if missed else "white" if ratios[i, j] > DARK else "black"
         axes.text(j, i, text, ha="center", va="center", fontsize=7, color=color)
     image = axes.imshow(ratios, cmap="YlGnBu", vmin=0, vmax=8, alpha=0.7, aspect="auto")
     axes.set_xticks(range(len(HANDS)), HANDS, rotation=45, ha="right")
