@@ -81,11 +81,7 @@ def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:
         UnknownNameError: No such method.
         UnsupportedError: The method cannot take the robot.
     """
-    tolerance = Tolerance()
-    if arguments.tolerance_position is not None:
-        tolerance = replace(tolerance, position=arguments.tolerance_position)
-    if arguments.tolerance_angle is not None:
-        tolerance = replace(tolerance, angle=arguments.tolerance_angle)
+    tolerance = the_tolerance(arguments)
     method = METHODS[0] if arguments.method is None else arguments.method
     if method not in METHODS:
         raise UnknownNameError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
@@ -94,6 +90,16 @@ def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:
         return Solver(
             robot, method, tolerance, arguments.limits, arguments.finger_step, scene=scene
         )
+
+
+def the_tolerance(arguments: argparse.Namespace) -> Tolerance:
+    """When a contact counts as reached."""
+    tolerance = Tolerance()
+    if arguments.tolerance_position is not None:
+        tolerance = replace(tolerance, position=arguments.tolerance_position)
+    if arguments.tolerance_angle is not None:
+        tolerance = replace(tolerance, angle=arguments.tolerance_angle)
+    return tolerance
 
 
 def the_scene(arguments: argparse.Namespace) -> Scene | None:
