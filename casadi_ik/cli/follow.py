@@ -67,8 +67,6 @@ def follow(arguments: argparse.Namespace) -> Answer:
 def _start(solver: Solver, frames: Frames) -> Array:
     """Where a robot begins of which nobody says where it is."""
     home = solver.robot.home
-    if frames.points is None or frames.normals is None:
-        return home
     first = frames.points[:1], frames.normals[:1]
     if not np.isfinite(first[0]).any():
         return home
@@ -84,7 +82,6 @@ def _followed(
     for first in range(0, len(times), FRAMES_AT_ONCE):
         now = times[first : first + FRAMES_AT_ONCE]
         if frames.keypoints is None:
-            assert frames.points is not None and frames.normals is not None
             both = frames.at(now, frames.points), frames.at(now, frames.normals)
             yield from (follower(*target) for target in zip(*both, strict=True))
             continue

@@ -27,14 +27,14 @@ class Frames:
     Attributes:
         times: (k,) [s], the first 0.
         keypoints: (k, 21, 3) of a person's hand [m]; None: contacts are given.
-        points: (k, f, 3) contact points [m], base frame; None: keypoints are given.
+        points: (k, f, 3) contact points [m], base frame; nothing where keypoints are given.
         normals: (k, f, 3) outward pad normals; NaN where free.
     """
 
     times: Array
     keypoints: Array | None
-    points: Array | None
-    normals: Array | None
+    points: Array
+    normals: Array
 
     @property
     def last(self) -> float:
@@ -99,7 +99,8 @@ def read_frames(path: Path, fingers: int) -> Frames:
             f"{path}: times: expected {len(frames)} growing numbers of seconds, one per frame"
         )
     if key == "keypoints":
-        return Frames(times - times[0], frames, None, None)
+        nothing = np.zeros((len(frames), 0, 3))
+        return Frames(times - times[0], frames, nothing, nothing)
     free = np.full(frames.shape, np.nan) if normals is None else normals
     return Frames(times - times[0], None, frames, free)
 

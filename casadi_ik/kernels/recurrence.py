@@ -1,4 +1,4 @@
-"""A function whose first result is its next first input: ``(state, parameters) -> (state', record)``.
+"""A function whose first result is its next input: ``(state, parameters) -> (state', record)``.
 
 One step at a time in memory made once, or a whole row of steps in one call of compiled code.
 """
@@ -44,9 +44,7 @@ class Recurrence:
         self._slow: BufferedFunction | None = None
         if kernel.compiled:
             self._calls = tuple(
-                SingleCall(
-                    kernel.name, kernel.entry, [here, self.parameters], [there, self.record]
-                )
+                SingleCall(kernel.name, kernel.entry, [here, self.parameters], [there, self.record])
                 for here, there in (self._states, self._states[::-1])
             )
         else:

@@ -14,8 +14,11 @@ from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.problems import Problems, Tolerance
 
-TINY = 1e-12
-"""Squared length of a normal below which it is none."""
+WHOLE, PLACES = "points and normals", "points"
+"""What all fingers are asked for."""
+
+ANY = (1.0, 0.0, 0.0)
+"""A normal that does not count, as a unit vector all the same."""
 
 
 class Asked:
@@ -39,8 +42,9 @@ class Asked:
         tolerances = tuple(plan.questions.tolerances.values())
         self._usual, self._tolerances = contact_weights(tolerances), tolerance_rows(tolerances)
         self._fill(**plan.habits)
+        self._told = self.run.record
         self._points, self._normals = self.views["points"], self.views["normals"]
-        self._whole = False
+        self._mode = ""
 
     def state_at(self, q: Array) -> Array:
         """The state of rest at a posture (n,)."""
@@ -51,8 +55,32 @@ class Asked:
         for name, value in values.items():
             self.views[name][...] = value
 
-    def ask(self, points: Array, normals: Array) -> str:
-        """Ask for points and normals.
+    def ask(self, points: Array, normals: Array | None) -> None:
+        """Ask for points and normals that are all there; `sound` tells if they were not.
+
+        Args:
+            points: (f, 3) [m].
+            normals: (f, 3) of any length; None: all are free.
+        """
+        self._points[...] = points
+        if normals is not None:
+            self._normals[...] = normals
+        mode = WHOLE if normals is not None else PLACES
+        if self._mode != mode:
+            known = np.array([1.0, mode == WHOLE])
+            self._fill(weights=known * self._usual, **self._tolerances)
+            if normals is None:
+                self._normals[...] = ANY
+            self._mode = mode
+
+    @property
+    def sound(self) -> bool:
+        """Whether what was asked in the last step were numbers and directions."""
+        told = self._told[-1]
+        return bool(told - told == 0.0)
+
+    def ask_partly(self, points: Array, normals: Array) -> str:
+        """Ask for points and normals of which some may be free.
 
         Args:
             points: (f, 3) [m]; all NaN where a finger is free.
@@ -61,28 +89,19 @@ class Asked:
         Returns:
             What is wrong with them, "" if nothing is; then nothing is asked.
         """
-        lengths = np.einsum("ij,ij->i", normals, normals)
-        total = float(points.sum() + lengths.sum())
-        if total - total == 0.0 and float(lengths.min()) > TINY:
-            self._points[...] = points
-            np.divide(normals, np.sqrt(lengths)[:, None], out=self._normals)
-            if not self._whole:
-                self._fill(weights=self._usual, **self._tolerances)
-                self._whole = True
-            return ""
         reason = fault(points, normals)
         if reason:
             return reason
-        self._whole = False
-        unit = normals / np.sqrt(lengths)[:, None]
-        known = np.stack([~np.isnan(points[:, 0]), ~np.isnan(unit[:, 0])], axis=1)
-        self._fill(points=np.nan_to_num(points), normals=np.nan_to_num(unit))
+        self._mode = ""
+        known = ~np.isnan(np.stack([points[:, 0], normals[:, 0]], axis=1))
+        facing = np.where(known[:, 1:], normals, ANY)
+        self._fill(points=np.nan_to_num(points), normals=facing)
         self._fill(weights=known * self._usual, **self._tolerances)
         return ""
 
     def ask_problem(self, problem: Problems) -> None:
         """Ask for one target of the graph's kinds, checked before."""
-        self._whole = False
+        self._mode = ""
         rows = contact_rows(self.cycle, problem)
         self._fill(**{name: values[0] for name, values in rows.items()})
         self._fill(**tolerance_rows(problem.tolerances))
@@ -97,10 +116,14 @@ class Asked:
         if "palm_weight" in self.views:
             self._fill(palm_weight=0.0)
 
+    def lead_to(self, posture: Array) -> None:
+        """Where motions lead that the contacts leave free, (n,)."""
+        self._fill(posture=posture)
+
     def ask_nothing(self) -> None:
         """Ask for nothing: the goal stays."""
-        self._whole = False
-        self._fill(weights=0.0)
+        self._mode = ""
+        self._fill(points=0.0, normals=ANY, weights=0.0)
         self.free_palm()
 
 
@@ -132,6 +155,7 @@ def contact_rows(cycle: Cycle, problems: Problems) -> dict[str, Array]:
     values: dict[str, Array] = {
         f"{name}s": np.nan_to_num(problems.vectors(f"{name}s")) for name in cycle.contacts.data
     }
+    values["normals"] = np.where(known[1][..., None], values["normals"], ANY)
     return values | {"weights": np.stack(known, axis=2) * contact_weights(problems.tolerances)}
 
 
@@ -153,6 +177,6 @@ def fault(points: Array, normals: Array) -> str:
         return "there is no contact"
     if (free & faces).any():
         return "a normal has no point"
-    if (np.einsum("ij,ij->i", normals[faces], normals[faces]) <= TINY).any():
+    if not normals[faces].any(axis=1).all():
         return "a normal is zero"
     return ""

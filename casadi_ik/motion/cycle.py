@@ -7,9 +7,9 @@ Where it is to go, the *goal*, is found by a few Gauss-Newton steps of all motor
 within bounds, r and J the contacts' residual (`ContactRows`), every motor in its own unit. They
 begin where the goal before was, so it stays on its branch.
 
-While motors can keep up with the contacts they are *at* the goal: the bounds are what velocities and
-accelerations permit, and the anchor is where the motors' own momentum leads, so motions that the
-contacts leave free are smooth, and near singular postures accelerations stay moderate at the
+While motors can keep up with the contacts they are *at* the goal: the bounds are what velocities
+and accelerations permit, and the anchor is where the motors' own momentum leads. So motions that
+the contacts leave free are smooth, and near singular postures accelerations stay moderate at the
 price of a small error. Errors that this leaves fade over some cycles (`left` is what may still be
 there), since bounds and errors that have to vanish at once would fight each other.
 
@@ -144,6 +144,7 @@ class Cycle:
                 Field("angle_error", (f,), unit="rad"),
                 Field("goal_position_error", (f,), unit="m", doc="of the goal"),
                 Field("goal_angle_error", (f,), unit="rad"),
+                Field("sound", doc="finite if all numbers of the target are, and no normal is 0"),
             )
         )
 
@@ -173,6 +174,12 @@ class Cycle:
     def _symbols(self, *names: str) -> list[ca.SX]:
         return [ca.SX.sym(name, len(self.robot.actuators)) for name in names]
 
+    def _unpacked(self, parameters: ca.SX) -> dict[str, Expr]:
+        """Parameters by name, normals as unit vectors."""
+        p = self.parameters.unpack(parameters)
+        lengths = ca.sqrt(ca.sum2(p["normals"] ** 2))
+        return p | {"normals": p["normals"] / ca.repmat(lengths, 1, 3)}
+
     def _begin(self) -> ca.Function:
         """``(state, parameters) -> (first, low, high, anchor, left)`` of the goal."""
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
@@ -195,7 +202,7 @@ class Cycle:
         goal, low, high, anchor = self._symbols("goal", "low", "high", "anchor")
         left = ca.SX.sym("left", self.state.size - 3 * goal.numel() - 1)
         parameters = self.parameters.symbols("parameters")
-        p = self.parameters.unpack(parameters)
+        p = self._unpacked(parameters)
         after = self._goal(goal, (low, high), anchor, left, p)
         return ca.Function(
             "step", [goal, low, high, anchor, left, parameters], shared(ca.densify(after))
@@ -204,7 +211,7 @@ class Cycle:
     def _end(self) -> ca.Function:
         """``(state, first, goal', low, high, parameters) -> (state', record)``."""
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
-        s, p = self.state.unpack(state), self.parameters.unpack(parameters)
+        s, p = self.state.unpack(state), self._unpacked(parameters)
         there = s["there"] > 0.5
         first, wanted, low, high = self._symbols("first", "wanted", "low", "high")
         goal = share_within(first, wanted, low, high)
@@ -226,6 +233,7 @@ class Cycle:
             "angle_error": own_angle,
             "goal_position_error": position,
             "goal_angle_error": angle,
+            "sound": ca.sum1(after["left"]),
         }
         outputs = shared(self.state.pack(after), self.record.pack(record))
         return ca.Function("end", [state, first, wanted, low, high, parameters], outputs)

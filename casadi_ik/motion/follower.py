@@ -44,10 +44,10 @@ class Follower:
         self._change = plan.rates.steps(plan.period)[1]
         robot = plan.robot
         self._n, self._shape = len(robot.actuators), (len(robot.fingers), 3)
-        self._free = np.full(self._shape, np.nan)
         self._usual = usual(self._shape[0])
         self._tolerances = self._own = tuple(plan.questions.tolerances.values())
         self._all_asked: dict[Kinds, Asked] = {}
+        self._posture = plan.posture
         self._guard = None if plan.check is None else Guard(plan)
         self._asked = self._of(self._usual)
         self.reset(plan.q0)
@@ -58,6 +58,7 @@ class Follower:
         if found is None:
             obstacles = 0 if self._guard is None else OBSTACLES
             found = self._all_asked[kinds] = Asked(self._plan, kinds, obstacles)
+            found.lead_to(self._posture)
         return found
 
     def _take_up(self, kinds: Kinds) -> None:
@@ -84,6 +85,8 @@ class Follower:
     def branch(self, q: ArrayLike) -> None:
         """Change the branch: the motors go to a posture, every one on its own, and follow there.
 
+        Motions that the contacts leave free lead to this posture from now on.
+
         A solution of the contacts of now (`Solver.solve`, `Solver.solve_all`) is what to ask for:
         from another posture the goal moves on to them at once.
 
@@ -93,8 +96,11 @@ class Follower:
         Raises:
             InputError: Wrong shape or numbers.
         """
-        n, state = self._n, self._asked.run.state
-        state[2 * n : 3 * n], state[3 * n] = self._inside(q), 0.0
+        n, state, goal = self._n, self._asked.run.state, self._inside(q)
+        state[2 * n : 3 * n], state[3 * n] = goal, 0.0
+        self._posture = goal
+        for asked in self._all_asked.values():
+            asked.lead_to(goal)
 
     def _inside(self, q: ArrayLike) -> Array:
         return np.clip(self._plan.questions.start(q), *self._plan.bounds)
@@ -124,31 +130,56 @@ class Follower:
             InputError: Wrong shapes or no numbers, a grasp the robot cannot take, a palm's pose
                 that is no rigid motion. Points and normals that are bad numbers are no error.
         """
-        reason = ""
+        self._cycles += 1
+        self._reason = ""
         if isinstance(target, Grasp):
             self._ask_grasp(target, normals)
-        else:
-            points = self._vectors("points", target)
-            facing = self._free if normals is None else self._vectors("normals", normals)
-            if self._asked.cycle.kinds != self._usual:
-                self._take_up(self._usual)
-            self._tolerances = self._own
-            reason = self._asked.ask(points, facing)
+            return self._step(palm, palm_weight)[: self._n].copy()
+        points = self._vectors("points", target)
+        facing = None if normals is None else self._vectors("normals", normals)
+        if self._asked.cycle.kinds != self._usual:
+            self._take_up(self._usual)
+        self._tolerances = self._own
+        self._asked.ask(points, facing)
+        after = self._step(palm, palm_weight)
+        if not self._asked.sound:
+            after = self._step_partly(points, facing, palm, palm_weight)
+        return after[: self._n].copy()
+
+    def _step(self, palm: ArrayLike | None, palm_weight: tuple[float, float]) -> Array:
+        """The state after a step towards what was asked."""
         asked = self._asked
         if palm is not None:
             asked.ask_palm(self._pose(palm), palm_weight)
-        self._reason = reason
-        if reason:
-            asked.ask_nothing()
-            self._go_to_rest(asked)
-        self._cycles += 1
         if self._guard is None:
             after = asked.run.step()
         else:
             after, self._stopped = self._guard.step(asked)
         if palm is not None:
             asked.free_palm()
-        return after[: self._n].copy()
+        return after
+
+    def _step_partly(
+        self,
+        points: Array,
+        normals: Array | None,
+        palm: ArrayLike | None,
+        palm_weight: tuple[float, float],
+    ) -> Array:
+        """The same instead of the last step, with contacts of which some are free or none."""
+        asked = self._asked
+        asked.run.back()
+        free = np.full(self._shape, np.nan)
+        self._reason = asked.ask_partly(points, free if normals is None else normals)
+        if not self._reason:
+            after = self._step(palm, palm_weight)
+            if asked.sound:
+                return after
+            asked.run.back()
+            self._reason = "a number is out of range"
+        asked.ask_nothing()
+        self._go_to_rest(asked)
+        return self._step(None, palm_weight)
 
     def _ask_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
         if normals is not None:
@@ -229,5 +260,3 @@ class Follower:
         slack = most * (1 + TOLERANCE_SLACK)
         # What is free is NaN, and no miss.
         return not ((position > slack[0]) | (angle > slack[1])).any()
-
-

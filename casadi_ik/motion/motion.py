@@ -138,5 +138,7 @@ class Motion:
         positions = np.stack([np.atleast_1d(values) for values in joints.values()], axis=1)
         states = channel("/joint_states", JOINT_STATE)
         for i, stamp in enumerate(stamps.tolist()):
-            state = cdr_message(divmod(stamp, BILLION), root, list(joints), positions[i], none, none)
+            state = cdr_message(
+                divmod(stamp, BILLION), root, list(joints), positions[i], none, none
+            )
             writer.add_message(states, stamp, state, stamp, sequence=i)

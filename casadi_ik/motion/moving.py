@@ -18,7 +18,7 @@ from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.plan import FollowPlan
 from casadi_ik.motion.rates import Rates, rates_of, seconds, unbounded
 from casadi_ik.motion.tracking import Track, track
-from casadi_ik.motion.walker import CYCLES, Walker
+from casadi_ik.motion.walker import Walker
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
@@ -122,13 +122,13 @@ class MovingSolver:
         engine, start = self._engine.kinds_of(problems), self._questions.start(q0)
         _ = engine.finder
         ((kinds, _, _),) = by_kinds(problems.rows(slice(0, 1)))
-        rates, cycle = unbounded(self.robot), 1.0
+        travel = None
         if period is not None:
-            cycle = seconds("period", period) / CYCLES
-            rates = rates_of(self.robot, velocity, rates.acceleration)
-        plan = self._plan(start, self._bounds(problems), cycle, rates, start, math.inf, PATH_PULL)
+            travel = rates_of(self.robot, velocity, None).steps(seconds("period", period))[0]
+        bounds, rates = self._bounds(problems), unbounded(self.robot)
+        walker = Walker(self._plan(start, bounds, 1.0, rates, start, math.inf, PATH_PULL), kinds)
         prefer = "limits" if q0 is None else "q0"
-        return track(engine, problems, start, prefer, Walker(plan, kinds), seed)
+        return track(engine, problems, start, prefer, walker, travel, seed)
 
     def _plan(
         self,

@@ -75,11 +75,7 @@ class Path:
         return sum(not reachable for reachable in self._reachable.values())
 
     def follow(self, start: Array) -> tuple[Array, list[Jump]]:
-        """Configurations (k, n) that begin with `start`, and the jumps between them.
-
-        Where the motors are too slow, the goal that they cannot keep up with goes on all the same,
-        and they run after it.
-        """
+        """Configurations (k, n) that begin with `start`, and the jumps between them."""
         count, n = len(self.problems), self.walker.n
         first = self.walker.at(start)
         states = np.empty((count, len(first)))
@@ -142,11 +138,10 @@ class Path:
                     return direct, None
                 held = goal if held is None else held
                 goal = found[0].q
-        after = self.walker.walk(self.walker.heading(before, goal), row)[0]
-        reached = after[2 * n : 3 * n]
-        if held is None or self._parts(reached - here) <= LEAP:
+        after = self.walker.at(goal)
+        if held is None or self._parts(goal - here) <= LEAP:
             return after, None
-        return after, self._jump(i, here, reached, held)
+        return after, self._jump(i, here, goal, held)
 
     def _in_small_steps(self, i: int, before: Array) -> tuple[Array, Array | None]:
         """Move the contacts from the last grasp to this one bit by bit.

@@ -11,7 +11,6 @@ from casadi_ik.motion.rates import Rates
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.questions import Questions
 
-
 FADING = 0.05
 """Seconds in which an error of the contacts fades."""
 

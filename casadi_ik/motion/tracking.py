@@ -49,7 +49,13 @@ class Track:
 
 
 def track(
-    engine: Engine, problems: Problems, q0: Array, prefer: str, walker: Walker, seed: int
+    engine: Engine,
+    problems: Problems,
+    q0: Array,
+    prefer: str,
+    walker: Walker,
+    travel: Array | None,
+    seed: int,
 ) -> Track:
     """Follow k grasps of the same kinds.
 
@@ -62,6 +68,8 @@ def track(
         q0: (n,) where the robot is.
         prefer: How the solutions of the first grasp are ranked, see `PREFERENCES`.
         walker: Goes along them.
+        travel: (n,) how far every motor may move from one grasp to the next; None: any distance.
+            Where motors are too slow they run after the motion that they cannot keep up with.
         seed: Of the starts of arms without a closed form.
 
     Raises:
@@ -81,6 +89,8 @@ def track(
             break
     assert best is not None
     q, jumps = best
+    if travel is not None:
+        q = _run_after(q, travel)
     verdict = judge(engine.robot, problems, q)
     return Track(
         q=q,
@@ -108,6 +118,17 @@ def _starts(
         return [alternative.q for alternative in found]
     # Not to be solved: the nearest there is.
     return [engine.finder.trials.method.run(first, q0[None], seed, trace=False).q[0]]
+
+
+def _run_after(path: Array, travel: Array) -> Array:
+    """Motors (k, n) that go straight to where the path (k, n) is, as far as they come."""
+    q = path.copy()
+    for i in range(1, len(q)):
+        way = path[i] - q[i - 1]
+        share = np.max(np.abs(way) / travel)
+        if share > 1:
+            q[i] = q[i - 1] + way / share
+    return q
 
 
 def _solved(

@@ -11,13 +11,12 @@ from casadi_ik.motion.plan import FollowPlan
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.problems import Problems
 
-
-CYCLES = 3
+CYCLES = 2
 """Cycles that a target is given: those of a path may be farther apart than those of a stream."""
 
 
 class Walker:
-    """Makes cycles of one graph; the plan's period is that of a cycle.
+    """Makes cycles of one graph, without limits of velocity.
 
     Attributes:
         n: How many motors there are.
@@ -32,12 +31,6 @@ class Walker:
     def at(self, q: Array) -> Array:
         """The state of rest at a posture (n,)."""
         return self._asked.state_at(q)
-
-    def heading(self, state: Array, goal: Array) -> Array:
-        """A state with another goal (n,)."""
-        n, other = self.n, state.copy()
-        other[2 * n : 3 * n], other[3 * n] = goal, 0.0
-        return other
 
     def walk(self, state: Array, problems: Problems) -> Array:
         """Follow targets, `CYCLES` each.

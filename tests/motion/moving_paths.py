@@ -7,7 +7,6 @@ import numpy as np
 import casadi_ik as ik
 from casadi_ik.arrays import Array
 
-
 EASE = 0.5
 """Seconds in which a path comes to its speed."""
 

@@ -41,13 +41,12 @@ def test_what_moves_smoothly_is_followed_within_tolerance(robot, solver, seed):
         states.append(follower.state)
     check_limits(robot, follower, np.array(q))
     statuses = [state.status for state in states]
-    # From rest it takes the motors a while to catch up with what moves already.
-    assert set(statuses[100:]) == {ik.FollowStatus.FOLLOWING}
-    position, angle = robot.errors(np.array(q[101:]), points[100:], normals[100:])
-    assert position.max() <= 1e-3
-    told = np.array([state.position_error for state in states[100:]])
+    assert set(statuses) == {ik.FollowStatus.FOLLOWING}
+    position, angle = robot.errors(np.array(q[1:]), points, normals)
+    assert position.max() <= 2e-3
+    told = np.array([state.position_error for state in states])
     np.testing.assert_allclose(told, position, atol=1e-12)
-    np.testing.assert_allclose([state.angle_error for state in states[100:]], angle, atol=1e-7)
+    np.testing.assert_allclose([state.angle_error for state in states], angle, atol=1e-7)
 
 
 kinds = st.sampled_from(["random", "near", "far", "NaN", "partly", "infinite", "zero", "free"])
@@ -146,7 +145,7 @@ def test_out_of_reach_and_back(robot, solver):
     away = np.concatenate([np.linspace(0, 0.9, 400), np.linspace(0.9, 0, 400), np.zeros(600)])
     q, states = [robot.home], []
     for off in away:
-        q.append(follower(points + [off, 0.0, 0.0], normals))
+        q.append(follower(points + np.array([off, 0.0, 0.0]), normals))
         states.append(follower.state)
     check_limits(robot, follower, np.array(q))
     statuses = [state.status for state in states]
@@ -168,7 +167,7 @@ def test_fingertips_alone_and_a_wrist(robot, solver):
         assert follower.state.status is ik.FollowStatus.FOLLOWING
         assert np.isnan(follower.state.angle_error).all()
         away[weight] = np.linalg.norm(robot.palm(follower.state.q)[:3, 3] - palm[:3, 3])
-    assert away[0.1] < 0.2 * away[0.0]
+    assert away[0.1] < 0.5 * away[0.0]
 
 
 def test_another_branch_when_asked(robot, solver):

@@ -128,7 +128,9 @@ def test_what_is_refused(robot, solver):
         solver.track(moving, velocity=1.0)
     with pytest.raises(InputError, match="period: found -1, expected a number of seconds > 0"):
         solver.track(moving, period=-1)
-    with pytest.raises(InputError, match="velocity: found .*, expected a number > 0, or 14 of them"):
+    with pytest.raises(
+        InputError, match=r"velocity: found .*, expected a number > 0, or 14 of them"
+    ):
         solver.track(moving, period=1.0, velocity=[1.0, 2.0])
     with pytest.raises(UnsupportedError, match="method 'ipopt' gives one solution"):
         ik.Solver(robot, "ipopt").track(moving)
