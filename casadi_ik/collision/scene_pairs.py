@@ -70,6 +70,7 @@ def pair_table(model: CollisionModel, scene: Scene, touched_by: Sequence[str]) -
         tuple(places),
         tuple(items),
         tuple(names),
+        model.moving,
     )
 
 

@@ -32,7 +32,7 @@ from casadi_ik.solving.alternatives.tracking import Tracker
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
-from casadi_ik.solving.freeing import freed
+from casadi_ik.solving.freeing import freed, freed_at_once
 from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.solved_part import SolvedPart, judged
@@ -198,16 +198,20 @@ class Engine:
             verdict = judge_errors(problems, *found.errors)
         if verdict is None:
             return None
-        distance = closest = None
+        q, distance, closest = found.q, None, None
         if (around := self.around(problems)) is not None:
-            clear = around.check(found.q[None])
+            clear = around.check(q[None])
             if not clear.free[0]:
-                return None
+                other = freed_at_once(self, problems, around, q, start)
+                if other is None:
+                    return None
+                q, verdict, clear = other
+                seconds = time.perf_counter() - begin
             distance, closest = float(clear.distance[0]), clear.pair(0)
         return Solution(
             success=True,
             status=Status.SOLVED,
-            q=found.q,
+            q=q,
             iterations=found.iterations,
             restarts=found.restarts,
             time=seconds,
