@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.solved_part import SolvedPart, judged
 from casadi_ik.solving.workers import workers
+from casadi_ik.solving.write_behind import WriteBehind
 
 MANIPULABILITY = "manipulability"
 """The preference that is seen to after the solve."""
@@ -238,10 +239,12 @@ class Engine:
         if recorder is not None and (measures := self.method.trace_format.measures) is not None:
             measures.prepare()
         batches = []
-        for part in self._parts(problems, starts, run):
-            if recorder is not None:
-                part.record(recorder, self.method.trace_format, run.seed)
-            batches.append(part.batch)
+        with WriteBehind() as behind:
+            for part in self._parts(problems, starts, run):
+                if recorder is not None:
+                    form = self.method.trace_format
+                    behind.do(partial(part.record, recorder, form, run.seed))
+                batches.append(part.batch)
         return BatchSolution.joined(batches)
 
     def _parts(self, problems: Problems, starts: Array, run: Run) -> Iterator[SolvedPart]:
