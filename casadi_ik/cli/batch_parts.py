@@ -1,4 +1,4 @@
-"""`casadi-ik batch` in parts: in processes of this machine or on a cluster, taken up after a kill."""
+"""`casadi-ik batch` in parts: here or on a cluster, taken up again after a kill."""
 
 from __future__ import annotations
 
