@@ -28,16 +28,14 @@ from casadi_ik.logs.write.provenance import plain
 PART_SIZE = 20_000
 """Targets of a part unless said: a fraction of a second to a few seconds of one core."""
 
-IN_ONE_FILE = ".npz"
-
 
 def in_parts(arguments: argparse.Namespace) -> bool:
-    """Whether what was asked for is done in parts: whoever asks for one file of one has it so."""
+    """Whether what was asked for is done in parts."""
     return bool(
         arguments.dask is not None
         or arguments.resume
         or arguments.part_size is not None
-        or arguments.out.suffix.lower() != IN_ONE_FILE
+        or arguments.out.is_dir()
         or Path(arguments.targets).is_dir()
         or Path(arguments.targets).suffix.lower() == ".parquet"
     )
@@ -55,7 +53,7 @@ def batch_in_parts(arguments: argparse.Namespace) -> Answer:
     q0, fixed = the_start(arguments, robot), the_fixed(arguments, robot)
     source = source_of(path, robot.fingers, arguments.part_size or PART_SIZE)
     count = source.count
-    one_file = out.suffix.lower() == IN_ONE_FILE
+    one_file = bool(out.suffix) and not out.is_dir()
     if one_file:
         check_outputs([("--out", out)], inputs=[file.path for file in source.files])
     solver = the_solver(arguments, robot)

@@ -178,7 +178,7 @@ def _add_batch(commands: Any) -> None:
         metavar="OUT",
         type=file_name(),
         required=True,
-        help="write the solutions: to OUT.npz, or as parts into a folder",
+        help="write the solutions: to OUT.npz, or in parts into a folder (a name without suffix)",
     )
     parser.add_argument(
         "--dask",
