@@ -29,6 +29,7 @@ from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.free import FreeFinder
 from casadi_ik.solving.alternatives.tracking import Tracker
+from casadi_ik.solving.alternatives.way_out import with_way_out
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
@@ -268,7 +269,9 @@ class Engine:
                 outcome = replace(outcome, q=batch.q, time=batch.time)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
-            return SolvedPart(asked, starts[rows], started, outcome, batch)
+                if around is not None and len(problems) == 1:
+                    batch = with_way_out(self, asked, starts[0], run.seed, batch)
+            return SolvedPart(asked, starts[rows], started, outcome, batch, around)
 
         if diagnose:
             for kinds, _, _ in by_kinds(problems):
