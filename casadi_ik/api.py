@@ -214,6 +214,7 @@ class Solver(ChoosingSolver):
         diagnose: bool = False,
         fixed: Mapping[str, float] | None = None,
         prefer: str | None = None,
+        first_row: int = 0,
     ) -> Generator[SolvedBlock, None, None]:
         """Solve targets that come block by block, in the memory that one block takes.
 
@@ -231,6 +232,7 @@ class Solver(ChoosingSolver):
             diagnose: See there.
             fixed: See there.
             prefer: See there.
+            first_row: Number of the first target, where these are a part of more.
 
         Yields:
             The blocks, solved.
@@ -247,7 +249,7 @@ class Solver(ChoosingSolver):
         with recorder_of(self, log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
             run = Run(q0, seed, jobs, recorder, diagnose)
-            yield from Stream(self._engine, ask, tolerances, run).solve(blocks)
+            yield from Stream(self._engine, ask, tolerances, run).solve(blocks, first_row)
 
     def track(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,6 +29,7 @@ class Table:
         items: Name of the item of every other solid.
         names: (p, 2) what each pair is called: links, or a link and an item.
         moving: Links that an arm may move while its palm stays.
+        margins: (p,) what each pair has to be apart, beyond what its shapes may overlap [m].
     """
 
     radii: Array
@@ -41,6 +42,7 @@ class Table:
     items: tuple[str, ...]
     names: tuple[tuple[str, str], ...]
     moving: frozenset[str] = frozenset()
+    margins: Array = field(default_factory=lambda: np.zeros(0))
 
     def poses(
         self, items: dict[str, Item], moved: str | None = None, to: Array | None = None
@@ -100,17 +102,12 @@ class Table:
     def only(self, rows: NDArray[np.bool_]) -> Table:
         """The same with some of the pairs."""
         names = tuple(name for name, kept in zip(self.names, rows.tolist(), strict=True) if kept)
-        return Table(
-            self.radii,
-            self.halves,
-            np.ascontiguousarray(self.pairs[rows]),
-            self.offsets[rows],
-            self.own,
-            self.solids,
-            self.places,
-            self.items,
-            names,
-            self.moving,
+        return replace(
+            self,
+            pairs=np.ascontiguousarray(self.pairs[rows]),
+            offsets=self.offsets[rows],
+            names=names,
+            margins=self.margins[rows],
         )
 
 

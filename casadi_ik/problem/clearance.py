@@ -104,13 +104,11 @@ class Surroundings:
     def check(self, q: Array) -> Clearances:
         """Clearances of configurations (k, n)."""
         room, pairs = self.kernel.least(q, self.poses, self.table)
-        offsets = np.append(self.table.offsets, 0.0)[pairs]
+        margins = np.append(self.table.margins, self.margin)[pairs]
         unknown = ~np.isfinite(q).all(axis=1)
         room = np.where(unknown, np.nan, room - self.margin)
         free = room >= -ROUNDING
-        return Clearances(
-            room + self.margin + np.maximum(offsets, 0.0), free, pairs, self.table.names, room
-        )
+        return Clearances(room + margins, free, pairs, self.table.names, room)
 
     def free(self, q: Array) -> NDArray[np.bool_]:
         """(k,) whether configurations (k, n) are free; quicker than `check`."""
