@@ -17,6 +17,7 @@ from casadi_ik.motion.tracking import Track
 from casadi_ik.problem.collision_report import CollisionReport
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
+from casadi_ik.problem.ranking import Choice, Ranking
 from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trajectory import Trajectory
@@ -30,6 +31,7 @@ __all__ = [
     "ArmHand",
     "BatchSolution",
     "CasadiIKError",
+    "Choice",
     "CollisionReport",
     "Contact",
     "ContactVerdict",
@@ -40,6 +42,7 @@ __all__ = [
     "Grasp",
     "Jump",
     "Phase",
+    "Ranking",
     "Reason",
     "Scene",
     "ScrewControl",

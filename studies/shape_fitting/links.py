@@ -53,6 +53,8 @@ def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, Surface
         print(f"  joints not found in {file.name}: {missing}")
     parents = {joint.name: joint for joint in part.joints}
     holder = {matched[name].child: parents[name].child for name in matched}
+    for name, joint in matched.items():  # what hangs on a joint that moves there and not here
+        holder.setdefault(joint.parent, parents[name].parent)
     # The root's own body: all that is fixed to what the first joints hang on.
     first = next(j for j in part.joints if j.name in matched)
     body = rigid(tree, matched[first.name].parent)
