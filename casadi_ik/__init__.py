@@ -13,6 +13,7 @@ from casadi_ik.methods.screw_control.objectives import ScrewTask
 from casadi_ik.problem.collision_report import CollisionReport
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
+from casadi_ik.problem.ranking import Choice, Ranking
 from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trajectory import Trajectory
@@ -27,6 +28,7 @@ __all__ = [
     "ArmHand",
     "BatchSolution",
     "CasadiIKError",
+    "Choice",
     "CollisionReport",
     "Contact",
     "ContactVerdict",
@@ -34,6 +36,7 @@ __all__ = [
     "Grasp",
     "Jump",
     "Phase",
+    "Ranking",
     "Reason",
     "Scene",
     "ScrewControl",

@@ -22,15 +22,15 @@ from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
 from casadi_ik.problem.solution import BatchSolution, Solution
-from casadi_ik.solving.alternatives.finder import APART, Alternative
 from casadi_ik.solving.alternatives.tracking import Track, travel_limits
+from casadi_ik.solving.choosing_solver import ChoosingSolver
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.stream import SolvedBlock, Stream
 
 
-class Solver:
+class Solver(ChoosingSolver):
     """A method on a robot, with a tolerance; build it once and use it for every grasp.
 
     Attributes:
@@ -214,6 +214,7 @@ class Solver:
         diagnose: bool = False,
         fixed: Mapping[str, float] | None = None,
         prefer: str | None = None,
+        first_row: int = 0,
     ) -> Generator[SolvedBlock, None, None]:
         """Solve targets that come block by block, in the memory that one block takes.
 
@@ -231,6 +232,7 @@ class Solver:
             diagnose: See there.
             fixed: See there.
             prefer: See there.
+            first_row: Number of the first target, where these are a part of more.
 
         Yields:
             The blocks, solved.
@@ -247,46 +249,7 @@ class Solver:
         with recorder_of(self, log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
             run = Run(q0, seed, jobs, recorder, diagnose)
-            yield from Stream(self._engine, ask, tolerances, run).solve(blocks)
-
-    def solve_all(
-        self,
-        grasp: Grasp,
-        limit: int = 16,
-        prefer: str = "limits",
-        q0: ArrayLike | None = None,
-        seed: int = 0,
-        fixed: Mapping[str, float] | None = None,
-        apart: float = APART,
-    ) -> tuple[Alternative, ...]:
-        """Find different solutions of one grasp, best first.
-
-        For every hand posture that meets the contacts: of an arm in closed form every branch
-        (signs of shoulder, elbow and wrist) with the intervals of its freedom, see `ArmBranch`,
-        and the preferred arm of each; of another arm the different configurations that many
-        starts lead to. Of two alike, one.
-
-        Args:
-            grasp: A contact per finger; its fingers must be the robot's.
-            limit: How many at most.
-            prefer: What comes first: "limits" (far from its limits), "manipulability" (of the
-                arm), "clearance", or "q0" (close to it).
-            q0: (n,) where the robot is [rad or m]; None is `robot.home`.
-            seed: As for `solve`.
-            fixed: As for `solve`.
-            apart: How different they are: of any two, at least one actuator differs by this part
-                of its range, 0 to 1. 0: all that are found.
-
-        Returns:
-            The solutions; none if the grasp cannot be solved (`solve` says why).
-
-        Raises:
-            InputError: Bad limit, preference, distance or q0, or a grasp the robot cannot take.
-        """
-        problems = self._questions.of_grasps([grasp], fixed)
-        finder = self._engine.kinds_of(problems).finder
-        start, around = self._questions.start(q0), self._engine.around(problems)
-        return finder.find(problems, start, seed, limit, prefer, apart, around)
+            yield from Stream(self._engine, ask, tolerances, run).solve(blocks, first_row)
 
     def track(
         self,

@@ -78,6 +78,7 @@ def pair_table(model: CollisionModel, scene: Scene, touched_by: Sequence[str]) -
         tuple(items),
         tuple(names),
         margins=np.array(margins, dtype=float),
+        moving=model.moving,
     )
 
 

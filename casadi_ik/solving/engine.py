@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -33,11 +33,12 @@ from casadi_ik.solving.alternatives.way_out import with_way_out
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
-from casadi_ik.solving.freeing import freed
+from casadi_ik.solving.freeing import freed, freed_at_once
 from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.solved_part import SolvedPart, judged
 from casadi_ik.solving.workers import workers
+from casadi_ik.solving.write_behind import WriteBehind
 
 MANIPULABILITY = "manipulability"
 """The preference that is seen to after the solve."""
@@ -199,16 +200,20 @@ class Engine:
             verdict = judge_errors(problems, *found.errors)
         if verdict is None:
             return None
-        distance = closest = None
+        q, distance, closest = found.q, None, None
         if (around := self.around(problems)) is not None:
-            clear = around.check(found.q[None])
+            clear = around.check(q[None])
             if not clear.free[0]:
-                return None
+                other = freed_at_once(self, problems, around, q, start)
+                if other is None:
+                    return None
+                q, verdict, clear = other
+                seconds = time.perf_counter() - begin
             distance, closest = float(clear.distance[0]), clear.pair(0)
         return Solution(
             success=True,
             status=Status.SOLVED,
-            q=found.q,
+            q=q,
             iterations=found.iterations,
             restarts=found.restarts,
             time=seconds,
@@ -239,10 +244,12 @@ class Engine:
         if recorder is not None and (measures := self.method.trace_format.measures) is not None:
             measures.prepare()
         batches = []
-        for part in self._parts(problems, starts, run):
-            if recorder is not None:
-                part.record(recorder, self.method.trace_format, run.seed)
-            batches.append(part.batch)
+        with WriteBehind() as behind:
+            for part in self._parts(problems, starts, run):
+                if recorder is not None:
+                    form = self.method.trace_format
+                    behind.do(partial(part.record, recorder, form, run.seed))
+                batches.append(part.batch)
         return BatchSolution.joined(batches)
 
     def _parts(self, problems: Problems, starts: Array, run: Run) -> Iterator[SolvedPart]:
