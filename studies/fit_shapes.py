@@ -17,8 +17,10 @@ from shape_fitting.writing import write
 
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
+from casadi_ik.importing.capsules import LEAST_SAVING
 from casadi_ik.importing.fitted import MOST, fitted, worst
 from casadi_ik.importing.posture import Postures
+from casadi_ik.importing.surfaces import together
 from casadi_ik.importing.touching import may_touch
 from casadi_ik.robots.described_parts import arm_part, hand_part
 from casadi_ik.robots.schema import ArmFile, HandFile
@@ -32,6 +34,10 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     parser.add_argument("--names", default="")
     parser.add_argument("--most", type=int, default=MOST)
+    parser.add_argument("--saving", type=float, default=LEAST_SAVING)
+    parser.add_argument(
+        "--apart", nargs="*", default=[], help="our links that hold several of the file: each alone"
+    )
     parser.add_argument("--without", nargs="*", default=[], help="links of the file to leave out")
     given = parser.parse_args()
     path = resolve(given.name, given.kind)
@@ -39,14 +45,19 @@ def main() -> None:
         part: Any = arm_part(read(path, ArmFile)[0], path)
     else:
         part = hand_part(read(path, HandFile)[0], path)
-    surfaces = in_our_links(part, given.file, set(given.without))
+    parts = in_our_links(part, given.file, set(given.without))
+    surfaces = {link: whole for link, some in parts.items() if (whole := together(some))}
     flat = {part.root} if given.kind == "hands" else set()
-    shapes = fitted(surfaces, flat, most=given.most)
+    shapes = fitted(surfaces, flat, most=given.most, saving=given.saving)
+    for link in given.apart:
+        named = {str(i): one for i, one in enumerate(parts[link])}
+        each = fitted(named, named)
+        shapes[link] = [shape for found in each.values() for shape in found]
     touching = may_touch(part, shapes, surfaces)
     write(path, shapes, touching, given.names or given.file.name)
     count = sum(map(len, shapes.values()))
     for link, found in shapes.items():
-        print(f"  {link}: {len(found)}, {1e3 * found[0].excess:.0f} mm")
+        print(f"  {link}: {len(found)}, {1e3 * worst({link: found}):.0f} mm")
     print(
         f"{given.name}: {len(shapes)} links, {count} shapes, at most {1e3 * worst(shapes):.0f} mm"
     )

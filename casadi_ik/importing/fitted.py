@@ -10,7 +10,7 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.importing.boxes import FittedBox, fit_boxes
-from casadi_ik.importing.capsules import FittedCapsule, cut, excess, fit
+from casadi_ik.importing.capsules import LEAST_SAVING, FittedCapsule, cut, excess, fit
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.robots.collision import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
 
@@ -35,6 +35,7 @@ def fitted(
     flat: Collection[str],
     known: Mapping[str, Sequence[ShapeEntry]] | None = None,
     most: int = MOST,
+    saving: float = LEAST_SAVING,
 ) -> dict[str, list[ShapeEntry]]:
     """Shapes that hold links.
 
@@ -43,6 +44,7 @@ def fitted(
         flat: Links that may be held by boxes: a palm, which fingers come near.
         known: By link shapes that are simple already; they stay what they are.
         most: Capsules of a large link, at the most.
+        saving: Part of the volume that another one has to save.
     """
     found: dict[str, list[ShapeEntry]] = {}
     for link, surface in surfaces.items():
@@ -51,13 +53,13 @@ def fitted(
         elif len(surface.triangles) and float(np.ptp(surface.points, axis=0).max()) > LEAST:
             large = float(np.ptp(surface.points, axis=0).max()) > LARGE
             triangles = surface.points[surface.triangles]
-            found[link] = _held(triangles, most if large else SMALL, link in flat)
+            found[link] = _held(triangles, most if large else SMALL, link in flat, saving)
     return found
 
 
-def _held(triangles: Array, most: int, flat: bool) -> list[ShapeEntry]:
+def _held(triangles: Array, most: int, flat: bool, saving: float) -> list[ShapeEntry]:
     """Capsules that hold a mesh, or boxes where it may be flat and they hold it closer."""
-    capsules, beyond = fit(triangles, most)
+    capsules, beyond = fit(triangles, most, saving)
     boxes = fit_boxes(triangles) if flat else []
     if boxes:
         closer = excess(boxes, cut(triangles).reshape(-1, 3))

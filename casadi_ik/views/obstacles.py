@@ -26,7 +26,7 @@ SCENE_COLOR = "#b9c0c7"
 PLATE = 0.6
 """Half the edge of what is drawn of a half-space, about the robot [m]."""
 
-ROD = 0.004
+ROD = 0.003
 """Radius of the rod between the nearest points, and half that of the balls at them [m]."""
 
 SKIN = 0.001
@@ -56,22 +56,21 @@ def scene_solids(scene: Scene, about: Array, without: str) -> list[Solid]:
 
 
 def nearest_pair(
-    robot: ArmHand, q: ArrayLike, scene: Scene, pair: tuple[str, str], shapes: bool
-) -> list[Solid]:
-    """A rod between the nearest points of a pair, and their shapes if wanted.
+    robot: ArmHand, q: ArrayLike, scene: Scene, pair: tuple[str, str]
+) -> tuple[list[Solid], list[Solid]]:
+    """A rod between the nearest points of a pair, and the two shapes that they are on.
 
     Args:
         robot: With shapes.
         q: (n,) actuator positions [rad or m].
         scene: With what is grasped.
         pair: Two links, or a link and an item of the scene.
-        shapes: Whether the two shapes that are nearest are wanted.
     """
     links = robot.links(np.asarray(q, dtype=float))
     first, second = pair
     mine = _capsules(robot, first)
     if not mine:
-        return []
+        return [], []
     theirs, solids = _capsules(robot, second), [one for one in _solids(scene) if one[0] == second]
     capsules = [*mine, *theirs]
     where = np.concatenate([_segment(one, links[one.link]) for one in capsules])
@@ -91,21 +90,22 @@ def nearest_pair(
     poses = [np.append(pose[:3, :3].ravel(), pose[:3, 3]) for _, _, pose in solids]
     found = nearest(where[None], np.array(poses).reshape(-1, 12), table)
     if not len(pairs):
-        return []
+        return [], []
     which = int(found.distance[0].argmin())
     i, j = pairs[which].tolist()
     one, way = where[6 * i : 6 * i + 6], found.way[0, which]
     start = one[:3] + found.first[0, which] * one[3:] - table.radii[i] * way
     end = start - float(found.distance[0, which]) * way
-    drawn = [_tube(one, float(table.radii[i]))] if shapes else []
-    if shapes and j < len(capsules):
-        drawn.append(_tube(where[6 * j : 6 * j + 6], float(table.radii[j])))
-    elif shapes:
+    shapes = [_tube(one, float(table.radii[i]))]
+    if j < len(capsules):
+        shapes.append(_tube(where[6 * j : 6 * j + 6], float(table.radii[j])))
+    else:
         _, solid, pose = solids[j - len(capsules)]
         if solid.kind is not Kind.HALF_SPACE:
-            drawn.append(_mesh(solid, pose, end))
+            shapes.append(_mesh(solid, pose, end))
     marks = [capsule(start, end, ROD), *(capsule(p, p, 2 * ROD) for p in (start, end))]
-    return [(mesh, NEAREST_COLOR) for mesh in (*drawn, *marks)]
+    rod, held = ([(mesh, NEAREST_COLOR) for mesh in some] for some in (marks, shapes))
+    return rod, held
 
 
 def _solids(scene: Scene) -> Iterator[tuple[str, CollisionSolid, Array]]:

@@ -49,11 +49,11 @@ CLOSE = (0.40, 0.06, 0.60, 0.82)
 WINDOW = (1200, 900)
 """Of `show` [pixels]."""
 
-OBJECT, GHOST, WRIST, SCENE, NEAREST = 0.5, 0.45, 0.3, 0.45, 0.8
+OBJECT, GHOST, WRIST, SCENE, TOUCHING = 0.5, 0.45, 0.3, 0.45, 0.35
 """Opacity of the object, of contacts that something hides, of the arm in the close-up, of what
-stands about, and of what is nearest to touching."""
+stands about, and of what touches."""
 
-AROUND = ("scene", "nearest")
+AROUND = ("scene", "nearest", "touching")
 """Groups that there are where a scene is drawn."""
 
 WRIST_LENGTH = 0.10
@@ -120,7 +120,7 @@ def draw_solution(
         stage.aim(view, _points(solids["hand"], near), pixels, (0.17, 0.02))
         # The arm is pale: it may stand in the way.
         image = over(1.0, stage.shoot("wrist"), WRIST * _inwards(pixels))
-        image = over(image, stage.shoot("hand", "object", "marks", "nearest"))
+        image = over(image, stage.shoot("hand", "object", "marks", "nearest", "touching"))
         axes = _panel(figure, CLOSE, over(image, stage.shoot("marks", "nearest"), GHOST))
         seen = stage.project(robot.contacts(solution.q)[0])
     label_fingers(axes, dict(zip(robot.fingers, seen, strict=True)), solution, grasp)
@@ -249,10 +249,11 @@ def _around(stage: Stage, robot: ArmHand, solution: Solution, grasp: Grasp, scen
     whole = in_scene(scene, grasp)
     about = robot.links(solution.q)[robot.description.root][:3, 3]
     stage.add("scene", scene_solids(whole, about, grasp.object), SCENE)
-    pair, near = solution.closest, []
+    pair = solution.closest
     if pair is not None and np.isfinite(solution.q).all():
-        near = nearest_pair(robot, solution.q, whole, pair, not solution.success)
-    stage.add("nearest", near, NEAREST)
+        rod, shapes = nearest_pair(robot, solution.q, whole, pair)
+        stage.add("nearest", rod)
+        stage.add("touching", [] if solution.success else shapes, TOUCHING)
 
 
 def _object(grasp: Grasp) -> list[Solid]:

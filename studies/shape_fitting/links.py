@@ -29,8 +29,8 @@ class Axis:
     way: Array
 
 
-def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, Surface]:
-    """The file's shapes by our link, in its frame."""
+def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, list[Surface]]:
+    """The shapes of the file's links by our link, in its frame."""
     tree = read_tree(file)
     theirs = tree_poses(tree)
     ours = Postures(part).poses({})
@@ -79,14 +79,7 @@ def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, Surface
         pose = np.linalg.inv(ours[holder[link]]) @ base @ theirs[link]
         if len(surface.triangles):
             parts.setdefault(holder[link], []).append(surface.moved(pose))
-    joined = {}
-    for link in ours:
-        if link in parts:
-            points = [one.points for one in parts[link]]
-            starts = np.cumsum([0, *(len(one) for one in points[:-1])])
-            triangles = [one.triangles + n for one, n in zip(parts[link], starts, strict=True)]
-            joined[link] = Surface(np.concatenate(points), np.concatenate(triangles))
-    return joined
+    return {link: parts[link] for link in ours if link in parts}
 
 
 def rigid(tree: RobotTree, link: str) -> set[str]:
