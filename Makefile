@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 OUT := out/demo
-SOLVE := $(BIN)/casadi-ik solve cup --log $(OUT)/cup.mcap --out $(OUT)/cup.json
+SOLVE := $(BIN)/casadi-ik solve cup --scene table --log $(OUT)/cup.mcap --out $(OUT)/cup.json
 PAPER := $(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup_paper.mcap
 
 .PHONY: help demo test lint bench notebooks clean

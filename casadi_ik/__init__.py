@@ -10,15 +10,19 @@ from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
 from casadi_ik.methods.registry import METHODS, register_method
 from casadi_ik.methods.screw_control.objectives import ScrewTask
+from casadi_ik.motion.follower import Follower
+from casadi_ik.motion.following import FollowState, FollowStatus
+from casadi_ik.motion.path import Jump
+from casadi_ik.motion.tracking import Track
 from casadi_ik.problem.collision_report import CollisionReport
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
+from casadi_ik.problem.ranking import Choice, Ranking
 from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trajectory import Trajectory
 from casadi_ik.solving.alternatives.branches import ArmBranch
 from casadi_ik.solving.alternatives.finder import Alternative
-from casadi_ik.solving.alternatives.tracking import Jump, Track
 
 __all__ = [
     "METHODS",
@@ -27,13 +31,18 @@ __all__ = [
     "ArmHand",
     "BatchSolution",
     "CasadiIKError",
+    "Choice",
     "CollisionReport",
     "Contact",
     "ContactVerdict",
     "Diagnosis",
+    "FollowState",
+    "FollowStatus",
+    "Follower",
     "Grasp",
     "Jump",
     "Phase",
+    "Ranking",
     "Reason",
     "Scene",
     "ScrewControl",

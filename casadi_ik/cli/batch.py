@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-
+from casadi_ik.batches.columns import columns
+from casadi_ik.batches.target_file import TargetFile
 from casadi_ik.cli.answer import Answer, Exit
+from casadi_ik.cli.batch_parts import batch_in_parts, in_parts
+from casadi_ik.cli.batch_progress import progress
 from casadi_ik.cli.batch_totals import BatchTotals
 from casadi_ik.cli.outputs import check_outputs
 from casadi_ik.cli.question import (
@@ -24,8 +23,7 @@ from casadi_ik.cli.question import (
 )
 from casadi_ik.cli.report import batch_report
 from casadi_ik.cli.say import say
-from casadi_ik.cli.solution_file import columns, growing_npz
-from casadi_ik.cli.target_file import TargetFile
+from casadi_ik.cli.solution_file import growing_npz
 from casadi_ik.grasps.pose import moved
 
 BLOCK = 4096
@@ -70,6 +68,8 @@ def batch(arguments: argparse.Namespace) -> Answer:
         CasadiIKError: Bad input, or an output that cannot be written.
         KeyboardInterrupt: Ctrl-C; what was finished by then is written.
     """
+    if in_parts(arguments):
+        return batch_in_parts(arguments)
     path = Path(arguments.targets)
     robot = the_robot(arguments.robot)
     q0 = the_start(arguments, robot)
@@ -93,11 +93,13 @@ def batch(arguments: argparse.Namespace) -> Answer:
         arguments.prefer,
     )
     totals = BatchTotals()
-    with growing_npz(arguments.out, "--out") as npz, closing(blocks), _progress(count) as show:
+    with growing_npz(arguments.out, "--out") as npz, closing(blocks), progress(count) as show:
         try:
             for block in blocks:
-                npz.append(columns(block.solution))
-                totals.add(block)
+                arrays = columns(block.solution)
+                npz.append(arrays)
+                totals.add(arrays, block.first_row)
+                totals.note_faults(block.faults)
                 show(len(block.solution))
                 pace.end()
         except KeyboardInterrupt:
@@ -115,13 +117,3 @@ def _say_faults(path: str, totals: BatchTotals) -> None:
         say("bad row", f"{path}: {fault}")
     if totals.faults:
         say("bad rows", f"{path}: {totals.faults} of {totals.count}; their status is INVALID")
-
-
-@contextmanager
-def _progress(count: int) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr where that is a terminal; calling what it yields moves it on."""
-    console = Console(file=sys.stderr)
-    parts = BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*parts, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=count)
-        yield lambda solved: bar.advance(task, solved)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-
-from casadi_ik.solving.stream import SolvedBlock
 
 ROWS_SHOWN = 12
 """How many unsolved rows are kept by number."""
@@ -47,22 +46,32 @@ class BatchTotals:
     first_faults: list[str] = field(default_factory=list)
     _times: list[np.ndarray] = field(default_factory=list)
 
-    def add(self, block: SolvedBlock) -> None:
-        """Count a block in."""
-        batch = block.solution
-        self.count += len(batch)
-        self.solved += int(batch.success.sum())
-        self.statuses.update(batch.status_names.tolist())
-        self.reasons.update(found.reason.name for found in batch.diagnoses if found is not None)
-        self.iterations += int(batch.iterations.sum())
-        self.most_iterations = max(self.most_iterations, int(batch.iterations.max()))
-        self.restarts += int(batch.restarts.sum())
-        self.most_restarts = max(self.most_restarts, int(batch.restarts.max()))
-        rows = block.first_row + np.flatnonzero(~batch.success)
+    def add(self, arrays: Mapping[str, np.ndarray], first_row: int) -> None:
+        """Count answers in.
+
+        Args:
+            arrays: Those of `batches.columns`.
+            first_row: Number of the first target.
+        """
+        count, success = len(arrays["status"]), arrays["success"]
+        self.count += count
+        self.solved += int(success.sum())
+        self.statuses.update(arrays["status"].tolist())
+        reasons = arrays.get("reason", np.zeros(0, "<U1"))
+        self.reasons.update(reasons[reasons != ""].tolist())
+        for name in ("iterations", "restarts"):
+            values, most = arrays[name], f"most_{name}"
+            setattr(self, name, getattr(self, name) + int(values.sum()))
+            setattr(self, most, max(getattr(self, most), int(values.max())))
+        rows = first_row + np.flatnonzero(~success)
         self.missed += rows[: ROWS_SHOWN - len(self.missed)].tolist()
-        self.faults += len(block.faults)
-        self.first_faults += list(block.faults.values())[: FAULTS_SHOWN - len(self.first_faults)]
-        self._times.append(batch.time.astype(np.float32))
+        self._times.append(arrays["time"].astype(np.float32))
+
+    def note_faults(self, faults: Mapping[int, str]) -> None:
+        """Take note of malformed targets, what is wrong by number."""
+        self.faults += len(faults)
+        texts = [text for _, text in sorted(faults.items())]
+        self.first_faults += texts[: FAULTS_SHOWN - len(self.first_faults)]
 
     @property
     def times(self) -> np.ndarray:

@@ -52,6 +52,9 @@ def add_import(commands: Any) -> None:
         help="the hand's base on the tip: x y z [m] roll pitch yaw [rad] (default: on it)",
     )
     parser.add_argument(
+        "--srdf", metavar="FILE.srdf", help="links that may touch, beside those that are found to"
+    )
+    parser.add_argument(
         "--picture",
         metavar="FILE.png",
         type=file_name(".png"),

@@ -20,6 +20,7 @@ from casadi_ik.cli.say import PROGRAM
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.importing import imported
 from casadi_ik.importing.check import largest_difference
+from casadi_ik.importing.fitted import worst
 from casadi_ik.importing.imported import Imported
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.robots.part import PREFIX
@@ -32,6 +33,9 @@ SEARCHED = (
     "  the arm has no known closed form: it is searched, and a solve takes several times as long"
 )
 """Said of an arm whose axes are those of no family."""
+
+SHAPELESS = "  the files have no shapes of links: a scene needs `collision:` in the description"
+"""Said where there is nothing to be fitted."""
 
 SAME = 1e-9
 """Poses that differ by no more [m, or in their axes] are the same."""
@@ -50,8 +54,9 @@ def import_robot(arguments: argparse.Namespace) -> Answer:
         return _drawn_again(first, arguments)
     if out is None:
         raise InputError("--out: missing, expected the name of the description to be written")
+    srdf = arguments.srdf and Path(arguments.srdf)
     outputs = {"--out": out, "--picture": picture}
-    check_outputs(outputs.items(), inputs=[one for one in (arm, hand) if one])
+    check_outputs(outputs.items(), inputs=[one for one in (arm, hand, srdf) if one])
     draw = _drawing() if picture is not None else None
     found = imported.import_robot(
         arm,
@@ -70,6 +75,8 @@ def import_robot(arguments: argparse.Namespace) -> Answer:
         nonlocal found
         part.write_text(found.written.text(), encoding="utf-8")
         found = found.at_home(part)
+        part.write_text(found.written.text(), encoding="utf-8")
+        found = found.with_shapes(part, srdf)
         part.write_text(found.written.text(), encoding="utf-8")
         robots.append(imported.loaded(part))
         if arguments.check:
@@ -104,6 +111,8 @@ def _command(arguments: argparse.Namespace) -> str:
     for option in ("tip", "palm"):
         if getattr(arguments, option) is not None:
             words += [f"--{option}", getattr(arguments, option)]
+    if arguments.srdf is not None:
+        words += ["--srdf", arguments.srdf]
     if arguments.mount is not None:
         words += ["--mount", *(f"{value:g}" for value in _mount(arguments) or ())]
     return shlex.join(words)
@@ -168,6 +177,12 @@ def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> l
     for name, value in differences.items():
         verdict = "as its own library has it" if value <= SAME else "NOT as its own library has it"
         pairs[f"check {name}"] = f"{verdict}: poses differ by at most {value:.1e}"
+    if lines.shapes:
+        count = sum(map(len, lines.shapes.values()))
+        pairs["shapes"] = (
+            f"{count} on {len(lines.shapes)} links, at most {1e3 * worst(lines.shapes):.0f} mm "
+            f"beyond their meshes; {len(lines.touching)} pairs may touch"
+        )
     rows = table("finger", "pad on link", "joints", "point [mm]", "normal", right=("joints",))
     for branch, pad in zip(found.branches, found.pads, strict=True):
         # What is rounded to -0.0 is zero.
@@ -177,5 +192,7 @@ def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> l
     notes: list[RenderableType] = [Text(f"  {note}", "yellow") for note in lines.notes]
     if is_searched(description):
         notes.append(Text(SEARCHED, "yellow"))
+    if not lines.shapes:
+        notes.append(Text(SHAPELESS, "yellow"))
     guessed = Text("  pads, thumb, palm and home are guesses: see the lines marked GUESS", "yellow")
     return [headline(True, "IMPORTED", what), fields(pairs), rows, *notes, guessed]

@@ -235,6 +235,8 @@ def _origin(about: logs.LogInfo) -> dict[str, str]:
         "machine": _flat(metadata.get("machine", {})),
         "versions": " ".join(f"{name} {value}" for name, value in packages.items()),
     }
+    if "scene" not in metadata.get("parameters", {}):
+        pairs["collision"] = "not checked"
     for name, value in metadata.get("parameters", {}).items():
         pairs[name.replace("_", " ")] = _flat(value)
     for key, values in about.differs.items():

@@ -8,7 +8,9 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from casadi_ik.cli.calibrate_parser import add_calibrate
+from casadi_ik.cli.choose_parser import add_choose
 from casadi_ik.cli.export_parser import add_export
+from casadi_ik.cli.follow_parser import add_follow
 from casadi_ik.cli.import_parser import add_import
 from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.say import PROGRAM
@@ -71,6 +73,9 @@ and with --scene:
 and with --diagnose, where a target is not solved (else "" and NaN):
   reason (k,), nearest_q (k, n) closest to the contacts, enough_position (k,) [m] and
   enough_angle (k,) [rad]: the tolerances with which it would be solved
+A Parquet file has a row per target: columns FINGER_x, _y, _z, _nx, _ny, _nz for every finger.
+In parts (--dask, --resume, --part-size, or files that are no npz) the finished ones stand in OUT,
+or beside OUT.npz until all are there; a kill costs those being solved, --resume does the rest.
 A row that is no target (partly NaN, infinite, a zero normal) gets the status INVALID and NaN; it
 is named on stderr and does not stop the rest.
 
@@ -107,6 +112,8 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True, title="commands")
     _add_solve(commands)
     _add_batch(commands)
+    add_follow(commands)
+    add_choose(commands)
     add_import(commands)
     add_export(commands)
     add_calibrate(commands)
@@ -156,14 +163,40 @@ def _add_batch(commands: Any) -> None:
         description="Find the position of every motor for many targets.",
         epilog=_BATCH_EXAMPLES,
     )
-    parser.add_argument("targets", metavar="TARGETS.npz", help="points and normals, see below")
+    parser.add_argument(
+        "targets",
+        metavar="TARGETS",
+        help="points and normals in an npz or Parquet file, or a folder of such files, see below",
+    )
     parser.add_argument("--robot", metavar="R", required=True, help="a shipped name or a YAML file")
     _add_solver_options(parser)
     parser.add_argument(
-        "--jobs", metavar="N", type=whole(1), default=1, help="threads (default: 1)"
+        "--jobs",
+        metavar="N",
+        type=whole(1),
+        default=1,
+        help="threads, or in parts processes (default: 1)",
     )
     parser.add_argument(
-        "--out", metavar="OUT.npz", type=file_name(), required=True, help="write the solutions"
+        "--out",
+        metavar="OUT",
+        type=file_name(),
+        required=True,
+        help="write the solutions: to OUT.npz, or in parts into a folder (a name without suffix)",
+    )
+    parser.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="solve in parts on a Dask cluster: what `dask scheduler` prints, tcp://HOST:8786 "
+        "(needs casadi-ik[cluster])",
+    )
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="solve in parts that survive a kill, and go on with those that are there",
+    )
+    parser.add_argument(
+        "--part-size", metavar="N", type=whole(1), help="targets of a part (default: 20000)"
     )
     _add_diagnose(parser, default=False)
     parser.set_defaults(run=_batch)
@@ -240,7 +273,10 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
         help="actuators that are not to move, and where they stand [rad or m]",
     )
     parser.add_argument(
-        "--log", metavar="FILE.mcap", type=file_name(), help="write every iteration to a log"
+        "--log",
+        metavar="FILE.mcap",
+        type=file_name(),
+        help="write every iteration to a log; a batch in parts: into a folder, read as one log",
     )
 
 

@@ -81,19 +81,29 @@ def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:
         UnknownNameError: No such method.
         UnsupportedError: The method cannot take the robot.
     """
-    tolerance = Tolerance()
-    if arguments.tolerance_position is not None:
-        tolerance = replace(tolerance, position=arguments.tolerance_position)
-    if arguments.tolerance_angle is not None:
-        tolerance = replace(tolerance, angle=arguments.tolerance_angle)
     method = METHODS[0] if arguments.method is None else arguments.method
     if method not in METHODS:
         raise UnknownNameError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
     scene = the_scene(arguments)
     with located(f"--method {method}", (UnsupportedError,)), located("--finger-step"):
         return Solver(
-            robot, method, tolerance, arguments.limits, arguments.finger_step, scene=scene
+            robot,
+            method,
+            the_tolerance(arguments),
+            arguments.limits,
+            arguments.finger_step,
+            scene=scene,
         )
+
+
+def the_tolerance(arguments: argparse.Namespace) -> Tolerance:
+    """When contacts count as reached."""
+    tolerance = Tolerance()
+    if arguments.tolerance_position is not None:
+        tolerance = replace(tolerance, position=arguments.tolerance_position)
+    if arguments.tolerance_angle is not None:
+        tolerance = replace(tolerance, angle=arguments.tolerance_angle)
+    return tolerance
 
 
 def the_scene(arguments: argparse.Namespace) -> Scene | None:

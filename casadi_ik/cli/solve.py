@@ -26,7 +26,7 @@ from casadi_ik.problem.proof import Proof
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.solution import Solution
 
-Draw = Callable[[ArmHand, Solution, Grasp, Path], object]
+Draw = Callable[..., object]
 
 
 def solve(arguments: argparse.Namespace) -> Answer:
@@ -61,7 +61,7 @@ def solve(arguments: argparse.Namespace) -> Answer:
         text = json.dumps(as_json(solution), indent=2, allow_nan=False) + "\n"
         write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
     if picture is not None and draw is not None:
-        draw(robot, solution, grasp, picture)
+        draw(robot, solution, grasp, picture, scene=solver.scene)
     written = [(option.lstrip("-"), file) for option, file in outputs.items() if file is not None]
     warning = "" if arguments.scene else penetration(robot, grasp, solution)
     report = solution_report(grasp.name or str(path), solver, solution, written, warning)

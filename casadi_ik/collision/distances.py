@@ -118,7 +118,7 @@ def _lowest(solid: Solid, c: Array, h: Array) -> tuple[Array, Array, Array]:
     """Where on segments a solid is nearest, a lower bound of that distance, and the way out."""
 
     def look(t: Array) -> tuple[Array, Array, Array]:
-        value, way = _signed(solid, c + t[..., None] * h)
+        value, way = signed(solid, c + t[..., None] * h)
         return value, np.einsum("...i,...i->...", way, h), way
 
     low, high = np.full(c.shape[:-1], -1.0), np.ones(c.shape[:-1])
@@ -150,8 +150,13 @@ def _lowest(solid: Solid, c: Array, h: Array) -> tuple[Array, Array, Array]:
     return t, bound, np.where(inner[..., None], share * lw + (1 - share) * rw, way)
 
 
-def _signed(solid: Solid, p: Array) -> tuple[Array, Array]:
+def signed(solid: Solid, p: Array) -> tuple[Array, Array]:
     """Signed distances of points (..., 3) from a solid in its frame, and their gradients."""
+    if solid.kind is Kind.CAPSULE:
+        foot = np.zeros_like(p)
+        foot[..., 2] = np.clip(p[..., 2], -solid.size[1], solid.size[1])
+        off = np.linalg.norm(p - foot, axis=-1)
+        return off - solid.size[0], (p - foot) / np.maximum(off, TINY)[..., None]
     if solid.kind is Kind.HALF_SPACE:
         return p[..., 2], np.broadcast_to([0.0, 0.0, 1.0], p.shape)
     if solid.kind is Kind.CONVEX:

@@ -64,6 +64,18 @@ class CollisionModel:
         """Whether a link cannot move."""
         return self.bodies[link] == self.bodies[self.robot.root]
 
+    @property
+    def moving(self) -> frozenset[str]:
+        """Links that the arm may move while the palm stays: between the base and the palm."""
+        palm = self.bodies[self.robot.palm_link]
+        carried = {self.robot.root} if palm == self.bodies[self.robot.root] else set[str]()
+        for joint in self.robot.joints:
+            if joint.parent in carried or self.bodies[joint.child] == palm:
+                carried.add(joint.child)
+        return frozenset(
+            link for link in self.bodies if link not in carried and not self.is_fixed(link)
+        )
+
     def without(self, more: Iterable[Touching]) -> CollisionModel:
         """The same with more links that may touch."""
         added = tuple(more)

@@ -103,12 +103,20 @@ SolidEntry = (
 )
 
 
+class MarginEntry(Struct, frozen=True):
+    """Two of links and solids, and how far they have to be apart whatever else is said."""
+
+    links: tuple[str, str]
+    margin: Length
+
+
 class SceneFile(Struct, frozen=True):
     """``models/scenes/*.yaml``."""
 
     solids: dict[str, SolidEntry] = msgspec.field(default_factory=dict)
     margin: Length = 0.0
     grasped: str | None = None
+    margins: list[MarginEntry] = msgspec.field(default_factory=list)
     touching: list[TouchingEntry] = msgspec.field(default_factory=list)
     name: str = ""
     description: str = ""
@@ -138,6 +146,8 @@ class Scene:
         items: What stands there, by name.
         margin: Distance to keep, also between links [m].
         grasped: Name of the item that is grasped: links with a contact may touch it.
+        margins: By pair of links or items the distance to keep instead of the scene's or item's
+            [m].
         touching: Links that may touch an item or each other, and why.
         name: What it is called.
     """
@@ -148,6 +158,7 @@ class Scene:
         margin: float = 0.0,
         grasped: str | None = None,
         touching: Sequence[Mapping[str, Any]] = (),
+        margins: Sequence[Mapping[str, Any]] = (),
         name: str = "scene",
     ) -> None:
         """Make a scene; without solids the robot is checked against itself.
@@ -158,6 +169,7 @@ class Scene:
             margin: Distance to keep [m].
             grasped: Name of the solid that is grasped.
             touching: ``{"links": [LINK, SOLID], "reason": TEXT}`` each.
+            margins: ``{"links": [LINK, SOLID], "margin": 0.01}`` each, of links or solids [m].
             name: What to call it.
 
         Raises:
@@ -168,6 +180,7 @@ class Scene:
             "margin": margin,
             "grasped": grasped,
             "touching": [_plain(one) for one in touching],
+            "margins": [_plain(one) for one in margins],
         }
         where = Path(name)
         raw = in_si(data)
@@ -203,6 +216,13 @@ class Scene:
                 f"{path}: grasped: unknown solid {entry.grasped!r}; the scene's: {known}"
             )
         self.touching = tuple(Touching(one.links, one.reason) for one in entry.touching)
+        self.margins: dict[frozenset[str], float] = {}
+        for i, pair in enumerate(entry.margins):
+            if not 0 <= pair.margin < math.inf:
+                raise DescriptionError(
+                    f"{path}: margins[{i}].margin: found {pair.margin:g}, expected >= 0 m"
+                )
+            self.margins[frozenset(pair.links)] = pair.margin
 
     def __repr__(self) -> str:
         return f"<Scene {self.name}: {', '.join(self.items) or 'empty'}, margin {self.margin:g} m>"

@@ -28,19 +28,22 @@ def pair_table(model: CollisionModel, scene: Scene, touched_by: Sequence[str]) -
     """
     links, known = model.links, set(model.robot.links) | set(scene.items)
     stated = {frozenset(one.links) for one in scene.touching}
-    for i, one in enumerate(scene.touching):
-        for name in one.links:
-            if name not in known:
+    for key, named in (
+        ("touching", [one.links for one in scene.touching]),
+        ("margins", list(scene.margins)),
+    ):
+        for i, pair in enumerate(named):
+            for name in sorted(set(pair) - known):
                 raise DescriptionError(
-                    f"{scene.name}: touching[{i}].links: unknown {name!r}; known: "
+                    f"{scene.name}: {key}[{i}].links: unknown {name!r}; known: "
                     + ", ".join([*scene.items, *model.robot.links])
                 )
     solids, places, items = list(own_solids(model.robot)), [], []
     own = len(solids)
-    pairs, offsets, names = [], [], []
+    pairs, offsets, margins, names = [], [], [], []
     count = len(model.capsules)
     for name, item in scene.items.items():
-        extra = 0.0 if item.margin is None else item.margin - scene.margin
+        usual = scene.margin if item.margin is None else item.margin
         for solid, place in item.parts:
             for i, link in enumerate(links):
                 may = frozenset((link, name)) in stated
@@ -49,7 +52,9 @@ def pair_table(model: CollisionModel, scene: Scene, touched_by: Sequence[str]) -
                 if may or fixed or (name == scene.grasped and link in touched_by):
                     continue
                 pairs.append((i, count + len(solids)))
-                offsets.append(extra)
+                margin = scene.margins.get(frozenset((link, name)), usual)
+                offsets.append(margin - scene.margin)
+                margins.append(margin)
                 names.append((link, name))
             solids.append(solid)
             places.append(place)
@@ -57,8 +62,10 @@ def pair_table(model: CollisionModel, scene: Scene, touched_by: Sequence[str]) -
     for (i, j), offset in zip(model.pairs.tolist(), model.offsets.tolist(), strict=True):
         both = model.names(i, j)
         if frozenset(both) not in stated:
+            margin = scene.margins.get(frozenset(both), scene.margin)
             pairs.append((i, j))
-            offsets.append(offset)
+            offsets.append(offset + margin - scene.margin)
+            margins.append(margin)
             names.append(both)
     return Table(
         model.radii,
@@ -70,6 +77,8 @@ def pair_table(model: CollisionModel, scene: Scene, touched_by: Sequence[str]) -
         tuple(places),
         tuple(items),
         tuple(names),
+        margins=np.array(margins, dtype=float),
+        moving=model.moving,
     )
 
 

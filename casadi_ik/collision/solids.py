@@ -132,7 +132,7 @@ def _bent(shape: BentCapsule) -> list[tuple[Solid, Array]]:
 
 def _planes(normals: Array, support: Callable[[Array], Array]) -> Array:
     """(m, 4) planes that touch a body, with these normals and evenly spread ones."""
-    ways = np.concatenate([_distinct(normals), _sphere(DIRECTIONS)])
+    ways = np.concatenate([_distinct(normals), spread(DIRECTIONS)])
     return np.column_stack([ways, support(ways)])
 
 
@@ -142,7 +142,7 @@ def _distinct(normals: Array) -> Array:
     return unit[np.sort(first)]
 
 
-def _sphere(count: int) -> Array:
+def spread(count: int) -> Array:
     """(count, 3) unit vectors spread evenly, along a spiral."""
     z = 1 - (2 * np.arange(count) + 1) / count
     turn = np.pi * (3 - math.sqrt(5)) * np.arange(count)

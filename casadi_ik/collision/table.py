@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +28,8 @@ class Table:
         places: Pose (4, 4) of every other solid in its item's frame.
         items: Name of the item of every other solid.
         names: (p, 2) what each pair is called: links, or a link and an item.
+        moving: Links that an arm may move while its palm stays.
+        margins: (p,) what each pair has to be apart, beyond what its shapes may overlap [m].
     """
 
     radii: Array
@@ -39,6 +41,8 @@ class Table:
     places: tuple[Array, ...]
     items: tuple[str, ...]
     names: tuple[tuple[str, str], ...]
+    moving: frozenset[str] = frozenset()
+    margins: Array = field(default_factory=lambda: np.zeros(0))
 
     def poses(
         self, items: dict[str, Item], moved: str | None = None, to: Array | None = None
@@ -67,19 +71,43 @@ class Table:
         """See `driver_rows`; made once."""
         return driver_rows(self.solids)
 
+    @cached_property
+    def held(self) -> Table:
+        """The pairs whose distances follow from the hand and where its palm is."""
+        return self.only(~self._swinging)
+
+    @cached_property
+    def swung(self) -> Table:
+        """The pairs whose distances depend on the arm that holds the palm."""
+        return self.only(self._swinging)
+
+    @cached_property
+    def of_robot(self) -> Table:
+        """The pairs of the robot with itself."""
+        return self.only(self._within)
+
+    @cached_property
+    def of_scene(self) -> Table:
+        """The pairs of the robot with what stands about it."""
+        return self.only(~self._within)
+
+    @property
+    def _swinging(self) -> NDArray[np.bool_]:
+        return np.array([not self.moving.isdisjoint(pair) for pair in self.names], dtype=bool)
+
+    @property
+    def _within(self) -> NDArray[np.bool_]:
+        return self.pairs[:, 1] < len(self.radii) + self.own
+
     def only(self, rows: NDArray[np.bool_]) -> Table:
         """The same with some of the pairs."""
         names = tuple(name for name, kept in zip(self.names, rows.tolist(), strict=True) if kept)
-        return Table(
-            self.radii,
-            self.halves,
-            np.ascontiguousarray(self.pairs[rows]),
-            self.offsets[rows],
-            self.own,
-            self.solids,
-            self.places,
-            self.items,
-            names,
+        return replace(
+            self,
+            pairs=np.ascontiguousarray(self.pairs[rows]),
+            offsets=self.offsets[rows],
+            names=names,
+            margins=self.margins[rows],
         )
 
 

@@ -59,6 +59,16 @@ def frame_matrix(frame: Frame) -> Array:
     return pose
 
 
+def roll_pitch_yaw(rotation: Array) -> Array:
+    """(3,) angles about the fixed axes [rad] of a rotation (3, 3): `frame_matrix` turned round."""
+    flat = math.hypot(rotation[0, 0], rotation[1, 0])
+    pitch = math.atan2(-rotation[2, 0], flat)
+    if flat > 1e-9:
+        roll = math.atan2(rotation[2, 1], rotation[2, 2])
+        return np.array([roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0])])
+    return np.array([math.atan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])
+
+
 def read_yaml(path: Path) -> Any:
     """Parse a YAML file; quantities with units become SI floats.
 

@@ -64,26 +64,41 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
     """
     path = resolve(name_or_path, "grasps")
     entry, _ = read(path, GraspFile)
+    return grasp_of(entry, path, path.stem)
+
+
+def grasp_of(entry: GraspFile, path: Path, name: str, where: str = "") -> Grasp:
+    """A grasp as a file has it.
+
+    Args:
+        entry: What the file says.
+        path: The file.
+        name: What to call it.
+        where: Key of the entry in the file, with a dot behind.
+
+    Raises:
+        DescriptionError: A malformed contact, or a number that is not finite.
+    """
     contacts: dict[str, Contact] = {}
     for finger, contact in entry.contacts.items():
         try:
             contacts[finger] = _contact(contact)
         except InputError as error:
-            raise DescriptionError(f"{path}: contacts.{finger}.{error}") from error
+            raise DescriptionError(f"{path}: {where}contacts.{finger}.{error}") from error
     for key, value in _loose_numbers(entry):
         if not math.isfinite(value):
-            raise DescriptionError(f"{path}: {key}: found {value}, expected a finite number")
+            raise DescriptionError(f"{path}: {where}{key}: found {value}, expected a finite number")
     try:
         return Grasp(
             contacts=contacts,
             robot=entry.robot,
-            name=path.stem,
+            name=name,
             object=entry.object.name if entry.object else "",
             object_pose=frame_matrix(entry.object.pose) if entry.object else None,
             posture=entry.posture,
         )
     except InputError as error:
-        raise DescriptionError(f"{path}: {error}") from error
+        raise DescriptionError(f"{path}: {where}{error}") from error
 
 
 def _contact(entry: ContactEntry) -> Contact:

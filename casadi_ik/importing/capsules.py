@@ -15,7 +15,7 @@ import numpy as np
 from casadi_ik.arrays import Array
 
 LEAST_SAVING = 0.04
-"""Part of the volume that another capsule has to save."""
+"""Part of the volume that another capsule has to save, unless told."""
 
 INSIDE = 1500
 """Points that volumes are counted by."""
@@ -82,12 +82,15 @@ class FittedCapsule:
         return np.concatenate([ends, mantle + self.radius * flat])
 
 
-def fit(triangles: Array, most: int = 4) -> tuple[list[FittedCapsule], float]:
+def fit(
+    triangles: Array, most: int = 4, saving: float = LEAST_SAVING
+) -> tuple[list[FittedCapsule], float]:
     """Capsules that hold a mesh.
 
     Args:
         triangles: (t, 3, 3) corners [m].
         most: How many at most.
+        saving: Part of the volume that another capsule has to save.
 
     Returns:
         The capsules, and by how much they stand out beyond the mesh at most [m], as far as samples
@@ -112,7 +115,7 @@ def fit(triangles: Array, most: int = 4) -> tuple[list[FittedCapsule], float]:
         if not options:
             break
         least, i, two, pair = min(options, key=lambda option: option[0])
-        if least > volume - LEAST_SAVING:
+        if least > volume - saving:
             break
         volume = least
         parts[i : i + 1], found[i : i + 1], cuts[i : i + 1] = two, pair, [None, None]

@@ -21,6 +21,7 @@ from casadi_ik.importing.fingers import Branch, find_fingers
 from casadi_ik.importing.home import guess_home
 from casadi_ik.importing.pads import Pad, guess_pads
 from casadi_ik.importing.posture import Postures
+from casadi_ik.importing.robot_shapes import robot_shapes
 from casadi_ik.importing.surfaces import Surface, checked_surfaces
 from casadi_ik.importing.thumb import guess_palm_frame, guess_thumb
 from casadi_ik.importing.write import FileLine, Written
@@ -58,6 +59,28 @@ class Imported:
         home = guess_home(description).tolist()
         named = dict(zip(description.actuator_names, home, strict=True))
         return replace(self, written=replace(self.written, home=named))
+
+    def with_shapes(self, path: Path, srdf: Path | None = None) -> Imported:
+        """With the shapes of its links, for the description as it was written to a path.
+
+        Args:
+            path: The description.
+            srdf: A file that says which links may touch.
+
+        Raises:
+            CasadiIKError: The description cannot be loaded.
+        """
+        robot = load_description(path)
+        shapes, touching, notes = robot_shapes(robot, self.files)
+        text = "" if srdf is None else file_text(srdf, path)
+        written = replace(
+            self.written,
+            shapes=shapes,
+            touching=touching,
+            srdf=text,
+            notes=[*self.written.notes, *(n for n in notes if n not in self.written.notes)],
+        )
+        return replace(self, written=written)
 
 
 def import_robot(

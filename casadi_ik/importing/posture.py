@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.robots.description import Joint
-from casadi_ik.robots.part import Part
 from casadi_ik.robots.robot_files.tree import turned
+
+
+class Jointed(Protocol):
+    """Links held together by joints: a part, or a robot."""
+
+    def root(self) -> str:
+        """The base link."""
+        ...
+
+    def joints(self) -> Sequence[Joint]:
+        """The joints, parents before children."""
+        ...
 
 
 class Postures:
     """A part and its joints in positions."""
 
-    def __init__(self, part: Part) -> None:
+    def __init__(self, part: Jointed) -> None:
         """Take a part."""
         self.part = part
         self.joints = {joint.name: joint for joint in part.joints}

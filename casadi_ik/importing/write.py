@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from casadi_ik.arrays import Array
+from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.importing.pads import Pad
+from casadi_ik.importing.shape_lines import collision_lines
+from casadi_ik.importing.words import one_line, scalar
+from casadi_ik.robots.collision import ShapeEntry, Touching
 
-PLAIN = re.compile(r"[A-Za-z_/.][A-Za-z0-9_./+-]*")
-"""What YAML takes for text without quotes; nothing that it could take for anything else."""
-
-RESERVED = {"true", "false", "yes", "no", "on", "off", "null", "y", "n", "."}
+MADE = (
+    "# Shapes as in the files; meshes are held by capsules or boxes, which stand out by `excess`."
+)
+"""Before the shapes."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,9 @@ class Written:
         thumb: The thumb's name, and how it was found.
         notes: What could not be read.
         home: By actuator; empty as long as it is not known.
+        shapes: By link; empty as long as they are not known.
+        touching: Links whose shapes may touch.
+        srdf: File that names more of them.
     """
 
     command: str
@@ -70,6 +74,9 @@ class Written:
     thumb: tuple[str, str]
     notes: Sequence[str]
     home: Mapping[str, float] = field(default_factory=dict)
+    shapes: Mapping[str, Sequence[ShapeEntry]] = field(default_factory=dict)
+    touching: Sequence[Touching] = ()
+    srdf: str = ""
 
     def text(self) -> str:
         """The YAML."""
@@ -77,31 +84,33 @@ class Written:
             f"# Made by: {self.command}",
             "# What no file of a robot says was guessed: look at the lines marked GUESS, correct",
             "# them here. To see them: casadi-ik import THIS.yaml --picture FILE.png",
-            *(f"# {_one_line(note)}" for note in self.notes),
-            f"name: {_scalar(self.name)}",
+            *(f"# {one_line(note)}" for note in self.notes),
+            f"name: {scalar(self.name)}",
         ]
         if self.arm is not None:
-            lines += _file_lines("arm", self.arm, "tip", [_scalar(self.arm.end)])
+            lines += _file_lines("arm", self.arm, "tip", [scalar(self.arm.end)])
         palm = (
-            f"{{link: {_scalar(self.hand.end)}, xyz: {_vector(self.palm[:3, 3])}, "
-            f"rpy: {_vector(_rpy(self.palm[:3, :3]))}}}"
+            f"{{link: {scalar(self.hand.end)}, xyz: {_vector(self.palm[:3, 3])}, "
+            f"rpy: {_vector(roll_pitch_yaw(self.palm[:3, :3]))}}}"
         )
         about = ["# z away from the palm, y towards the thumb, origin amid the fingers' bases"]
         lines += _file_lines(self.key, self.hand, "palm", [palm, *about])
         if self.mount is not None:
             x = _vector(np.array(self.mount[:3])), _vector(np.array(self.mount[3:]))
             lines.append(f"mount: {{xyz: {x[0]}, rpy: {x[1]}}}  # {self.mount_how}")
-        lines.append(f"thumb: {_scalar(self.thumb[0])}  # {_guess(self.thumb[1])}")
+        lines.append(f"thumb: {scalar(self.thumb[0])}  # {_guess(self.thumb[1])}")
         lines.append("fingers:  # xyz [m] and outward normal of the pad, in the link's frame")
         for name, pad in self.fingers.items():
-            lines.append(f"  # GUESS: {_one_line(pad.how)}")
+            lines.append(f"  # GUESS: {one_line(pad.how)}")
             lines.append(
-                f"  {_scalar(name)}: {{link: {_scalar(pad.link)}, xyz: {_vector(pad.point)}, "
+                f"  {scalar(name)}: {{link: {scalar(pad.link)}, xyz: {_vector(pad.point)}, "
                 f"normal: {_vector(pad.normal)}}}"
             )
         if self.home:
             lines.append("home:  # GUESS: half closed, the arm away from limits and singularities")
-            lines += [f"  {_scalar(name)}: {value:.6g}" for name, value in self.home.items()]
+            lines += [f"  {scalar(name)}: {value:.6g}" for name, value in self.home.items()]
+        if self.shapes:
+            lines += [MADE, *collision_lines(self.shapes, self.touching, srdf=self.srdf)]
         return "\n".join(lines) + "\n"
 
 
@@ -109,35 +118,25 @@ def _file_lines(key: str, line: FileLine, end: str, ends: Iterable[str]) -> list
     value, *more = ends
     found = [
         f"{key}:",
-        f"  file: {_scalar(line.file)}",
+        f"  file: {scalar(line.file)}",
         *(f"  {text}" for text in more),
         f"  {end}: {value}  # {_guess(line.how)}",
     ]
     if line.limits:
         found.append("  limits:  # GUESS: the file states none")
         found += [
-            f"    {_scalar(name)}: [{low:.6g}, {high:.6g}]"
+            f"    {scalar(name)}: [{low:.6g}, {high:.6g}]"
             for name, (low, high) in line.limits.items()
         ]
     if line.locked:
         found.append("  locked:  # these joints have no single axis")
-        found += [f"    {_scalar(name)}: {value:.6g}" for name, value in line.locked.items()]
+        found += [f"    {scalar(name)}: {value:.6g}" for name, value in line.locked.items()]
     return found
 
 
 def _guess(how: str) -> str:
-    how = _one_line(how)
+    how = one_line(how)
     return how if how.startswith("--") else f"GUESS: {how}"
-
-
-def _one_line(text: str) -> str:
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
-
-
-def _scalar(text: str) -> str:
-    if PLAIN.fullmatch(text) and text.lower() not in RESERVED:
-        return text
-    return json.dumps(text, ensure_ascii=False)
 
 
 def _vector(values: Array) -> str:
@@ -147,13 +146,3 @@ def _vector(values: Array) -> str:
 def _number(value: float) -> str:
     text = f"{value:.6f}".rstrip("0").rstrip(".")
     return "0" if text in ("-0", "") else text
-
-
-def _rpy(rotation: Array) -> Array:
-    """Angles (3,) about the fixed axes, as URDF has them."""
-    flat = math.hypot(rotation[0, 0], rotation[1, 0])
-    pitch = math.atan2(-rotation[2, 0], flat)
-    if flat > 1e-9:
-        roll = math.atan2(rotation[2, 1], rotation[2, 2])
-        return np.array([roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0])])
-    return np.array([math.atan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])

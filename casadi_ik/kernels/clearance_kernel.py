@@ -38,7 +38,7 @@ BLOCK = 1024
 
 
 class ClearanceJob(ctypes.Structure):
-    """`clearance_job` of drivers/clearance.c."""
+    """`clearance_job` of drivers/clearance_job.c."""
 
     _fields_ = (
         ("q", ctypes.c_void_p),
@@ -52,7 +52,9 @@ class ClearanceJob(ctypes.Structure):
         ("pairs", ctypes.c_void_p),
         ("offsets", ctypes.c_void_p),
         ("n_pairs", ctypes.c_int64),
+        ("first", ctypes.c_int64),
         ("most", ctypes.c_double),
+        ("enough", ctypes.c_double),
         ("least", ctypes.c_void_p),
         ("closest", ctypes.c_void_p),
         ("every", ctypes.c_void_p),
@@ -84,7 +86,7 @@ class ClearanceKernel:
         self._n, self._size = n, size
         self._robot = robot
         self._compiled = compiled
-        self._run = self._load() if compiled else None
+        self.entry: Any = self._load() if compiled else None
 
     def _load(self) -> Any:
         lanes = machine_lanes()
@@ -97,7 +99,7 @@ class ClearanceKernel:
             library = load_library(
                 f"{self._graph.name}_lanes{lanes}",
                 lambda: row_major(self._graph.function),
-                define(constants) + driver_text("clearance"),
+                define(constants) + driver_text("clearance_job") + driver_text("clearance"),
                 SYMBOL,
                 f"{self._graph.recipe} lanes {lanes}",
                 partial(lanes_source, lanes=lanes),
@@ -128,7 +130,12 @@ class ClearanceKernel:
         return FunctionKernel(graph, self._compiled)
 
     def least(
-        self, q: Array, poses: Array, table: Table, most: float = math.inf
+        self,
+        q: Array,
+        poses: Array,
+        table: Table,
+        most: float = math.inf,
+        enough: float = -math.inf,
     ) -> tuple[Array, NDArray[np.int64]]:
         """The smallest distance of each configuration.
 
@@ -137,11 +144,12 @@ class ClearanceKernel:
             poses: (m, 12) of the scene's solids, or (k, m, 12).
             table: The pairs.
             most: Distances above it are not told apart: they are `most`.
+            enough: Distances below it are not told apart either: they are anything below it.
 
         Returns:
             (k,) [m], offsets taken off, and (k,) the pair; -1 where none is below `most`.
         """
-        return self._distances(q, poses, table, most, None)
+        return self._distances(q, poses, table, most, None, enough)
 
     def every(self, q: Array, poses: Array, table: Table) -> Array:
         """(k, p) distances of all pairs [m], see `least`."""
@@ -149,8 +157,49 @@ class ClearanceKernel:
         self._distances(q, poses, table, math.inf, found)
         return found
 
+    def job(
+        self, q: Array, poses: Array, table: Table, most: float, enough: float
+    ) -> tuple[ClearanceJob, tuple[Any, ...]]:
+        """What the driver works on, without memory for results; and what has to be kept meanwhile.
+
+        Args:
+            q: (k, n), aligned doubles.
+            poses: As for `least`.
+            table: As for `least`.
+            most: As for `least`.
+            enough: As for `least`.
+        """
+        solids, planes = table.for_driver
+        places = doubles(poses)
+        radii, halves, offsets = map(doubles, (table.radii, table.halves, table.offsets))
+        job = ClearanceJob(
+            q=memory(q),
+            poses=places.ctypes.data,
+            pose_step=places[0].size if places.ndim == 3 else 0,
+            n_solids=len(solids) - table.own,
+            solids=solids.ctypes.data,
+            planes=planes.ctypes.data,
+            radii=memory(radii),
+            halves=memory(halves),
+            pairs=table.pairs.ctypes.data,
+            offsets=memory(offsets),
+            n_pairs=len(table.pairs),
+            first=-1,
+            most=most,
+            enough=enough,
+            count=len(q),
+            slice=SLICE,
+        )
+        return job, (q, places, radii, halves, offsets, table)
+
     def _distances(
-        self, q: Array, poses: Array, table: Table, most: float, every: Array | None
+        self,
+        q: Array,
+        poses: Array,
+        table: Table,
+        most: float,
+        every: Array | None,
+        enough: float = -math.inf,
     ) -> tuple[Array, NDArray[np.int64]]:
         given = doubles(q)
         if poses.ndim == 3 and len(poses) == 1:
@@ -162,34 +211,13 @@ class ClearanceKernel:
         least, closest = np.full(len(given), most), np.full(len(given), -1, dtype=np.int64)
         if not len(given) or not len(table.pairs):
             return least, closest
-        if self._run is None:
+        if self.entry is None:
             self._by_numpy(given, poses, table, least, closest, every)
             return least, closest
-        solids, planes = table.for_driver
-        places = doubles(poses)
-        moving = places.ndim == 3
-        radii, halves, offsets = map(doubles, (table.radii, table.halves, table.offsets))
-        job = ClearanceJob(
-            memory(given),
-            places.ctypes.data,
-            places[0].size if moving else 0,
-            len(solids) - table.own,
-            solids.ctypes.data,
-            planes.ctypes.data,
-            memory(radii),
-            memory(halves),
-            table.pairs.ctypes.data,
-            memory(offsets),
-            len(table.pairs),
-            most,
-            memory(least),
-            memory(closest),
-            None if every is None else memory(every),
-            len(given),
-            0,
-            SLICE,
-        )
-        while (code := self._run(ctypes.byref(job))) != DriverCode.DONE:
+        job, _kept = self.job(given, poses, table, most, enough)
+        job.least, job.closest = memory(least), memory(closest)
+        job.every = None if every is None else memory(every)
+        while (code := self.entry(ctypes.byref(job))) != DriverCode.DONE:
             check(self._graph.name, code)
         return least, closest
 

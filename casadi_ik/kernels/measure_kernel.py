@@ -46,6 +46,11 @@ class MeasureKernel:
         if self._map is None:
             _ = self._one_by_one
 
+    @property
+    def entry(self) -> Any:
+        """The compiled map, with vectors or without; None if there is none."""
+        return self._one_by_one.entry if self._map is None else self._map
+
     @cached_property
     def _one_by_one(self) -> FunctionKernel:
         """For machines without such vectors."""

@@ -86,21 +86,35 @@ class Surroundings:
         """With some of the pairs."""
         return Surroundings(self.kernel, self.table.only(pairs), self.poses, self.margin)
 
+    @property
+    def held(self) -> Surroundings:
+        """With the pairs alone that the hand and its palm's pose decide."""
+        return Surroundings(self.kernel, self.table.held, self.poses, self.margin)
+
+    @property
+    def robot_alone(self) -> Surroundings:
+        """With the pairs alone of the robot with itself."""
+        return Surroundings(self.kernel, self.table.of_robot, self.poses, self.margin)
+
+    @property
+    def scene_alone(self) -> Surroundings:
+        """With the pairs alone of the robot with what stands about it."""
+        return Surroundings(self.kernel, self.table.of_scene, self.poses, self.margin)
+
     def check(self, q: Array) -> Clearances:
         """Clearances of configurations (k, n)."""
         room, pairs = self.kernel.least(q, self.poses, self.table)
-        offsets = np.append(self.table.offsets, 0.0)[pairs]
+        margins = np.append(self.table.margins, self.margin)[pairs]
         unknown = ~np.isfinite(q).all(axis=1)
         room = np.where(unknown, np.nan, room - self.margin)
         free = room >= -ROUNDING
-        return Clearances(
-            room + self.margin + np.maximum(offsets, 0.0), free, pairs, self.table.names, room
-        )
+        return Clearances(room + margins, free, pairs, self.table.names, room)
 
     def free(self, q: Array) -> NDArray[np.bool_]:
         """(k,) whether configurations (k, n) are free; quicker than `check`."""
-        least, _ = self.kernel.least(q, self.poses, self.table, self.margin)
-        return (least >= self.margin - ROUNDING) & np.isfinite(q).all(axis=1)
+        enough = self.margin - ROUNDING
+        least, _ = self.kernel.least(q, self.poses, self.table, self.margin, enough)
+        return (least >= enough) & np.isfinite(q).all(axis=1)
 
     def gradient(self, q: Array) -> tuple[Array, Array]:
         """The smallest room of configurations and how it grows.

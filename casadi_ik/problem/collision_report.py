@@ -2,9 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class WayOut:
+    """What else would do, as far as it was tried.
+
+    Attributes:
+        moved: Translation of what is grasped, with its contacts, for which there is a free answer,
+            base frame [m]: the shortest of those tried, at which the object itself stands free;
+            None: none of them has one.
+        farthest: How far it was moved at the most [m].
+        fewer: Fingers without whose contact there is a free answer.
+    """
+
+    moved: tuple[float, float, float] | None
+    farthest: float
+    fewer: tuple[str, ...]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The same in short lines."""
+        lines = [f"solvable without the contact of {name}" for name in self.fewer]
+        if self.moved is None:
+            far = f"{1e3 * self.farthest:.0f} mm"
+            return (*lines, f"the object moved by up to {far} in 26 directions does not help")
+        way = ", ".join(f"{1e3 * value + 0.0:.0f}" for value in self.moved)
+        length = 1e3 * math.hypot(*self.moved)
+        return (*lines, f"solvable with the object moved by {length:.0f} mm: ({way}) mm")
 
 
 @dataclass(frozen=True)
@@ -17,6 +46,8 @@ class CollisionReport:
         tried: Answers (hands, arms, elbows) that were looked at.
         without_scene: Whether one of them is free of the robot itself, the scene left out.
         without_self: Whether one of them is free of the scene, the robot itself left out.
+        way_out: What else would do; None if that was not looked for: it is where one grasp is
+            solved and a diagnosis asked for.
     """
 
     pair: Pair
@@ -24,6 +55,7 @@ class CollisionReport:
     tried: int
     without_scene: bool
     without_self: bool
+    way_out: WayOut | None = None
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -37,4 +69,4 @@ class CollisionReport:
             lines.append("solvable without the scene")
         if self.without_self:
             lines.append("solvable if the robot could pass through itself")
-        return tuple(lines)
+        return tuple(lines) if self.way_out is None else (*lines, *self.way_out.lines)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
+from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.problem.trace import TraceFormat
@@ -32,6 +33,7 @@ class SolveBlock:
         rows: The iterations of all solves, one solve after the other, (sum of
             `BatchSolution.iterations`,) of the format's layout.
         started: When each solve began, (k,) [ns since the Unix epoch].
+        around: What they were checked against; None: nothing.
     """
 
     format: TraceFormat
@@ -42,6 +44,7 @@ class SolveBlock:
     batch: BatchSolution
     rows: NDArray[Any]
     started: NDArray[np.int64]
+    around: Surroundings | None = None
 
     def __len__(self) -> int:
         return len(self.batch)

@@ -151,6 +151,9 @@ SIGMA, CONDITION = "sigma_", "condition_"
 """What stands before the name of a Jacobian in the fields of its smallest singular value and of its
 condition number; NaN where it is not measured."""
 
+CLEARANCE = "clearance"
+"""Name of the field that a log adds where there is a scene."""
+
 
 def packed(flags: NDArray[np.bool_]) -> NDArray[np.uint32]:
     """Flags of all actuators (k, n) as the words of a mask, (k,) or (k, words)."""

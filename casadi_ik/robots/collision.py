@@ -8,7 +8,7 @@ them and a solid of a scene, are apart, the capsules stand for one.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -152,6 +152,20 @@ class Shapes:
                 replace(one, links=tuple(names.get(link, link) for link in one.links))
                 for one in self.touching
             ),
+        )
+
+    def without(self, links: Collection[str]) -> Shapes:
+        """The same without those of some links."""
+        kept = [i for i, one in enumerate(self.solids) if one.link not in links]
+        place = {old: new for new, old in enumerate(kept)} | {-1: -1}
+        return Shapes(
+            tuple(
+                replace(one, covers=place[one.covers])
+                for one in self.capsules
+                if one.link not in links
+            ),
+            tuple(self.solids[i] for i in kept),
+            self.touching,
         )
 
     def __add__(self, other: Shapes) -> Shapes:

@@ -11,6 +11,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.robots.checks import check_couplings
+from casadi_ik.robots.collision import NO_SHAPES, CollisionEntry, Shapes, link_shapes
 from casadi_ik.robots.couplings import Coupling, Linear
 from casadi_ik.robots.description import Actuator, Joint, frozen
 from casadi_ik.robots.part import HandPart, Part
@@ -56,7 +57,8 @@ def arm_from_file(entry: ArmFromFile, key: str, beside: Path) -> Part:
     joints, actuators = _Chosen(tree, entry, chain, (), where).parts()
     source = {key: f"{tree.path.name}, links {root} to {tip}"}
     name = tree.path.stem
-    return Part(name, where, root, joints, actuators, source, tip, np.eye(4), {})
+    shapes = _shapes(tree, root, joints)
+    return Part(name, where, root, joints, actuators, source, tip, np.eye(4), {}, shapes)
 
 
 def hand_from_file(
@@ -100,6 +102,7 @@ def hand_from_file(
         palm.link,
         frame_matrix(Frame(palm.xyz, palm.rpy)),
         {},
+        _shapes(tree, root, joints),
         pads=pads,
     )
 
@@ -114,6 +117,17 @@ def leaves(tree: RobotTree, root: str) -> list[str]:
 def _tree(entry: Entry, beside: Path) -> RobotTree:
     path = Path(entry.file).expanduser()
     return read_tree(path if path.is_absolute() else beside.parent / path)
+
+
+def _shapes(tree: RobotTree, root: str, joints: list[Joint]) -> Shapes:
+    """The simple shapes of a file; none where there are meshes, so that nothing is left out."""
+    links = [root, *(joint.child for joint in joints)]
+    if tree.shapes.meshes & set(links):
+        return NO_SHAPES
+    entries = {
+        link: list(tree.shapes.entries[link]) for link in links if link in tree.shapes.entries
+    }
+    return link_shapes(CollisionEntry(links=entries), links, tree.path)
 
 
 class _Chosen:

@@ -79,8 +79,10 @@ def _robot(path: Path) -> RobotDescription:
     robot = _joined(
         top.name, arm, mount, hand, fingers, top.thumb, top.home, str(path), units, top.sources
     )
+    # What a description says of a link goes before what its file says.
+    said = () if top.collision is None else top.collision.links
     more = link_shapes(top.collision, robot.links, path)
-    return replace(robot, shapes=robot.shapes + more)
+    return replace(robot, shapes=robot.shapes.without(said) + more)
 
 
 def _imports(raw: Any) -> bool:

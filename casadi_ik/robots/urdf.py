@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from casadi_ik.arrays import Array
+from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.robots.description import RobotDescription
 
 LINK_RADIUS = {"arm": 0.055, "mount": 0.03, "hand": 0.009}
@@ -162,18 +163,8 @@ def _along(end: Array) -> Array:
 
 
 def _origin(element: ElementTree.Element, pose: Array) -> None:
-    rotation = pose[:3, :3]
-    horizontal = math.hypot(rotation[0, 0], rotation[1, 0])
-    pitch = math.atan2(-rotation[2, 0], horizontal)
-    if horizontal > 1e-9:
-        roll = math.atan2(rotation[2, 1], rotation[2, 2])
-        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
-    else:
-        roll = math.atan2(-rotation[1, 2], rotation[1, 1])
-        yaw = 0.0
-    ElementTree.SubElement(
-        element, "origin", xyz=_numbers(pose[:3, 3]), rpy=_numbers(np.array([roll, pitch, yaw]))
-    )
+    rpy = roll_pitch_yaw(pose[:3, :3])
+    ElementTree.SubElement(element, "origin", xyz=_numbers(pose[:3, 3]), rpy=_numbers(rpy))
 
 
 def _numbers(values: Array) -> str:

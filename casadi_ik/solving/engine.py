@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -28,15 +28,16 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.free import FreeFinder
-from casadi_ik.solving.alternatives.tracking import Tracker
+from casadi_ik.solving.alternatives.way_out import with_way_out
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
-from casadi_ik.solving.freeing import freed
+from casadi_ik.solving.freeing import freed, freed_at_once
 from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.solved_part import SolvedPart, judged
 from casadi_ik.solving.workers import workers
+from casadi_ik.solving.write_behind import WriteBehind
 
 MANIPULABILITY = "manipulability"
 """The preference that is seen to after the solve."""
@@ -134,15 +135,6 @@ class Engine:
         """What targets are checked against; None: nothing."""
         return None if self.check is None else self.check.around(problems)
 
-    @cached_property
-    def tracker(self) -> Tracker:
-        """Follows moving grasps.
-
-        Raises:
-            UnsupportedError: The method is not hand-first.
-        """
-        return Tracker(self.robot, self._hand_first, self.finder)
-
     def preference(self, prefer: str | None, started: bool) -> str:
         """What is preferred, see `preference`.
 
@@ -198,16 +190,20 @@ class Engine:
             verdict = judge_errors(problems, *found.errors)
         if verdict is None:
             return None
-        distance = closest = None
+        q, distance, closest = found.q, None, None
         if (around := self.around(problems)) is not None:
-            clear = around.check(found.q[None])
+            clear = around.check(q[None])
             if not clear.free[0]:
-                return None
+                other = freed_at_once(self, problems, around, q, start)
+                if other is None:
+                    return None
+                q, verdict, clear = other
+                seconds = time.perf_counter() - begin
             distance, closest = float(clear.distance[0]), clear.pair(0)
         return Solution(
             success=True,
             status=Status.SOLVED,
-            q=found.q,
+            q=q,
             iterations=found.iterations,
             restarts=found.restarts,
             time=seconds,
@@ -238,10 +234,12 @@ class Engine:
         if recorder is not None and (measures := self.method.trace_format.measures) is not None:
             measures.prepare()
         batches = []
-        for part in self._parts(problems, starts, run):
-            if recorder is not None:
-                part.record(recorder, self.method.trace_format, run.seed)
-            batches.append(part.batch)
+        with WriteBehind() as behind:
+            for part in self._parts(problems, starts, run):
+                if recorder is not None:
+                    form = self.method.trace_format
+                    behind.do(partial(part.record, recorder, form, run.seed))
+                batches.append(part.batch)
         return BatchSolution.joined(batches)
 
     def _parts(self, problems: Problems, starts: Array, run: Run) -> Iterator[SolvedPart]:
@@ -265,7 +263,9 @@ class Engine:
                 outcome = replace(outcome, q=batch.q, time=batch.time)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
-            return SolvedPart(asked, starts[rows], started, outcome, batch)
+                if around is not None and len(problems) == 1:
+                    batch = with_way_out(self, asked, starts[0], run.seed, batch)
+            return SolvedPart(asked, starts[rows], started, outcome, batch, around)
 
         if diagnose:
             for kinds, _, _ in by_kinds(problems):

@@ -11,13 +11,14 @@ from typing import Protocol
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.problem.clearance import Surroundings
+from casadi_ik.problem.clearance import Clearances, Surroundings
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.alternatives.free import FreeFinder
 from casadi_ik.solving.solved_part import judged
 
@@ -81,3 +82,26 @@ def freed(
         judged(robot, batch.method, problems, ended, around),
         collisions=tuple(reports),
     )
+
+
+def freed_at_once(
+    engine: Freeing, problems: Problems, around: Surroundings, q: Array, start: Array
+) -> tuple[Array, SolvedVerdict, Clearances] | None:
+    """Another arm for the hand of one answer that touches something, judged; None: look further.
+
+    What it gives is what `freed` gives, which looks there first.
+
+    Args:
+        engine: The engine for the target.
+        problems: One target.
+        around: What it is checked against.
+        q: (n,) the answer.
+        start: (n,) where the robot is.
+    """
+    finder = engine.freer
+    found = finder.beside(problems, around, q[None], start[None])
+    verdict = None if found is None else judge_one(finder.robot, problems, found)
+    if found is None or verdict is None:
+        return None
+    clear = around.check(found[None])
+    return (found, verdict, clear) if clear.free[0] else None

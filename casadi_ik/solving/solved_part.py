@@ -28,6 +28,7 @@ class SolvedPart:
         started: When it was begun, since the Unix epoch [ns].
         outcome: What the method came to.
         batch: The same, judged.
+        around: What the answers were checked against; None: nothing.
     """
 
     problems: Problems
@@ -35,6 +36,7 @@ class SolvedPart:
     started: int
     outcome: Outcome
     batch: BatchSolution
+    around: Surroundings | None = None
 
     def record(self, recorder: Recorder, form: TraceFormat, seed: int) -> None:
         """Hand it on with its iterations, if they were kept."""
@@ -51,6 +53,7 @@ class SolvedPart:
             batch=batch,
             rows=self.outcome.rows,
             started=self.started + (before * 1e9).astype(np.int64),
+            around=self.around,
         )
         recorder.record(block)
 

@@ -53,15 +53,18 @@ class Stream:
     tolerances: tuple[Tolerance, ...]
     run: Run
 
-    def solve(self, blocks: Iterable[Block]) -> Iterator[SolvedBlock]:
+    def solve(self, blocks: Iterable[Block], first_row: int = 0) -> Iterator[SolvedBlock]:
         """Solve one block after the other; a target's numbers do not depend on the blocks.
+
+        Args:
+            blocks: Arrays of targets.
+            first_row: Number of the first target.
 
         Raises:
             InputError: Bad q0, or a block of the wrong shape.
         """
         if self.run.start(self.engine.robot).ndim != 1:
             raise InputError("q0: found several, expected one start for all targets")
-        first_row = 0
         for given in blocks:
             named = given if isinstance(given, Mapping) else dict(zip(REQUIRED, given, strict=True))
             arrays = {name: np.asanyarray(array) for name, array in named.items()}

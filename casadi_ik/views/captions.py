@@ -16,6 +16,7 @@ from casadi_ik.views.picture import FAINT, INK
 OBJECT_COLOR = "#8cc4e8"
 TARGET_COLOR = "#f0b400"
 MET_COLOR, MISSED_COLOR = "#1f9d55", "#d62f3c"
+NEAREST_COLOR = "#e00000"
 
 
 def label_fingers(axes: Axes, places: dict[str, Array], solution: Solution, grasp: Grasp) -> None:
@@ -68,7 +69,9 @@ def add_title(figure: Figure, solution: Solution, grasp: Grasp) -> None:
     figure.text(0.02, 0.90, how, size=11, color=FAINT, va="center")
 
 
-def add_legend(figure: Figure, solution: Solution, grasp: Grasp, has_object: bool) -> None:
+def add_legend(
+    figure: Figure, solution: Solution, grasp: Grasp, has_object: bool, has_scene: bool = False
+) -> None:
     """What the arrows mean."""
     states = {verdict.ok for verdict in solution.contacts.values()}
     handles: list[Line2D | Patch] = [_mark(TARGET_COLOR, _asked(grasp), 4.5)]
@@ -78,6 +81,10 @@ def add_legend(figure: Figure, solution: Solution, grasp: Grasp, has_object: boo
         handles.append(_mark(MISSED_COLOR, "reached, out of tolerance", 2.0))
     if has_object:
         handles.append(Patch(color=OBJECT_COLOR, label="object"))
+    if has_scene and solution.closest is not None and solution.clearance is not None:
+        pair = " and ".join(solution.closest)
+        label = f"nearest: {pair}, {1e3 * solution.clearance:.1f} mm"
+        handles.append(Line2D([], [], color=NEAREST_COLOR, lw=3.0, label=label))
     style = {"frameon": False, "fontsize": 10, "labelcolor": INK}
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), **style)
 

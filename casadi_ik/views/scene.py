@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Grasp, load_object
 from casadi_ik.problem.solution import Solution
@@ -28,6 +29,7 @@ from casadi_ik.views.captions import (
     label_fingers,
 )
 from casadi_ik.views.marks import contact_marks, target_place
+from casadi_ik.views.obstacles import in_scene, nearest_pair, scene_solids
 from casadi_ik.views.picture import DPI, INK, new_figure, save_picture
 from casadi_ik.views.robot_body import robot_body
 from casadi_ik.views.shapes import Solid, with_edges
@@ -47,8 +49,12 @@ CLOSE = (0.40, 0.06, 0.60, 0.82)
 WINDOW = (1200, 900)
 """Of `show` [pixels]."""
 
-OBJECT, GHOST, WRIST = 0.5, 0.45, 0.3
-"""Opacity of the object, of contacts that something hides, and of the arm in the close-up."""
+OBJECT, GHOST, WRIST, SCENE, TOUCHING = 0.5, 0.45, 0.3, 0.45, 0.35
+"""Opacity of the object, of contacts that something hides, of the arm in the close-up, of what
+stands about, and of what touches."""
+
+AROUND = ("scene", "nearest", "touching")
+"""Groups that there are where a scene is drawn."""
 
 WRIST_LENGTH = 0.10
 """Of the arm, the close-up shows what is no further than this from the palm [m]."""
@@ -65,6 +71,7 @@ def draw_solution(
     grasp: Grasp,
     path: str | PathLike[str] | None = None,
     *,
+    scene: Scene | None = None,
     view: View | None = None,
     dpi: float = DPI,
 ) -> Figure:
@@ -75,6 +82,8 @@ def draw_solution(
         solution: The answer.
         grasp: The question; if it names an object that has a description, that is drawn too.
         path: PNG file to write, if any.
+        scene: What stood about the robot: that is drawn too, and of the pair that is nearest to
+            touching the way between them in red; their shapes as well if they do touch.
         view: Azimuth and elevation [rad] from which the close-up is seen; None: chosen so that
             the fingertips are well apart.
         dpi: Dots per inch.
@@ -94,13 +103,15 @@ def draw_solution(
     }
     with _one_at_a_time, closing(Stage()) as stage:
         solids = _fill(stage, robot, solution.q, grasp, colors)
+        if scene is not None:
+            _around(stage, robot, solution, grasp, scene)
         view = view or close_view(robot, solution.q)
         target = _middle(robot, solution.q, grasp)
         pixels = _pixels(figure, WHOLE)
         stage.aim(whole_view(target, view), _points(*solids.values()), pixels, (0.03, 0.10))
         image = over(1.0, stage.shoot("floor"), _inwards(pixels))
-        image = over(image, stage.shoot("arm", "wrist", "hand", "object", "marks"))
-        _panel(figure, WHOLE, over(image, stage.shoot("marks"), GHOST))
+        image = over(image, stage.shoot("arm", "wrist", "hand", "object", "marks", *AROUND))
+        _panel(figure, WHOLE, over(image, stage.shoot("marks", "nearest"), GHOST))
 
         palm = robot.palm(solution.q)[:3, 3]
         there = solids["object"] + solids["marks"]
@@ -109,12 +120,12 @@ def draw_solution(
         stage.aim(view, _points(solids["hand"], near), pixels, (0.17, 0.02))
         # The arm is pale: it may stand in the way.
         image = over(1.0, stage.shoot("wrist"), WRIST * _inwards(pixels))
-        image = over(image, stage.shoot("hand", "object", "marks"))
-        axes = _panel(figure, CLOSE, over(image, stage.shoot("marks"), GHOST))
+        image = over(image, stage.shoot("hand", "object", "marks", "nearest", "touching"))
+        axes = _panel(figure, CLOSE, over(image, stage.shoot("marks", "nearest"), GHOST))
         seen = stage.project(robot.contacts(solution.q)[0])
     label_fingers(axes, dict(zip(robot.fingers, seen, strict=True)), solution, grasp)
     add_title(figure, solution, grasp)
-    add_legend(figure, solution, grasp, bool(solids["object"]))
+    add_legend(figure, solution, grasp, bool(solids["object"]), scene is not None)
     if path is not None:
         save_picture(figure, path)
     return figure
@@ -231,6 +242,18 @@ def _fill(
     stage.add("object", solids["object"], OBJECT)
     stage.add("marks", solids["marks"])
     return solids
+
+
+def _around(stage: Stage, robot: ArmHand, solution: Solution, grasp: Grasp, scene: Scene) -> None:
+    """Put what stands about on the stage, and what is nearest to touching."""
+    whole = in_scene(scene, grasp)
+    about = robot.links(solution.q)[robot.description.root][:3, 3]
+    stage.add("scene", scene_solids(whole, about, grasp.object), SCENE)
+    pair = solution.closest
+    if pair is not None and np.isfinite(solution.q).all():
+        rod, shapes = nearest_pair(robot, solution.q, whole, pair)
+        stage.add("nearest", rod)
+        stage.add("touching", [] if solution.success else shapes, TOUCHING)
 
 
 def _object(grasp: Grasp) -> list[Solid]:

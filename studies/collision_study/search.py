@@ -1,64 +1,151 @@
-"""Grasps at random places of a cluttered table, and a dense search of the solutions of each."""
+"""Grasps all about a place of a cluttered table, and a dense search of those not solved."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.problem.clearance import Surroundings
-from casadi_ik.solving.trials import Descent, repeated
+from casadi_ik.problem.clearance import SceneCheck, Surroundings
+from casadi_ik.problem.questions import Questions, tolerances_by_finger
+from collision_study.oracles import CoalOracle
 
 TABLE = {"kind": "box", "size": [3, 3, 0.04], "xyz": [0, 0, -0.02]}
 NEAR = 0.12
 """Clutter keeps so far [m] from the object's middle: what stands in the hand cannot be grasped."""
-STARTS = 256
-"""Random starts solved at once."""
+TURNS = 16
+"""How often each grasp is turned about the vertical at its place."""
+AT_ONCE = 2048
+"""Answers of a dense search that are looked for at once."""
+SAFE = 2e-3
+"""Margin [m] of the answers that a dense search has to find for a target to count."""
+MICROMETRE = 1e-6
+WARM = 4
+"""Targets of a batch that is solved first, so that no time holds what is done once."""
 
 
-@dataclass(frozen=True, eq=False)
-class Target:
-    """A grasp and what stands about it."""
+@dataclass(frozen=True)
+class Piece:
+    """A place of a table with clutter about it, at which all grasps are tried.
 
-    grasp: ik.Grasp
-    scene: ik.Scene
+    Attributes:
+        robot: Name of the robot; its shipped grasps are tried.
+        clutter: Solids beside the table.
+        number: Of the place.
+        seed: Of the study.
+        searched: Answers of a dense search.
+    """
 
-
-def placed_targets(
-    robot: ik.ArmHand, blind: ik.Solver, rng: np.random.Generator, count: int, clutter: int
-) -> list[Target]:
-    """Shipped grasps moved to random places that contacts alone can be solved at."""
-    grasps = [ik.load_grasp(name) for name in ik.shipped_grasps(robot.name)]
-    found: list[Target] = []
-    while len(found) < count:
-        grasp = grasps[len(found) % len(grasps)]
-        assert grasp.object_pose is not None
-        angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 0.85)
-        motion = np.eye(4)
-        turn = rng.uniform(-np.pi, np.pi)
-        motion[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-        goal = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.1, 0.6)])
-        motion[:3, 3] = goal - motion[:3, :3] @ grasp.object_pose[:3, 3]
-        moved = _moved(grasp, motion)
-        if not blind.solve(moved, diagnose=False).success:
-            continue
-        solids = {"table": TABLE} | _clutter(rng, clutter, goal)
-        found.append(Target(moved, ik.Scene(solids)))
-    return found
+    robot: str
+    clutter: int
+    number: int
+    seed: int
+    searched: int
 
 
-def _moved(grasp: ik.Grasp, motion: Array) -> ik.Grasp:
-    assert grasp.object_pose is not None
-    turn, shift = motion[:3, :3], motion[:3, 3]
-    contacts = {
-        name: ik.Contact(
-            turn @ one.point + shift, None if one.normal is None else turn @ one.normal
+def solve_piece(piece: Piece) -> dict[str, Any]:
+    """The targets of a piece, those that contacts alone can be solved at."""
+    robot = ik.load_robot(piece.robot)
+    blind = ik.Solver(robot)
+    rng = np.random.default_rng([piece.seed, piece.clutter, piece.number])
+    angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 0.85)
+    goal = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.1, 0.6)])
+    solids = {"table": TABLE, **_clutter(rng, piece.clutter, goal)}
+    rows = []
+    for name in ik.shipped_grasps(robot.name):
+        grasps = [_moved(ik.load_grasp(name), goal, rng) for _ in range(TURNS)]
+        arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
+        points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
+        known = blind.solve_batch(points, normals)
+        kept = np.flatnonzero(known.success)
+        if len(kept):
+            some = [grasps[i] for i in kept]
+            rows += _solved(robot, solids, some, points[kept], normals[kept], known.q[kept], piece)
+    return {"targets": rows}
+
+
+def _solved(
+    robot: ik.ArmHand,
+    solids: dict[str, Any],
+    grasps: list[ik.Grasp],
+    points: Array,
+    normals: Array,
+    blind: Array,
+    piece: Piece,
+) -> list[dict[str, Any]]:
+    """What comes of the same grasp turned in several ways, a row for each."""
+    name = grasps[0].object
+    poses = np.stack([grasp.object_pose for grasp in grasps if grasp.object_pose is not None])
+    held = {"kind": "object", "object": name, "xyz": poses[0][:3, 3].tolist()}
+    scene = ik.Scene({**solids, name: held}, grasped=name)
+    solver = ik.Solver(robot, scene=scene)
+    solver.solve_batch(points[:WARM], normals[:WARM], object_pose=poses[:WARM])
+    begin = time.process_time()
+    batch = solver.solve_batch(points, normals, object_pose=poses)
+    spent = (time.process_time() - begin) / len(points)
+    check = SceneCheck(robot, scene)
+    rows = []
+    for i, grasp in enumerate(grasps):
+        around = surroundings(check, robot, grasp)
+        false = missed = False
+        if batch.success[i]:
+            false = bool(CoalOracle(robot, around).penetrating(batch.q[i][None], MICROMETRE)[0])
+        else:
+            rng = np.random.default_rng([piece.seed, piece.number, i])
+            missed = dense(robot, points[i], normals[i], around, piece.searched, rng)
+        begin = time.process_time()
+        solver.solve(grasp, diagnose=False)
+        rows.append(
+            {
+                "grasp": name,
+                "status": batch.status_names[i].item(),
+                "blind": bool(around.free(blind[i][None])[0]),
+                "missed": missed,
+                "false": false,
+                "batch": spent,
+                "single": time.process_time() - begin,
+            }
         )
-        for name, one in grasp.contacts.items()
-    }
-    return ik.Grasp(contacts, object=grasp.object, object_pose=motion @ grasp.object_pose)
+    return rows
+
+
+def surroundings(check: SceneCheck, robot: ik.ArmHand, grasp: ik.Grasp) -> Surroundings:
+    """What a grasp is checked against."""
+    questions = Questions(robot, tolerances_by_finger(None, robot.fingers), True)
+    return check.around(questions.of_grasps([grasp], None))
+
+
+def dense(
+    robot: ik.ArmHand,
+    points: Array,
+    normals: Array,
+    around: Surroundings,
+    count: int,
+    rng: np.random.Generator,
+) -> bool:
+    """Whether one of many solutions has room to spare: those nearest to so many random postures."""
+    blind = ik.Solver(robot)
+    for first in range(0, count, AT_ONCE):
+        some = min(AT_ONCE, count - first)
+        both = (np.tile(one, (some, 1, 1)) for one in (points, normals))
+        found = blind.solve_batch(*both, q0=robot.random(rng, some), prefer="q0")
+        q = found.q[found.success]
+        if len(q) and (around.rows(np.zeros(len(q), np.intp)).check(q).room >= SAFE).any():
+            return True
+    return False
+
+
+def _moved(grasp: ik.Grasp, goal: Array, rng: np.random.Generator) -> ik.Grasp:
+    """The grasp with its object at a place, turned about the vertical."""
+    assert grasp.object_pose is not None
+    turn, motion = rng.uniform(-np.pi, np.pi), np.eye(4)
+    motion[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    motion[:3, 3] = goal - motion[:3, :3] @ grasp.object_pose[:3, 3]
+    return grasp.at(motion)
 
 
 def _clutter(rng: np.random.Generator, count: int, goal: Array) -> dict[str, dict[str, object]]:
@@ -77,34 +164,3 @@ def _clutter(rng: np.random.Generator, count: int, goal: Array) -> dict[str, dic
         )
         found[f"clutter_{len(found)}"] = kinds[len(found) % 3] | rest
     return found
-
-
-def dense(
-    solver: ik.Solver,
-    grasp: ik.Grasp,
-    around: Surroundings,
-    count: int,
-    margin: float,
-    rng: np.random.Generator,
-) -> bool:
-    """Whether one of many solutions of a grasp has room to spare."""
-    engine = solver._engine
-    problems = solver._questions.of_grasps([grasp], None)
-    finder = engine.freer
-    trials, limits = finder.trials, finder.trials.limits(problems)
-    descent = Descent(trials, problems)
-    looked = 0
-    while looked < count:
-        starts = solver.robot.random(rng, STARTS)
-        q = descent.run(np.zeros(STARTS, np.intp), limits.clip(starts))
-        q = q[trials.solved(repeated(problems, STARTS), q, True)]
-        looked += STARTS
-        if not len(q):
-            continue
-        swung = finder.swung(q, limits.lower, limits.upper)
-        every = q if swung is None else np.concatenate([q, swung.q])
-        looked += len(every)
-        rows = around.rows(np.zeros(len(every), np.intp))
-        if (rows.check(every).room >= margin).any():
-            return True
-    return False

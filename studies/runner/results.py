@@ -5,32 +5,17 @@ from __future__ import annotations
 import hashlib
 import json
 from functools import partial
-from importlib.metadata import version
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
+from casadi_ik.batches.code import code_version
 from casadi_ik.errors import InputError
 from runner.block import PART
 from runner.study import Block, Study, robot_of
 
 STUDY_FILE = "study.json"
-DECIDING = ("*.py", "*.c")
-IDLE = ("cli", "views", "logs")
-"""Parts of the package that have no say in what a solve comes to."""
-
-
-def code_version() -> str:
-    """Version of the package and a digest of the sources that decide a result."""
-    digest = hashlib.sha256()
-    root = Path(str(files("casadi_ik")))
-    for path in sorted(path for pattern in DECIDING for path in root.rglob(pattern)):
-        name = path.relative_to(root)
-        if name.parts[0] not in IDLE:
-            digest.update(name.as_posix().encode() + b"\0" + path.read_bytes())
-    return f"{version('casadi-ik')}+{digest.hexdigest()[:12]}"
 
 
 def fingerprint(study: Study) -> dict[str, Any]:

@@ -29,8 +29,8 @@ class Axis:
     way: Array
 
 
-def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, Surface]:
-    """The file's shapes by our link, in its frame."""
+def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, list[Surface]]:
+    """The shapes of the file's links by our link, in its frame."""
     tree = read_tree(file)
     theirs = tree_poses(tree)
     ours = Postures(part).poses({})
@@ -53,6 +53,8 @@ def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, Surface
         print(f"  joints not found in {file.name}: {missing}")
     parents = {joint.name: joint for joint in part.joints}
     holder = {matched[name].child: parents[name].child for name in matched}
+    for name, joint in matched.items():  # what hangs on a joint that moves there and not here
+        holder.setdefault(joint.parent, parents[name].parent)
     # The root's own body: all that is fixed to what the first joints hang on.
     first = next(j for j in part.joints if j.name in matched)
     body = rigid(tree, matched[first.name].parent)
@@ -77,14 +79,7 @@ def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, Surface
         pose = np.linalg.inv(ours[holder[link]]) @ base @ theirs[link]
         if len(surface.triangles):
             parts.setdefault(holder[link], []).append(surface.moved(pose))
-    joined = {}
-    for link in ours:
-        if link in parts:
-            points = [one.points for one in parts[link]]
-            starts = np.cumsum([0, *(len(one) for one in points[:-1])])
-            triangles = [one.triangles + n for one, n in zip(parts[link], starts, strict=True)]
-            joined[link] = Surface(np.concatenate(points), np.concatenate(triangles))
-    return joined
+    return {link: parts[link] for link in ours if link in parts}
 
 
 def rigid(tree: RobotTree, link: str) -> set[str]:

@@ -121,6 +121,9 @@ def test_a_robot_without_shapes_works_but_takes_no_scene(tmp_path):
         "panda+allegro_right",
         "ur5e+shadow",
         "iiwa14+leap",
+        "sawyer+robotiq_3f",
+        "xarm6+unitree_dex3",
+        "ar10",
     ],
 )
 def test_shipped_robots_stand_free_at_home(name):

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import casadi_ik as ik
+from casadi_ik.batches.target_file import TargetFile
 from casadi_ik.cli.outputs import OutputError, check_outputs
-from casadi_ik.cli.target_file import TargetFile
 from casadi_ik.errors import LONGEST, CasadiIKError, DescriptionError, InputError
 from casadi_ik.grasps import load_object
 

@@ -45,6 +45,7 @@ def test_a_finger_that_lags_at_a_limit() -> None:
     )
     assert found.verdict == (
         "finger_2 misses its point by 9.00 mm",
+        "collision not checked",
         "at its end at a limit: joint_b",
     )
 
@@ -91,7 +92,10 @@ def test_a_finger_that_was_there_and_left() -> None:
         "thumb lagged: it ends 1.00 mm and 10.00 deg off; it was within tolerance in 31 "
         "iterations, the last of them 30",
     )
-    assert found.verdict == ("thumb misses its normal by 10.00 deg",)
+    assert found.verdict == (
+        "thumb misses its normal by 10.00 deg",
+        "collision not checked",
+    )
 
 
 def test_who_came_last_when_it_is_solved() -> None:
@@ -105,7 +109,7 @@ def test_who_came_last_when_it_is_solved() -> None:
         "finger_2 was the last to come within tolerance, in iteration 34; the others were there "
         "in iteration 22",
     )
-    assert found.verdict == ("every contact is within tolerance",)
+    assert found.verdict == ("every contact is within tolerance", "collision not checked")
     rows["position_error"][:34, 0] = 0.05
     assert explain(make_one(rows)).fingers == (
         "the fingers came within tolerance together, in iteration 34",
@@ -191,6 +195,7 @@ def test_without_a_trace_only_the_end_is_told() -> None:
         "the log kept no iterations of this solve",
         "thumb misses its point by 100.00 mm and its normal by 11.46 deg",
         "finger_2 misses its point by 100.00 mm and its normal by 11.46 deg",
+        "collision not checked",
     )
 
 

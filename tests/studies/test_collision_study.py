@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import collision
 import pytest
+from collision_study import search
 
 
 def test_a_check_is_never_free_where_others_see_a_penetration():
@@ -14,9 +18,18 @@ def test_a_check_is_never_free_where_others_see_a_penetration():
         assert "1 um: **0**" in sentence
 
 
-def test_the_choice_is_measured(monkeypatch: pytest.MonkeyPatch):
+def test_the_choice_is_measured_and_taken_up_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(collision, "CLUTTER", (3,))
-    (row,) = collision.choice(1, 64, 0)
-    clutter, targets, _, found, _, false_free, *_ = row
-    assert (clutter, targets, false_free) == ("3", "1", "0")
-    assert found in ("0 of 0", "1 of 1")
+    monkeypatch.setattr(search, "TURNS", 2)
+    words = ["--checked", "60", "--timed", "32", "--count", "1", "--searched", "64"]
+    words += ["--out", str(tmp_path / "out"), "--report", str(tmp_path / "report")]
+    collision.main(words)
+    (path,) = (tmp_path / "out").glob("*.json")
+    targets = json.loads(path.read_text())["targets"]
+    assert targets
+    assert not any(one["false"] for one in targets)
+    written = path.stat().st_mtime_ns
+    collision.main(words)
+    assert path.stat().st_mtime_ns == written
+    names = [one["name"] for one in json.loads((tmp_path / "report" / "metrics.json").read_text())]
+    assert "collision/kuka_lwr_barrett/3/found" in names

@@ -11,15 +11,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 import small_study
+from dask_processes import scheduler_process, worker_process
 from runner import (
-    cluster,
     interval_text,
     mean_metric,
     median_metric,
@@ -32,6 +31,7 @@ from runner.block import solve_block
 from runner.results import STUDY_FILE, claim, missing
 
 import casadi_ik as ik
+from casadi_ik.batches import backend
 from casadi_ik.errors import InputError
 from casadi_ik.logs import Keep
 
@@ -80,53 +80,28 @@ def test_jobs_change_nothing(done, tmp_path):
     assert contents(tmp_path).equals(contents(done))
 
 
-@contextmanager
-def dask_process(*words: str, says: str) -> Iterator[str]:
-    """A process of Dask's command line, from when it has said something; gives the line.
-
-    It runs elsewhere and knows the installed package only: the studies are not on its path.
-    """
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dask", *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        cwd=Path(ik.__file__).parents[1] / "casadi_ik",
-        env=os.environ | {"PYTHONPATH": str(Path(ik.__file__).parents[1])},
-    )
-    assert process.stdout is not None
-    try:
-        yield next(line for line in process.stdout if says in line)
-        # What it says meanwhile may be as much as a pipe holds.
-    finally:
-        process.terminate()
-        process.communicate(timeout=30)
-
-
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
     """The address of a scheduler without workers."""
-    words = ("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show")
-    with dask_process(*words, says="Scheduler at:") as line:
-        yield line.split()[-1]
+    with scheduler_process() as (_, address):
+        yield address
 
 
 def test_a_dask_cluster_without_workers_is_refused(scheduler, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "PATIENCE", 1)
+    monkeypatch.setattr(backend, "PATIENCE", 1)
     with pytest.raises(InputError, match="found no worker within 1 s"):
         run(STUDY, tmp_path, dask=scheduler)
 
 
 def test_no_dask_scheduler_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "PATIENCE", 1)
+    monkeypatch.setattr(backend, "PATIENCE", 1)
     with pytest.raises(InputError, match="found no scheduler"):
         run(STUDY, tmp_path, dask="tcp://127.0.0.1:9")
 
 
 def test_a_dask_cluster_needs_the_installed_package_only(done, scheduler, tmp_path):
     """Scheduler and worker as the documentation starts them; the study as a program."""
-    worker = ("worker", scheduler, "--nthreads", "1", "--no-dashboard", "--no-nanny")
-    with dask_process(*worker, says="Registered to:"):
+    with worker_process(scheduler):
         command = [sys.executable, str(Path(small_study.__file__)), str(tmp_path), scheduler]
         environment = os.environ | {"PYTHONPATH": FOLDERS}
         ended = subprocess.run(
@@ -141,14 +116,14 @@ def test_a_worker_with_another_version_is_named(monkeypatch):
     class Client:
         def wait_for_workers(self, n_workers: int, timeout: float) -> None: ...
 
-        def run(self, function):
-            return {"tcp://worker:1": function() | {"casadi-ik": "0.0.1"}}
+        def run(self, function, packages):
+            return {"tcp://worker:1": function(packages) | {"casadi-ik": "0.0.1"}}
 
-        def run_on_scheduler(self, function):
-            return function()
+        def run_on_scheduler(self, function, packages):
+            return function(packages)
 
     with pytest.raises(InputError, match=r"tcp://worker:1 has .*casadi-ik 0\.0\.1.*expected"):
-        cluster._check(Client(), "tcp://here:1")  # type: ignore[arg-type]
+        backend._check(Client(), "tcp://here:1", backend.PACKAGES)  # type: ignore[arg-type]
 
 
 def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):

@@ -19,7 +19,13 @@ import casadi_ik as ik
 from casadi_ik.errors import InputError, PictureError
 from casadi_ik.logs import EventKind, MethodRows, Table
 from casadi_ik.views import draw_alternatives, draw_convergence, draw_solution
-from casadi_ik.views.captions import MET_COLOR, MISSED_COLOR, OBJECT_COLOR, TARGET_COLOR
+from casadi_ik.views.captions import (
+    MET_COLOR,
+    MISSED_COLOR,
+    NEAREST_COLOR,
+    OBJECT_COLOR,
+    TARGET_COLOR,
+)
 from casadi_ik.views.marks import contact_marks, target_place
 from casadi_ik.views.picture import new_figure, save_picture
 from casadi_ik.views.strips import events_strip
@@ -339,3 +345,20 @@ def test_the_strip_of_events_has_a_row_per_kind_and_jacobian() -> None:
         "restart": [(29.5, 1.0)],
     }
     assert events_strip(None).rows == {}
+
+
+def test_a_scene_is_drawn_with_what_touches_in_red(robot, grasp) -> None:
+    """The ball over the cup is red, because the hand is in it, and the legend says how deep."""
+    place = grasp.object_pose[:3, 3] + np.array([0.1, 0.0, 0.2])
+    solids = {
+        "table": {"kind": "box", "size": [2, 2, 0.04], "xyz": [0, 0, -0.02]},
+        "ball": {"kind": "sphere", "radius": 0.16, "xyz": place},
+    }
+    scene = ik.Scene(solids)
+    answer = ik.Solver(robot, scene=scene).solve(grasp, diagnose=False)
+    assert answer.status is ik.Status.COLLISION
+    figure = draw_solution(robot, answer, grasp, scene=scene, dpi=COARSE)
+    assert f"and ball, {1e3 * answer.clearance:.1f} mm" in words(figure)
+    plain = draw_solution(robot, answer, grasp, dpi=COARSE)
+    assert count(figure, NEAREST_COLOR) > count(plain, NEAREST_COLOR) + 200
+    assert "nearest" not in words(plain)

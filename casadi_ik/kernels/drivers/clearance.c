@@ -15,32 +15,6 @@ enum { MOST_CUTS = 40 };
 #define CLOSE 1e-7
 #define TINY 1e-30
 
-typedef struct {
-  int64_t kind;
-  double size[3];
-  double reach;                /* of the ball about its origin that holds it */
-  int64_t first, planes;       /* rows of the table of planes */
-} solid;
-
-typedef struct {
-  const double *q;             /* count rows of N_Q */
-  const double *poses;         /* of the scene's solids: rotation row by row, then the origin */
-  int64_t pose_step;           /* doubles from one configuration to the next, 0: the same for all */
-  int64_t n_solids;            /* of the scene; they come behind the robot's own */
-  const solid *solids;
-  const double *planes;
-  const double *radii, *halves;
-  const int32_t *pairs;        /* capsule; another, or N_CAPSULES + solid */
-  const double *offsets;       /* taken off each pair's distance */
-  int64_t n_pairs;
-  double most;                 /* distances above this are not told apart */
-  double *least;
-  int64_t *closest;            /* pair of the least; -1: none below `most` */
-  double *every;               /* count rows of n_pairs, or NULL */
-  int64_t count, next;
-  double slice;
-} clearance_job;
-
 typedef struct { lanes x, y, z; } vector;
 typedef struct { lanes value, slope; } along;
 
@@ -185,7 +159,7 @@ static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, 
 EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
   workspace space;
   lanes *q, *placed, *poses;
-  int64_t ticks = 0, k, pair;
+  int64_t ticks = 0, k;
   double limit;
   int lane, outcome = set_up(&space, N_Q + 6 * N_CAPSULES + 12 * (N_OWN + (size_t) job->n_solids));
   if (outcome != DONE) return outcome;
@@ -214,7 +188,9 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
       outcome = STEP_FAILED;
       break;
     }
-    for (pair = 0; pair < job->n_pairs; ++pair) {
+    /* What was in the way last may be in the way again. */
+    for (k = job->first < 0 ? 0 : -1; k < job->n_pairs; ++k) {
+      const int64_t pair = k < 0 ? job->first : k;
       const int i = job->pairs[2 * pair], j = job->pairs[2 * pair + 1];
       const vector c = load(placed + 6 * i), h = load(placed + 6 * i + 3);
       const double radius = job->radii[i] + job->offsets[pair], half = job->halves[i];
@@ -240,6 +216,10 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
       nearer = distance < least;
       least = lanes_select(nearer, distance, least);
       who = lanes_select(nearer, SPREAD((double) pair), who);
+      if (lanes_all(least < SPREAD(job->enough))) {
+        job->first = pair;
+        break;
+      }
     }
     for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
       job->least[job->next + lane] = least[lane];

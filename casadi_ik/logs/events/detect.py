@@ -13,6 +13,7 @@ standard field            events
 ``POSITION_ERROR`` and
 ``ANGLE_ERROR``
 ``Q``                     OSCILLATION
+``CLEARANCE``             COLLISION_ENTERED, COLLISION_LEFT (of a log with a scene)
 ========================  ==============================================================
 
 The standard fields are those of `casadi_ik.problem.trace`. One that a layout does not have gives
@@ -27,13 +28,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arrays import Bools
+from casadi_ik.logs.events.collisions import collisions
 from casadi_ik.logs.events.kinds import EventKind, event_format, mask_words
 from casadi_ik.logs.events.limits import limit_changes
 from casadi_ik.logs.events.rules import EventRules
 from casadi_ik.logs.events.singular import jacobians, near_singular, nearest_singular
 from casadi_ik.logs.events.standstill import oscillations, stalls
 from casadi_ik.logs.events.traces import Rows, Traces, Words, bits_of, words_of
-from casadi_ik.problem.trace import ACTIVE_MASK, LIMIT_MASK, PHASE, RESTART, TraceFormat
+from casadi_ik.problem.trace import (
+    ACTIVE_MASK,
+    CLEARANCE,
+    LIMIT_MASK,
+    PHASE,
+    RESTART,
+    TraceFormat,
+)
 
 
 def detect_events(
@@ -80,6 +89,9 @@ def _collect(collected: _Collected, traces: Traces, rules: EventRules) -> None:
             row = np.flatnonzero(joints.any(axis=1))
             size, size_before = (bits_of(words[row]).sum(axis=1) for words in (mask, before))
             collected.add(row, kind, size, size_before, joints[row])
+    if CLEARANCE in traces.names:
+        for kind, row, value in collisions(traces, rules):
+            collected.add(row, kind, value, rules.clearance)
     known = jacobians(traces.form, rules)
     for number, jacobian in enumerate(known, start=1):
         for kind, row, value, threshold in near_singular(traces, jacobian, rules):

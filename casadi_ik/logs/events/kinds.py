@@ -40,6 +40,10 @@ class EventKind(IntEnum):
     """The errors stand still: their relative spread against what counts as still."""
     OSCILLATION = 9
     """Actuators go to and fro without progress: the longest step against what counts as one."""
+    COLLISION_ENTERED = 10
+    """Two shapes have come nearer than they may: the clearance against the margin."""
+    COLLISION_LEFT = 11
+    """No two shapes are nearer than they may be any more: the clearance against the margin."""
 
 
 SINGULAR = (EventKind.NEAR_SINGULAR, EventKind.ILL_CONDITIONED)

@@ -28,6 +28,8 @@ class EventRules:
         oscillation_window: Iterations over which an oscillation is judged, at least 3.
         oscillation_step: Shortest step of a coordinate that counts as moving [rad or m].
         oscillation_progress: Relative fall of the error over the window that counts as progress.
+        clearance: Clearance below which something is touched [m]; a log with a scene takes the
+            scene's margin.
     """
 
     singular: Mapping[str, float] = field(default_factory=dict)
@@ -39,6 +41,7 @@ class EventRules:
     oscillation_window: int = 6
     oscillation_step: float = 1e-4
     oscillation_progress: float = 0.05
+    clearance: float = 0.0
 
     def __post_init__(self) -> None:
         if self.stall_window < 1 or self.oscillation_window < 3:

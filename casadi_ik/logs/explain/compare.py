@@ -83,6 +83,10 @@ def _lines(solve: OneSolve) -> dict[str, str]:
         lines[f"{finger} off by"] = errors(
             float(solve.position_error[i]), float(solve.angle_error[i])
         )
+    clearance = solve.clearance
+    lines["collision"] = (
+        "not checked" if clearance is None else f"clearance {1e3 * clearance:.2f} mm"
+    )
     if len(solve.rows) == 0:
         return lines
     counts: Counter[str] = Counter()

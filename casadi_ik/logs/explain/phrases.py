@@ -60,6 +60,10 @@ def told(event: Happening) -> str:
             return f"on to {plain_name(event.phase)}"
         case "STALL":
             return f"{plain_name(event.phase)} stalls: errors change by {value} of themselves"
+        case "COLLISION_ENTERED":
+            return f"something touches: clearance {1e3 * event.value:.2f} mm"
+        case "COLLISION_LEFT":
+            return f"nothing touches any more: clearance {1e3 * event.value:.2f} mm"
         case "OSCILLATION":
             return f"{joints} to and fro without progress: steps up to {value}"
         case kind:

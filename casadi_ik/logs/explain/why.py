@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.logs.explain.collisions import answer_lines, collision_lines
 from casadi_ik.logs.explain.phrases import errors, listed, number, plain_name
 from casadi_ik.logs.explain.row_errors import errors_of, within, worst
 from casadi_ik.logs.read.one_solve import OneSolve, Stretch
@@ -66,7 +67,12 @@ def explain(solve: OneSolve) -> Explanation:
         headline,
         tuple(_phases(solve)),
         tuple(_fingers(solve)),
-        (*_singularities(solve), *_limits(solve), *_standstills(solve)),
+        (
+            *_singularities(solve),
+            *_limits(solve),
+            *_standstills(solve),
+            *collision_lines(solve),
+        ),
         (*_verdict(solve), *_at_the_end(solve)),
     )
 
@@ -245,7 +251,11 @@ def _verdict(solve: OneSolve) -> Iterator[str]:
             yield f"{finger} misses {' and '.join(missed) or 'a tolerance of its own'}"
     if solve.ok.all():
         good = "every contact is within tolerance"
-        yield good if solve.success else f"{good}, but a limit is violated"
+        if solve.status == "COLLISION":
+            yield f"{good}, and limits are kept, but something touches"
+        else:
+            yield good if solve.success else f"{good}, but a limit is violated"
+    yield from answer_lines(solve)
 
 
 def _at_the_end(solve: OneSolve) -> Iterator[str]:
@@ -264,8 +274,6 @@ def _at_the_end(solve: OneSolve) -> Iterator[str]:
     if at_limit:
         beyond = " or beyond" if solve.asked.limits == "ignore" else ""
         yield f"at its end at{beyond} a limit: {', '.join(at_limit)}"
-    if solve.status == "COLLISION":
-        yield "contacts and limits are met by its answer, but something touches"
     if solve.status == "ITERATION_LIMIT":
         yield _progress(solve)
 

@@ -100,6 +100,8 @@ class OneSolve:
         asked: The question apart from its targets.
         shard: Name of the shard it comes from, if the log has several.
         number: Its number there; random numbers follow from it and the seed.
+        clearance: Of the answer [m]; None if the solver had no scene.
+        closest: The pair that is nearest to being too near; None as well if there is nothing.
     """
 
     method: str
@@ -126,6 +128,8 @@ class OneSolve:
     shard: str = ""
     number: int = 0
     target_more: Mapping[str, Array] = field(default_factory=dict)
+    clearance: float | None = None
+    closest: tuple[str, str] | None = None
 
     @property
     def tolerances(self) -> tuple[Tolerance, ...]:
@@ -200,6 +204,7 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
     iterations = log.iterations(method=part.method, solve=number).part
     events = log.events(method=part.method, solve=number)
     sources = log.sources.sources
+    checked = "clearance" in (part.rows.dtype.names or ())
     source = sources[0 if part.shard is None else int(part.shard[0])]
     return OneSolve(
         method=part.method,
@@ -226,6 +231,8 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
         shard=source.name if len(sources) > 1 else "",
         number=number - source.first,
         target_more=_more(row),
+        clearance=float(row["clearance"]) if checked else None,
+        closest=_pair(record) if checked else None,
     )
 
 
@@ -234,6 +241,11 @@ def _more(row: np.void) -> dict[str, Array]:
     known = row.dtype.names or ()
     more = {name: row[f"target_{name}"] for name in NAMES if f"target_{name}" in known}
     return {name: array for name, array in more.items() if not np.isnan(array).all()}
+
+
+def _pair(record: Mapping[str, Any]) -> tuple[str, str] | None:
+    pair = str(record["closest_first"]), str(record["closest_second"])
+    return None if "none" in pair else pair
 
 
 def _range(numbers: NDArray[np.int64]) -> str:

@@ -37,7 +37,7 @@ from casadi_ik.logs.write.provenance import log_metadata
 from casadi_ik.logs.write.solve_rows import solve_format, solve_rows
 from casadi_ik.logs.write.topic_messages import block_messages
 from casadi_ik.problem.recorder import SolveBlock
-from casadi_ik.problem.trace import TraceFormat
+from casadi_ik.problem.trace import CLEARANCE, TraceFormat
 
 Compression = Literal["none", "lz4", "zstd"]
 
@@ -134,14 +134,15 @@ class McapRecorder:
             return
         self._check(block)
         method = self._method(block)
-        rows = measured_rows(method.given, block.rows)
-        block = replace(block, format=method.form, rows=rows)
-        counts = block.batch.iterations
-        events = detect_events(block.format, block.rows, counts, self._rules)
+        block = replace(block, format=method.form, rows=measured_rows(block))
+        counts, rules = block.batch.iterations, self._rules
+        if block.around is not None:
+            rules = replace(rules, clearance=block.around.margin)
+        events = detect_events(block.format, block.rows, counts, rules)
         kinds = len(EventKind)
         cell = events["solve_id"].astype(np.int64) * kinds + events["kind"]
         tally = np.bincount(cell, minlength=len(block) * kinds).reshape(-1, kinds)
-        solves = solve_rows(block, tally, method.formats["solve"].layout)
+        solves = solve_rows(block, tally, method.formats["solve"])
         singular = tally[:, list(SINGULAR)].sum(axis=1) > 0
         solves["kept"] = self.keep(block.first, block.batch.success, singular)
         messages = block_messages(block, events, solves, method.channels, self.clock)
@@ -194,6 +195,7 @@ class McapRecorder:
             same = known.given.layout == block.format.layout and known.given.labels == (
                 block.format.labels
             )
+            same &= (block.around is not None) == (CLEARANCE in known.form.layout.names)
             if not same or known.fingers != block.fingers:
                 raise LogError(f"{where}: layout or labels differ from the method's earlier solves")
         try:
@@ -213,7 +215,7 @@ class McapRecorder:
         known = self._methods.get(block.method)
         if known is not None:
             return known
-        form = measured_format(block.format)
+        form = measured_format(block.format, block.around is not None)
         formats = {
             "iteration": form,
             "solve": solve_format(replace(block, format=form)),

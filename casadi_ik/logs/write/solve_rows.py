@@ -21,6 +21,18 @@ STATUSES = (*Status.labels(), Status.INVALID.name)
 """Names of the codes of a solve's status: those of `Status`, the last for its -1."""
 
 
+PAIR = ("closest_first", "closest_second")
+
+MOST_NAMES = 256
+"""Codes of one byte."""
+
+CHECKED = (
+    Field("clearance", (), "f8", "m", "of the answer, as `Solution.clearance`"),
+    *(Field(name, (), "u1", "", "of the pair that is nearest to being too near") for name in PAIR),
+)
+"""What is known where there is a scene."""
+
+
 def solve_format(block: SolveBlock) -> TraceFormat:
     """Layout and labels of the solves of a method."""
     n, f = block.batch.q.shape[1], len(block.fingers)
@@ -31,6 +43,7 @@ def solve_format(block: SolveBlock) -> TraceFormat:
         if names
         else ()
     )
+    checked = block.batch.clearance is not None
     layout = Layout.record(
         Field("started", (), "f8", "s", "since the Unix epoch"),
         Field("time", (), "f8", "s"),
@@ -45,6 +58,7 @@ def solve_format(block: SolveBlock) -> TraceFormat:
         Field("target_normals", (f, 3), "f8", "", "base frame; NaN if free"),
         *(Field(f"target_{name}", (f, 3), "f8", "", "base frame; NaN if free") for name in NAMES),
         *measured,
+        *(CHECKED if checked else ()),
         Field("solve_id", (), "u4"),
         Field("iterations", (), "u4", "", "over all phases and restarts"),
         Field("restarts", (), "u4"),
@@ -72,18 +86,20 @@ def solve_format(block: SolveBlock) -> TraceFormat:
         "status": STATUSES,
         "prefer": (NO_PREFERENCE, *PREFERENCES),
     }
+    if checked:
+        labels |= dict.fromkeys(PAIR, _pair_names(block))
     return TraceFormat(layout, labels)
 
 
-def solve_rows(block: SolveBlock, events: NDArray[np.int64], layout: Layout) -> NDArray[Any]:
+def solve_rows(block: SolveBlock, events: NDArray[np.int64], form: TraceFormat) -> NDArray[Any]:
     """The rows (k,) of a block; which solves are kept is left open.
 
     Args:
         block: The solves.
         events: (k, kinds) events by kind.
-        layout: Of `solve_format`.
+        form: Of `solve_format`.
     """
-    batch, problems = block.batch, block.problems
+    batch, problems, layout = block.batch, block.problems, form.layout
     rows = _alike(block, layout)
     rows["started"] = block.started * 1e-9
     rows["solve_id"] = block.first + np.arange(len(block))
@@ -108,7 +124,21 @@ def solve_rows(block: SolveBlock, events: NDArray[np.int64], layout: Layout) -> 
         rows[name] = getattr(batch, name)
     if "lowest_sigma" in layout.names:
         rows["lowest_sigma"] = _lowest(block)
+    if batch.clearance is not None:
+        rows["clearance"] = batch.clearance
+        known = {name: code for code, name in enumerate(form.labels[PAIR[0]])}
+        none = (form.labels[PAIR[0]][0],) * 2
+        pairs = [none if pair is None else pair for pair in batch.closest]
+        for i, field in enumerate(PAIR):
+            rows[field] = [known.get(pair[i], len(known) - 1) for pair in pairs]
     return rows
+
+
+def _pair_names(block: SolveBlock) -> tuple[str, ...]:
+    """What the closest pair may be called; the last stands for what is not among them."""
+    pairs = () if block.around is None else block.around.table.names
+    names = list(dict.fromkeys(name for pair in pairs for name in pair))
+    return ("none", *names[: MOST_NAMES - 2], "other")
 
 
 def _alike(block: SolveBlock, layout: Layout) -> NDArray[Any]:

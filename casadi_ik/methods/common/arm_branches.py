@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 
-from casadi_ik.symbolic.closed_arms.form import ClosedForm
+from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.symbolic.closed_arms.form import SIGNS, ClosedForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.srs_arm import SrsArm, at_angle, euler_angles, limit_roots, swivel
 from casadi_ik.symbolic.subexpressions import shared
@@ -61,6 +62,35 @@ def form_at(form: ClosedForm) -> ca.Function:
     arms = ca.horzcat(*(arm for bend in bends for arm in bend.arms())).T
     slack = ca.vertcat(*(bend.slack for bend in bends for _ in bend.ends))
     return ca.Function("form_at", inputs, shared(arms, slack))
+
+
+def arms_graph(arm: SrsArm | ClosedForm, name: str, recipe: str) -> FunctionGraph:
+    """All arms at a place of what the arm is free in, of one vector.
+
+    Args:
+        arm: The arm.
+        name: Of the function.
+        recipe: What it follows from.
+
+    Returns:
+        Rotation (9, row by row), origin (3) [m], and of an S-R-S arm elbow sign and swivel [rad],
+        of another the position of its swept joint [rad] -> the joints of the arm of every side one
+        after the other [rad], then the slack of each: >= 0 within reach.
+    """
+    alone = isinstance(arm, SrsArm)
+    sides, joints = (len(SIDES), 7) if isinstance(arm, SrsArm) else (len(SIGNS), len(arm.screws))
+    size = 12 + (2 if alone else 1)
+
+    def build() -> ca.Function:
+        x = ca.SX.sym("x", size)
+        palm = [ca.reshape(x[:9], 3, 3).T, x[9:12]]
+        at = arm_at(arm) if isinstance(arm, SrsArm) else form_at(arm)
+        arms, slack = at(*palm, *ca.vertsplit(x[12:]))
+        slacks = ca.repmat(slack, sides, 1) if alone else slack
+        return ca.Function(name, [x], shared(ca.vertcat(ca.vec(arms.T), slacks)), ["x"], ["arms"])
+
+    outputs = ((sides * (joints + 1), 1),)
+    return FunctionGraph(name, build, {"x": (size, 1)}, outputs, recipe)
 
 
 def _inputs() -> tuple[list[ca.SX], Pose, ca.SX]:

@@ -11,6 +11,7 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, MissingExtraError
 from casadi_ik.robots.couplings import Coupling, Linear, Polynomial
+from casadi_ik.robots.robot_files.file_shapes import mjcf_shapes
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, fixed, turned
 
 WORLD = "world"
@@ -63,7 +64,7 @@ def read_mjcf(path: Path) -> RobotTree:
     if len(roots) == 1 and roots[0].type in ("fixed", "free"):
         root = roots[0].child
         joints.remove(roots[0])
-    return RobotTree(path, root, tuple(joints), motors)
+    return RobotTree(path, root, tuple(joints), motors, mjcf_shapes(mujoco, model, names))
 
 
 def joint_name(model: Any, joint: int) -> str:

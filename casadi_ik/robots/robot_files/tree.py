@@ -13,6 +13,7 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.robots.couplings import Coupling
+from casadi_ik.robots.robot_files.file_shapes import NO_FILE_SHAPES, FileShapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +52,14 @@ class RobotTree:
         root: Its base link.
         joints: All joints, parents before children.
         motors: Lower and upper end of motors that are no joints (a tendon's), by name.
+        shapes: Those of its links for collisions.
     """
 
     path: Path
     root: str
     joints: tuple[TreeJoint, ...]
     motors: dict[str, tuple[float, float]] = field(default_factory=dict)
+    shapes: FileShapes = NO_FILE_SHAPES
 
     @cached_property
     def links(self) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, MissingExtraError
 from casadi_ik.robots.couplings import Coupling, Linear
+from casadi_ik.robots.robot_files.file_shapes import urdf_shapes
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, parents_first
 from casadi_ik.robots.robot_files.xml_text import (
     Element,
@@ -57,7 +58,8 @@ def read_urdf(element: Element, path: Path) -> RobotTree:
     root = _root(links, joints, path)
     model = _model(element, links, joints, path)
     found = {joint.name: joint for joint in _from_model(model, joints, path)}
-    return RobotTree(path, root, parents_first([found[name] for name in joints], root))
+    ordered = parents_first([found[name] for name in joints], root)
+    return RobotTree(path, root, ordered, shapes=urdf_shapes(element))
 
 
 def bare(element: Element) -> Element:

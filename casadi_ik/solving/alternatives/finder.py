@@ -102,7 +102,8 @@ class AlternativeFinder:
         return None if arm is None else branches_of(arm, self._compiled)
 
     @cached_property
-    def _manipulability(self) -> FunctionKernel:
+    def manipulability(self) -> FunctionKernel:
+        """Of the arm, for a configuration."""
         q = ca.SX.sym("q", len(self.robot.actuators))
         linear, angular = actuated(self.robot.description, q).palm_jacobian(self._arm)
         measure = manipulability(ca.vertcat(linear, angular))
@@ -140,7 +141,7 @@ class AlternativeFinder:
         if not isinstance(limit, (int, np.integer)) or limit < 1:
             raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
         preference(prefer, started=True)
-        apart = _distance(apart)
+        apart = checked_distance(apart)
         limits = self.trials.limits(problems)
         found: list[_Found] = []
         for number, q in enumerate(self._postures(problems, q0, limits)):
@@ -252,6 +253,10 @@ class AlternativeFinder:
         """Some columns of configurations as parts of their ranges."""
         return q[:, columns] / (self.robot.upper - self.robot.lower)[columns]
 
+    def arm_margins(self, q: Array) -> Array:
+        """(k,) smallest distance of the arm from its limits, as a part of half its range."""
+        return self._margins(q, self._arm)
+
     def _margins(self, q: Array, columns: list[int]) -> Array:
         half = (self.robot.upper - self.robot.lower)[columns] / 2
         inside = np.minimum(q - self.robot.lower, self.robot.upper - q)[:, columns] / half
@@ -283,7 +288,7 @@ class AlternativeFinder:
         return self._measured(q)
 
     def _measured(self, q: Array) -> Array:
-        return self._manipulability(q)[0] if self._arm else np.zeros(len(q))
+        return self.manipulability(q)[0] if self._arm else np.zeros(len(q))
 
     def _described(self, problems: Problems, found: _Found, q0: Array) -> Alternative:
         q = found.q[None]
@@ -320,7 +325,7 @@ def _distinct(parts: Array, apart: float, limit: int | None = None) -> list[int]
     return kept
 
 
-def _distance(apart: float) -> float:
+def checked_distance(apart: float) -> float:
     """A least difference of configurations.
 
     Raises:

@@ -1,49 +1,64 @@
-"""All arms that hold hands where they are, for many hands at once."""
+"""The preferred arms that hold hands where they are and touch nothing, for many hands at once."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.methods.common.arm_branches import SIDES, arm_at, form_at
+from casadi_ik.kernels.measure_kernel import MeasureKernel
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.kernels.swing_kernel import ArmPlaces, Checked, Order, SwingKernel
+from casadi_ik.methods.common.arm_branches import SIDES, arms_graph
 from casadi_ik.methods.common.arm_placement import ALLOWED
+from casadi_ik.problem.clearance import ROUNDING, Surroundings
+from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.symbolic.closed_arms.form import SIGNS
 from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.srs_arm import SrsArm
 
-SWIVELS = 24
+SWIVELS = 12
 """Swivels looked at all around, for every branch."""
 
-CLOSER = 15
+BETWEEN = 1
+"""So many more between each two of them, where nothing is found."""
+
+CLOSER = 13
 """Swivels looked at around the one that was taken."""
 
-ELBOWS = (1.0, -1.0)
+TURN = 2 * np.pi
+
+ORDERS = {
+    "limits": Order.LIMITS,
+    "q0": Order.NEAREST,
+    "manipulability": Order.MEASURED,
+    CLEARANCE: Order.CLEAREST,
+}
+
+Preference: TypeAlias = str | Callable[[Array], Array]
+"""One of `PREFERENCES`, or what gives configurations (m, n) their scores (m,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Swung:
-    """Arms of hands.
+    """Arms of k hands.
 
     Attributes:
         q: (m, n) configurations within the bounds.
         owner: (m,) number of the hand.
-        swivel: (m,) [rad].
-        branch: (m,) number of elbow and side.
+        tried: (k,) arms of each hand that were within bounds.
     """
 
     q: Array
     owner: NDArray[np.intp]
-    swivel: Array
-    branch: NDArray[np.intp]
-
-    def rows(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Swung:
-        """Some of them."""
-        return Swung(self.q[rows], self.owner[rows], self.swivel[rows], self.branch[rows])
+    tried: NDArray[np.int64]
 
 
 class ArmSwings:
@@ -53,76 +68,251 @@ class ArmSwings:
     arm of six joints has none.
     """
 
-    def __init__(self, robot: ArmHand, arm: ArmForm, compiled: bool = True) -> None:
-        """Compile the function of the arm or load it from the cache."""
-        self._robot = robot
+    def __init__(
+        self,
+        robot: ArmHand,
+        arm: ArmForm,
+        measure: Callable[[], FunctionKernel],
+        compiled: bool = True,
+    ) -> None:
+        """Compile the function of the arm or load it from the cache.
+
+        Args:
+            robot: The robot.
+            arm: Its arm.
+            measure: Gives the manipulability of the arm as a function of q.
+            compiled: False keeps to the virtual machine and numpy.
+        """
+        self._robot, self._measure = robot, measure
         self._columns = list(robot.description.arm_actuators)
-        self._elbows, self._sides = ELBOWS, len(SIDES)
-        self._range: tuple[float, float] | None = (0.0, 2 * np.pi)
-        if isinstance(arm, SrsArm):
-            self._at = FunctionKernel(arm_at(arm), compiled)
-        else:
-            self._at = FunctionKernel(form_at(arm), compiled)
-            self._elbows, self._sides = (1.0,), len(SIGNS)
-            self._range = None
-            if arm.swept_joint is not None:
-                column = self._columns[arm.swept_joint]
-                low, high = robot.lower[column], robot.upper[column]
-                middle, half = (low + high) / 2, min((high - low) / 2, np.pi)
-                self._range = (float(middle - half), float(middle + half))
-        self._srs = isinstance(arm, SrsArm)
+        self.places = places = _places(robot, arm)
+        name = ca.Function.fix_name(f"{robot.name}_all_arms")
+        graph = arms_graph(arm, name, recipe(name, robot.description))
+        self._arms = MeasureKernel(graph, compiled)
+        self._kernel = SwingKernel(places, self._arms, compiled)
 
-    def all_around(self, q: Array, lower: Array, upper: Array) -> Swung:
-        """Every branch at swivels all around, within bounds (n,), for hands as in q (k, n)."""
-        angles = self._swivels()
-        count, each = len(q), len(self._elbows) * len(angles)
-        owner = np.repeat(np.arange(count), each)
-        elbows = np.tile(np.repeat(self._elbows, len(angles)), count)
-        tried = np.tile(angles, count * len(self._elbows))
-        return self._arms(q, owner, elbows, tried, lower, upper)
-
-    def _swivels(self) -> Array:
-        if self._range is None:
-            return np.zeros(1)
-        first, last = self._range
-        return first + (last - first) * (np.arange(SWIVELS) + 0.5) / SWIVELS
-
-    def around(self, q: Array, swung: Swung, lower: Array, upper: Array) -> Swung:
-        """Of one arm per hand the swivels about it, of its branch; owners are rows of `swung`."""
-        if self._range is None:
-            return Swung(swung.q, np.arange(len(q)), swung.swivel, swung.branch)
-        step = (self._range[1] - self._range[0]) / SWIVELS
-        offsets = step * np.linspace(-1, 1, CLOSER + 2)[1:-1]
-        owner = np.repeat(np.arange(len(q)), CLOSER)
-        angles = (swung.swivel[:, None] + offsets).ravel()
-        elbows = np.array(self._elbows)[swung.branch // self._sides][owner]
-        found = self._arms(q, owner, elbows, angles, lower, upper)
-        same = found.branch == swung.branch[found.owner]
-        return Swung(found.q[same], found.owner[same], found.swivel[same], found.branch[same])
-
-    def _arms(
+    def choose(
         self,
         q: Array,
-        owner: NDArray[np.intp],
-        elbows: Array,
-        angles: Array,
-        lower: Array,
-        upper: Array,
+        starts: Array,
+        bounds: tuple[Array, Array],
+        prefer: Preference,
+        around: Surroundings | None,
+        room: Array,
+        branches: bool = False,
+        closer: bool = True,
     ) -> Swung:
-        if not len(angles):
-            none = np.zeros(0, dtype=np.intp)
-            return Swung(q[:0], none, angles, none)
-        columns = self._columns
-        palms = self._robot.palm(q)[owner]
-        origin = np.ascontiguousarray(palms[:, :3, 3])
-        freedom = (elbows, angles) if self._srs else (angles,)
-        arms, reach = self._at(palms[:, :3, :3], origin, *freedom)
-        low, high = lower[columns], upper[columns]
-        margin = np.minimum(arms - low, high - arms).min(axis=2)
-        within = reach.reshape(len(angles), -1) >= 0
-        rows, sides = np.nonzero((margin >= ALLOWED) & within)
-        found = q[owner[rows]]
-        found[:, columns] = arms[rows, sides]
-        signs = (elbows[rows] < 0).astype(np.intp)
-        clipped = np.clip(found, lower, upper)
-        return Swung(clipped, owner[rows], angles[rows], signs * self._sides + sides)
+        """The preferred arm that touches nothing, of every hand that has one.
+
+        Args:
+            q: (k, n) configurations of hands that touch nothing themselves, with an arm for each.
+            starts: (k, n) where the robot is.
+            bounds: (n,) and (n,).
+            prefer: What is preferred.
+            around: What nothing may touch; None: nothing is checked.
+            room: (k,) of what the hand alone decides [m]; infinite where nothing is checked.
+            branches: Whether to give the preferred arm of every branch, instead of one.
+            closer: Whether to look about the swivels at which they were found.
+
+        Returns:
+            The arms; with "clearance" those with most room, free or not.
+        """
+        if not len(q):
+            return Swung(q, np.zeros(0, np.intp), np.zeros(0, np.int64))
+        palms = self._robot.palm(q)
+        inside = bounds[0][self._columns], bounds[1][self._columns]
+        checked = None
+        if around is not None:
+            checked = Checked(
+                around.kernel, around.table.swung, around.poses, around.margin, ROUNDING, room
+            )
+        order = None if callable(prefer) else ORDERS[prefer]
+        measure = self._measure() if order is Order.MEASURED else None
+        if order is None or not self._kernel.can(checked, measure):
+            return _Slow(
+                self, palms, q, starts, inside, prefer, around, room, branches, closer
+            ).run()
+        arms, score, tried = self._kernel.choose(
+            q, palms, starts, inside, order, checked, branches, closer, measure
+        )
+        owner, group = np.nonzero(score > -np.inf)
+        found = q[owner]
+        found[:, self._columns] = arms[owner, group]
+        return Swung(found, owner, tried)
+
+    def rated(self, q: Array, starts: Array, prefer: Preference) -> Array:
+        """(m,) the order of arms of the same hand, higher is better."""
+        if callable(prefer):
+            return np.asarray(prefer(q), dtype=float)
+        arm, places = q[:, self._columns], self.places
+        ranges = places.high - places.low
+        if prefer == "q0":
+            away = (arm - starts[:, self._columns]) / ranges
+            return -np.square(away).sum(axis=1)
+        if prefer == "manipulability":
+            return self._measure()(q)[0]
+        return (np.minimum(arm - places.low, places.high - arm) / (0.5 * ranges)).min(axis=1)
+
+    def at(
+        self, palms: Array, owner: NDArray[np.intp], tried: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Arms (m, sides, a) of hands at places (m, f), and whether each is within reach."""
+        turned = palms[owner]
+        rotation = turned[:, :3, :3].reshape(-1, 9)
+        found = self._arms(np.hstack([rotation, turned[:, :3, 3], tried]))
+        sides, a = self.places.sides, len(self._columns)
+        arms = found[:, : sides * a].reshape(-1, sides, a)
+        return arms, found[:, sides * a :] >= 0
+
+
+def _places(robot: ArmHand, arm: ArmForm) -> ArmPlaces:
+    columns = list(robot.description.arm_actuators)
+    sides, first, last = len(SIDES), 0.0, TURN
+    swept = True
+    if not isinstance(arm, SrsArm):
+        sides, swept = len(SIGNS), arm.swept_joint is not None
+        if arm.swept_joint is not None:
+            low, high = (ends[columns[arm.swept_joint]] for ends in (robot.lower, robot.upper))
+            middle, half = (low + high) / 2, min((high - low) / 2, np.pi)
+            first, last = middle - half, middle + half
+    step = (last - first) / SWIVELS
+    middles = first + step * (np.arange(SWIVELS) + 0.5)
+    between = np.arange(1, BETWEEN + 1) / (BETWEEN + 1)
+    levels = [middles, (middles[:, None] + step * between).ravel()]
+    if not swept:
+        levels = [np.zeros(1), np.zeros(0)]
+    placed = [level[:, None] for level in levels]
+    if isinstance(arm, SrsArm):
+        placed = [
+            np.vstack([np.insert(one, 0, sign, axis=1) for sign in (1, -1)]) for one in placed
+        ]
+    closer = step * np.linspace(-1, 1, CLOSER + 2)[1:-1] if swept else np.zeros(0)
+    return ArmPlaces(
+        np.array(columns, dtype=np.int64),
+        robot.lower[columns],
+        robot.upper[columns],
+        sides,
+        (placed[0], placed[1]),
+        closer,
+        ALLOWED,
+    )
+
+
+class _Slow:
+    """The same choice in numpy: for a preference of one's own, and without a compiler."""
+
+    def __init__(
+        self,
+        swings: ArmSwings,
+        palms: Array,
+        q: Array,
+        starts: Array,
+        bounds: tuple[Array, Array],
+        prefer: Preference,
+        around: Surroundings | None,
+        room: Array,
+        branches: bool,
+        closer: bool,
+    ) -> None:
+        self.room = room
+        self.swings, self.palms, self.q, self.starts = swings, palms, q, starts
+        self.bounds, self.prefer, self.around, self.branches = bounds, prefer, around, branches
+        self.places = swings.places
+        self.closer = swings.places.closer if closer else np.zeros(0)
+        self.groups = self.places.branches + 1 if branches else 1
+        self.tried = np.zeros(len(q), dtype=np.int64)
+
+    def run(self) -> Swung:
+        """Level by level, until every hand has an arm."""
+        count = len(self.q) * self.groups
+        best, score = np.empty((count, self.q.shape[1])), np.full(count, -np.inf)
+        left = np.arange(len(self.q))
+        for level, given in enumerate(self.places.levels):
+            if not len(given) or not len(left):
+                continue
+            of_place = np.repeat(left, len(given))
+            found = self._look(of_place, np.tile(given, (len(left), 1)))
+            if not level:
+                own = left, self.q[left], np.full((len(left), given.shape[1]), np.nan)
+                group = np.full(len(left), self.places.branches)
+                found = [np.concatenate(both) for both in zip(found, (*own, group), strict=True)]
+            np.add.at(self.tried, found[0], 1)
+            taken = self._take(best, score, *found)
+            owner, _, places, branch = (each[taken] for each in found)
+            self._refine(best, score, owner, places, branch)
+            enough = score.reshape(-1, self.groups).max(axis=1) >= (
+                -ROUNDING if self.prefer == CLEARANCE else -np.inf
+            )
+            done = enough & np.isfinite(score.reshape(-1, self.groups)).any(axis=1)
+            left = left[~done[left]]
+        rows = np.flatnonzero(score > -np.inf)
+        return Swung(best[rows], rows // self.groups, self.tried)
+
+    def _look(self, owner: NDArray[np.intp], places: Array) -> list[Array]:
+        """Owner, configuration, place and branch of the arms within bounds at places."""
+        swings, columns = self.swings, self.places.columns
+        arms, reached = swings.at(self.palms, owner, places)
+        lower, upper = self.bounds
+        if self.prefer == "q0":
+            start = self.starts[owner][:, None, columns]
+            turned = arms + TURN * np.floor((start - arms) / TURN + 0.5)
+            arms = np.where((turned >= lower) & (turned <= upper), turned, arms)
+        margin = np.minimum(arms - lower, upper - arms).min(axis=2)
+        rows, side = np.nonzero((margin >= self.places.allowed) & reached)
+        found = self.q[owner[rows]]
+        found[:, columns] = np.clip(arms[rows, side], lower, upper)
+        bent = (places[rows, 0] < 0) if places.shape[1] > 1 else np.zeros(len(rows), dtype=bool)
+        return [owner[rows], found, places[rows], bent * self.places.sides + side]
+
+    def _take(
+        self,
+        best: Array,
+        score: Array,
+        owner: NDArray[np.intp],
+        q: Array,
+        places: Array,
+        branch: NDArray[np.intp],
+    ) -> NDArray[np.intp]:
+        """Keep the preferred free arm of every hand and branch; the rows that were kept."""
+        del places
+        if not len(q):
+            return np.zeros(0, dtype=np.intp)
+        slot = owner * self.groups + (branch if self.branches else 0)
+        value = self.swings.rated(q, self.starts[owner], self.prefer)
+        if self.around is not None:
+            around = self.around.rows(owner)
+            around = Surroundings(around.kernel, around.table.swung, around.poses, around.margin)
+            if self.prefer == CLEARANCE:
+                value = np.minimum(around.check(q).room, self.room[owner])
+            else:
+                value = np.where(around.free(q), value, -np.inf)
+        # Of equals that farthest from limits, of those the first.
+        margin = self.swings.rated(q, q, "limits") if self.prefer == CLEARANCE else np.zeros(len(q))
+        order = np.lexsort((-np.arange(len(q)), margin, value, slot))
+        last = order[np.append(slot[order][1:] != slot[order][:-1], True)]
+        better = last[value[last] > score[slot[last]]]
+        best[slot[better]], score[slot[better]] = q[better], value[better]
+        return better
+
+    def _refine(
+        self,
+        best: Array,
+        score: Array,
+        owner: NDArray[np.intp],
+        places: Array,
+        branch: NDArray[np.intp],
+    ) -> None:
+        """Places about those of arms that were taken, their branches only."""
+        closer = self.closer
+        varied = np.flatnonzero(np.isfinite(places[:, 0]))
+        if not len(closer) or not len(varied):
+            return
+        from_row = np.repeat(varied, len(closer))
+        near = places[from_row]
+        near[:, -1] += np.tile(closer, len(varied))
+        # A hand may have several branches: each is looked at as if it were a hand of its own.
+        for one in np.unique(branch[varied]):
+            mine = branch[from_row] == one
+            found = self._look(owner[from_row[mine]], near[mine])
+            same = found[3] == one
+            self._take(best, score, *(each[same] for each in found))

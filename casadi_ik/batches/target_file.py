@@ -75,6 +75,15 @@ class TargetFile:
         """
         return sum(len(block["points"]) for block in self.blocks(lambda: size))
 
+    def rows(self) -> int:
+        """How many targets there are, by the heads of its arrays alone.
+
+        Raises:
+            InputError: As `check`, as far as the heads tell.
+        """
+        with self._opened() as archive, self._member(archive, KEYS[0]) as points:
+            return points.count
+
     def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, Array]]:
         """Arrays (up to size, f, 3) by name, one block after the other.
 

@@ -1,0 +1,139 @@
+"""`casadi-ik choose`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from casadi_ik.api import Solver
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.batches.target_file import TargetFile
+from casadi_ik.cli.answer import Answer, Exit
+from casadi_ik.cli.outputs import check_outputs, write_output
+from casadi_ik.cli.question import (
+    located,
+    the_object_pose,
+    the_robot,
+    the_scene,
+    the_start,
+    the_tolerance,
+)
+from casadi_ik.cli.report import clearance, duration, files, headline, table
+from casadi_ik.cli.solve import as_json
+from casadi_ik.errors import DescriptionError
+from casadi_ik.grasps import Contact, Grasp
+from casadi_ik.grasps.candidates import load_candidates
+from casadi_ik.problem.contacts.arrays import NAMES
+from casadi_ik.problem.problems import DIRECTIONS
+from casadi_ik.problem.ranking import Ranking
+
+BLOCK = 4096
+"""Rows of an npz file that are read at once."""
+
+
+def choose(arguments: argparse.Namespace) -> Answer:
+    """Rank the answers to many grasps.
+
+    Raises:
+        CasadiIKError: Bad input, or an output that cannot be written.
+    """
+    path, out = Path(arguments.candidates), arguments.out
+    robot = the_robot(arguments.robot)
+    q0, pose = the_start(arguments, robot), the_object_pose(arguments)
+    grasps = the_candidates(path, robot)
+    check_outputs([("--out", out)], inputs=[path])
+    solver = Solver(robot, tolerance=the_tolerance(arguments), scene=the_scene(arguments))
+    with located(str(path)):
+        ranking = solver.choose(grasps, pose, q0, arguments.limit, arguments.prefer, arguments.seed)
+    text = json.dumps(_ranked(ranking, grasps), indent=2, allow_nan=False) + "\n"
+    write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
+    report = _report(path.name, solver, ranking, grasps, out)
+    return Answer(report, Exit.DONE if ranking.entries else Exit.NOT_SOLVED)
+
+
+def the_candidates(path: Path, robot: ArmHand) -> tuple[Grasp, ...]:
+    """The grasps of a file or a folder.
+
+    Raises:
+        InputError: It is missing, empty or malformed, or has fingers that the robot has not.
+    """
+    if path.suffix == ".npz":
+        return tuple(_of_arrays(path, robot.fingers))
+    if not path.exists():
+        raise DescriptionError(f"{path}: no such file or folder, expected candidates")
+    grasps = load_candidates(path)
+    for grasp in grasps:
+        with located(f"{path}: {grasp.name}"):
+            grasp.arrays(robot.fingers)
+    return grasps
+
+
+def _of_arrays(path: Path, fingers: tuple[str, ...]) -> list[Grasp]:
+    found: list[Grasp] = []
+    for block in TargetFile(path, len(fingers)).blocks(lambda: BLOCK):
+        for row in range(len(block["points"])):
+            with located(f"{path}: row {len(found)}"):
+                given = {name: rows[row] for name, rows in block.items()}
+                contacts = {
+                    finger: contact
+                    for i, finger in enumerate(fingers)
+                    if (contact := _contact({name: v[i] for name, v in given.items()})) is not None
+                }
+                found.append(Grasp(contacts))
+    return found
+
+
+def _contact(vectors: dict[str, np.ndarray]) -> Contact | None:
+    """What an npz file says of a finger; None where that is free."""
+    given = {name: vector for name, vector in vectors.items() if not np.isnan(vector).all()}
+    if not given:
+        return None
+    if DIRECTIONS in given and "points" not in given:
+        return Contact(direction=given[DIRECTIONS])
+    more = {name[:-1]: given[name] for name in NAMES if name in given}
+    return Contact(given.get("points"), given.get("normals"), **more)
+
+
+def _ranked(ranking: Ranking, grasps: tuple[Grasp, ...]) -> dict[str, Any]:
+    return {
+        "candidates": ranking.candidates,
+        "answered": ranking.answered,
+        "prefer": ranking.prefer,
+        "failures": dict(ranking.failures),
+        "ranked": [
+            {
+                "candidate": one.candidate,
+                "name": grasps[one.candidate].name,
+                "score": one.score,
+                "solution": as_json(one.solution),
+            }
+            for one in ranking
+        ],
+    }
+
+
+def _report(
+    name: str, solver: Solver, ranking: Ranking, grasps: tuple[Grasp, ...], out: Path
+) -> RenderableType:
+    found = f"{ranking.answered} of {ranking.candidates} candidates of {name} have an answer"
+    seconds = sum(one.solution.time for one in ranking.entries[:1]) * ranking.candidates
+    parts: list[RenderableType] = [
+        headline(bool(ranking.entries), "FOUND" if ranking.entries else "NONE FOUND", found)
+    ]
+    if ranking.entries:
+        best = table("candidate", "name", "score", "clearance", right=("score",))
+        for one in ranking:
+            clear = clearance(one.solution) if one.solution.clearance is not None else "not checked"
+            label = grasps[one.candidate].name
+            best.add_row(str(one.candidate), label, f"{one.score:.4g}", clear)
+        parts += [Text(f"  by {ranking.prefer}, in {duration(seconds)}"), best]
+    if solver.scene is None:
+        parts.append(Text("  collision not checked"))
+    parts += [Text(f"  {count} have none: {reason}") for reason, count in ranking.failures.items()]
+    return Group(*parts, *files([("out", out)]))

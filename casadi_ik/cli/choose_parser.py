@@ -1,0 +1,99 @@
+"""What can be said behind `casadi-ik choose`."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from casadi_ik.cli.values import file_name, numbers, one_of, positive, whole
+from casadi_ik.problem.preference import PREFERENCES
+
+if TYPE_CHECKING:
+    from casadi_ik.cli.answer import Answer
+
+_EXAMPLES = """\
+examples:
+  casadi-ik choose candidates.yaml --robot panda+allegro_right --scene table --out ranked.json
+  casadi-ik choose grasps/ --robot R --object-pose 0.5 0 0.1 0 0 1.57 --prefer q0 --out ranked.json
+
+CANDIDATES is one of
+  a YAML file with a list of grasps, each as a grasp file has it:
+    candidates:
+      - contacts: {thumb: {point: [0.02, 0.10, 0.05], normal: [0.0, -0.94, 0.34]}, ...}
+      - contacts: ...
+  a folder of grasp files
+  an npz file with points and normals (k, f, 3), as for `casadi-ik batch`
+
+RANKED.json holds the answers, best first, each with the number of its candidate and its score, and
+how many candidates have none, by reason.
+
+exit codes: 0 at least one found, 1 none (the report counts the reasons), 2 bad input
+"""
+
+
+def add_choose(commands: Any) -> None:
+    """Add `choose` to the commands."""
+    parser = commands.add_parser(
+        "choose",
+        help="find the best of many grasps of one object",
+        description="Of many grasps find those that are best to take, and how.",
+        epilog=_EXAMPLES,
+    )
+    parser.add_argument("candidates", metavar="CANDIDATES", help="the grasps, see below")
+    parser.add_argument("--robot", metavar="R", required=True, help="a shipped name or a YAML file")
+    parser.add_argument(
+        "--object-pose",
+        metavar="X",
+        type=numbers,
+        nargs="+",
+        help="where the object is: x y z [m] roll pitch yaw [rad] in the base frame; candidates "
+        "that do not say where theirs is are in its frame",
+    )
+    parser.add_argument(
+        "--scene",
+        metavar="FILE",
+        help="what answers must not touch: a shipped name or a YAML file (default: nothing is "
+        "checked)",
+    )
+    parser.add_argument(
+        "--prefer",
+        metavar="|".join(PREFERENCES),
+        type=one_of(*PREFERENCES),
+        help="what comes first: far from limits, with a manipulable arm, near the start, or with "
+        "--scene far from what may be hit (default: q0 if it is given, else limits)",
+    )
+    parser.add_argument(
+        "--q0",
+        metavar="V",
+        type=numbers,
+        nargs="+",
+        help="where the robot is: a number per actuator [rad or m] (default: home)",
+    )
+    parser.add_argument(
+        "--limit", metavar="N", type=whole(1), default=10, help="answers at most (default: 10)"
+    )
+    parser.add_argument(
+        "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"
+    )
+    parser.add_argument(
+        "--tolerance-position",
+        metavar="METRES",
+        type=positive,
+        help="when a contact point counts as reached (default: 0.005)",
+    )
+    parser.add_argument(
+        "--tolerance-angle",
+        metavar="RADIANS",
+        type=positive,
+        help="when a contact normal counts as reached (default: 0.0524, 3 deg)",
+    )
+    parser.add_argument(
+        "--out", metavar="RANKED.json", type=file_name(), required=True, help="write the answers"
+    )
+    parser.set_defaults(run=_choose)
+
+
+def _choose(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.choose import choose
+
+    return choose(arguments)

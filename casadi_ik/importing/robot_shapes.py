@@ -1,0 +1,52 @@
+"""The shapes of a whole robot from the files of its parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from casadi_ik.importing.fitted import fitted
+from casadi_ik.importing.surfaces import Surface, checked_surfaces
+from casadi_ik.importing.touching import may_touch
+from casadi_ik.robots.collision import ShapeEntry, Touching
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.robots.part import PREFIX
+from casadi_ik.robots.robot_files.read import read_tree
+
+
+def robot_shapes(
+    robot: RobotDescription, files: tuple[Path | None, Path]
+) -> tuple[dict[str, list[ShapeEntry]], list[Touching], list[str]]:
+    """Shapes by link of the robot, links that may touch, and what could not be read.
+
+    Simple shapes stay what they are; a mesh, or what is seen of a link that says nothing of
+    collisions, is held by few capsules.
+
+    Args:
+        robot: The robot, imported from the files.
+        files: The arm's, if it has one of its own, and the hand's.
+    """
+    surfaces: dict[str, Surface] = {}
+    simple: dict[str, list[ShapeEntry]] = {}
+    notes: list[str] = []
+    taken: set[str] = set()
+    for file in files:
+        if file is None:
+            continue
+        tree = read_tree(file)
+        ours = {link: _ours(link, robot.links, taken) for link in tree.links}
+        wanted = {link: name for link, name in ours.items() if name in robot.links}
+        found, said = checked_surfaces(file, wanted)
+        surfaces |= {wanted[link]: surface for link, surface in found.items()}
+        entries = tree.shapes.entries
+        simple |= {wanted[link]: list(entries[link]) for link in wanted if link in entries}
+        notes += said
+        taken |= set(tree.links)
+    ordered = {link: surfaces[link] for link in robot.links if link in surfaces}
+    shapes = fitted(ordered, {robot.palm_link}, simple)
+    return shapes, may_touch(robot, shapes, surfaces), notes
+
+
+def _ours(link: str, links: tuple[str, ...], taken: set[str]) -> str:
+    """What a link of a file is called in the robot."""
+    prefixed = PREFIX + link
+    return prefixed if prefixed in links and link in taken else link

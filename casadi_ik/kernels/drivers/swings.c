@@ -1,0 +1,343 @@
+/* For hands that stay where they are the preferred arms that touch nothing.
+ *
+ * All arms in closed form, at given places of what an arm is free in (the swivel of its elbow, its
+ * swept joint), are put in the asked order and checked, as many at a time as go side by side, until
+ * one is free. Places about that one are then looked at in the same way, on its branch only. Where
+ * nothing is free, places between the given ones are looked at before the hand is given up.
+ *
+ * The compiled kernels are called by pointers.
+ */
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#if defined(_WIN32)
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+
+enum { DONE = 0, SLICE_OVER = 1, NO_MEMORY = -1 };
+enum { FAR_FROM_LIMITS, NEAR_START, MEASURED, CLEAREST };
+enum { PALM = 12, LEVELS = 2 };
+
+#define TURN 6.283185307179586
+
+typedef struct {
+  int (*arms)(map_job *);      /* rotation, origin, freedom -> the arm of every side, their slacks */
+  int (*measure)(map_job *);   /* q -> how good it is; for MEASURED */
+  int (*check)(clearance_job *);
+  clearance_job *clear;        /* what is checked; NULL: nothing is */
+  int64_t lanes;               /* configurations that are checked side by side */
+  int64_t order;
+  int64_t n_q, n_arm, n_free, n_sides;
+  int64_t n_groups;            /* 1: one arm is wanted; else one of every branch, and the given one */
+  int64_t n_places[LEVELS], n_closer;
+  const double *places[LEVELS]; /* rows of n_free, the last of which may be varied */
+  const double *closer;        /* by how much, about what was chosen */
+  const int64_t *columns;      /* of the arm in q */
+  const double *lower, *upper; /* bounds of the arm */
+  const double *low, *range;   /* its limits, which order it */
+  const double *q, *palms, *starts; /* rows of n_q, 16 and n_q */
+  const double *caps;          /* room that no arm of the hand can exceed */
+  const double *poses;
+  int64_t pose_step;           /* doubles from one hand to the next, 0: the same for all */
+  double margin, rounding;     /* distance to keep, and what it may be short of that */
+  double allowed;              /* how far a joint may be within its bounds at least: rounding */
+  int64_t count;
+  double *chosen;              /* rows of n_groups arms */
+  double *score;               /* rows of n_groups: of the arm alone; -inf: there is none */
+  int64_t *tried;              /* arms within bounds */
+} swings_job;
+
+/* Arms that were found, and what becomes of them. */
+typedef struct {
+  int64_t count;
+  double *found, *score;
+  int64_t *arm, *place, *group; /* place in `found`, row of the samples, branch */
+  char *used;
+} pool;
+
+typedef struct {
+  pool all, near;
+  double *samples, *rows, *least;
+  int64_t *closest, *picked;
+  void *memory;
+} scratch;
+
+static int64_t most_arms(const swings_job *job, int near) {
+  int64_t places = near ? job->n_closer : job->n_places[0];
+  if (!near && job->n_places[1] > places) places = job->n_places[1];
+  return places * job->n_sides + 1;
+}
+
+static int lay_out(const swings_job *job, scratch *space) {
+  const int64_t sides = job->n_sides, wide = job->n_arm + 1;
+  pool *pools[] = {&space->all, &space->near};
+  const int64_t most = most_arms(job, 0) > most_arms(job, 1) ? most_arms(job, 0) : most_arms(job, 1);
+  const size_t numbers = (size_t) (2 * most * (wide + 4) + most * (PALM + job->n_free)
+                                   + (most + job->lanes) * job->n_q + 3 * job->lanes + 2 * sides);
+  char *next = calloc(numbers * sizeof(double) + 2 * (size_t) most, 1);
+  int i;
+  if (!next) return NO_MEMORY;
+  space->memory = next;
+#define TAKE(where, type, size) \
+  (where) = (type *) next;      \
+  next += (size_t) (size) * sizeof(type)
+  for (i = 0; i < 2; ++i) {
+    TAKE(pools[i]->found, double, most * wide);
+    TAKE(pools[i]->score, double, most);
+    TAKE(pools[i]->arm, int64_t, most);
+    TAKE(pools[i]->place, int64_t, most);
+    TAKE(pools[i]->group, int64_t, most);
+  }
+  TAKE(space->samples, double, most * (PALM + job->n_free));
+  TAKE(space->rows, double, (most + job->lanes) * job->n_q);
+  TAKE(space->least, double, job->lanes);
+  TAKE(space->closest, int64_t, job->lanes);
+  TAKE(space->picked, int64_t, job->lanes);
+  for (i = 0; i < 2; ++i) {
+    TAKE(pools[i]->used, char, most);
+  }
+#undef TAKE
+  return DONE;
+}
+
+static int mapped(int (*kernel)(map_job *), const double *in, int64_t wide, double *out,
+                  int64_t wide_out, int64_t count) {
+  const double *inputs[1];
+  double *outputs[1];
+  map_job map = {0};
+  int code;
+  inputs[0] = in;
+  outputs[0] = out;
+  map.inputs = inputs;
+  map.input_steps = &wide;
+  map.outputs = outputs;
+  map.output_steps = &wide_out;
+  map.count = count;
+  map.slice = 1.0;
+  do code = kernel(&map);
+  while (code == SLICE_OVER);
+  return code;
+}
+
+/* Puts an arm into its bounds and the asked turn; whether it was within, as far as rounding goes. */
+static int admit(const swings_job *job, double *arm, const double *start) {
+  int64_t j;
+  for (j = 0; j < job->n_arm; ++j) {
+    const double low = job->lower[j], high = job->upper[j];
+    double x = arm[j];
+    if (job->order == NEAR_START) {
+      const double turned = x + TURN * floor((start[job->columns[j]] - x) / TURN + 0.5);
+      if (turned >= low && turned <= high) x = turned;
+    }
+    if (!(x - low >= job->allowed && high - x >= job->allowed)) return 0;
+    arm[j] = x < low ? low : x > high ? high : x;
+  }
+  return 1;
+}
+
+static double rated(const swings_job *job, const double *arm, const double *start) {
+  double value = job->order == NEAR_START ? 0.0 : INFINITY;
+  int64_t j;
+  for (j = 0; j < job->n_arm; ++j) {
+    const double range = job->range[j];
+    if (job->order == NEAR_START) {
+      const double part = (arm[j] - start[job->columns[j]]) / range;
+      value -= part * part;
+    } else {
+      const double below = arm[j] - job->low[j], above = job->low[j] + range - arm[j];
+      const double part = (below < above ? below : above) / (0.5 * range);
+      if (part < value) value = part;
+    }
+  }
+  return value;
+}
+
+static void configuration(const swings_job *job, int64_t hand, const double *arm, double *q) {
+  int64_t j;
+  memcpy(q, job->q + hand * job->n_q, (size_t) job->n_q * sizeof(double));
+  for (j = 0; j < job->n_arm; ++j) q[job->columns[j]] = arm[j];
+}
+
+static void add(const swings_job *job, int64_t hand, pool *to, int64_t arm, int64_t place,
+                int64_t group) {
+  const double *start = job->starts + hand * job->n_q;
+  double *found = to->found + arm;
+  const int64_t i = to->count;
+  if (!admit(job, found, start)) return;
+  to->score[i] = rated(job, found, start);
+  to->arm[i] = arm;
+  to->place[i] = place;
+  to->group[i] = group;
+  to->used[i] = 0;
+  ++to->count;
+}
+
+/* The arms of so many samples; those of one side only if it is not negative. */
+static int look(const swings_job *job, scratch *space, int64_t hand, pool *to, int64_t count,
+                int64_t side) {
+  const int64_t wide = PALM + job->n_free, size = job->n_sides * (job->n_arm + 1);
+  const double *palm = job->palms + 16 * hand;
+  int64_t i, k, s;
+  int code;
+  for (s = 0; s < count; ++s) {
+    double *sample = space->samples + s * wide;
+    for (i = 0; i < 3; ++i) {
+      for (k = 0; k < 3; ++k) sample[3 * i + k] = palm[4 * i + k];
+      sample[9 + i] = palm[4 * i + 3];
+    }
+  }
+  to->count = 0;
+  code = mapped(job->arms, space->samples, wide, to->found, size, count);
+  if (code != DONE) return code;
+  for (s = 0; s < count; ++s) {
+    const double *slack = to->found + s * size + job->n_sides * job->n_arm;
+    const int64_t bent = job->n_free > 1 && space->samples[s * wide + PALM] < 0;
+    for (k = 0; k < job->n_sides; ++k) {
+      if ((side < 0 || k == side) && slack[k] >= 0) {
+        add(job, hand, to, s * size + k * job->n_arm, s, bent * job->n_sides + k);
+      }
+    }
+  }
+  return DONE;
+}
+
+static int measured(const swings_job *job, scratch *space, int64_t hand, pool *of) {
+  int64_t i;
+  if (job->order != MEASURED) return DONE;
+  for (i = 0; i < of->count; ++i) {
+    configuration(job, hand, of->found + of->arm[i], space->rows + i * job->n_q);
+  }
+  return of->count ? mapped(job->measure, space->rows, job->n_q, of->score, 1, of->count) : DONE;
+}
+
+/* The first in the asked order that is free, of a group, and better than what is there; or -1. */
+static int pick(const swings_job *job, scratch *space, int64_t hand, pool *from, int64_t group,
+                double *better, int64_t *chosen) {
+  const int clearest = job->order == CLEAREST;
+  clearance_job *clear = job->clear;
+  *chosen = -1;
+  for (;;) {
+    int64_t count = 0, i, n;
+    int code;
+    for (; count < (clear ? job->lanes : 1); ++count) {
+      double top = clearest ? -INFINITY : *better;
+      int64_t best = -1;
+      for (i = 0; i < from->count; ++i) {
+        if (from->used[i] || !(from->score[i] > top)) continue;
+        if (job->n_groups > 1 && from->group[i] != group) continue;
+        top = from->score[i];
+        best = i;
+      }
+      if (best < 0) break;
+      from->used[best] = 1;
+      space->picked[count] = best;
+      configuration(job, hand, from->found + from->arm[best], space->rows + count * job->n_q);
+    }
+    if (!count) return DONE;
+    if (!clear) {
+      *chosen = space->picked[0];
+      *better = from->score[*chosen];
+      return DONE;
+    }
+    clear->q = space->rows;
+    clear->poses = job->poses + hand * job->pose_step;
+    clear->pose_step = 0;
+    clear->most = clearest ? INFINITY : job->margin;
+    clear->enough = clearest ? *better + job->margin : job->margin - job->rounding;
+    clear->least = space->least;
+    clear->closest = space->closest;
+    clear->count = count;
+    clear->next = 0;
+    do code = job->check(clear);
+    while (code == SLICE_OVER);
+    if (code != DONE) return code;
+    for (n = 0; n < count; ++n) {
+      double room = space->least[n] - job->margin;
+      /* Of arms with as much room as their hand has, the first in the order of limits. */
+      if (clearest && room > job->caps[hand]) room = job->caps[hand];
+      i = space->picked[n];
+      if (clearest ? room > *better : room >= -job->rounding) {
+        *chosen = i;
+        *better = clearest ? room : from->score[i];
+        if (!clearest) return DONE;
+      }
+    }
+    if (clearest && *better >= job->caps[hand]) return DONE;
+  }
+}
+
+/* Places about the one that an arm was found at, its branch only. */
+static int refine(const swings_job *job, scratch *space, int64_t hand, const double *place,
+                  int64_t group, double *better, double *arm) {
+  int64_t i, chosen;
+  int code;
+  for (i = 0; i < job->n_closer; ++i) {
+    double *freedom = space->samples + i * (PALM + job->n_free) + PALM;
+    memcpy(freedom, place, (size_t) job->n_free * sizeof(double));
+    freedom[job->n_free - 1] += job->closer[i];
+  }
+  code = look(job, space, hand, &space->near, job->n_closer, group % job->n_sides);
+  if (code == DONE) code = measured(job, space, hand, &space->near);
+  if (code == DONE) code = pick(job, space, hand, &space->near, group, better, &chosen);
+  if (code == DONE && chosen >= 0) {
+    memcpy(arm, space->near.found + space->near.arm[chosen], (size_t) job->n_arm * sizeof(double));
+  }
+  return code;
+}
+
+static int swing(const swings_job *job, scratch *space, int64_t hand, int level, int *any) {
+  const int64_t count = job->n_places[level], wide = PALM + job->n_free;
+  const int64_t size = job->n_sides * (job->n_arm + 1);
+  pool *all = &space->all;
+  int64_t i, group, chosen;
+  int code;
+  for (i = 0; i < count; ++i) {
+    memcpy(space->samples + i * wide + PALM, job->places[level] + i * job->n_free,
+           (size_t) job->n_free * sizeof(double));
+  }
+  code = look(job, space, hand, all, count, -1);
+  if (code != DONE) return code;
+  if (!level) {
+    double *own = all->found + count * size;
+    for (i = 0; i < job->n_arm; ++i) own[i] = job->q[hand * job->n_q + job->columns[i]];
+    add(job, hand, all, count * size, -1, job->n_groups - 1);
+  }
+  job->tried[hand] += all->count;
+  code = measured(job, space, hand, all);
+  if (code != DONE) return code;
+  for (group = 0; group < job->n_groups; ++group) {
+    double *score = job->score + hand * job->n_groups + group;
+    double *arm = job->chosen + (hand * job->n_groups + group) * job->n_arm;
+    code = pick(job, space, hand, all, group, score, &chosen);
+    if (code != DONE) return code;
+    if (chosen < 0) continue;
+    if (job->order != CLEAREST || *score >= -job->rounding) *any = 1;
+    memcpy(arm, all->found + all->arm[chosen], (size_t) job->n_arm * sizeof(double));
+    if (all->place[chosen] < 0 || !job->n_closer) continue;
+    code = refine(job, space, hand, job->places[level] + all->place[chosen] * job->n_free,
+                  all->group[chosen], score, arm);
+    if (code != DONE) return code;
+  }
+  return DONE;
+}
+
+EXPORT int casadi_ik_swings(swings_job *job) {
+  scratch space;
+  int64_t hand, i;
+  int code = lay_out(job, &space);
+  if (code != DONE) return code;
+  for (hand = 0; hand < job->count && code == DONE; ++hand) {
+    int level, any = 0;
+    job->tried[hand] = 0;
+    for (i = 0; i < job->n_groups; ++i) job->score[hand * job->n_groups + i] = -INFINITY;
+    for (level = 0; level < LEVELS && !any && code == DONE; ++level) {
+      if (job->n_places[level]) code = swing(job, &space, hand, level, &any);
+    }
+  }
+  free(space.memory);
+  return code;
+}

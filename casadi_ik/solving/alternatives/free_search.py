@@ -1,0 +1,295 @@
+"""Answers that touch nothing: other arms for the same hand, other hands, and a way out.
+
+What is looked at, until one is free: all branches of the arm over the whole swivel with the hand as
+it is; the hand postures of every round, each with all its arms; descents from random arms; and
+steps away from what is nearest, each brought back to the contacts. A hand that touches something by
+itself is done with before any of its arms is looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array
+from casadi_ik.problem.clearance import ROUNDING, Surroundings
+from casadi_ik.problem.collision_report import CollisionReport
+from casadi_ik.problem.preference import CLEARANCE
+from casadi_ik.problem.problems import Problems
+from casadi_ik.solving.alternatives.finder import AlternativeFinder
+from casadi_ik.solving.alternatives.of_each import Different, best_of_each, first_of_each
+from casadi_ik.solving.alternatives.swings import ArmSwings, Preference
+from casadi_ik.solving.trials import Descent
+
+STARTS = 24
+"""Random arms that a target is solved from, where the arm has no closed form."""
+
+HANDS = 8
+"""As many where it has: then it is other hands that are looked for."""
+
+ALIKE = 0.02
+"""Hands all of whose motors differ by less [of their ranges] have the same arms."""
+
+ROUNDS = 3
+"""Rounds of hand postures."""
+
+ESCAPES = 4
+"""Steps away from what is nearest."""
+
+STEPS = (0.3, 0.1, 0.03, 0.01)
+"""Lengths of such a step, of which the best is taken; motions as parts of motors' ranges."""
+
+NUDGE = 1e-5
+"""Difference [of a motor's range] from which it is taken which way there is more room."""
+
+GAIN = 0.1
+"""What a step away has to gain at least, of what there is to gain."""
+
+HOPEFUL = 4
+"""Hands with most room that are looked at for why there is no answer."""
+
+
+@dataclass(frozen=True, eq=False)
+class FreeAnswers:
+    """What was found for k targets.
+
+    Attributes:
+        q: (k, n) a free answer; where there is none, the one that is nearest to it.
+        free: (k,) whether it is.
+        reports: Why there is none; None where there is.
+    """
+
+    q: Array
+    free: NDArray[np.bool_]
+    reports: tuple[CollisionReport | None, ...]
+
+
+class FreeSearch:
+    """The search for some targets.
+
+    Attributes:
+        best: (k, n) the preferred of what is free so far.
+        free: (k,) whether there is any.
+    """
+
+    def __init__(
+        self,
+        finder: AlternativeFinder,
+        swings: ArmSwings | None,
+        problems: Problems,
+        around: Surroundings,
+        starts: Array,
+        seed: int,
+    ) -> None:
+        self.finder, self.swings = finder, swings
+        self.problems, self.around = problems, around
+        self.starts, self.seed = starts, seed
+        self.trials = finder.trials
+        self.limits = self.trials.limits(problems)
+        count, n = starts.shape
+        self.best, self.score = np.full((count, n), np.nan), np.full(count, -np.inf)
+        self.nearest, self.room = np.full((count, n), np.nan), np.full(count, -np.inf)
+        self.free = np.zeros(count, dtype=bool)
+        self.tried = np.zeros(count, dtype=np.int64)
+        self.hands: list[tuple[Array, NDArray[np.intp], Array]] = []
+        robot, hand = finder.robot, finder.hand
+        self._ranges = np.maximum(robot.upper - robot.lower, 1e-9)
+        self._known, self._swung = (Different(count, len(hand), ALIKE) for _ in range(2))
+        self._fresh = np.ones(count, dtype=bool)
+
+    def run(self, q: Array, every: bool = False) -> None:
+        """Look until all are free; or first, if asked, at the hands of a round whether or not."""
+        self.swing(q, np.arange(len(q)))
+        for hands, owner in self._others(every):
+            self.swing(hands, owner)
+        blocked = np.flatnonzero(~self.free)
+        if len(blocked):
+            self._find_nearest(blocked)
+            self._escape()
+
+    def take(self, q: Array, owner: NDArray[np.intp]) -> Array:
+        """Keep the preferred free ones of configurations (m, n), and the nearest; their room."""
+        if not len(q):
+            return np.zeros(0)
+        room = self.around.rows(owner).check(q).room
+        rows = best_of_each(owner, room, self.room)
+        self.nearest[owner[rows]], self.room[owner[rows]] = q[rows], room[rows]
+        kept = np.flatnonzero(room >= -ROUNDING)
+        if len(kept):
+            some, mine = q[kept], owner[kept]
+            score = score_of(self.finder, some, self.starts[mine], self.problems.prefer, room[kept])
+            rows = best_of_each(mine, score, self.score)
+            self.best[mine[rows]], self.score[mine[rows]] = some[rows], score[rows]
+            self.free[mine[rows]] = True
+        return room
+
+    def swing(self, q: Array, owner: NDArray[np.intp]) -> None:
+        """The preferred free arms of hands (m, n) of targets."""
+        if not len(q):
+            return
+        around = self.around.rows(owner)
+        if self.swings is None:
+            self.take(q, owner)
+            self.hands.append((q, owner, np.zeros(len(q))))
+            np.add.at(self.tried, owner, 1)
+            return
+        room = around.held.check(q).room
+        parts = (q / self._ranges)[:, self.finder.hand]
+        fresh = self._known.add(parts, owner)
+        self._fresh[owner[fresh]] = True
+        self.hands.append((q[fresh], owner[fresh], room[fresh]))
+        kept = np.flatnonzero(room >= -ROUNDING)
+        np.add.at(self.tried, owner[room < -ROUNDING], 1)
+        kept = kept[self._swung.add(parts[kept], owner[kept])]
+        found, mine, tried = self._arms(q[kept], owner[kept], room[kept], self.around)
+        np.add.at(self.tried, owner[kept], tried)
+        self.take(found, mine)
+
+    def _arms(
+        self,
+        q: Array,
+        owner: NDArray[np.intp],
+        room: Array,
+        around: Surroundings,
+        prefer: Preference | None = None,
+    ) -> tuple[Array, NDArray[np.intp], NDArray[np.int64]]:
+        """Preferred arms of hands, their targets, and how many were tried for each hand."""
+        swings = self.swings
+        assert swings is not None
+        swung = swings.choose(
+            q,
+            self.starts[owner],
+            (self.limits.lower, self.limits.upper),
+            prefer or self.problems.prefer,
+            around.rows(owner),
+            room,
+        )
+        return *self._solved(swung.q, owner[swung.owner]), swung.tried
+
+    def _others(self, every: bool) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+        """Answers with other hands and arms, of the targets that are not free."""
+        method, hand = self.trials.method, self.finder.hand
+        for number in range(min(ROUNDS, method.options.rounds)):
+            # Where a round has brought no other hand, the next will not either.
+            rows = np.flatnonzero((~self.free | (every and not number)) & self._fresh)
+            if not len(rows):
+                break
+            self._fresh[:] = False
+            some = self.problems.rows(rows)
+            postures = method.postures(some, number)
+            count = postures.shape[1]
+            owner = np.repeat(rows, count)
+            starts = self.limits.clip(self.starts[owner])
+            flat = postures.reshape(-1, postures.shape[2])
+            asked = self.problems.rows(owner)
+            ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat))
+            yield self._solved(ends, owner)
+        rows = np.flatnonzero(~self.free)
+        if not len(rows):
+            return
+        robot = self.finder.robot
+        count = STARTS if self.swings is None else HANDS
+        owner = np.repeat(rows, count)
+        # Row by row, so that a target's starts do not depend on the others of a batch.
+        starts = np.concatenate(
+            [
+                robot.random(np.random.default_rng([self.seed, int(row)]), count)
+                for row in (self.problems.number(int(r)) for r in rows)
+            ]
+        )
+        last = self.hands[0][0]
+        starts[::2, hand] = last[owner[::2]][:, hand]
+        ends = Descent(self.trials, self.problems).run(owner, self.limits.clip(starts))
+        yield self._solved(ends, owner)
+
+    def _solved(self, q: Array, owner: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+        if not len(q):
+            return q, owner
+        asked = self.problems.rows(owner)
+        good = self.trials.solved(asked, q, asked.enforce_limits)
+        return q[good], owner[good]
+
+    def _find_nearest(self, rows: NDArray[np.intp]) -> None:
+        """The answers with most room, of the hands with most."""
+        q, owner, room = self._hands_of(rows)
+        if self.swings is None:
+            return
+        kept = first_of_each(owner, np.lexsort((-room, owner)), 1)
+        found, mine, _ = self._arms(q[kept], owner[kept], room[kept], self.around, CLEARANCE)
+        self.take(np.concatenate([found, q[kept]]), np.concatenate([mine, owner[kept]]))
+
+    def _hands_of(self, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp], Array]:
+        """All hands of some targets, their owners and their room."""
+        q, owner, room = (np.concatenate(each) for each in zip(*self.hands, strict=True))
+        mine = np.isin(owner, rows)
+        return q[mine], owner[mine], room[mine]
+
+    def _escape(self) -> None:
+        """Steps away from what is nearest, brought back to the contacts."""
+        ranges, n = self._ranges, len(self._ranges)
+        rows = np.flatnonzero(~self.free & np.isfinite(self.nearest).all(axis=1))
+        for _ in range(ESCAPES):
+            if not len(rows):
+                return
+            before = self.room[rows].copy()
+            nudged = self.nearest[rows][:, None] + np.diag(NUDGE * ranges)
+            around = self.around.rows(np.repeat(rows, n))
+            room = around.check(nudged.reshape(-1, n)).room.reshape(-1, n)
+            way = (room - before[:, None]) / NUDGE
+            way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+            owner = np.repeat(rows, len(STEPS))
+            steps = np.tile(STEPS, len(rows))[:, None]
+            there = self.nearest[owner] + steps * (way * ranges).repeat(len(STEPS), axis=0)
+            ends = Descent(self.trials, self.problems).run(owner, self.limits.clip(there))
+            self.take(*self._solved(ends, owner))
+            rows = rows[~self.free[rows] & (self.room[rows] > (1 - GAIN) * before)]
+
+    def found(self) -> FreeAnswers:
+        """What it came to."""
+        q = np.where(self.free[:, None], self.best, self.nearest)
+        reports: list[CollisionReport | None] = [None] * len(q)
+        blocked = np.flatnonzero(~self.free)
+        if not len(blocked):
+            return FreeAnswers(q, self.free, tuple(reports))
+        clear = self.around.rows(blocked).check(q[blocked])
+        alone = self._possible(blocked, self.around.robot_alone)
+        passing = self._possible(blocked, self.around.scene_alone)
+        for i, row in enumerate(blocked.tolist()):
+            pair = clear.pair(i)
+            assert pair is not None
+            reports[row] = CollisionReport(
+                pair,
+                -float(clear.room[i]),
+                int(self.tried[row]),
+                bool(alone[row]),
+                bool(passing[row]),
+            )
+        return FreeAnswers(q, self.free, tuple(reports))
+
+    def _possible(self, rows: NDArray[np.intp], around: Surroundings) -> NDArray[np.bool_]:
+        """(all targets,) whether one of the hands is free of some of the pairs alone."""
+        q, owner, room = self._hands_of(rows)
+        possible = np.zeros(len(self.free), dtype=bool)
+        if self.swings is None:
+            possible[owner[around.rows(owner).free(q)]] = True
+            return possible
+        kept = np.flatnonzero(around.rows(owner).held.free(q))
+        kept = kept[first_of_each(owner[kept], np.lexsort((-room[kept], owner[kept])), HOPEFUL)]
+        any_room = np.full(len(kept), np.inf)
+        _, mine, _ = self._arms(q[kept], owner[kept], any_room, around, "limits")
+        possible[mine] = True
+        return possible
+
+
+def score_of(
+    finder: AlternativeFinder, q: Array, starts: Array, prefer: Preference, room: Array
+) -> Array:
+    """(m,) what is preferred of configurations, higher is better; `room` (m,) for "clearance"."""
+    if callable(prefer):
+        return np.asarray(prefer(q), dtype=float)
+    if prefer == CLEARANCE:
+        return room
+    return finder.score(q, starts, prefer)

@@ -1,0 +1,155 @@
+"""What else would do where every answer touches something: the object elsewhere, a finger fewer.
+
+Whatever is said to help was solved: there is a free answer for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.collision.gaps import gaps
+from casadi_ik.collision.scene import Item, Scene
+from casadi_ik.problem.clearance import SceneCheck
+from casadi_ik.problem.collision_report import WayOut
+from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.solution import BatchSolution
+from casadi_ik.solving.run import Run
+
+STEPS = (0.01, 0.02, 0.04, 0.08, 0.16)
+"""How far the object is moved [m], until it helps."""
+
+HALVINGS = 4
+"""By which the shortest way is found once one helps."""
+
+WAYS = np.array(
+    [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z],
+    dtype=float,
+)
+WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
+"""(26, 3) unit vectors to the faces, edges and corners of a cube."""
+
+ROUNDING = 1e-9
+"""By which a moved object may be nearer to something than it stands [m]."""
+
+Free = Callable[[Problems], NDArray[np.bool_]]
+"""Of k targets, which have a free answer."""
+
+
+class Solving(Protocol):
+    """An engine."""
+
+    robot: ArmHand
+    check: SceneCheck | None
+
+    def solve(self, problems: Problems, run: Run) -> BatchSolution:
+        """Solve targets."""
+        ...
+
+
+def with_way_out(
+    engine: Solving, problems: Problems, start: Array, seed: int, batch: BatchSolution
+) -> BatchSolution:
+    """The answer to one target that touches something, with what else would do in its report.
+
+    Args:
+        engine: Solves.
+        problems: The target.
+        start: (n,) where the robot is.
+        seed: Of all random numbers.
+        batch: The answer.
+    """
+    (report,), check = batch.collisions, engine.check
+    if report is None or check is None:
+        return batch
+    scene, known = check.scene, problems
+    if problems.object_pose is None and scene.grasped in scene.items:
+        known = problems.holding(scene.grasped or "", scene.items[scene.grasped or ""].pose)
+
+    def free(asked: Problems) -> NDArray[np.bool_]:
+        return engine.solve(asked, Run(start, seed)).success
+
+    moved = _moved(known, _standing(check, known), free)
+    found = WayOut(moved, STEPS[-1], _fewer(known, engine.robot.fingers, free))
+    return replace(batch, collisions=(replace(report, way_out=found),))
+
+
+def _standing(check: SceneCheck, problems: Problems) -> Callable[[Array], NDArray[np.bool_]]:
+    """Which shifts (k, 3) let what is grasped stand as free as it stands now."""
+    scene: Scene = check.scene
+    name, pose = problems.object or scene.grasped or "", problems.object_pose
+    if name and pose is not None:
+        scene = scene.holding(name, pose[0])
+    item = scene.items.get(name)
+    others: list[Item] = [one for key, one in scene.items.items() if key != name]
+
+    def stands(shifts: Array) -> NDArray[np.bool_]:
+        if item is None or not others:
+            return np.ones(len(shifts), dtype=bool)
+        every = gaps(item, others, np.concatenate([np.zeros((1, 3)), shifts]))
+        return every[1:] >= min(float(every[0]), 0.0) - ROUNDING
+
+    return stands
+
+
+def _moved(
+    problems: Problems, stands: Callable[[Array], NDArray[np.bool_]], free: Free
+) -> tuple[float, float, float] | None:
+    """The shortest shift that helps."""
+
+    def helps(shifts: Array) -> NDArray[np.bool_]:
+        good = stands(shifts)
+        if good.any():
+            good[good] = free(_shifted(problems, shifts[good]))
+        return good
+
+    before = 0.0
+    for step in STEPS:
+        ways = WAYS[helps(step * WAYS)]
+        if len(ways):
+            low, high = np.full(len(ways), before), np.full(len(ways), step)
+            for _ in range(HALVINGS):
+                middle = (low + high) / 2
+                good = helps(middle[:, None] * ways)
+                low, high = np.where(good, low, middle), np.where(good, middle, high)
+            x, y, z = (high[:, None] * ways)[int(high.argmin())].tolist()
+            return x, y, z
+        before = step
+    return None
+
+
+def _shifted(problems: Problems, shifts: Array) -> Problems:
+    """One target at as many places."""
+    asked = problems.rows(np.zeros(len(shifts), dtype=np.intp))
+    pose = asked.object_pose
+    if pose is not None:
+        pose = pose.copy()
+        pose[:, :3, 3] += shifts
+    return replace(
+        asked, points=asked.points + shifts[:, None], object_pose=pose, picked=None, first_row=0
+    )
+
+
+def _fewer(problems: Problems, fingers: Sequence[str], free: Free) -> tuple[str, ...]:
+    """Fingers without whose contact there is a free answer."""
+    placed = ~np.isnan(problems.points[0]).all(axis=1)
+    facing = ~np.isnan(problems.normals[0]).all(axis=1)
+    named = np.flatnonzero(placed | facing)
+    # A finger with more than a point and a normal would make it a target of other kinds.
+    plain = [i for i in named if all(np.isnan(v[0, i]).all() for v in problems.more.values())]
+    if len(named) < 2:
+        return ()
+    return tuple(fingers[i] for i in plain if free(_without(problems, i))[0])
+
+
+def _without(problems: Problems, finger: int) -> Problems:
+    """One target with a finger free."""
+    points, normals = problems.points.copy(), problems.normals.copy()
+    points[:, finger], normals[:, finger] = np.nan, np.nan
+    return replace(problems, points=points, normals=normals)

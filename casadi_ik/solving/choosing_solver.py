@@ -1,0 +1,111 @@
+"""What a solver offers where there is a choice: all solutions of a grasp, the best of many."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from numpy.typing import ArrayLike
+
+from casadi_ik.grasps import Grasp
+from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.ranking import Ranking
+from casadi_ik.solving.alternatives.finder import APART, Alternative
+from casadi_ik.solving.choice import Judgement, choose
+from casadi_ik.solving.engine import Engine
+
+
+class ChoosingSolver:
+    """The part of `Solver` that chooses."""
+
+    _engine: Engine
+    _questions: Questions
+
+    def solve_all(
+        self,
+        grasp: Grasp,
+        limit: int = 16,
+        prefer: str = "limits",
+        q0: ArrayLike | None = None,
+        seed: int = 0,
+        fixed: Mapping[str, float] | None = None,
+        apart: float = APART,
+    ) -> tuple[Alternative, ...]:
+        """Find different solutions of one grasp, best first.
+
+        For every hand posture that meets the contacts: of an arm in closed form every branch
+        (signs of shoulder, elbow and wrist) with the intervals of its freedom, see `ArmBranch`,
+        and the preferred arm of each; of another arm the different configurations that many
+        starts lead to. Of two alike, one.
+
+        Args:
+            grasp: A contact per finger; its fingers must be the robot's.
+            limit: How many at most.
+            prefer: What comes first: "limits" (far from its limits), "manipulability" (of the
+                arm), "clearance", or "q0" (close to it).
+            q0: (n,) where the robot is [rad or m]; None is `robot.home`.
+            seed: As for `solve`.
+            fixed: As for `solve`.
+            apart: How different they are: of any two, at least one actuator differs by this part
+                of its range, 0 to 1. 0: all that are found.
+
+        Returns:
+            The solutions; none if the grasp cannot be solved (`solve` says why).
+
+        Raises:
+            InputError: Bad limit, preference, distance or q0, or a grasp the robot cannot take.
+        """
+        problems = self._questions.of_grasps([grasp], fixed)
+        finder = self._engine.kinds_of(problems).finder
+        start, around = self._questions.start(q0), self._engine.around(problems)
+        return finder.find(problems, start, seed, limit, prefer, apart, around)
+
+    def choose(
+        self,
+        grasps: Sequence[Grasp],
+        object_pose: ArrayLike | None = None,
+        q0: ArrayLike | None = None,
+        limit: int = 10,
+        prefer: Judgement | None = None,
+        seed: int = 0,
+        fixed: Mapping[str, float] | None = None,
+        apart: float = APART,
+    ) -> Ranking:
+        """Of many grasps find those that are best to take, and how.
+
+        Of every candidate the different hands that meet its contacts are looked at, with every
+        branch of the arm all around its swivel; free of collision where the solver has a scene.
+
+        Args:
+            grasps: The candidates.
+            object_pose: (4, 4) where the object is in the base frame; candidates that do not say
+                where theirs is are in its frame. None: they are in the base frame.
+            q0: (n,) where the robot is [rad or m]; None is `robot.home`.
+            limit: How many answers at most.
+            prefer: What comes first: "q0", "limits", "manipulability", "clearance" as for `solve`,
+                or a function of the robot and configurations (m, n) that gives their scores (m,),
+                higher is better, -inf for never. None: "q0" if q0 is given, else "limits".
+            seed: As for `solve`.
+            fixed: As for `solve`.
+            apart: How different answers are, of one candidate or several: of any two at least one
+                actuator differs by this part of its range, 0 to 1. 0: all that are not the same.
+
+        Returns:
+            The answers, best first, and why candidates have none.
+
+        Raises:
+            InputError: No candidates, no rigid object_pose, bad q0, limit, preference or distance,
+                or a grasp the robot cannot take.
+            UnsupportedError: The method is not hand-first.
+        """
+        return choose(
+            self._engine,
+            self._questions,
+            grasps,
+            object_pose,
+            q0,
+            limit,
+            prefer,
+            seed,
+            fixed,
+            apart,
+        )

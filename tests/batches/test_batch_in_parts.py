@@ -1,0 +1,215 @@
+"""Batches in parts: the same answers whoever solves them, and nothing lost or done twice."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from dask_processes import scheduler_process, worker_process
+
+import casadi_ik as ik
+from casadi_ik.cli.main import main
+
+ROBOT = ("--robot", "kuka_lwr_barrett")
+COUNT, SIZE = 6000, 100
+PARTS = ("--part-size", str(SIZE))
+
+
+@pytest.fixture(scope="module")
+def targets(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Targets that can be reached, one that cannot be asked, in one file."""
+    points, normals = robot.contacts(robot.random(np.random.default_rng(4), COUNT))
+    points[321, 0, 0] = np.inf
+    path = tmp_path_factory.mktemp("targets") / "targets.npz"
+    np.savez(path, points=points, normals=normals)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(targets: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+    """The answers of a batch in one go."""
+    out = tmp_path_factory.mktemp("whole") / "out.npz"
+    assert main(["batch", str(targets), *ROBOT, "--out", str(out)]) == 1
+    return answers(out)
+
+
+def answers(path: Path) -> dict[str, np.ndarray]:
+    """What a file of answers holds but the times."""
+    with np.load(path) as arrays:
+        return {name: arrays[name] for name in arrays.files if name != "time"}
+
+
+def same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    assert found.keys() == expected.keys()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+
+
+def begun(*words: object) -> subprocess.Popen[str]:
+    """The command line as a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "casadi_ik", "batch", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {"PYTHONPATH": str(Path(ik.__file__).parents[1])},
+    )
+
+
+def wait_for_parts(folder: Path, least: int, process: subprocess.Popen[str]) -> list[Path]:
+    """Wait until so many parts are there, or the process has ended."""
+    end = time.monotonic() + 120
+    while time.monotonic() < end:
+        parts = sorted(folder.glob("part-*.npz"))
+        if len(parts) >= least or process.poll() is not None:
+            return parts
+        time.sleep(0.01)
+    raise AssertionError(f"{folder}: fewer than {least} parts")
+
+
+def test_killed_and_taken_up_again(targets: Path, whole: dict[str, np.ndarray], tmp_path: Path):
+    """The client is killed; what it had finished is kept as it is, and the rest is done."""
+    out, folder = tmp_path / "out.npz", tmp_path / "out.npz.parts"
+    words = (targets, *ROBOT, *PARTS, "--resume", "--out", out, "--log", tmp_path / "logs")
+    process = begun(*words)
+    wait_for_parts(folder, 5, process)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    kept = {path: path.stat().st_mtime_ns for path in folder.glob("part-*.npz")}
+    assert 5 <= len(kept) < COUNT // SIZE
+    assert not out.exists()
+    first = next(iter(kept))
+    first.unlink()  # as if it had been lost
+    before = {path: stamp for path, stamp in kept.items() if path != first}
+
+    process = begun(*words)
+    wait_for_parts(folder, len(kept) + 2, process)
+    with contextlib.suppress(FileNotFoundError):  # it is through already
+        assert {path: path.stat().st_mtime_ns for path in before} == before
+    report, error = process.communicate(timeout=300)
+    assert process.returncode == 1, error
+    assert f"{COUNT - 1} of {COUNT}" in report
+    same(answers(out), whole)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["logs", "out.npz"]
+    log = ik.logs.open(tmp_path / "logs")
+    assert len(log.solves()) == COUNT - 1
+
+
+@pytest.fixture
+def cluster() -> Iterator[tuple[str, subprocess.Popen[str], list[subprocess.Popen[str]]]]:
+    """A scheduler and two workers."""
+    with ExitStack() as stack:
+        scheduler, address = stack.enter_context(scheduler_process())
+        workers = [stack.enter_context(worker_process(address)) for _ in range(2)]
+        yield address, scheduler, workers
+
+
+def test_a_cluster_that_loses_a_worker_then_its_scheduler(
+    cluster, targets: Path, whole: dict[str, np.ndarray], tmp_path: Path
+):
+    address, scheduler, workers = cluster
+    out = tmp_path / "out"
+    words = (targets, *ROBOT, *PARTS, "--resume", "--dask", address, "--out", out)
+    process = begun(*words)
+    wait_for_parts(out, 5, process)
+    workers[0].kill()
+    there = len(wait_for_parts(out, 12, process))
+    assert there >= 12
+    scheduler.kill()
+    report, error = process.communicate(timeout=120)
+    if process.returncode == 2:
+        assert report == ""
+        assert f"casadi-ik: error: --dask {address}: the cluster went away" in error
+        assert "--resume goes on" in error
+        assert "Traceback" not in error
+    else:  # it was faster than the kill
+        assert process.returncode == 1, error
+
+    assert main(["batch", str(targets), *ROBOT, *PARTS, "--resume", "--out", str(out)]) == 1
+    parts = [answers(path) for path in sorted(out.glob("part-*.npz"))]
+    assert len(parts) == COUNT // SIZE
+    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    same(found, whole)
+
+
+def test_a_folder_of_files_and_a_table(
+    targets: Path, robot: ik.ArmHand, whole: dict[str, np.ndarray], tmp_path: Path
+):
+    """A Parquet file and an npz file, one after the other."""
+    with np.load(targets) as arrays:
+        points, normals = arrays["points"][:250].copy(), arrays["normals"][:250]
+    columns = {
+        f"{finger}_{axis}": array[:, i, j]
+        for i, finger in enumerate(robot.fingers)
+        for endings, array in ((("x", "y", "z"), points), (("nx", "ny", "nz"), normals))
+        for j, axis in enumerate(endings)
+    }
+    folder = tmp_path / "targets"
+    folder.mkdir()
+    pl.DataFrame(columns)[:130].write_parquet(folder / "a.parquet")
+    np.savez(folder / "b.npz", points=points[130:], normals=normals[130:])
+    out = tmp_path / "out.npz"
+    assert main(["batch", str(folder), *ROBOT, *PARTS, "--out", str(out)]) == 0
+    same(answers(out), {name: array[:250] for name, array in whole.items()})
+
+
+Change = Callable[[Path], list[str]]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda _: [], "holds parts of this batch, expected --resume"),
+        (lambda _: ["--resume", "--seed", "7"], "seed: these parts were made with 0, this batch"),
+        (lambda out: _damage(out), "damaged"),
+    ],
+)
+def test_what_is_there_must_belong(
+    change: Change, says: str, robot: ik.ArmHand, tmp_path: Path, capsys
+):
+    points, normals = robot.contacts(robot.random(np.random.default_rng(4), 20))
+    path, out = tmp_path / "targets.npz", tmp_path / "out"
+    np.savez(path, points=points, normals=normals)
+    words = ["batch", str(path), *ROBOT, "--part-size", "10", "--out", str(out)]
+    assert main(words) == 0
+    capsys.readouterr()
+    assert main([*words, *change(out)]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+
+
+def _damage(out: Path) -> list[str]:
+    path = out / "part-000001.npz"
+    path.write_bytes(path.read_bytes()[:100])
+    return ["--resume"]
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("missing.parquet", "missing.parquet: no Parquet file"),
+        ("empty", "found no .npz or .parquet file in it"),
+        ("other.parquet", "thumb_x: missing, expected columns thumb_x"),
+    ],
+)
+def test_bad_targets(name: str, says: str, tmp_path: Path, capsys):
+    (tmp_path / "empty").mkdir()
+    pl.DataFrame({"x": [1.0]}).write_parquet(tmp_path / "other.parquet")
+    out = tmp_path / "out"
+    assert main(["batch", str(tmp_path / name), *ROBOT, "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not out.exists()

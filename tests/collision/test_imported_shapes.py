@@ -1,0 +1,160 @@
+"""Shapes of somebody's files: simple ones as they are, meshes held by capsules, written down."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.collision.model import collision_model
+from casadi_ik.collision.scene import Scene
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.files.reading import Frame, convert, frame_matrix
+from casadi_ik.files.units import in_si
+from casadi_ik.importing import imported
+from casadi_ik.importing.shape_lines import collision_lines
+from casadi_ik.problem.clearance import SceneCheck
+from casadi_ik.robots import load_description
+from casadi_ik.robots.collision import (
+    BoxEntry,
+    CapsuleEntry,
+    CollisionEntry,
+    Touching,
+    capsules_of,
+)
+
+PLACE = '<origin xyz="0 0 0.02" rpy="0.3 0.2 0.1"/>'
+SIMPLE = {
+    "palm": '<box size="0.1 0.06 0.02"/>',
+    "left_1": '<cylinder radius="0.01" length="0.05"/>',
+    "right_1": '<sphere radius="0.012"/>',
+    "left_2": '<cylinder radius="0.008" length="0.04"/>',
+}
+
+
+def write_hand(folder: Path, right_2: str = '<sphere radius="0.01"/>') -> Path:
+    """Two fingers of two links each, opposed, with a shape on every link."""
+    shapes = SIMPLE | {"right_2": right_2}
+    text = "".join(
+        f'<link name="{name}"><collision>{PLACE}<geometry>{shape}</geometry></collision></link>\n'
+        for name, shape in shapes.items()
+    )
+    for side, y, axis in (("left", 0.04, "1 0 0"), ("right", -0.04, "-1 0 0")):
+        for number, parent, xyz in ((1, "palm", f"0 {y} 0.05"), (2, f"{side}_1", "0 0 0.05")):
+            text += (
+                f'<joint name="{side}_j{number}" type="revolute"><origin xyz="{xyz}"/>'
+                f'<parent link="{parent}"/><child link="{side}_{number}"/><axis xyz="{axis}"/>'
+                '<limit lower="-0.2" upper="1.2" velocity="1" effort="1"/></joint>\n'
+            )
+    path = folder / "hand.urdf"
+    path.write_text(f'<robot name="hand">{text}</robot>')
+    return path
+
+
+def write_mesh(folder: Path, rng: np.random.Generator) -> np.ndarray:
+    """A bent slab as an STL; its corners."""
+    x, y = (one.ravel() for one in np.meshgrid(np.linspace(-0.01, 0.01, 5), np.linspace(0, 1, 9)))
+    top = np.column_stack([x, 0.02 * y * y, 0.05 * y]) + rng.normal(0, 1e-4, (45, 3))
+    points = np.concatenate([top, top + np.array([0, 0.006, 0])])
+    lines = ["solid slab"]
+    for layer in (0, 45):
+        for row in range(8):
+            for column in range(4):
+                i = layer + 5 * row + column
+                for corners in ((i, i + 1, i + 5), (i + 1, i + 6, i + 5)):
+                    three = points[list(corners)]
+                    inner = "".join(f"vertex {a:.9g} {b:.9g} {c:.9g}\n" for a, b, c in three)
+                    lines.append(f"facet normal 0 0 1\nouter loop\n{inner}endloop\nendfacet")
+    (folder / "slab.stl").write_text("\n".join([*lines, "endsolid slab\n"]))
+    return points
+
+
+DESCRIPTION = """
+name: mine
+hand: {file: hand.urdf, palm: palm}
+fingers:
+  left: {link: left_2, xyz: [0, -0.01, 0.03], normal: [0, -1, 0]}
+  right: {link: right_2, xyz: [0, 0.01, 0.03], normal: [0, 1, 0]}
+"""
+
+
+def test_a_description_reads_simple_shapes_of_its_file(tmp_path: Path) -> None:
+    write_hand(tmp_path)
+    path = tmp_path / "mine.yaml"
+    path.write_text(DESCRIPTION)
+    shapes = load_description(path).shapes
+    assert [(one.link, one.kind, one.size.tolist()) for one in shapes.solids] == [
+        ("palm", "box", [0.1, 0.06, 0.02]),
+        ("left_1", "cylinder", [0.01, 0.05, 0.0]),
+        ("left_2", "cylinder", [0.008, 0.04, 0.0]),
+    ]
+    spheres = [one for one in shapes.capsules if one.covers < 0]
+    assert [(one.link, one.radius) for one in spheres] == [("right_1", 0.012), ("right_2", 0.01)]
+    np.testing.assert_allclose(spheres[0].center, [0, 0, 0.02])
+    # What the description says of a link goes before its file.
+    own = "collision: {links: {palm: [{kind: sphere, radius: 5 cm}]}}\n"
+    path.write_text(DESCRIPTION + own)
+    palm = [one for one in load_description(path).shapes.capsules if one.link == "palm"]
+    assert [one.radius for one in palm] == [0.05]
+
+
+def test_meshes_that_nobody_fitted_are_no_shapes(tmp_path: Path, rng) -> None:
+    write_mesh(tmp_path, rng)
+    write_hand(tmp_path, '<mesh filename="slab.stl"/>')
+    path = tmp_path / "mine.yaml"
+    path.write_text(DESCRIPTION)
+    with pytest.raises(UnsupportedError, match="its hand has no shapes, which a scene needs"):
+        collision_model(load_description(path))
+
+
+def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
+    points = write_mesh(tmp_path, rng)
+    hand = write_hand(tmp_path, '<mesh filename="slab.stl"/>')
+    (tmp_path / "hand.srdf").write_text(
+        "<robot name='x'>"
+        "<disable_collisions link1='left_2' link2='right_2' reason='Never'/></robot>"
+    )
+    out = tmp_path / "mine.yaml"
+    found = imported.import_robot(None, hand, out, command="casadi-ik import")
+    out.write_text(found.written.text())
+    found = found.at_home(out).with_shapes(out, tmp_path / "hand.srdf")
+    out.write_text(found.written.text())
+    entry = yaml.safe_load(out.read_text())["collision"]
+    assert entry["links"]["left_1"][0]["kind"] == "cylinder"
+    assert entry["links"]["left_1"][0]["radius"] == "10 mm"
+    fitted = entry["links"]["right_2"]
+    assert {one["kind"] for one in fitted} <= {"capsule", "sphere"}
+    excess = float(fitted[0]["excess"].removesuffix(" mm"))
+    assert 0 < excess < 20
+    description = load_description(out)
+    # In the link's frame the mesh is turned as the file has it.
+    pose = frame_matrix(Frame((0, 0, 0.02), (0.3, 0.2, 0.1)))
+    mesh = points @ pose[:3, :3].T + pose[:3, 3]
+    apart = np.full(len(mesh), np.inf)
+    for one in description.shapes.capsules:
+        if one.link == "right_2":
+            t = np.clip((mesh - one.center) @ one.half / max(one.half @ one.half, 1e-30), -1, 1)
+            gap = np.linalg.norm(mesh - one.center - t[:, None] * one.half, axis=1) - one.radius
+            apart = np.minimum(apart, gap)
+    assert apart.max() <= 0
+    assert sum(one.link == "right_2" for one in description.shapes.capsules) == len(fitted)
+    excluded = {frozenset(one.links): one.reason for one in collision_model(description).excluded}
+    assert excluded[frozenset(("left_2", "right_2"))] == "hand.srdf: Never"
+    assert SceneCheck(ArmHand(description), Scene(), compiled=False).model.pairs.size
+
+
+def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
+    """Shapes come back from the YAML as they were."""
+    shapes = {
+        "a link": [BoxEntry(size=(0.1, 0.2, 0.3), xyz=(0.01, 0, 0), rpy=(0.1, 0, 0), excess=0.004)],
+        "b": [CapsuleEntry(ends=((0, 0, 0), (0, 0, 0.1)), radius=0.02)],
+    }
+    lines = collision_lines(shapes, [Touching(("a link", "b"), "they do", 0.003)], "shapes")
+    entry = convert(in_si(yaml.safe_load("\n".join(lines))["collision"]), CollisionEntry, tmp_path)
+    assert entry.links["a link"] == shapes["a link"]
+    assert entry.links["b"] == shapes["b"]
+    assert entry.touching[0].depth == 0.003
+    assert len(capsules_of(entry.links["b"][0])) == 1

@@ -1,0 +1,83 @@
+"""What else would do where every answer touches something, and margins of single pairs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.collision.gaps import gaps
+from casadi_ik.errors import DescriptionError
+
+
+@pytest.fixture(scope="module")
+def robot() -> ik.ArmHand:
+    return ik.load_robot("kuka_lwr_barrett")
+
+
+def test_what_is_said_to_help_does(robot) -> None:
+    """A ball over the cup: it is said how far the cup has to go, and there it has an answer."""
+    cup = ik.load_grasp("cup")
+    ball = {"kind": "sphere", "radius": 0.16, "xyz": (cup.object_pose[:3, 3] + [0.1, 0, 0.2])}
+    solver = ik.Solver(robot, scene=ik.Scene({"ball": ball}))
+    solution = solver.solve(cup)
+    assert solution.status is ik.Status.COLLISION
+    found = solution.collision.way_out
+    assert 0 < np.linalg.norm(found.moved) <= found.farthest
+    pose = cup.object_pose.copy()
+    pose[:3, 3] += found.moved
+    assert solver.solve(cup.in_object_frame().at(pose)).success
+    lines = "\n".join(solution.collision.lines)
+    assert f"moved by {1e3 * np.linalg.norm(found.moved):.0f} mm" in lines
+    for name in found.fewer:
+        fewer = {key: c for key, c in cup.contacts.items() if key != name}
+        assert solver.solve(dataclasses.replace(cup, contacts=fewer)).success
+        assert f"solvable without the contact of {name}" in lines
+    assert solver.solve(cup, diagnose=False).collision.way_out is None
+
+
+def test_an_object_is_not_moved_into_the_table() -> None:
+    scene = ik.Scene(
+        {
+            "table": {"kind": "box", "size": [1, 1, 0.1], "xyz": [0, 0, -0.05]},
+            "wall": {"kind": "half-space", "xyz": [0, 0.2, 0], "rpy": [np.pi / 2, 0, 0]},
+            "cup": {"kind": "cylinder", "radius": 0.04, "length": 0.1, "xyz": [0, 0, 0.05]},
+            "pole": {"kind": "capsule", "radius": 0.01, "length": 0.2, "xyz": [0.1, 0, 0.1]},
+        }
+    )
+    others = [item for name, item in scene.items.items() if name != "cup"]
+    shifts = np.array([[0, 0, 0.02], [0, 0, -0.02], [0, 0.17, 0.02], [0.06, 0, 0.05]])
+    found = gaps(scene.items["cup"], others, shifts)
+    np.testing.assert_allclose(found, [0.02, -0.02, -0.01, -0.01], atol=2e-3)
+
+
+def test_margins_of_single_pairs(robot) -> None:
+    """A pair's own margin goes before the solid's and the scene's; the clearance stays true."""
+    post = {"kind": "box", "size": [0.1, 0.1, 0.4], "xyz": [0.5, 0.5, 0.2], "margin": 0.03}
+    less = [{"links": ["lwr_link_6", "post"], "margin": 0.002}]
+    clearances = []
+    for margins, kept in (((), 0.03), (less, 0.002)):
+        scene = ik.Scene({"post": post}, margin=0.01, margins=margins)
+        solver = ik.Solver(robot, scene=scene, compiled=False)
+        around = solver._engine.around(solver._questions.of_grasps([ik.load_grasp("cup")], None))
+        of_pair = np.array([set(names) == {"lwr_link_6", "post"} for names in around.table.names])
+        found = around.only(of_pair).check(robot.home[None])
+        clearances.append(float(found.distance[0]))
+        assert found.room[0] == pytest.approx(found.distance[0] - kept)
+    assert clearances[0] == pytest.approx(clearances[1])
+
+
+@pytest.mark.parametrize(
+    ("margin", "message"),
+    [
+        ({"links": ["moon", "a"], "margin": 0.1}, r"margins\[0\].links: unknown 'moon'; known: a"),
+        ({"links": ["a", "lwr_link_6"], "margin": -1}, r"margins\[0\].margin: found -1, expected"),
+        ({"links": ["a", "a"], "margin": float("nan")}, r"margins\[0\].margin: found nan"),
+    ],
+)
+def test_bad_margins_are_named(robot, margin, message) -> None:
+    box = {"kind": "box", "size": [1, 1, 1], "xyz": [3, 0, 0]}
+    with pytest.raises(DescriptionError, match=message):
+        ik.Solver(robot, scene=ik.Scene({"a": box}, margins=[margin]), compiled=False)

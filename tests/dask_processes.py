@@ -1,0 +1,52 @@
+"""Scheduler and workers of Dask as processes, the way its documentation starts them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import casadi_ik as ik
+
+SCHEDULER = ("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show")
+WORKER = ("--nthreads", "1", "--no-dashboard", "--no-nanny")
+
+
+@contextmanager
+def dask_process(*words: str, says: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A process of Dask's command line, from when it has said something; gives the line too.
+
+    It runs elsewhere and knows the installed package only.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dask", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=Path(ik.__file__).parents[1] / "casadi_ik",
+        env=os.environ | {"PYTHONPATH": str(Path(ik.__file__).parents[1])},
+    )
+    assert process.stdout is not None
+    try:
+        yield process, next(line for line in process.stdout if says in line)
+        # What it says meanwhile may be as much as a pipe holds.
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+@contextmanager
+def scheduler_process() -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A scheduler without workers and its address."""
+    with dask_process(*SCHEDULER, says="Scheduler at:") as (process, line):
+        yield process, line.split()[-1]
+
+
+@contextmanager
+def worker_process(address: str) -> Iterator[subprocess.Popen[str]]:
+    """A worker of one thread that a scheduler knows already."""
+    with dask_process("worker", address, *WORKER, says="Registered to:") as (process, _):
+        yield process

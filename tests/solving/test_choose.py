@@ -1,0 +1,210 @@
+"""Of many grasps those that are best to take."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import coal
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError, UnsupportedError
+
+ROBOT = "kuka_lwr_barrett"
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def robot() -> ik.ArmHand:
+    return ik.load_robot(ROBOT)
+
+
+@pytest.fixture(scope="module")
+def solver(robot) -> ik.Solver:
+    return ik.Solver(robot)
+
+
+@pytest.fixture(scope="module")
+def careful(robot) -> ik.Solver:
+    return ik.Solver(robot, scene=ik.load_scene("table"))
+
+
+@pytest.fixture(scope="module")
+def cup() -> ik.Grasp:
+    return ik.load_grasp("cup")
+
+
+@pytest.fixture(scope="module")
+def candidates(cup) -> list[ik.Grasp]:
+    """The cup's grasp turned about the cup, in the cup's frame; some of them out of reach."""
+    own = cup.in_object_frame()
+    angles = np.linspace(0, 2 * np.pi, COUNT, endpoint=False)
+    return [replace(own.at(turned(angle)), object_pose=np.eye(4)) for angle in angles]
+
+
+def turned(angle: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return pose
+
+
+def scored(robot, q, prefer, q0):
+    if prefer == "limits":
+        half = (robot.upper - robot.lower) / 2
+        return (np.minimum(q - robot.lower, robot.upper - q) / half).min(axis=1)
+    return -np.linalg.norm((q - q0) / (robot.upper - robot.lower), axis=1)
+
+
+@pytest.mark.parametrize("prefer", ["limits", "q0"])
+def test_the_order_is_that_of_the_score(solver, robot, candidates, cup, prefer):
+    ranked = solver.choose(candidates, cup.object_pose, robot.home, 20, prefer)
+    q = np.stack([one.solution.q for one in ranked])
+    scores = np.array([one.score for one in ranked])
+    np.testing.assert_allclose(scores, scored(robot, q, prefer, robot.home), atol=1e-12)
+    assert (np.diff(scores) <= 0).all()
+    assert len(ranked) > 5
+    # One after the other nobody does better.
+    alone = [solver.choose([one], cup.object_pose, robot.home, 1, prefer) for one in candidates]
+    best = max(one[0].score for one in alone if len(one))
+    assert ranked[0].score == pytest.approx(best, abs=1e-9)
+
+
+def test_answers_meet_their_candidates_and_differ(solver, robot, candidates, cup):
+    ranked = solver.choose(candidates, object_pose=cup.object_pose, limit=30)
+    parts = []
+    for one in ranked:
+        points, normals = candidates[one.candidate].at(cup.object_pose).arrays(robot.fingers)
+        position, angle = robot.errors(one.solution.q, points, normals)
+        assert (position <= 5e-3).all()
+        assert (angle <= np.deg2rad(3)).all()
+        assert robot.beyond_limits(one.solution.q) <= 1e-9
+        assert one.solution.success
+        parts.append(one.solution.q / (robot.upper - robot.lower))
+    for i, part in enumerate(parts):
+        assert all(np.abs(part - other).max() >= 0.25 for other in parts[:i])
+    assert ranked.answered + sum(ranked.failures.values()) == ranked.candidates == COUNT
+    assert len(solver.choose(candidates, cup.object_pose, limit=3)) == 3
+    alike = solver.choose(candidates, cup.object_pose, limit=200, apart=0)
+    assert len(alike) > len(ranked)
+
+
+def test_a_candidate_in_the_objects_frame_is_the_one_moved_to_it(solver, candidates, cup):
+    placed = [one.at(cup.object_pose) for one in candidates]
+    there = solver.choose(placed)
+    here = solver.choose(candidates, object_pose=cup.object_pose)
+    assert [one.candidate for one in here] == [one.candidate for one in there]
+    for one, other in zip(here, there, strict=True):
+        np.testing.assert_allclose(one.solution.q, other.solution.q, atol=1e-6)
+    # A candidate that says where its object is moves with it.
+    moved = solver.choose([cup, *candidates], object_pose=cup.object_pose, limit=50, apart=0)
+    np.testing.assert_allclose(
+        [one.score for one in moved if one.candidate == 0],
+        [one.score for one in moved if one.candidate == 1],
+        atol=1e-6,
+    )
+
+
+def test_answers_are_free_for_coal(careful, robot, candidates, cup):
+    ranked = careful.choose(candidates, object_pose=cup.object_pose, limit=20)
+    assert len(ranked) >= 3
+    shapes = robot.description.shapes.capsules
+    table = ik.load_scene("table")
+    (box, place) = table.items["table"].parts[0]
+    pose = table.items["table"].pose @ place
+    still = careful._engine.check.model.is_fixed
+    for one in ranked:
+        assert one.solution.clearance >= 0
+        links = robot.links(one.solution.q)
+        for shape in shapes:
+            if shape.covers >= 0 or still(shape.link):
+                continue
+            length = float(np.linalg.norm(shape.half))
+            turn = np.eye(3)
+            if length:
+                z = shape.half / length
+                side = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
+                side /= np.linalg.norm(side)
+                turn = np.column_stack([side, np.cross(z, side), z])
+            link = links[shape.link]
+            away = coal.distance(
+                coal.Capsule(shape.radius, 2 * length),
+                coal.Transform3s(link[:3, :3] @ turn, link[:3, :3] @ shape.center + link[:3, 3]),
+                coal.Box(*(2 * box.size)),
+                coal.Transform3s(pose[:3, :3], pose[:3, 3]),
+                coal.DistanceRequest(True),
+                coal.DistanceResult(),
+            )
+            assert away >= -1e-6, shape.link
+
+
+def test_reasons_are_counted(robot, candidates, cup):
+    ball = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3].tolist()}
+    solver = ik.Solver(robot, scene=ik.Scene({"balloon": ball}))
+    far = turned(0.0)
+    far[:3, 3] = [5.0, 0.0, 0.0]
+    unreachable = replace(candidates[0].at(far), object_pose=np.eye(4))
+    ranked = solver.choose([*candidates, unreachable], cup.object_pose)
+    assert len(ranked) == ranked.answered == 0
+    assert sum(ranked.failures.values()) == COUNT + 1
+    named = [reason for reason in ranked.failures if reason.startswith("COLLISION: ")]
+    assert named
+    assert all("balloon" in reason for reason in named)
+    assert any(not reason.startswith("COLLISION") for reason in ranked.failures)
+    assert "0 of 13 candidates have an answer" in str(ranked)
+
+
+def test_a_preference_of_ones_own(solver, robot, candidates, cup):
+    def straight(asked: ik.ArmHand, q: np.ndarray) -> np.ndarray:
+        assert asked.name == robot.name
+        return -np.abs(q[:, 0])
+
+    ranked = solver.choose(candidates, cup.object_pose, prefer=straight, limit=5)
+    np.testing.assert_allclose(
+        [one.score for one in ranked], [-abs(one.solution.q[0]) for one in ranked]
+    )
+    usual = solver.choose(candidates, cup.object_pose, limit=5)
+    assert ranked[0].score >= max(-abs(one.solution.q[0]) for one in usual)
+
+
+def test_the_arms_measure_and_clearance_rank_too(solver, careful, candidates, cup):
+    for one, prefer in ((solver, "manipulability"), (careful, "clearance")):
+        scores = [c.score for c in one.choose(candidates, cup.object_pose, prefer=prefer)]
+        assert scores == sorted(scores, reverse=True)
+        assert scores
+        assert scores[0] > 0
+
+
+def test_grasps_with_other_fingers_rank_together(solver, candidates, cup):
+    pinch = ik.Grasp(
+        {name: candidates[0].contacts[name] for name in ("thumb", "finger_2")}, object=cup.object
+    )
+    ranked = solver.choose([*candidates, pinch], cup.object_pose, limit=100, apart=0)
+    assert COUNT in {one.candidate for one in ranked}
+    assert 0 in {one.candidate for one in ranked}
+
+
+def test_bad_questions_are_one_clear_line(solver, robot, candidates, cup):
+    skewed = np.eye(4)
+    skewed[0, 0] = 2.0
+    unknown = np.eye(4)
+    unknown[0, 3] = np.nan
+    for words, text in (
+        ({"grasps": []}, "grasps: found none, expected at least one"),
+        ({"object_pose": unknown}, "object_pose: holds NaN or infinity, expected finite numbers"),
+        ({"object_pose": skewed}, "object_pose: its first three columns are no rotation"),
+        ({"object_pose": np.zeros((3, 4))}, r"object_pose: found shape \(3, 4\)"),
+        ({"prefer": "best"}, "prefer: found 'best', expected one of limits"),
+        ({"prefer": "clearance"}, "which needs a solver with a scene"),
+        ({"prefer": lambda _, q: q}, r"prefer: gave shape .*, expected \(\d+,\)"),
+        ({"prefer": lambda _, q: q[:, 0] * np.nan}, "prefer: gave NaN"),
+        ({"limit": 0}, "limit: found 0, expected an integer >= 1"),
+        ({"apart": 2}, "apart: found 2, expected a number from 0 to 1"),
+        ({"q0": [0.0]}, r"q0: found shape \(1,\)"),
+        ({"grasps": [candidates[0], "cup"]}, r"grasps\[1\]: found str, expected a Grasp"),
+    ):
+        with pytest.raises(InputError, match=text) as raised:
+            solver.choose(**{"grasps": candidates, "object_pose": cup.object_pose} | words)
+        assert "\n" not in str(raised.value)
+    with pytest.raises(UnsupportedError, match="gives one solution"):
+        ik.Solver(robot, "thumb-first", compiled=False).choose(candidates, cup.object_pose)
