@@ -10,6 +10,10 @@ from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
 from casadi_ik.methods.registry import METHODS, register_method
 from casadi_ik.methods.screw_control.objectives import ScrewTask
+from casadi_ik.motion.follower import Follower
+from casadi_ik.motion.following import FollowState, FollowStatus
+from casadi_ik.motion.path import Jump
+from casadi_ik.motion.tracking import Track
 from casadi_ik.problem.collision_report import CollisionReport
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
@@ -19,7 +23,6 @@ from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trajectory import Trajectory
 from casadi_ik.solving.alternatives.branches import ArmBranch
 from casadi_ik.solving.alternatives.finder import Alternative
-from casadi_ik.solving.alternatives.tracking import Jump, Track
 
 __all__ = [
     "METHODS",
@@ -33,6 +36,9 @@ __all__ = [
     "Contact",
     "ContactVerdict",
     "Diagnosis",
+    "FollowState",
+    "FollowStatus",
+    "Follower",
     "Grasp",
     "Jump",
     "Phase",

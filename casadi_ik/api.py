@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping
 from os import PathLike
 from typing import Any
 
@@ -11,18 +11,18 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.scene import Scene, grasped_in
-from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.write.opening import recorder_of
 from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
+from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
 from casadi_ik.problem.solution import BatchSolution, Solution
-from casadi_ik.solving.alternatives.tracking import Track, travel_limits
 from casadi_ik.solving.choosing_solver import ChoosingSolver
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.fast import FastSolver
@@ -30,7 +30,7 @@ from casadi_ik.solving.run import Run
 from casadi_ik.solving.stream import SolvedBlock, Stream
 
 
-class Solver(ChoosingSolver):
+class Solver(MovingSolver, ChoosingSolver):
     """A method on a robot, with a tolerance; build it once and use it for every grasp.
 
     Attributes:
@@ -250,44 +250,6 @@ class Solver(ChoosingSolver):
             tolerances = tuple(self.tolerances.values())
             run = Run(q0, seed, jobs, recorder, diagnose)
             yield from Stream(self._engine, ask, tolerances, run).solve(blocks, first_row)
-
-    def track(
-        self,
-        grasps: Sequence[Grasp],
-        q0: ArrayLike | None = None,
-        period: float | None = None,
-        velocity: ArrayLike | None = None,
-        seed: int = 0,
-        fixed: Mapping[str, float] | None = None,
-    ) -> Track:
-        """Follow a moving grasp: every solution continues the one before.
-
-        The motion begins with the solution of the first grasp from which the others are reached
-        without a jump between branches; a jump that cannot be avoided is reported.
-
-        Args:
-            grasps: In order; the tolerances are those of the first.
-            q0: (n,) where the robot is [rad or m]: the motion begins near it. None: it begins far
-                from the limits.
-            period: Time from one grasp to the next [s]; then the motors' velocity limits are kept,
-                and a grasp that moves too fast is followed as well as they allow.
-            velocity: Other velocity limits, (n,) or a number [rad/s or m/s].
-            seed: As for `solve`.
-            fixed: As for `solve`.
-
-        Raises:
-            InputError: No grasp, bad q0, period or velocity, or a grasp the robot cannot take.
-            UnsupportedError: The method is not hand-first, or the solver has a scene.
-        """
-        if self.scene is not None:
-            raise UnsupportedError("track: knows no scenes, expected a solver without one")
-        if not grasps:
-            raise InputError("grasps: found none, expected at least one")
-        problems = self._questions.of_grasps(grasps, fixed)
-        tracker = self._engine.kinds_of(problems).tracker
-        travel = travel_limits(self.robot, period, velocity)
-        prefer = "limits" if q0 is None else "q0"
-        return tracker.track(problems, self._questions.start(q0), prefer, travel, seed)
 
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
         """Solve one grasp by hand, one iteration at a time.

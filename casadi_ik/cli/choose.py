@@ -13,6 +13,7 @@ from rich.text import Text
 
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.batches.target_file import TargetFile
 from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import (
@@ -25,7 +26,6 @@ from casadi_ik.cli.question import (
 )
 from casadi_ik.cli.report import clearance, duration, files, headline, table
 from casadi_ik.cli.solve import as_json
-from casadi_ik.cli.target_file import TargetFile
 from casadi_ik.errors import DescriptionError
 from casadi_ik.grasps import Contact, Grasp
 from casadi_ik.grasps.candidates import load_candidates

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from casadi_ik.cli.calibrate_parser import add_calibrate
 from casadi_ik.cli.choose_parser import add_choose
 from casadi_ik.cli.export_parser import add_export
+from casadi_ik.cli.follow_parser import add_follow
 from casadi_ik.cli.import_parser import add_import
 from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.say import PROGRAM
@@ -111,6 +112,7 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True, title="commands")
     _add_solve(commands)
     _add_batch(commands)
+    add_follow(commands)
     add_choose(commands)
     add_import(commands)
     add_export(commands)

@@ -176,6 +176,7 @@ class SwingKernel:
         order: Order,
         checked: Checked | None,
         branches: bool,
+        closer: bool,
         measure: FunctionKernel | None = None,
     ) -> tuple[Array, Array, NDArray[np.int64]]:
         """The preferred arms of hands.
@@ -188,6 +189,7 @@ class SwingKernel:
             order: What is preferred.
             checked: What arms must not touch; None: nothing is checked.
             branches: Whether one arm of every branch is wanted, and the given one; else one arm.
+            closer: Whether to look about what was found.
             measure: Of q, for `Order.MEASURED`.
 
         Returns:
@@ -214,7 +216,7 @@ class SwingKernel:
                 n_sides=places.sides,
                 n_groups=groups,
                 n_places=(ctypes.c_int64 * 2)(*map(len, self._tables[:2])),
-                n_closer=len(self._tables[2]),
+                n_closer=len(self._tables[2]) if closer else 0,
                 places=(ctypes.c_void_p * 2)(*(t.ctypes.data for t in self._tables[:2])),
                 closer=self._tables[2].ctypes.data,
                 columns=self._columns.ctypes.data,

@@ -15,7 +15,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
-from casadi_ik.grasps.pose import inverse, moved, one_pose
+from casadi_ik.grasps.pose import moved, one_pose
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.preference import preference
@@ -32,9 +32,6 @@ from casadi_ik.solving.solved_part import judged
 
 Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
 """One of `PREFERENCES`, or what gives configurations (m, n) of a robot their scores (m,)."""
-
-BLOCK = 64
-"""Answers that are judged at once."""
 
 
 def choose(
@@ -64,27 +61,36 @@ def choose(
     pose = None if object_pose is None else one_pose(object_pose, "object_pose")
     asked = list(_asked(questions, grasps, pose, fixed, usual))
     wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
+    parts: list[tuple[NDArray[np.intp], Answers]] = []
+    answers, entries = None, list[Choice]()
     for thorough in (False, True):
-        found = [
-            answers_of(
-                engine.kinds_of(some).freer,
-                some,
-                engine.around(some),
+        for rows, some in asked:
+            left = rows if answers is None else rows[answers.reasons[rows] != ""]
+            if not len(left):
+                continue
+            mine = some.rows(np.searchsorted(rows, left))
+            found = answers_of(
+                engine.kinds_of(mine).freer,
+                mine,
+                engine.around(mine),
                 start,
                 wanted,
+                int(limit),
                 seed,
                 thorough,
-            ).moved(rows)
-            for rows, problems in asked
-            for rows, some in _of_kinds(rows, problems)
-        ]
-        if any(len(part.q) for part in found) or engine.check is None:
+            )
+            parts.append((left, found))
+        answers = Answers.joined(parts, len(grasps))
+        entries = _Ranked(engine, asked, answers, apart).best(int(limit))
+        if len(entries) >= limit:
             break
-    reasons = [reason for part in found for reason in part.reasons if reason]
     seconds = (time.perf_counter() - begin) / len(grasps)
-    ranked = _Ranked(engine, asked, found, apart, seconds)
+    assert answers is not None
+    reasons = [reason for reason in answers.reasons.tolist() if reason]
     return Ranking(
-        entries=tuple(ranked.best(int(limit))),
+        entries=tuple(
+            replace(one, solution=replace(one.solution, time=seconds)) for one in entries
+        ),
         candidates=len(grasps),
         answered=len(grasps) - len(reasons),
         failures=dict(Counter(reasons).most_common()),
@@ -113,7 +119,7 @@ def _asked(
     fixed: Mapping[str, float] | None,
     prefer: str,
 ) -> Iterator[tuple[NDArray[np.intp], Problems]]:
-    """Candidates with the same fingers, tolerances and object together, in the base frame."""
+    """Candidates with the same fingers, tolerances, kinds and object, in the base frame."""
     if not len(grasps):
         raise InputError("grasps: found none, expected at least one")
     groups: dict[object, list[int]] = {}
@@ -125,8 +131,10 @@ def _asked(
         groups.setdefault(key, []).append(number)
     for numbers in groups.values():
         some = [grasps[number] for number in numbers]
-        problems = questions.of_grasps(some, fixed, prefer)
-        yield np.array(numbers, dtype=np.intp), _placed(problems, some, pose)
+        rows = np.array(numbers, dtype=np.intp)
+        problems = _placed(questions.of_grasps(some, fixed, prefer), some, pose)
+        for _, of_kinds, alike in by_kinds(problems):
+            yield (rows if of_kinds is None else rows[of_kinds]), alike
 
 
 def _placed(problems: Problems, grasps: Sequence[Grasp], pose: Array | None) -> Problems:
@@ -134,26 +142,17 @@ def _placed(problems: Problems, grasps: Sequence[Grasp], pose: Array | None) -> 
     if pose is None:
         return problems
     places = [grasp.object_pose for grasp in grasps if grasp.object_pose is not None]
-    motions = [pose @ inverse(place) for place in places] if places else [pose] * len(grasps)
-    motion = np.stack(motions)
     arrays = {"points": problems.points, "normals": problems.normals, **problems.more}
-    if not places:
-        arrays = moved(arrays, pose)
-    else:
-        turn = motion[:, :3, :3].transpose(0, 2, 1)
-        arrays = {name: array @ turn for name, array in arrays.items()}
-        arrays["points"] = arrays["points"] + motion[:, None, :3, 3]
+    for name, array in arrays.items() if places else ():
+        # Seen from the object first.
+        stack = np.stack(places)
+        shift = stack[:, None, :3, 3] if name == "points" else 0.0
+        arrays[name] = (array - shift) @ stack[:, :3, :3]
+    arrays = moved(arrays, pose)
     points, normals = arrays.pop("points"), arrays.pop("normals")
     named = grasps[0].object
     at = np.broadcast_to(pose, (len(grasps), 4, 4)) if named or places else None
     return replace(problems, points=points, normals=normals, more=arrays, object_pose=at)
-
-
-def _of_kinds(
-    rows: NDArray[np.intp], problems: Problems
-) -> Iterator[tuple[NDArray[np.intp], Problems]]:
-    for _, of_kinds, some in by_kinds(problems):
-        yield (rows if of_kinds is None else rows[of_kinds]), some
 
 
 class _Ranked:
@@ -163,58 +162,47 @@ class _Ranked:
         self,
         engine: Engine,
         asked: Sequence[tuple[NDArray[np.intp], Problems]],
-        found: Sequence[Answers],
+        answers: Answers,
         apart: float,
-        seconds: float,
     ) -> None:
-        self.engine, self.asked, self.apart, self.seconds = engine, asked, apart, seconds
-        self.q = np.concatenate([part.q for part in found])
-        self.owner = np.concatenate([part.owner for part in found])
-        self.score = np.concatenate([part.score for part in found])
+        self.engine, self.asked, self.answers, self.apart = engine, asked, answers, apart
 
-    def best(self, limit: int) -> Iterator[Choice]:
+    def best(self, limit: int) -> list[Choice]:
         """The best that differ from each other."""
-        robot = self.engine.robot
-        # Of equals the first candidate.
-        order = np.lexsort((self.owner, -self.score))
-        ranges = robot.upper - robot.lower
-        kept: list[Array] = []
-        for first in range(0, len(order), BLOCK):
-            rows = order[first : first + BLOCK]
-            solutions = self._judged(rows)
-            for row in rows.tolist():
-                solution = solutions[row]
-                part = self.q[row] / ranges
-                alike = any(np.abs(part - other).max() < self.apart for other in kept)
-                same = any(np.array_equal(part, other) for other in kept)
-                if not solution.success or alike or same:
-                    continue
-                kept.append(part)
-                yield Choice(int(self.owner[row]), solution, float(self.score[row]))
-                if len(kept) == limit:
-                    return
+        answers, robot = self.answers, self.engine.robot
+        # Of equals that whose arm is farther from its limits, then the first candidate.
+        left = np.lexsort((answers.owner, -answers.margin, -answers.score))
+        parts = answers.q / (robot.upper - robot.lower)
+        found: list[Choice] = []
+        while len(left) and len(found) < limit:
+            chosen: list[int] = []
+            while len(left) and len(found) + len(chosen) < limit:
+                row = int(left[0])
+                chosen.append(row)
+                off = np.abs(parts[left] - parts[row]).max(axis=1)
+                left = left[(off >= self.apart) & (off > 0)]
+            solutions = self._judged(np.array(chosen))
+            found += [
+                Choice(int(answers.owner[row]), solutions[row], float(answers.score[row]))
+                for row in chosen
+                if solutions[row].success
+            ]
+        return found
 
     def _judged(self, rows: NDArray[np.intp]) -> dict[int, Solution]:
         """Answers with the verdict on them, which has the last word."""
         found: dict[int, Solution] = {}
+        owner = self.answers.owner[rows]
         for numbers, problems in self.asked:
-            mine = rows[np.isin(self.owner[rows], numbers)]
+            mine = rows[np.isin(owner, numbers)]
             if not len(mine):
                 continue
-            places = np.searchsorted(numbers, self.owner[mine])
-            for _, of_kinds, some in by_kinds(problems.rows(places)):
-                here = mine if of_kinds is None else mine[of_kinds]
-                none = np.zeros(len(here), dtype=np.int64)
-                outcome = Outcome(
-                    self.q[here],
-                    np.full(len(here), int(Status.SOLVED), dtype=np.int64),
-                    none,
-                    none,
-                    np.full(len(here), self.seconds),
-                    {},
-                )
-                around = self.engine.around(some)
-                method = self.engine.method.name
-                batch = judged(self.engine.robot, method, some, outcome, around)
-                found |= {int(row): batch.solution(i) for i, row in enumerate(here.tolist())}
+            some = problems.rows(np.searchsorted(numbers, self.answers.owner[mine]))
+            none = np.zeros(len(mine), dtype=np.int64)
+            status = np.full(len(mine), int(Status.SOLVED), dtype=np.int64)
+            q = self.answers.q[mine]
+            outcome = Outcome(q, status, none, none, np.zeros(len(mine)), {})
+            around, method = self.engine.around(some), self.engine.method.name
+            batch = judged(self.engine.robot, method, some, outcome, around)
+            found |= {int(row): batch.solution(i) for i, row in enumerate(mine.tolist())}
         return found

@@ -28,7 +28,6 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.free import FreeFinder
-from casadi_ik.solving.alternatives.tracking import Tracker
 from casadi_ik.solving.alternatives.way_out import with_way_out
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
@@ -135,15 +134,6 @@ class Engine:
     def around(self, problems: Problems) -> Surroundings | None:
         """What targets are checked against; None: nothing."""
         return None if self.check is None else self.check.around(problems)
-
-    @cached_property
-    def tracker(self) -> Tracker:
-        """Follows moving grasps.
-
-        Raises:
-            UnsupportedError: The method is not hand-first.
-        """
-        return Tracker(self.robot, self._hand_first, self.finder)
 
     def preference(self, prefer: str | None, started: bool) -> str:
         """What is preferred, see `preference`.

@@ -130,8 +130,6 @@ def test_all_solutions_are_free(solver):
 
 
 def test_what_knows_no_scene_says_so(solver):
-    with pytest.raises(UnsupportedError, match="track: knows no scenes"):
-        solver.track([ik.load_grasp("cup")])
     with pytest.raises(UnsupportedError, match="fast: checks no collisions"):
         solver.fast()
 

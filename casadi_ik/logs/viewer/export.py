@@ -30,16 +30,14 @@ from casadi_ik.errors import LogError
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs.explain.phrases import SERIOUS, errors, told
 from casadi_ik.logs.mcap import schema
+from casadi_ik.logs.mcap.cdr import JOINT_STATE, STRING, cdr_message
 from casadi_ik.logs.mcap.message_bytes import CDR_HEADER
 from casadi_ik.logs.read.one_solve import OneSolve
 from casadi_ik.logs.viewer.viewer_messages import (
-    JOINT_STATE,
-    STRING,
     Color,
     Schema,
     along,
     arrow,
-    cdr_message,
     fox,
     inverses,
     quaternion_of,
@@ -181,7 +179,8 @@ class _View:
         channel = self._ros("/joint_states", JOINT_STATE)
         none = np.zeros(0)
         for i, time in enumerate(self.times.tolist()):
-            state = cdr_message(stamp_of(time), self.root, list(joints), positions[i], none, none)
+            stamp = divmod(time, 1_000_000_000)
+            state = cdr_message(stamp, self.root, list(joints), positions[i], none, none)
             self._add(channel, i, state)
 
     def _targets(self) -> None:

@@ -1,8 +1,7 @@
-"""What a viewer file says, in its encodings: CDR for ROS 2, protobuf in Foxglove's schemas."""
+"""What a viewer file says in Foxglove's schemas, in protobuf."""
 
 from __future__ import annotations
 
-import struct
 from functools import cache
 
 import casadi as ca
@@ -10,7 +9,6 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import MissingExtraError
-from casadi_ik.logs.mcap.message_bytes import CDR_HEADER
 from casadi_ik.symbolic.so3 import quaternion_from_matrix
 
 try:
@@ -22,14 +20,11 @@ except ImportError as error:
     ) from error
 
 __all__ = [
-    "JOINT_STATE",
-    "STRING",
     "Array",
     "Color",
     "Schema",
     "along",
     "arrow",
-    "cdr_message",
     "fox",
     "inverses",
     "quaternion_of",
@@ -40,27 +35,6 @@ __all__ = [
 ]
 
 Color = tuple[float, float, float]
-
-STRING = ("std_msgs/msg/String", "string data\n")
-
-JOINT_STATE = (
-    "sensor_msgs/msg/JointState",
-    """\
-std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-""",
-)
 
 ARROW = 0.05
 """Length of a contact's normal [m]."""
@@ -74,25 +48,6 @@ def inverses(pose: Array) -> Array:
     result[:, :3, 3] = -(turned @ pose[:, :3, 3, None])[..., 0]
     result[:, 3, 3] = 1.0
     return result
-
-
-def cdr_message(*values: str | list[str] | Array | fox.Timestamp) -> bytes:
-    """A ROS 2 message of texts, lists of them, sequences of float64, and times."""
-    out = bytearray()
-    for value in values:
-        if isinstance(value, fox.Timestamp):
-            out += struct.pack("<iI", value.sec, value.nsec)
-        elif isinstance(value, np.ndarray):
-            out += bytes(-len(out) % 4) + struct.pack("<I", len(value))
-            if len(value):
-                out += bytes(-len(out) % 8) + value.astype("<f8").tobytes()
-        else:
-            if isinstance(value, list):
-                out += bytes(-len(out) % 4) + struct.pack("<I", len(value))
-            for text in [value] if isinstance(value, str) else value:
-                data = text.encode() + b"\0"
-                out += bytes(-len(out) % 4) + struct.pack("<I", len(data)) + data
-    return CDR_HEADER + bytes(out)
 
 
 def stamp_of(time: int) -> fox.Timestamp:

@@ -178,8 +178,13 @@ class LoopedMethod(ABC):
         states, parameters = self.begin(problems, q0[None])
         return Stepper(self.graph, states[0], parameters[0], next_round)
 
-    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
-        """Solve a batch; see `Method.run`. No random numbers are drawn."""
+    def run(
+        self, problems: Problems, q0: Array, seed: int, trace: bool, rounds: int | None = None
+    ) -> Outcome:
+        """Solve a batch; see `Method.run`. No random numbers are drawn.
+
+        `rounds` are so many at most instead of all.
+        """
         del seed
         self._check(problems)
         count = len(problems)
@@ -188,7 +193,7 @@ class LoopedMethod(ABC):
         states = np.empty((count, self.graph.state.size))
         status = np.empty(count, dtype=np.int64)
         left, some, here, last = np.arange(count), problems, q0, None
-        for number in range(self.rounds):
+        for number in range(self.rounds if rounds is None else rounds):
             if number:
                 left = np.flatnonzero(status != Status.SOLVED)
                 if not len(left):

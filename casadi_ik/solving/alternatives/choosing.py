@@ -19,6 +19,9 @@ from casadi_ik.solving.alternatives.swings import Preference
 TOGETHER = 1024
 """Candidates that are worked on at once."""
 
+CLOSER = 8
+"""So many times as many answers as are wanted are looked at closer."""
+
 
 @dataclass(frozen=True, eq=False)
 class Answers:
@@ -28,17 +31,34 @@ class Answers:
         q: (m, n) configurations, free of collision where that was asked for.
         owner: (m,) candidate of each.
         score: (m,) what they are ranked by, higher is better.
+        margin: (m,) smallest distance of the arm from its limits: where scores are equal.
         reasons: Why there is none, by candidate; "" where there is one.
     """
 
     q: Array
     owner: NDArray[np.intp]
     score: Array
-    reasons: tuple[str, ...]
+    margin: Array
+    reasons: NDArray[np.object_]
 
-    def moved(self, numbers: NDArray[np.intp]) -> Answers:
-        """The same with other numbers of the candidates."""
-        return Answers(self.q, numbers[self.owner], self.score, self.reasons)
+    @classmethod
+    def joined(cls, parts: list[tuple[NDArray[np.intp], Answers]], count: int) -> Answers:
+        """Those of all candidates; of one that is there twice the last reason holds.
+
+        Args:
+            parts: Numbers of some candidates, and their answers.
+            count: How many candidates there are.
+        """
+        reasons = np.full(count, "", dtype=object)
+        for numbers, part in parts:
+            reasons[numbers] = part.reasons
+        return cls(
+            np.concatenate([part.q for _, part in parts]),
+            np.concatenate([numbers[part.owner] for numbers, part in parts]),
+            np.concatenate([part.score for _, part in parts]),
+            np.concatenate([part.margin for _, part in parts]),
+            reasons,
+        )
 
 
 def answers_of(
@@ -47,6 +67,7 @@ def answers_of(
     around: Surroundings | None,
     start: Array,
     prefer: Preference,
+    limit: int,
     seed: int,
     thorough: bool,
 ) -> Answers:
@@ -58,22 +79,18 @@ def answers_of(
         around: What answers must not touch; None: nothing is checked.
         start: (n,) where the robot is.
         prefer: What is preferred.
+        limit: How many answers are wanted.
         seed: Of random arms.
-        thorough: Whether to look further, as for a single grasp, where all arms of the hands that
-            look like a candidate touch something.
+        thorough: Whether to look as far as for a single grasp, instead of at the first round of
+            hands.
     """
     parts = []
     for first in range(0, len(problems), TOGETHER):
         rows = np.arange(first, min(first + TOGETHER, len(problems)))
         nearby = None if around is None else around.rows(rows)
-        part = _Part(finder, problems.rows(rows), nearby, start, prefer)
-        parts.append(part.run(seed, thorough).moved(rows))
-    return Answers(
-        np.concatenate([part.q for part in parts]),
-        np.concatenate([part.owner for part in parts]),
-        np.concatenate([part.score for part in parts]),
-        tuple(reason for part in parts for reason in part.reasons),
-    )
+        part = _Part(finder, problems.rows(rows), nearby, start, prefer, limit)
+        parts.append((rows, part.run(seed, thorough)))
+    return Answers.joined(parts, len(problems))
 
 
 class _Part:
@@ -86,28 +103,32 @@ class _Part:
         around: Surroundings | None,
         start: Array,
         prefer: Preference,
+        limit: int,
     ) -> None:
         self.finder, self.problems, self.around = finder, problems, around
-        self.prefer, self.trials = prefer, finder.trials
+        self.prefer, self.limit, self.trials = prefer, limit, finder.trials
         self.starts = np.tile(start, (len(problems), 1))
         self.limits = self.trials.limits(problems)
 
     def run(self, seed: int, thorough: bool) -> Answers:
         """Their answers."""
         method = self.trials.method
-        outcome = method.run(self.problems, self.starts, seed, False)
+        rounds = None if thorough else 1
+        outcome = method.run(self.problems, self.starts, seed, False, rounds)
         good = self.trials.solved(self.problems, outcome.q, self.problems.enforce_limits)
         rows = np.flatnonzero(good)
         q, owner, pairs = self._answers(*self._hands(outcome.q, rows))
-        if thorough and self.around is not None and not len(q):
-            q, owner = self._further(outcome.q, rows, seed)
+        if thorough and self.around is not None:
+            left = rows[~np.isin(rows, owner)]
+            more, whose = self._further(outcome.q, left, seed)
+            q, owner = np.concatenate([q, more]), np.concatenate([owner, whose])
         reasons = np.array([Status(int(code)).name for code in outcome.status], dtype=object)
         # A method that is content with what the verdict refuses has come to a standstill.
         reasons[~good & (outcome.status == Status.SOLVED)] = Status.STALLED.name
         for row, pair in pairs.items():
             reasons[row] = f"{Status.COLLISION.name}: {pair[0]} and {pair[1]}"
         reasons[owner] = ""
-        return Answers(q, owner, self._score(q, owner), tuple(reasons.tolist()))
+        return Answers(q, owner, self._score(q, owner), self.finder.arm_margins(q), reasons)
 
     def _hands(self, q: Array, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
         """Different hands that meet the contacts of candidates, with an arm for each.
@@ -152,27 +173,42 @@ class _Part:
         kept = np.flatnonzero(room >= -ROUNDING)
         found, targets = q[kept], owner[kept]
         if swings is not None:
-            swung = swings.choose(
-                found,
-                self.starts[targets],
-                (self.limits.lower, self.limits.upper),
-                self.prefer,
-                None if around is None else around.rows(targets),
-                room[kept],
-                branches=True,
-            )
-            found, targets = swung.q, targets[swung.owner]
+            found, hand = self._arms(found, targets, room[kept])
+            targets = targets[hand]
         if around is None:
             return found, targets, {}
-        if self.prefer == CLEARANCE:
-            free = around.rows(targets).free(found)
-            found, targets = found[free], targets[free]
         left = np.flatnonzero(~np.isin(owner, targets))
         # The last word has the hand with most room.
         left = left[np.argsort(room[left], kind="stable")]
         clear = around.rows(owner[left]).check(q[left])
         named = ((row, clear.pair(i)) for i, row in enumerate(owner[left].tolist()))
         return found, targets, {row: pair for row, pair in named if pair is not None}
+
+    def _arms(
+        self, q: Array, owner: NDArray[np.intp], room: Array
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Free arms of hands, and whose hand it is; closer where the best of them are."""
+        found, hand = self._swung(q, owner, room, False)
+        score = self._score(found, owner[hand])
+        best = np.argsort(-score, kind="stable")[: CLOSER * self.limit]
+        again = np.unique(hand[best])
+        more, mine = self._swung(q[again], owner[again], room[again], True)
+        others = ~np.isin(hand, again)
+        return np.concatenate([found[others], more]), np.concatenate([hand[others], again[mine]])
+
+    def _swung(
+        self, q: Array, owner: NDArray[np.intp], room: Array, closer: bool
+    ) -> tuple[Array, NDArray[np.intp]]:
+        swings = self.finder.swings
+        assert swings is not None
+        around = None if self.around is None else self.around.rows(owner)
+        bounds = self.limits.lower, self.limits.upper
+        starts = self.starts[owner]
+        swung = swings.choose(q, starts, bounds, self.prefer, around, room, True, closer)
+        if around is None or self.prefer != CLEARANCE:
+            return swung.q, swung.owner
+        free = around.rows(swung.owner).free(swung.q)
+        return swung.q[free], swung.owner[free]
 
     def _further(
         self, q: Array, rows: NDArray[np.intp], seed: int

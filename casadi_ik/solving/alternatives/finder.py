@@ -253,6 +253,10 @@ class AlternativeFinder:
         """Some columns of configurations as parts of their ranges."""
         return q[:, columns] / (self.robot.upper - self.robot.lower)[columns]
 
+    def arm_margins(self, q: Array) -> Array:
+        """(k,) smallest distance of the arm from its limits, as a part of half its range."""
+        return self._margins(q, self._arm)
+
     def _margins(self, q: Array, columns: list[int]) -> Array:
         half = (self.robot.upper - self.robot.lower)[columns] / 2
         inside = np.minimum(q - self.robot.lower, self.robot.upper - q)[:, columns] / half

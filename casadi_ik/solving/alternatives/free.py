@@ -97,6 +97,10 @@ class FreeFinder:
         search.swing(q, np.zeros(1, dtype=np.intp))
         return search.best[0] if search.free[0] else None
 
+    def arm_margins(self, q: Array) -> Array:
+        """(m,) smallest distance of the arm from its limits, as a part of half its range."""
+        return self._finder.arm_margins(q)
+
     def score(self, q: Array, starts: Array, prefer: Preference, room: Array) -> Array:
         """(m,) what is preferred, higher is better; `room` (m,) for "clearance"."""
         return score_of(self._finder, q, starts, prefer, room)

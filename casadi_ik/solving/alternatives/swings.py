@@ -100,6 +100,7 @@ class ArmSwings:
         around: Surroundings | None,
         room: Array,
         branches: bool = False,
+        closer: bool = True,
     ) -> Swung:
         """The preferred arm that touches nothing, of every hand that has one.
 
@@ -111,6 +112,7 @@ class ArmSwings:
             around: What nothing may touch; None: nothing is checked.
             room: (k,) of what the hand alone decides [m]; infinite where nothing is checked.
             branches: Whether to give the preferred arm of every branch, instead of one.
+            closer: Whether to look about the swivels at which they were found.
 
         Returns:
             The arms; with "clearance" those with most room, free or not.
@@ -127,9 +129,11 @@ class ArmSwings:
         order = None if callable(prefer) else ORDERS[prefer]
         measure = self._measure() if order is Order.MEASURED else None
         if order is None or not self._kernel.can(checked, measure):
-            return _Slow(self, palms, q, starts, inside, prefer, around, room, branches).run()
+            return _Slow(
+                self, palms, q, starts, inside, prefer, around, room, branches, closer
+            ).run()
         arms, score, tried = self._kernel.choose(
-            q, palms, starts, inside, order, checked, branches, measure
+            q, palms, starts, inside, order, checked, branches, closer, measure
         )
         owner, group = np.nonzero(score > -np.inf)
         found = q[owner]
@@ -208,11 +212,13 @@ class _Slow:
         around: Surroundings | None,
         room: Array,
         branches: bool,
+        closer: bool,
     ) -> None:
         self.room = room
         self.swings, self.palms, self.q, self.starts = swings, palms, q, starts
         self.bounds, self.prefer, self.around, self.branches = bounds, prefer, around, branches
         self.places = swings.places
+        self.closer = swings.places.closer if closer else np.zeros(0)
         self.groups = self.places.branches + 1 if branches else 1
         self.tried = np.zeros(len(q), dtype=np.int64)
 
@@ -297,7 +303,7 @@ class _Slow:
         branch: NDArray[np.intp],
     ) -> None:
         """Places about those of arms that were taken, their branches only."""
-        closer = self.places.closer
+        closer = self.closer
         varied = np.flatnonzero(np.isfinite(places[:, 0]))
         if not len(closer) or not len(varied):
             return

@@ -1,0 +1,127 @@
+"""The file that `casadi-ik follow` reads: frames of a stream, with the times when they came."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
+from casadi_ik.motion.retarget import KEYPOINTS
+
+RATE = 30.0
+"""Frames in a second where the file has no times."""
+
+MOST = 2**28
+"""Numbers of an array, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames of a stream.
+
+    Attributes:
+        times: (k,) [s], the first 0.
+        keypoints: (k, 21, 3) of a person's hand [m]; None: contacts are given.
+        points: (k, f, 3) contact points [m], base frame; nothing where keypoints are given.
+        normals: (k, f, 3) outward pad normals; NaN where free.
+    """
+
+    times: Array
+    keypoints: Array | None
+    points: Array
+    normals: Array
+
+    @property
+    def last(self) -> float:
+        """When the last frame came [s]."""
+        return float(self.times[-1])
+
+    def at(self, times: Array, values: Array) -> Array:
+        """Values of frames between the frames, linearly; NaN beside a frame that has NaN."""
+        after = np.clip(np.searchsorted(self.times, times), 1, max(len(self.times) - 1, 1))
+        if len(self.times) == 1:
+            return np.repeat(values, len(times), axis=0)
+        start, end = self.times[after - 1], self.times[after]
+        share = np.clip((times - start) / (end - start), 0.0, 1.0)[:, None, None]
+        return np.where(
+            share <= 0,
+            values[after - 1],
+            np.where(
+                share >= 1,
+                values[after],
+                values[after - 1] + share * (values[after] - values[after - 1]),
+            ),
+        )
+
+
+def read_frames(path: Path, fingers: int) -> Frames:
+    """Read frames.
+
+    Args:
+        path: An npz file with `keypoints` (k, 21, 3), or with `points` (k, f, 3) and, if wanted,
+            `normals`; and if wanted `times` (k,) [s].
+        fingers: How many the robot has.
+
+    Raises:
+        InputError: Missing, damaged, or other arrays than expected; the message names file and
+            key.
+    """
+    arrays = _arrays(path)
+    known = {"keypoints", "points", "normals", "times"}
+    if ("keypoints" in arrays) == ("points" in arrays):
+        found = ", ".join(arrays) or "nothing"
+        raise InputError(
+            f"{path}: expected keypoints (k, {KEYPOINTS}, 3) or points (k, {fingers}, 3); "
+            f"found {found}"
+        )
+    for name in sorted(set(arrays) - known):
+        raise InputError(f"{path}: {name}: unknown, expected {', '.join(sorted(known))}")
+    key = "keypoints" if "keypoints" in arrays else "points"
+    shape = (KEYPOINTS if key == "keypoints" else fingers), 3
+    frames = arrays[key]
+    if frames.ndim != 3 or frames.shape[1:] != shape or not len(frames):
+        raise InputError(
+            f"{path}: {key}: found shape {frames.shape}, expected (k, {shape[0]}, 3), k >= 1"
+        )
+    normals = arrays.get("normals")
+    if normals is not None and (key == "keypoints" or normals.shape != frames.shape):
+        expected = "points beside them" if key == "keypoints" else f"{frames.shape}"
+        raise InputError(f"{path}: normals: found shape {normals.shape}, expected {expected}")
+    times = arrays.get("times", np.arange(len(frames)) / RATE)
+    steady = times.shape == (len(frames),) and np.isfinite(times).all()
+    if not (steady and (np.diff(times) > 0).all()):
+        raise InputError(
+            f"{path}: times: expected {len(frames)} growing numbers of seconds, one per frame"
+        )
+    if key == "keypoints":
+        nothing = np.zeros((len(frames), 0, 3))
+        return Frames(times - times[0], frames, nothing, nothing)
+    free = np.full(frames.shape, np.nan) if normals is None else normals
+    return Frames(times - times[0], None, frames, free)
+
+
+def _arrays(path: Path) -> dict[str, Array]:
+    found: dict[str, Array] = {}
+    try:
+        if not zipfile.is_zipfile(path):
+            path.open("rb").close()
+            raise InputError(f"{path}: not an npz file, expected one with keypoints or points")
+        with np.load(path, allow_pickle=False) as archive:
+            for name in archive.files:
+                found[name] = _numbers(path, name, archive[name])
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError) as error:
+        raise InputError(f"{path}: damaged: {error}") from error
+    return found
+
+
+def _numbers(path: Path, name: str, array: np.ndarray) -> Array:
+    if array.dtype.kind not in "fiu" or array.size > MOST:
+        raise InputError(f"{path}: {name}: found values of type {array.dtype}, expected numbers")
+    return array.astype(np.float64)

@@ -1,0 +1,1 @@
+"""Robots that move: targets followed cycle by cycle, motions along paths, ways to a grasp."""

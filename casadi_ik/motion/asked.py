@@ -1,0 +1,182 @@
+"""What a follower is asked in a cycle, written where its graph reads it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.grasps.pose import one_pose
+from casadi_ik.kernels import FunctionKernel
+from casadi_ik.kernels.recurrence import Recurrence
+from casadi_ik.motion.cycle import Cycle
+from casadi_ik.motion.plan import FollowPlan
+from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.problems import Problems, Tolerance
+
+WHOLE, PLACES = "points and normals", "points"
+"""What all fingers are asked for."""
+
+ANY = (1.0, 0.0, 0.0)
+"""A normal that does not count, as a unit vector all the same."""
+
+
+class Asked:
+    """One graph's memory, for contacts of some kinds.
+
+    Attributes:
+        run: The graph, step by step.
+        views: Its parameters by name; write into them.
+        record: What its last step tells, by name.
+    """
+
+    def __init__(self, plan: FollowPlan, kinds: Kinds, obstacles: int) -> None:
+        """Compile what is not compiled yet."""
+        self.cycle = cycle = Cycle(plan.robot.description, kinds, obstacles)
+        self.run = Recurrence(FunctionKernel(cycle.graph, plan.compiled))
+        self.views: dict[str, Array] = cycle.parameters.unpack(self.run.parameters)
+        self.record: dict[str, Array] = cycle.record.unpack(self.run.record)
+        fastest, change = plan.rates.steps(plan.period)
+        self._fill(lower=plan.bounds[0], upper=plan.bounds[1], posture=plan.posture)
+        self._fill(fastest=fastest, change=change)
+        tolerances = tuple(plan.questions.tolerances.values())
+        self._usual, self._tolerances = contact_weights(tolerances), tolerance_rows(tolerances)
+        self._fill(**plan.habits)
+        self._told = self.run.record
+        self._points, self._normals = self.views["points"], self.views["normals"]
+        self._mode = ""
+
+    def state_at(self, q: Array) -> Array:
+        """The state of rest at a posture (n,)."""
+        rest = {item.name: np.zeros(item.shape) for item in self.cycle.state}
+        return self.cycle.state.pack(rest | {"q": q, "goal": q, "there": 1.0})
+
+    def _fill(self, **values: Array | float) -> None:
+        for name, value in values.items():
+            self.views[name][...] = value
+
+    def ask(self, points: Array, normals: Array | None) -> None:
+        """Ask for points and normals that are all there; `sound` tells if they were not.
+
+        Args:
+            points: (f, 3) [m].
+            normals: (f, 3) of any length; None: all are free.
+        """
+        self._points[...] = points
+        if normals is not None:
+            self._normals[...] = normals
+        mode = WHOLE if normals is not None else PLACES
+        if self._mode != mode:
+            known = np.array([1.0, mode == WHOLE])
+            self._fill(weights=known * self._usual, **self._tolerances)
+            if normals is None:
+                self._normals[...] = ANY
+            self._mode = mode
+
+    @property
+    def sound(self) -> bool:
+        """Whether what was asked in the last step were numbers and directions."""
+        told = self._told[-1]
+        return bool(told - told == 0.0)
+
+    def ask_partly(self, points: Array, normals: Array) -> str:
+        """Ask for points and normals of which some may be free.
+
+        Args:
+            points: (f, 3) [m]; all NaN where a finger is free.
+            normals: (f, 3) of any length; all NaN where free.
+
+        Returns:
+            What is wrong with them, "" if nothing is; then nothing is asked.
+        """
+        reason = fault(points, normals)
+        if reason:
+            return reason
+        self._mode = ""
+        known = ~np.isnan(np.stack([points[:, 0], normals[:, 0]], axis=1))
+        facing = np.where(known[:, 1:], normals, ANY)
+        self._fill(points=np.nan_to_num(points), normals=facing)
+        self._fill(weights=known * self._usual, **self._tolerances)
+        return ""
+
+    def ask_problem(self, problem: Problems) -> None:
+        """Ask for one target of the graph's kinds, checked before."""
+        self._mode = ""
+        rows = contact_rows(self.cycle, problem)
+        self._fill(**{name: values[0] for name, values in rows.items()})
+        self._fill(**tolerance_rows(problem.tolerances))
+
+    def ask_palm(self, pose: Array, weight: tuple[float, float]) -> None:
+        """Ask for a pose of the palm (4, 4), as far as contacts leave it free."""
+        checked = one_pose(pose)
+        self._fill(palm_point=checked[:3, 3], palm_axes=checked[:3, :3], palm_weight=weight)
+
+    def free_palm(self) -> None:
+        """Ask for no pose of the palm."""
+        if "palm_weight" in self.views:
+            self._fill(palm_weight=0.0)
+
+    def lead_to(self, posture: Array) -> None:
+        """Where motions lead that the contacts leave free, (n,)."""
+        self._fill(posture=posture)
+
+    def ask_nothing(self) -> None:
+        """Ask for nothing: the goal stays."""
+        self._mode = ""
+        self._fill(points=0.0, normals=ANY, weights=0.0)
+        self.free_palm()
+
+
+def contact_weights(tolerances: tuple[Tolerance, ...]) -> Array:
+    """(f, 2) how much places and facings count: as 1 / tolerance, the tightest counts 1."""
+    loose = np.array([(one.position / LENGTH, one.angle) for one in tolerances])
+    return loose.min() / loose
+
+
+def tolerance_rows(tolerances: tuple[Tolerance, ...]) -> dict[str, Array]:
+    """Tolerances (f,) as the parameters of a cycle."""
+    return {
+        "position_tolerance": np.array([one.position for one in tolerances]),
+        "angle_tolerance": np.array([one.angle for one in tolerances]),
+    }
+
+
+def contact_rows(cycle: Cycle, problems: Problems) -> dict[str, Array]:
+    """Targets as the parameters of a cycle's contacts.
+
+    Args:
+        cycle: The graph.
+        problems: k targets of its kinds.
+
+    Returns:
+        By field (k, ...): vectors, with zeros where free, and weights.
+    """
+    known = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
+    values: dict[str, Array] = {
+        f"{name}s": np.nan_to_num(problems.vectors(f"{name}s")) for name in cycle.contacts.data
+    }
+    values["normals"] = np.where(known[1][..., None], values["normals"], ANY)
+    return values | {"weights": np.stack(known, axis=2) * contact_weights(problems.tolerances)}
+
+
+def fault(points: Array, normals: Array) -> str:
+    """What is wrong with a frame of a stream; "": nothing.
+
+    Args:
+        points: (f, 3), all NaN where a finger is free.
+        normals: (f, 3), all NaN where free.
+    """
+    for name, array in (("points", points), ("normals", normals)):
+        missing = np.isnan(array)
+        if (missing.any(axis=1) & ~missing.all(axis=1)).any():
+            return f"{name} are partly NaN"
+        if np.isinf(array).any():
+            return f"{name} are infinite"
+    free, faces = np.isnan(points[:, 0]), ~np.isnan(normals[:, 0])
+    if free.all():
+        return "there is no contact"
+    if (free & faces).any():
+        return "a normal has no point"
+    if not normals[faces].any(axis=1).all():
+        return "a normal is zero"
+    return ""

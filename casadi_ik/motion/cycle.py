@@ -1,0 +1,301 @@
+"""One cycle of a robot that follows moving contacts, as one graph.
+
+Where it is to go, the *goal*, is found by a few Gauss-Newton steps of all motors together,
+
+    min |r + J s - left|^2 + stir |r|^2 |s|^2 + |clearances|^2 + pull |goal + s - anchor|^2
+
+within bounds, r and J the contacts' residual (`ContactRows`), every motor in its own unit. They
+begin where the goal before was, so it stays on its branch.
+
+While motors can keep up with the contacts they are *at* the goal: the bounds are what velocities
+and accelerations permit, and the anchor is where the motors' own momentum leads. So motions that
+the contacts leave free are smooth, and near singular postures accelerations stay moderate at the
+price of a small error. Errors that this leaves fade over some cycles (`left` is what may still be
+there), since bounds and errors that have to vanish at once would fight each other.
+
+When contacts cannot be met so (they leap, or are too fast, or out of reach), goal and motors part:
+the goal goes on within the limits of position and velocity, and the motors run after it as fast as
+they may and without going past it (`limiter`), until they are there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+
+from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.methods.common.bounded_step import Bounded, damped_step
+from casadi_ik.methods.common.whole_contacts import whole_jacobian, whole_residual
+from casadi_ik.motion.limiter import chased, share_within, step_bounds
+from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts.kinds import Kinds, suffix
+from casadi_ik.problem.contacts.rows import ContactRows, tip_vectors, within_tolerance
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.actuated import actuated, motor_scales
+from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.so3 import skew
+from casadi_ik.symbolic.subexpressions import shared
+
+STEPS = 2
+"""Gauss-Newton steps of a cycle; the second goes on with the motors that the first held."""
+
+PASSES = 2
+"""Corrections of the set of motors at their bounds in a step."""
+
+STIR = 0.03
+"""How much damping grows with the squared residual: where contacts are out of reach the least
+residual is not small, and undamped Gauss-Newton swings about it."""
+
+CAP = 0.1
+"""Farthest that a motor's goal moves in a cycle [rad, or part of a slider's range], however fast
+the motor is: a goal that leaps may come down on another branch."""
+
+AVOIDANCE = 0.1
+"""How much a clearance counts, a contact counting 1: it may use what contacts leave free, and
+hardly moves a contact."""
+
+SAME = 1e-9
+"""So near to its goal a motor is there [rad or m]."""
+
+PALM_ROWS = 12
+"""Of the palm's residual: its place, and its three axes."""
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """The graph for one robot and kinds of contacts.
+
+    Attributes:
+        robot: The robot.
+        kinds: Of the contacts, by finger.
+        obstacles: Clearances that the goal minds at once.
+    """
+
+    robot: RobotDescription
+    kinds: Kinds
+    obstacles: int = 0
+
+    @cached_property
+    def contacts(self) -> ContactRows:
+        """The contacts' rows."""
+        return ContactRows(self.kinds)
+
+    @property
+    def palm(self) -> bool:
+        """Whether the palm moves, so that it may have a target too."""
+        return bool(self.robot.arm_actuators)
+
+    @cached_property
+    def state(self) -> Layout:
+        """What a cycle hands on to the next."""
+        n, rows = len(self.robot.actuators), self.contacts.size + PALM_ROWS * self.palm
+        return Layout(
+            (
+                Field("q", (n,), unit="rad or m", doc="where the motors are told to be"),
+                Field("moved", (n,), unit="rad or m", doc="their last step"),
+                Field("goal", (n,), unit="rad or m", doc="where they are going"),
+                Field("there", doc="1: they go with the goal; 0: they run after it"),
+                Field("left", (rows,), doc="residual of contacts and palm"),
+            )
+        )
+
+    @cached_property
+    def parameters(self) -> Layout:
+        """What a cycle is asked."""
+        n, m, f = len(self.robot.actuators), self.obstacles, len(self.kinds)
+        fields = [
+            *self.contacts.fields,
+            Field("position_tolerance", (f,), unit="m"),
+            Field("angle_tolerance", (f,), unit="rad"),
+            Field("lower", (n,), unit="rad or m"),
+            Field("upper", (n,), unit="rad or m"),
+            Field("posture", (n,), unit="rad or m", doc="where free motions lead"),
+            Field("fastest", (n,), unit="rad or m", doc="longest step of a cycle"),
+            Field("change", (n,), unit="rad or m", doc="how much a step may differ from the last"),
+            Field("pull", doc="of the anchor [unit of J'J]"),
+            Field("keep", doc="part of a free motion that the next cycle keeps"),
+            Field("drift", doc="part of the way to the posture that a free motion gains"),
+            Field("patience", doc="part of an error that may be left after a cycle"),
+        ]
+        if self.palm:
+            fields += [
+                Field("palm_point", (3,), unit="m", doc="where the palm is wanted, base frame"),
+                Field("palm_axes", (3, 3), doc="its axes as columns, base frame"),
+                Field("palm_weight", (2,), doc="of its place and its axes"),
+            ]
+        if m:
+            fields += [
+                Field("slopes", (m, n), unit="m per rad or m", doc="how clearances grow"),
+                Field("rooms", (m,), unit="m", doc="how much they lack; 0 or less: nothing"),
+            ]
+        return Layout(tuple(fields))
+
+    @cached_property
+    def record(self) -> Layout:
+        """What a cycle tells."""
+        f = len(self.kinds)
+        return Layout(
+            (
+                Field("position_error", (f,), unit="m", doc="of the motors; 0 if free"),
+                Field("angle_error", (f,), unit="rad"),
+                Field("goal_position_error", (f,), unit="m", doc="of the goal"),
+                Field("goal_angle_error", (f,), unit="rad"),
+                Field("sound", doc="finite if all numbers of the target are, and no normal is 0"),
+            )
+        )
+
+    @property
+    def graph(self) -> FunctionGraph:
+        """``(state, parameters) -> (state', record)``."""
+        what = f"cycle_{self.obstacles}" if self.obstacles else "cycle"
+        name = ca.Function.fix_name(f"{self.robot.name}_{what}{suffix(self.kinds)}")
+        inputs = {"state": (self.state.size, 1), "parameters": (self.parameters.size, 1)}
+        outputs = (self.state.size, 1), (self.record.size, 1)
+        known = recipe(name, self.robot, self.kinds, self.obstacles)
+        return FunctionGraph(name, lambda: self._build(name), inputs, outputs, known)
+
+    def _build(self, name: str) -> ca.Function:
+        begin, step, end = self._begin(), self._step(), self._end()
+        state = ca.MX.sym("state", self.state.size)
+        parameters = ca.MX.sym("parameters", self.parameters.size)
+        first, low, high, *others = begin(state, parameters)
+        goal = first
+        for _ in range(STEPS):
+            goal = step(goal, low, high, *others, parameters)
+        after, record = end(state, first, goal, low, high, parameters)
+        return ca.Function(
+            name, [state, parameters], [after, record], ["state", "parameters"], ["after", "record"]
+        )
+
+    def _symbols(self, *names: str) -> list[ca.SX]:
+        return [ca.SX.sym(name, len(self.robot.actuators)) for name in names]
+
+    def _unpacked(self, parameters: ca.SX) -> dict[str, Expr]:
+        """Parameters by name, normals as unit vectors."""
+        p = self.parameters.unpack(parameters)
+        lengths = ca.sqrt(ca.sum2(p["normals"] ** 2))
+        return p | {"normals": p["normals"] / ca.repmat(lengths, 1, 3)}
+
+    def _begin(self) -> ca.Function:
+        """``(state, parameters) -> (first, low, high, anchor, left)`` of the goal."""
+        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
+        s, p = self.state.unpack(state), self.parameters.unpack(parameters)
+        there = s["there"] > 0.5
+        low, high = step_bounds(s, p)
+        most = ca.fmin(p["fastest"], CAP * motor_scales(self.robot))
+        low = ca.fmax(p["lower"], s["goal"] + ca.if_else(there, low, -most))
+        high = ca.fmin(p["upper"], s["goal"] + ca.if_else(there, high, most))
+        along = ca.if_else(there, s["moved"], 0.0)
+        first = ca.fmin(ca.fmax(s["goal"] + along, low), high)
+        free = p["keep"] * s["moved"] + p["drift"] * (p["posture"] - s["goal"])
+        anchor = s["goal"] + ca.if_else(there, free, 0.0)
+        left = ca.if_else(there, p["patience"] * s["left"], 0.0)
+        outputs = shared(first, low, high, anchor, left)
+        return ca.Function("begin", [state, parameters], outputs)
+
+    def _step(self) -> ca.Function:
+        """``(goal, low, high, anchor, left, parameters) -> goal'``."""
+        goal, low, high, anchor = self._symbols("goal", "low", "high", "anchor")
+        left = ca.SX.sym("left", self.state.size - 3 * goal.numel() - 1)
+        parameters = self.parameters.symbols("parameters")
+        p = self._unpacked(parameters)
+        after = self._goal(goal, (low, high), anchor, left, p)
+        return ca.Function(
+            "step", [goal, low, high, anchor, left, parameters], shared(ca.densify(after))
+        )
+
+    def _end(self) -> ca.Function:
+        """``(state, first, goal', low, high, parameters) -> (state', record)``."""
+        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
+        s, p = self.state.unpack(state), self._unpacked(parameters)
+        there = s["there"] > 0.5
+        first, wanted, low, high = self._symbols("first", "wanted", "low", "high")
+        goal = share_within(first, wanted, low, high)
+        position, angle = self._errors(goal, p)
+        met = within_tolerance(position, angle, p["position_tolerance"], p["angle_tolerance"])
+        drawn = ca.if_else(met, goal - s["goal"], 0.0)
+        q = ca.if_else(there, goal, chased(s, goal, drawn, p))
+        arrived = ca.mmax(ca.fabs(goal - q)) <= SAME
+        after = {
+            "q": q,
+            "moved": q - s["q"],
+            "goal": goal,
+            "there": ca.if_else(ca.logic_and(met, ca.logic_or(there, arrived)), 1.0, 0.0),
+            "left": self._residual(q, p),
+        }
+        own_position, own_angle = self._errors(q, p)
+        record = {
+            "position_error": own_position,
+            "angle_error": own_angle,
+            "goal_position_error": position,
+            "goal_angle_error": angle,
+            "sound": ca.sum1(after["left"]),
+        }
+        outputs = shared(self.state.pack(after), self.record.pack(record))
+        return ca.Function("end", [state, first, wanted, low, high, parameters], outputs)
+
+    def _goal(
+        self, here: Expr, bounds: tuple[Expr, Expr], anchor: Expr, left: Expr, p: dict[str, Expr]
+    ) -> Expr:
+        """The solution (n, 1) of the least squares; a little of it may be beyond the bounds.
+
+        Args:
+            here: (n, 1) where it begins, within the bounds.
+            bounds: (n, 1) each.
+            anchor: (n, 1).
+            left: Residual that may be left.
+            p: Parameters.
+        """
+        n, scales = here.numel(), motor_scales(self.robot)
+        residual, jacobian = self._residual(here, p), self._jacobian(here, p)
+        missed = ca.dot(residual, residual)
+        residual = residual - left
+        if self.obstacles:
+            rooms = ca.fmax(p["rooms"], 0.0)
+            felt = AVOIDANCE / LENGTH * ca.if_else(rooms > 0, 1.0, 0.0)
+            residual = ca.vertcat(residual, AVOIDANCE / LENGTH * rooms)
+            jacobian = ca.vertcat(jacobian, -p["slopes"] * ca.repmat(felt, 1, n))
+        pull = ca.sqrt(p["pull"])
+        residual = ca.vertcat(residual, pull * (here - anchor) / scales)
+        jacobian = ca.vertcat(jacobian @ ca.diag(scales), pull * ca.SX.eye(n))
+        at, (low, high) = here / scales, bounds
+        box = Bounded(at, low / scales, high / scales, first=0)
+        found = damped_step(ca.sparsify(jacobian), residual, STIR * missed, box, PASSES)
+        return here + found.step * scales
+
+    def _residual(self, q: Expr, p: dict[str, Expr]) -> Expr:
+        """Of contacts and palm, (rows, 1)."""
+        residual = whole_residual(self.robot, self.contacts, q, p)
+        if not self.palm:
+            return residual
+        palm, weight = actuated(self.robot, q).kinematics.palm, p["palm_weight"]
+        off = weight[0] * (palm.origin - p["palm_point"]) / LENGTH
+        return ca.vertcat(residual, off, weight[1] * ca.vec(palm.rotation - p["palm_axes"]))
+
+    def _jacobian(self, q: Expr, p: dict[str, Expr]) -> Expr:
+        """Its Jacobian (rows, n)."""
+        jacobian = whole_jacobian(self.robot, self.contacts, q, p)
+        if not self.palm:
+            return jacobian
+        body, weight = actuated(self.robot, q), p["palm_weight"]
+        linear, angular = body.palm_jacobian(range(q.numel()))
+        axes = ca.horzsplit(body.kinematics.palm.rotation)
+        turned = [-weight[1] * skew(axis) @ angular for axis in axes]
+        rows = (weight[0] * linear / LENGTH, *turned)
+        return ca.vertcat(jacobian, *map(ca.sparsify, rows))
+
+    def _errors(self, q: Expr, p: dict[str, Expr]) -> tuple[Expr, Expr]:
+        """Distances [m] and angles [rad] of all contacts, (f, 1); 0 where free."""
+        kinematics = actuated(self.robot, q).kinematics
+        found: tuple[list[Expr], list[Expr]] = ([], [])
+        goals, weights = self.contacts.goals(p), p["weights"]
+        for i, (name, kind) in enumerate(zip(self.robot.finger_names, self.kinds, strict=True)):
+            tip = tip_vectors(kinematics, name)
+            for aspect, condition in enumerate(kind.conditions):
+                error = condition.measure(tip, goals[i])
+                found[aspect].append(ca.if_else(weights[i, aspect] > 0, error, 0.0))
+        return ca.vertcat(*found[0]), ca.vertcat(*found[1])

@@ -1,0 +1,262 @@
+"""A robot that follows moving contacts: one call a cycle, arrays in, motor positions out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
+from casadi_ik.grasps import Grasp
+from casadi_ik.grasps.arrays import real_array
+from casadi_ik.motion.asked import Asked
+from casadi_ik.motion.following import FollowState, FollowStatus
+from casadi_ik.motion.guard import OBSTACLES, Guard
+from casadi_ik.motion.plan import FollowPlan
+from casadi_ik.motion.stopping import stopping_way
+from casadi_ik.problem.contacts.arrays import by_kinds
+from casadi_ik.problem.contacts.kinds import Kinds, usual
+from casadi_ik.problem.verdict import TOLERANCE_SLACK
+
+NO_FRAME = "no frame yet"
+
+
+class Follower:
+    """Follows contacts from cycle to cycle; what it returns is safe to be sent to the motors.
+
+    Whatever the targets do: positions, velocities and accelerations stay within limits, the
+    posture stays on its branch, and where the solver has a scene the robot can always come to rest
+    before it touches anything that stands still. A frame that is none (partly NaN, infinite, a
+    zero normal, no contact at all) is no error of a stream: the motors come to rest, and go on
+    with the next. An instance follows one robot; threads need one each.
+
+    Attributes:
+        period: Time from cycle to cycle [s].
+        velocity: (n,) limits that are kept [rad/s or m/s].
+        acceleration: (n,) limits that are kept [rad/s^2 or m/s^2].
+    """
+
+    def __init__(self, plan: FollowPlan) -> None:
+        """Compile what is not compiled yet, and lay the memory out; `Solver.follow` makes it."""
+        self._plan = plan
+        self.period = plan.period
+        self.velocity, self.acceleration = plan.rates.velocity, plan.rates.acceleration
+        self._change = plan.rates.steps(plan.period)[1]
+        robot = plan.robot
+        self._n, self._shape = len(robot.actuators), (len(robot.fingers), 3)
+        self._usual = usual(self._shape[0])
+        self._tolerances = self._own = tuple(plan.questions.tolerances.values())
+        self._all_asked: dict[Kinds, Asked] = {}
+        self._posture = plan.posture
+        self._guard = None if plan.check is None else Guard(plan)
+        self._asked = self._of(self._usual)
+        self.reset(plan.q0)
+
+    def _of(self, kinds: Kinds) -> Asked:
+        """The memory for some kinds of contacts."""
+        found = self._all_asked.get(kinds)
+        if found is None:
+            obstacles = 0 if self._guard is None else OBSTACLES
+            found = self._all_asked[kinds] = Asked(self._plan, kinds, obstacles)
+            found.lead_to(self._posture)
+        return found
+
+    def _take_up(self, kinds: Kinds) -> None:
+        """Go on with contacts of some kinds."""
+        n, old = 3 * self._n + 1, self._asked.run.state
+        self._asked = self._of(kinds)
+        state = self._asked.run.state
+        # The errors that are left belong to other rows; none is the honest guess.
+        state[:n], state[n:] = old[:n], 0.0
+
+    def reset(self, q: ArrayLike) -> None:
+        """Go on from a posture, at rest: for a robot that something else has moved.
+
+        Args:
+            q: (n,) [rad or m]; moved into the limits.
+
+        Raises:
+            InputError: Wrong shape or numbers.
+        """
+        inside = self._inside(q)
+        self._asked.run.state[:] = self._asked.state_at(inside)
+        self._reason, self._cycles, self._stopped = NO_FRAME, 0, False
+
+    def branch(self, q: ArrayLike) -> None:
+        """Change the branch: the motors go to a posture, every one on its own, and follow there.
+
+        Motions that the contacts leave free lead to this posture from now on.
+
+        A solution of the contacts of now (`Solver.solve`, `Solver.solve_all`) is what to ask for:
+        from another posture the goal moves on to them at once.
+
+        Args:
+            q: (n,) [rad or m]; moved into the limits.
+
+        Raises:
+            InputError: Wrong shape or numbers.
+        """
+        n, state, goal = self._n, self._asked.run.state, self._inside(q)
+        state[2 * n : 3 * n], state[3 * n] = goal, 0.0
+        self._posture = goal
+        for asked in self._all_asked.values():
+            asked.lead_to(goal)
+
+    def _inside(self, q: ArrayLike) -> Array:
+        return np.clip(self._plan.questions.start(q), *self._plan.bounds)
+
+    def __call__(
+        self,
+        target: Grasp | ArrayLike,
+        normals: ArrayLike | None = None,
+        palm: ArrayLike | None = None,
+        palm_weight: tuple[float, float] = (0.1, 0.1),
+    ) -> Array:
+        """One cycle.
+
+        Args:
+            target: A grasp, whose contacts may be of any kind; or (f, 3) contact points [m], base
+                frame, in `robot.fingers` order, NaN marks a free finger.
+            normals: (f, 3) outward pad normals of any length, NaN marks a free one; None: all are
+                free.
+            palm: (4, 4) where the palm is wanted, base frame, as far as the contacts leave it
+                free; None: anywhere.
+            palm_weight: How much its place and its axes count, a contact counting 1.
+
+        Returns:
+            (n,) where the motors are to be at the end of the cycle [rad or m].
+
+        Raises:
+            InputError: Wrong shapes or no numbers, a grasp the robot cannot take, a palm's pose
+                that is no rigid motion. Points and normals that are bad numbers are no error.
+        """
+        self._cycles += 1
+        self._reason = ""
+        if isinstance(target, Grasp):
+            self._ask_grasp(target, normals)
+            return self._step(palm, palm_weight)[: self._n].copy()
+        points = self._vectors("points", target)
+        facing = None if normals is None else self._vectors("normals", normals)
+        if self._asked.cycle.kinds != self._usual:
+            self._take_up(self._usual)
+        self._tolerances = self._own
+        self._asked.ask(points, facing)
+        after = self._step(palm, palm_weight)
+        if not self._asked.sound:
+            after = self._step_partly(points, facing, palm, palm_weight)
+        return after[: self._n].copy()
+
+    def _step(self, palm: ArrayLike | None, palm_weight: tuple[float, float]) -> Array:
+        """The state after a step towards what was asked."""
+        asked = self._asked
+        if palm is not None:
+            asked.ask_palm(self._pose(palm), palm_weight)
+        if self._guard is None:
+            after = asked.run.step()
+        else:
+            after, self._stopped = self._guard.step(asked)
+        if palm is not None:
+            asked.free_palm()
+        return after
+
+    def _step_partly(
+        self,
+        points: Array,
+        normals: Array | None,
+        palm: ArrayLike | None,
+        palm_weight: tuple[float, float],
+    ) -> Array:
+        """The same instead of the last step, with contacts of which some are free or none."""
+        asked = self._asked
+        asked.run.back()
+        free = np.full(self._shape, np.nan)
+        self._reason = asked.ask_partly(points, free if normals is None else normals)
+        if not self._reason:
+            after = self._step(palm, palm_weight)
+            if asked.sound:
+                return after
+            asked.run.back()
+            self._reason = "a number is out of range"
+        asked.ask_nothing()
+        self._go_to_rest(asked)
+        return self._step(None, palm_weight)
+
+    def _ask_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
+        if normals is not None:
+            raise InputError("normals: found beside a grasp, expected them in it")
+        problem = self._plan.questions.of_grasps([grasp], None)
+        ((kinds, _, _),) = by_kinds(problem)
+        if kinds != self._asked.cycle.kinds:
+            self._take_up(kinds)
+        self._tolerances = problem.tolerances
+        self._asked.ask_problem(problem)
+        if self._guard is not None:
+            self._guard.surround(problem)
+
+    def _go_to_rest(self, asked: Asked) -> None:
+        """Make the place where the motors can stop their goal."""
+        n, state = self._n, asked.run.state
+        state[2 * n : 3 * n] = state[:n] + stopping_way(state[n : 2 * n], self._change)
+        state[3 * n] = 0.0
+
+    def _vectors(self, name: str, value: ArrayLike) -> Array:
+        """(f, 3) numbers, NaN and infinity among them."""
+        if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == self._shape:
+            return value
+        try:
+            array = real_array(value)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name}: expected an array of numbers: {error}") from error
+        if array.shape != self._shape:
+            raise InputError(f"{name}: found shape {array.shape}, expected {self._shape}")
+        return array
+
+    @property
+    def moves_palm(self) -> bool:
+        """Whether there is an arm, so that the palm may be asked for."""
+        return "palm_weight" in self._asked.views
+
+    def _pose(self, palm: ArrayLike) -> Array:
+        if not self.moves_palm:
+            raise InputError("palm: found a pose for a hand that stands still, expected None")
+        return np.asarray(palm, dtype=float)
+
+    @property
+    def state(self) -> FollowState:
+        """How the last cycle went."""
+        n, asked = self._n, self._asked
+        q, moved, goal = (part.copy() for part in asked.run.state[: 3 * n].reshape(3, n))
+        free = asked.views["weights"].T == 0
+        names = "position_error", "angle_error", "goal_position_error", "goal_angle_error"
+        errors = {
+            name: np.where(free[i % 2], np.nan, asked.record[name]) for i, name in enumerate(names)
+        }
+        clear = None if self._guard is None else self._guard.clearance(q)
+        return FollowState(
+            status=self._status(errors),
+            reason=self._reason,
+            q=q,
+            velocity=moved / self.period,
+            goal=goal,
+            **errors,
+            clearance=None if clear is None else float(clear.distance[0]),
+            closest=None if clear is None else clear.pair(0),
+            cycles=self._cycles,
+        )
+
+    def _status(self, errors: dict[str, Array]) -> FollowStatus:
+        if self._reason:
+            return FollowStatus.HOLDING
+        if self._met(errors["position_error"], errors["angle_error"]):
+            return FollowStatus.FOLLOWING
+        if self._stopped:
+            return FollowStatus.BLOCKED
+        if self._met(errors["goal_position_error"], errors["goal_angle_error"]):
+            return FollowStatus.LATE
+        return FollowStatus.MISSED
+
+    def _met(self, position: Array, angle: Array) -> bool:
+        most = np.array([(one.position, one.angle) for one in self._tolerances]).T
+        slack = most * (1 + TOLERANCE_SLACK)
+        # What is free is NaN, and no miss.
+        return not ((position > slack[0]) | (angle > slack[1])).any()

@@ -1,0 +1,144 @@
+"""A motion of the motors in time, and the files it is kept in."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import Writer
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
+from casadi_ik.files.writing import written_whole
+from casadi_ik.logs.mcap.cdr import JOINT_STATE, JOINT_TRAJECTORY, STRING, cdr_message
+
+SUFFIXES = (".npz", ".csv", ".mcap")
+"""Kinds of files."""
+
+BILLION = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Where the motors are at k times.
+
+    Attributes:
+        robot: The robot.
+        times: (k,) from the start [s].
+        q: (k, n) [rad or m].
+        velocity: (k, n) [rad/s or m/s].
+        acceleration: (k, n) [rad/s^2 or m/s^2].
+        notes: More that belongs to the times, (k, ...) by name; in npz files only.
+    """
+
+    robot: ArmHand
+    times: Array
+    q: Array
+    velocity: Array
+    acceleration: Array
+    notes: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @classmethod
+    def of_cycles(
+        cls, robot: ArmHand, period: float, q: Array, notes: dict[str, np.ndarray]
+    ) -> Motion:
+        """What a follower returned cycle by cycle.
+
+        Args:
+            robot: The robot.
+            period: Time of a cycle [s].
+            q: (k + 1, n) where the robot was at rest first, then the answers.
+            notes: (k + 1, ...) by name.
+        """
+        velocity = np.diff(q, axis=0, prepend=q[:1]) / period
+        acceleration = np.diff(velocity, axis=0, prepend=velocity[:1]) / period
+        times = period * np.arange(len(q))
+        return cls(robot, times, q, velocity, acceleration, notes)
+
+    def write(self, path: str | Path) -> None:
+        """Write a file; its kind follows from the suffix.
+
+        ``.npz``: `times`, `q`, `velocity`, `acceleration`, `actuators` and the notes. ``.csv``:
+        time, then positions, velocities and accelerations by actuator. ``.mcap``: for ROS 2 and
+        viewers, the whole as ``trajectory_msgs/JointTrajectory`` on ``/joint_trajectory``, every
+        time as ``sensor_msgs/JointState`` of all joints, and the robot as URDF.
+
+        Args:
+            path: The file; it is there when it is complete.
+
+        Raises:
+            InputError: Another suffix.
+            OSError: It cannot be written.
+        """
+        with written_whole(Path(path)) as part:
+            self.write_to(part)
+
+    def write_to(self, path: Path) -> None:
+        """Write a file that is not there yet, as `write` does but in its place."""
+        writers = dict(zip(SUFFIXES, (self._npz, self._csv, self._mcap), strict=True))
+        write = writers.get(path.suffix.lower())
+        if write is None:
+            expected = ", ".join(SUFFIXES)
+            raise InputError(f"{path}: found suffix {path.suffix!r}, expected one of {expected}")
+        write(path)
+
+    def _npz(self, path: Path) -> None:
+        np.savez(
+            path,
+            times=self.times,
+            q=self.q,
+            velocity=self.velocity,
+            acceleration=self.acceleration,
+            actuators=np.array(self.robot.actuators),
+            **self.notes,
+        )
+
+    def _csv(self, path: Path) -> None:
+        names = [
+            f"{name}{what}"
+            for what in ("", ".velocity", ".acceleration")
+            for name in self.robot.actuators
+        ]
+        rows = np.hstack([self.times[:, None], self.q, self.velocity, self.acceleration])
+        with path.open("x", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["time", *names])
+            writer.writerows(rows.tolist())
+
+    def _mcap(self, path: Path) -> None:
+        with path.open("xb") as stream:
+            writer = Writer(stream)
+            writer.start(profile="ros2", library="casadi_ik")
+            self._messages(writer)
+            writer.finish()
+
+    def _messages(self, writer: Writer) -> None:
+        def channel(topic: str, definition: tuple[str, str]) -> int:
+            name, text = definition
+            schema = writer.register_schema(name, "ros2msg", text.encode())
+            return writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
+
+        robot, none = self.robot, np.zeros(0)
+        root, stamps = robot.description.root, np.rint(self.times * BILLION).astype(np.int64)
+        described = channel("/robot_description", STRING)
+        writer.add_message(described, 0, cdr_message(robot.urdf()), 0)
+        points: list[str | list[str] | Array | tuple[int, int] | int] = []
+        rows = zip(stamps.tolist(), self.q, self.velocity, self.acceleration, strict=True)
+        for stamp, *values in rows:
+            points += [*values, none, divmod(stamp, BILLION)]
+        whole = cdr_message((0, 0), root, list(robot.actuators), len(self), *points)
+        writer.add_message(channel("/joint_trajectory", JOINT_TRAJECTORY), 0, whole, 0)
+        joints = robot.joints(self.q)
+        positions = np.stack([np.atleast_1d(values) for values in joints.values()], axis=1)
+        states = channel("/joint_states", JOINT_STATE)
+        for i, stamp in enumerate(stamps.tolist()):
+            state = cdr_message(
+                divmod(stamp, BILLION), root, list(joints), positions[i], none, none
+            )
+            writer.add_message(states, stamp, state, stamp, sequence=i)

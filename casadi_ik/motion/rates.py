@@ -1,0 +1,102 @@
+"""How fast motors may move, and how fast they may become so."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
+
+CROSSING = 1.0
+"""Seconds in which a motor whose velocity limit nobody states crosses its range."""
+
+RUN_UP = 0.25
+"""Seconds in which a motor comes from rest to its velocity limit, if no acceleration is given."""
+
+UNBOUNDED = 1e6
+"""What stands for no limit of a step, in ranges of the motor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """Limits of the motors' motion.
+
+    Attributes:
+        velocity: (n,) [rad/s or m/s].
+        acceleration: (n,) [rad/s^2 or m/s^2].
+    """
+
+    velocity: Array
+    acceleration: Array
+
+    def steps(self, period: float) -> tuple[Array, Array]:
+        """Longest step of a cycle and by how much it may differ from the last, (n,) each."""
+        return self.velocity * period, self.acceleration * period**2
+
+
+def own_velocities(robot: ArmHand) -> Array:
+    """(n,) velocity limits of the description; a range in `CROSSING` where it has none."""
+    stated = np.array([actuator.velocity for actuator in robot.description.actuators])
+    ranges = robot.upper - robot.lower
+    return np.where(np.isfinite(stated), stated, ranges / CROSSING)
+
+
+def rates_of(robot: ArmHand, velocity: Any, acceleration: Any) -> Rates:
+    """The limits that are asked for.
+
+    Args:
+        robot: The robot.
+        velocity: (n,) or a number; None: the description's.
+        acceleration: (n,) or a number; None: the velocity limit within `RUN_UP`.
+
+    Raises:
+        InputError: Other than positive numbers.
+    """
+    fastest = own_velocities(robot) if velocity is None else each(robot, "velocity", velocity)
+    if acceleration is None:
+        return Rates(fastest, fastest / RUN_UP)
+    return Rates(fastest, each(robot, "acceleration", acceleration))
+
+
+def each(robot: ArmHand, name: str, value: Any) -> Array:
+    """One positive number per motor.
+
+    Raises:
+        InputError: Something else.
+    """
+    n = len(robot.actuators)
+    try:
+        array = np.array(np.broadcast_to(np.asarray(value, dtype=float), (n,)))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{name}: found {value!r}, expected a number > 0, or {n} of them"
+        ) from error
+    if not (np.isfinite(array).all() and (array > 0).all()):
+        raise InputError(f"{name}: found {value!r}, expected a number > 0, or {n} of them")
+    return array
+
+
+def seconds(name: str, value: Any) -> float:
+    """A positive number of seconds.
+
+    Raises:
+        InputError: Something else.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise InputError(f"{name}: found {value!r}, expected a number of seconds > 0")
+    return number
+
+
+def unbounded(robot: ArmHand) -> Rates:
+    """No limits, for cycles of one second."""
+    anything = UNBOUNDED * np.maximum(robot.upper - robot.lower, 1.0)
+    return Rates(anything, anything)

@@ -1,0 +1,137 @@
+"""`casadi-ik choose`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import Command
+
+import casadi_ik as ik
+
+ROBOT = "kuka_lwr_barrett"
+PLACE = ("--object-pose", "-0.82", "0.127", "0.41", "0", "0", "0.3")
+
+
+def entry(angle: float) -> dict[str, Any]:
+    """The cup's grasp turned about the cup, in its frame, as a file has it."""
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    grasp = ik.load_grasp("cup").in_object_frame().at(turn)
+    return {
+        "contacts": {
+            name: {"point": contact.point.tolist(), "normal": contact.normal.tolist()}
+            for name, contact in grasp.contacts.items()
+        }
+    }
+
+
+@pytest.fixture
+def candidates(tmp_path: Path) -> Path:
+    path = tmp_path / "candidates.yaml"
+    entries = [entry(angle) for angle in (0.0, 1.5, 3.0, 4.5)]
+    path.write_text(yaml.safe_dump({"object": {"name": "cup"}, "candidates": entries}))
+    return path
+
+
+def test_the_best_are_written(run: Command, candidates: Path, tmp_path: Path) -> None:
+    out = tmp_path / "ranked.json"
+    words = ("choose", candidates, "--robot", ROBOT, *PLACE, "--out", out)
+    done = run(*words, "--limit", "3")
+    assert (done.exit, done.err) == (0, "")
+    assert done.out.startswith("FOUND")
+    assert "collision not checked" in done.out
+    found = json.loads(out.read_text())
+    assert found["candidates"] == 4
+    assert len(found["ranked"]) == 3
+    scores = [one["score"] for one in found["ranked"]]
+    assert scores == sorted(scores, reverse=True)
+    best = found["ranked"][0]
+    robot = ik.load_robot(ROBOT)
+    grasps = [ik.Grasp({n: ik.Contact(**c) for n, c in entry(a)["contacts"].items()})
+              for a in (0.0, 1.5, 3.0, 4.5)]  # fmt: skip
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]
+    pose[:3, 3] = [-0.82, 0.127, 0.41]
+    asked = grasps[best["candidate"]].at(pose).arrays(robot.fingers)
+    position, _ = robot.errors(best["solution"]["q"], *asked)
+    assert (position <= 5e-3).all()
+    free = run(*words, "--scene", "table", "--prefer", "clearance")
+    assert free.exit == 0
+    assert all(one["solution"]["clearance"] >= 0 for one in json.loads(out.read_text())["ranked"])
+
+
+def test_folders_and_arrays_hold_candidates_too(
+    run: Command, candidates: Path, tmp_path: Path
+) -> None:
+    out, folder = tmp_path / "ranked.json", tmp_path / "grasps"
+    words = ("--robot", ROBOT, *PLACE, "--limit", "5", "--out", out)
+    assert run("choose", candidates, *words).exit == 0
+    scores = [one["score"] for one in json.loads(out.read_text())["ranked"]]
+    folder.mkdir()
+    arrays = []
+    for i, one in enumerate(yaml.safe_load(candidates.read_text())["candidates"]):
+        path = folder / f"grasp_{i}.yaml"
+        path.write_text(yaml.safe_dump(one | {"object": {"name": "cup"}}))
+        arrays.append(ik.load_grasp(path).arrays(ik.load_robot(ROBOT).fingers))
+    targets = tmp_path / "targets.npz"
+    points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
+    np.savez(targets, points=points, normals=normals)
+    for other in (folder, targets):
+        assert run("choose", other, *words).exit == 0
+        found = [one["score"] for one in json.loads(out.read_text())["ranked"]]
+        np.testing.assert_allclose(found, scores, atol=1e-9)
+
+
+def test_none_found_counts_the_reasons(run: Command, candidates: Path, tmp_path: Path) -> None:
+    out = tmp_path / "ranked.json"
+    far = ("--object-pose", "5", "0", "0", "0", "0", "0")
+    done = run("choose", candidates, "--robot", ROBOT, *far, "--out", out)
+    assert done.exit == 1
+    assert done.out.startswith("NONE FOUND")
+    assert "4 have none: STALLED" in done.out
+    found = json.loads(out.read_text())
+    assert found["ranked"] == []
+    assert sum(found["failures"].values()) == 4
+
+
+def test_bad_input_is_one_line_and_writes_nothing(run: Command, tmp_path: Path) -> None:
+    out, words = tmp_path / "ranked.json", ("--robot", ROBOT, *PLACE)
+    bad = tmp_path / "bad.yaml"
+    for text, expected in (
+        ("candidates: []\n", "bad.yaml: candidates: found none, expected at least one grasp"),
+        ("candidates: 3\n", "bad.yaml: candidates: expected `array`, got `int`"),
+        (
+            "candidates:\n- contacts: {thumb: {point: [.nan, 0, 0]}}\n",
+            "bad.yaml: candidates[0].contacts.thumb.point: found [nan, 0.0, 0.0]",
+        ),
+        (
+            "candidates:\n- contacts: {elbow: {point: [0, 0, 0]}}\n",
+            "bad.yaml: bad[0]: contacts.elbow: no such finger",
+        ),
+    ):
+        bad.write_text(text)
+        error = run("choose", bad, *words, "--out", out).error
+        assert expected in error
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    rows = tmp_path / "rows.npz"
+    np.savez(rows, points=np.full((1, 3, 3), np.nan), normals=np.full((1, 3, 3), np.nan))
+    for path, expected in (
+        (empty, "empty: found no YAML file, expected grasp files"),
+        (tmp_path / "none.yaml", "none.yaml: no such file or folder"),
+        (rows, "rows.npz: row 0: contacts: empty"),
+    ):
+        assert expected in run("choose", path, *words, "--out", out).error
+    bad.write_text(yaml.safe_dump({"candidates": [entry(0.0)]}))
+    for more, expected in (
+        (("--prefer", "best"), "--prefer: found 'best'"),
+        (("--prefer", "clearance"), "needs a solver with a scene"),
+        (("--limit", "0"), "--limit: found '0'"),
+    ):
+        assert expected in run("choose", bad, *words, *more, "--out", out).error
+    assert not out.exists()

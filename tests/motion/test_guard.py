@@ -1,0 +1,91 @@
+"""A follower and a path with a scene: nothing that stands still is ever touched."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from moving_paths import smooth_path
+
+import casadi_ik as ik
+
+PERIOD = 0.004
+
+
+@pytest.fixture(scope="module")
+def solver(robot) -> ik.Solver:
+    return ik.Solver(robot, scene=ik.load_scene("table"))
+
+
+def clearances(solver, q):
+    problems = solver._questions.of_arrays(*solver.robot.contacts(q[:1]), None)
+    around = solver._engine.around(problems)
+    assert around is not None
+    return around.check(q)
+
+
+def test_targets_in_a_table_are_not_followed_there(robot, solver):
+    """It stops short of the table, says so, and goes on when the targets come out again."""
+    points, normals = robot.contacts(robot.home)
+    follower = solver.follow(robot.home, PERIOD)
+    deep = np.concatenate([np.linspace(0, 0.7, 500), np.linspace(0.7, 0, 500), np.zeros(300)])
+    q, states = [robot.home], []
+    for depth in deep:
+        q.append(follower(points - np.array([0.0, 0.0, depth]), normals))
+        states.append(follower.state)
+    found = clearances(solver, np.array(q))
+    assert found.free.all()
+    assert found.distance.min() < 0.03, "it never came near"
+    np.testing.assert_allclose(states[-1].clearance, found.distance[-1])
+    statuses = [state.status for state in states]
+    assert ik.FollowStatus.BLOCKED in statuses
+    assert not {ik.FollowStatus.FOLLOWING} & set(statuses[480:520])
+    assert statuses[-1] is ik.FollowStatus.FOLLOWING
+    steps = np.diff(np.array(q), axis=0)
+    assert (np.abs(steps) <= follower.velocity * PERIOD * (1 + 1e-9)).all()
+    changes = np.diff(steps, axis=0)
+    assert (np.abs(changes) <= follower.acceleration * PERIOD**2 * (1 + 1e-9)).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_leaping_targets_never_make_it_touch_anything(robot, solver, seed):
+    rng = np.random.default_rng(seed)
+    follower = solver.follow(robot.home, PERIOD)
+    q = [robot.home]
+    for _ in range(6):
+        target = robot.contacts(robot.random(rng, 1)[0])
+        q += [follower(*target) for _ in range(80)]
+    assert clearances(solver, np.array(q)).free.all()
+
+
+def test_a_path_keeps_clear(robot, solver):
+    """Down to the table and beyond: solved as far as that is free, never nearer than the margin."""
+    points, normals = robot.contacts(robot.home)
+    low = points[:, 2].min()
+    moving = [
+        ik.Grasp(
+            {
+                n: ik.Contact(p - [0, 0, z], m)
+                for n, p, m in zip(robot.fingers, points, normals, strict=True)
+            }
+        )
+        for z in np.linspace(0, low + 0.2, 40)
+    ]
+    track = solver.track(moving, q0=robot.home)
+    assert track.success[0]
+    assert not track.success[-1]
+    assert track.clearance is not None
+    assert clearances(solver, track.q).free.all()
+    np.testing.assert_allclose(track.clearance, clearances(solver, track.q).distance)
+
+
+def test_a_path_that_is_free_is_followed_as_without_a_scene(robot, solver):
+    path = smooth_path(robot, 2, 60, 0.02, share=0.5)
+    path = robot.home + 0.05 * (path - path[0])
+    assert clearances(solver, path).free.all()
+    moving = [
+        ik.Grasp({n: ik.Contact(*c) for n, *c in zip(robot.fingers, *pair, strict=True)})
+        for pair in zip(*robot.contacts(path), strict=True)
+    ]
+    track = solver.track(moving, q0=path[0])
+    assert track.success.all()
+    assert track.jumps == ()
