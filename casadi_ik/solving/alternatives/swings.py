@@ -249,7 +249,11 @@ class _Slow:
             of_place = np.repeat(left, len(given))
             found = self._look(of_place, np.tile(given, (len(left), 1)))
             if not level:
-                own = left, self.q[left], np.full((len(left), given.shape[1]), np.nan)
+                with_own, columns = self.q[left], self.places.columns
+                with_own[:, columns] = self._turned(
+                    with_own[:, columns], self.starts[left][:, columns]
+                )
+                own = left, with_own, np.full((len(left), given.shape[1]), np.nan)
                 group = np.full(len(left), self.places.branches)
                 found = [np.concatenate(both) for both in zip(found, (*own, group), strict=True)]
             np.add.at(self.tried, found[0], 1)
@@ -269,16 +273,21 @@ class _Slow:
         swings, columns = self.swings, self.places.columns
         arms, reached = swings.at(self.palms, owner, places)
         lower, upper = self.bounds
-        if self.prefer == "q0":
-            start = self.starts[owner][:, None, columns]
-            turned = arms + TURN * np.floor((start - arms) / TURN + 0.5)
-            arms = np.where((turned >= lower) & (turned <= upper), turned, arms)
+        arms = self._turned(arms, self.starts[owner][:, None, columns])
         margin = np.minimum(arms - lower, upper - arms).min(axis=2)
         rows, side = np.nonzero((margin >= self.places.allowed) & reached)
         found = self.q[owner[rows]]
         found[:, columns] = np.clip(arms[rows, side], lower, upper)
         bent = (places[rows, 0] < 0) if places.shape[1] > 1 else np.zeros(len(rows), dtype=bool)
         return [owner[rows], found, places[rows], bent * self.places.sides + side]
+
+    def _turned(self, arms: Array, starts: Array) -> Array:
+        """Arms in the turn that is nearest to the start, where that is preferred."""
+        lower, upper = self.bounds
+        if self.prefer != "q0":
+            return arms
+        turned = arms + TURN * np.floor((starts - arms) / TURN + 0.5)
+        return np.where((turned >= lower) & (turned <= upper), turned, arms)
 
     def _take(
         self,
