@@ -18,6 +18,7 @@ from casadi_ik.cli.frame_file import Frames, read_frames
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import located, the_robot, the_scene, the_start, the_tolerance
 from casadi_ik.cli.report import fields
+from casadi_ik.errors import InputError
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.following import FollowStatus
 from casadi_ik.motion.motion import Motion
@@ -35,7 +36,10 @@ def follow(arguments: argparse.Namespace) -> Answer:
     """
     path, out = Path(arguments.frames), arguments.out
     config = None if arguments.retarget is None else load_retarget(arguments.retarget)
-    robot = the_robot(arguments.robot or (config.robot if config else "") or None)
+    name = arguments.robot or (config.robot if config else "")
+    if not name:
+        raise InputError("--robot: missing, expected it here or as robot in --retarget")
+    robot = the_robot(name)
     frames = read_frames(path, len(robot.fingers))
     inputs = [path] + ([Path(arguments.retarget)] if arguments.retarget else [])
     check_outputs([("--out", out)], inputs)
