@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -65,6 +65,7 @@ class SwingsJob(ctypes.Structure):
         ("q", ctypes.c_void_p),
         ("palms", ctypes.c_void_p),
         ("starts", ctypes.c_void_p),
+        ("owner", ctypes.c_void_p),
         ("caps", ctypes.c_void_p),
         ("poses", ctypes.c_void_p),
         ("pose_step", ctypes.c_int64),
@@ -177,6 +178,7 @@ class SwingKernel:
         checked: Checked | None,
         branches: bool,
         closer: bool,
+        owner: NDArray[np.intp] | None = None,
         measure: FunctionKernel | None = None,
     ) -> tuple[Array, Array, NDArray[np.int64]]:
         """The preferred arms of hands.
@@ -190,6 +192,8 @@ class SwingKernel:
             checked: What arms must not touch; None: nothing is checked.
             branches: Whether one arm of every branch is wanted, and the given one; else one arm.
             closer: Whether to look about what was found.
+            owner: (k,) whose each hand is, one's hands together: those behind the first for which
+                an arm is found are left out. None: none is.
             measure: Of q, for `Order.MEASURED`.
 
         Returns:
@@ -203,8 +207,8 @@ class SwingKernel:
         tried = np.zeros(count, dtype=np.int64)
         given = [doubles(each) for each in (q, palms, starts, *bounds, places.low)]
         whole, palm, start, lower, upper, low = given
-        for first in range(0, count, AT_ONCE):
-            rows = slice(first, min(first + AT_ONCE, count))
+        whose = None if owner is None else np.ascontiguousarray(owner, dtype=np.int64)
+        for rows in _slices(count, whose):
             job = SwingsJob(
                 arms=_address(self._arms.entry),
                 measure=None if measure is None else _address(measure.entry),
@@ -227,6 +231,7 @@ class SwingKernel:
                 q=whole[rows].ctypes.data,
                 palms=palm[rows].ctypes.data,
                 starts=start[rows].ctypes.data,
+                owner=None if whose is None else whose[rows].ctypes.data,
                 allowed=places.allowed,
                 count=rows.stop - rows.start,
                 chosen=memory(chosen[rows]),
@@ -239,6 +244,17 @@ class SwingKernel:
             if code != DriverCode.DONE:
                 check("arm_swings", code)
         return chosen, score, tried
+
+
+def _slices(count: int, owner: NDArray[np.int64] | None) -> Iterator[slice]:
+    """Hands of one call each, those of an owner together."""
+    first = 0
+    while first < count:
+        last = min(first + AT_ONCE, count)
+        while owner is not None and last < count and owner[last] == owner[last - 1]:
+            last += 1
+        yield slice(first, last)
+        first = last
 
 
 def _put(job: SwingsJob, checked: Checked | None, rows: slice) -> Sequence[Any]:

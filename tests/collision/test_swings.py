@@ -98,3 +98,18 @@ def test_pairs_are_those_of_the_hand_or_of_the_arm(solver, robot, hands):
     one = around.rows(found.owner).held.check(found.q).room
     np.testing.assert_allclose(one, hands[3][found.owner], atol=1e-8)
     assert len(found.q) > 20
+
+
+def test_the_first_hand_of_a_target_with_an_arm_is_enough(swings, robot, hands, monkeypatch):
+    q, starts, around, room = hands
+    whose = np.arange(len(q)) // 3
+    words = q, starts, (robot.lower, robot.upper), "limits", around, room
+    every, compiled = swings.choose(*words), swings.choose(*words, of_one=whose)
+    targets = whose[every.owner]
+    firsts = every.owner[np.append(True, targets[1:] != targets[:-1])]
+    np.testing.assert_array_equal(compiled.owner, firsts)
+    monkeypatch.setattr(swings._kernel, "can", lambda *_: False)
+    plain = swings.choose(*words, of_one=whose)
+    np.testing.assert_array_equal(plain.owner, firsts)
+    np.testing.assert_array_equal(plain.tried, compiled.tried)
+    np.testing.assert_allclose(plain.q, compiled.q, atol=1e-9)

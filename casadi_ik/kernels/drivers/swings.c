@@ -40,6 +40,8 @@ typedef struct {
   const double *lower, *upper; /* bounds of the arm */
   const double *low, *range;   /* its limits, which order it */
   const double *q, *palms, *starts; /* rows of n_q, 16 and n_q */
+  const int64_t *owner;        /* of hands next to each other: once one has an arm the others of the
+                                  same owner are left out; NULL: none is */
   const double *caps;          /* room that no arm of the hand can exceed */
   const double *poses;
   int64_t pose_step;           /* doubles from one hand to the next, 0: the same for all */
@@ -328,15 +330,17 @@ static int swing(const swings_job *job, scratch *space, int64_t hand, int level,
 EXPORT int casadi_ik_swings(swings_job *job) {
   scratch space;
   int64_t hand, i;
-  int code = lay_out(job, &space);
+  int done = 0, code = lay_out(job, &space);
   if (code != DONE) return code;
   for (hand = 0; hand < job->count && code == DONE; ++hand) {
     int level, any = 0;
     job->tried[hand] = 0;
     for (i = 0; i < job->n_groups; ++i) job->score[hand * job->n_groups + i] = -INFINITY;
+    if (job->owner && hand && job->owner[hand] == job->owner[hand - 1] && done) continue;
     for (level = 0; level < LEVELS && !any && code == DONE; ++level) {
       if (job->n_places[level]) code = swing(job, &space, hand, level, &any);
     }
+    done = any;
   }
   free(space.memory);
   return code;

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,11 +40,14 @@ ROUNDS = 3
 ESCAPES = 4
 """Steps away from what is nearest."""
 
-STEPS = (0.3, 0.1, 0.03, 0.01)
+STEPS = (0.1, 0.02)
 """Lengths of such a step, of which the best is taken; motions as parts of motors' ranges."""
 
 NUDGE = 1e-5
 """Difference [of a motor's range] from which it is taken which way there is more room."""
+
+DEEP = 0.02
+"""What is farther inside something [m] than this is not got out of by such steps."""
 
 GAIN = 0.1
 """What a step away has to gain at least, of what there is to gain."""
@@ -100,6 +104,10 @@ class FreeSearch:
         self._known, self._swung = (Different(count, len(hand), ALIKE) for _ in range(2))
         self._fresh = np.ones(count, dtype=bool)
 
+    @cached_property
+    def _descent(self) -> Descent:
+        return Descent(self.trials, self.problems)
+
     def run(self, q: Array, every: bool = False) -> None:
         """Look until all are free; or first, if asked, at the hands of a round whether or not."""
         self.swing(q, np.arange(len(q)))
@@ -144,9 +152,18 @@ class FreeSearch:
         kept = np.flatnonzero(room >= -ROUNDING)
         np.add.at(self.tried, owner[room < -ROUNDING], 1)
         kept = kept[self._swung.add(parts[kept], owner[kept])]
+        kept = kept[self._in_order(q[kept], owner[kept])]
         found, mine, tried = self._arms(q[kept], owner[kept], room[kept], self.around)
         np.add.at(self.tried, owner[kept], tried)
         self.take(found, mine)
+
+    def _in_order(self, q: Array, owner: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Hands target by target, the preferred ones first as far as the hand goes."""
+        hand = self.finder.hand
+        if self.problems.prefer == "q0":
+            off = ((q - self.starts[owner]) / self._ranges)[:, hand]
+            return np.lexsort((np.square(off).sum(axis=1), owner))
+        return np.lexsort((-self.finder.score(q, q, "limits", hand), owner))
 
     def _arms(
         self,
@@ -159,13 +176,15 @@ class FreeSearch:
         """Preferred arms of hands, their targets, and how many were tried for each hand."""
         swings = self.swings
         assert swings is not None
+        asked = prefer or self.problems.prefer
         swung = swings.choose(
             q,
             self.starts[owner],
             (self.limits.lower, self.limits.upper),
-            prefer or self.problems.prefer,
+            asked,
             around.rows(owner),
             room,
+            of_one=owner if asked in ("limits", "q0") else None,
         )
         return *self._solved(swung.q, owner[swung.owner]), swung.tried
 
@@ -202,7 +221,7 @@ class FreeSearch:
         )
         last = self.hands[0][0]
         starts[::2, hand] = last[owner[::2]][:, hand]
-        ends = Descent(self.trials, self.problems).run(owner, self.limits.clip(starts))
+        ends = self._descent.run(owner, self.limits.clip(starts))
         yield self._solved(ends, owner)
 
     def _solved(self, q: Array, owner: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
@@ -230,7 +249,7 @@ class FreeSearch:
     def _escape(self) -> None:
         """Steps away from what is nearest, brought back to the contacts."""
         ranges, n = self._ranges, len(self._ranges)
-        rows = np.flatnonzero(~self.free & np.isfinite(self.nearest).all(axis=1))
+        rows = np.flatnonzero(~self.free & (self.room > -DEEP))
         for _ in range(ESCAPES):
             if not len(rows):
                 return
@@ -243,7 +262,7 @@ class FreeSearch:
             owner = np.repeat(rows, len(STEPS))
             steps = np.tile(STEPS, len(rows))[:, None]
             there = self.nearest[owner] + steps * (way * ranges).repeat(len(STEPS), axis=0)
-            ends = Descent(self.trials, self.problems).run(owner, self.limits.clip(there))
+            ends = self._descent.run(owner, self.limits.clip(there))
             self.take(*self._solved(ends, owner))
             rows = rows[~self.free[rows] & (self.room[rows] > (1 - GAIN) * before)]
 

@@ -101,6 +101,7 @@ class ArmSwings:
         room: Array,
         branches: bool = False,
         closer: bool = True,
+        of_one: NDArray[np.intp] | None = None,
     ) -> Swung:
         """The preferred arm that touches nothing, of every hand that has one.
 
@@ -113,6 +114,8 @@ class ArmSwings:
             room: (k,) of what the hand alone decides [m]; infinite where nothing is checked.
             branches: Whether to give the preferred arm of every branch, instead of one.
             closer: Whether to look about the swivels at which they were found.
+            of_one: (k,) whose each hand is, one's hands together: those behind the first that has
+                an arm are left out. None: none is.
 
         Returns:
             The arms; with "clearance" those with most room, free or not.
@@ -129,11 +132,10 @@ class ArmSwings:
         order = None if callable(prefer) else ORDERS[prefer]
         measure = self._measure() if order is Order.MEASURED else None
         if order is None or not self._kernel.can(checked, measure):
-            return _Slow(
-                self, palms, q, starts, inside, prefer, around, room, branches, closer
-            ).run()
+            slow = _Slow(self, palms, q, starts, inside, prefer, around, room, branches, closer)
+            return _first_hands(slow.run(), of_one)
         arms, score, tried = self._kernel.choose(
-            q, palms, starts, inside, order, checked, branches, closer, measure
+            q, palms, starts, inside, order, checked, branches, closer, of_one, measure
         )
         owner, group = np.nonzero(score > -np.inf)
         found = q[owner]
@@ -163,6 +165,20 @@ class ArmSwings:
         sides, a = self.places.sides, len(self._columns)
         arms = found[:, : sides * a].reshape(-1, sides, a)
         return arms, found[:, sides * a :] >= 0
+
+
+def _first_hands(swung: Swung, of_one: NDArray[np.intp] | None) -> Swung:
+    """Without the hands behind the first one of each owner that has an arm."""
+    if of_one is None or not len(swung.q):
+        return swung
+    whose = of_one[swung.owner]
+    starts = np.flatnonzero(np.append(True, whose[1:] != whose[:-1]))
+    first = np.repeat(swung.owner[starts], np.diff(np.append(starts, len(whose))))
+    kept = swung.owner == first
+    tried = swung.tried.copy()
+    for one, hand in zip(whose[starts].tolist(), swung.owner[starts].tolist(), strict=True):
+        tried[(of_one == one) & (np.arange(len(tried)) > hand)] = 0
+    return Swung(swung.q[kept], swung.owner[kept], tried)
 
 
 def _places(robot: ArmHand, arm: ArmForm) -> ArmPlaces:
@@ -233,7 +249,11 @@ class _Slow:
             of_place = np.repeat(left, len(given))
             found = self._look(of_place, np.tile(given, (len(left), 1)))
             if not level:
-                own = left, self.q[left], np.full((len(left), given.shape[1]), np.nan)
+                with_own, columns = self.q[left], self.places.columns
+                with_own[:, columns] = self._turned(
+                    with_own[:, columns], self.starts[left][:, columns]
+                )
+                own = left, with_own, np.full((len(left), given.shape[1]), np.nan)
                 group = np.full(len(left), self.places.branches)
                 found = [np.concatenate(both) for both in zip(found, (*own, group), strict=True)]
             np.add.at(self.tried, found[0], 1)
@@ -253,16 +273,21 @@ class _Slow:
         swings, columns = self.swings, self.places.columns
         arms, reached = swings.at(self.palms, owner, places)
         lower, upper = self.bounds
-        if self.prefer == "q0":
-            start = self.starts[owner][:, None, columns]
-            turned = arms + TURN * np.floor((start - arms) / TURN + 0.5)
-            arms = np.where((turned >= lower) & (turned <= upper), turned, arms)
+        arms = self._turned(arms, self.starts[owner][:, None, columns])
         margin = np.minimum(arms - lower, upper - arms).min(axis=2)
         rows, side = np.nonzero((margin >= self.places.allowed) & reached)
         found = self.q[owner[rows]]
         found[:, columns] = np.clip(arms[rows, side], lower, upper)
         bent = (places[rows, 0] < 0) if places.shape[1] > 1 else np.zeros(len(rows), dtype=bool)
         return [owner[rows], found, places[rows], bent * self.places.sides + side]
+
+    def _turned(self, arms: Array, starts: Array) -> Array:
+        """Arms in the turn that is nearest to the start, where that is preferred."""
+        lower, upper = self.bounds
+        if self.prefer != "q0":
+            return arms
+        turned = arms + TURN * np.floor((starts - arms) / TURN + 0.5)
+        return np.where((turned >= lower) & (turned <= upper), turned, arms)
 
     def _take(
         self,
