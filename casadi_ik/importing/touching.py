@@ -26,6 +26,12 @@ ENOUGH = 100
 LOOKED_AT = 300
 """Of those, in so many the meshes are looked at."""
 
+NESTED = 0.5
+"""Meshes that meet in a larger part of the configurations are built into each other."""
+
+TOLD_APART = 0.5
+"""Part of the configurations without contact that an allowed overlap has to leave free."""
+
 LESS = 0.9
 """Part of the depth at which meshes meet that shapes may overlap."""
 
@@ -93,14 +99,13 @@ def _verdict(
     if not always:
         return []
     meet = np.array([meshes.touch(poses[row], *links) for row in looked.tolist()])
-    if meet.all():
-        return [Touching(links, said + "their meshes as well")]
-    # As deep as where the meshes meet they may not be.
-    depth = math.floor(LESS * float(-least[looked[meet]].max()) * GRID) / GRID
-    if depth <= 0:
-        return []
-    said += f"their meshes in {meet.sum()} of {len(looked)}, all deeper"
-    return [Touching(links, said, depth)]
+    said += f"their meshes in {meet.sum()} of {len(looked)}"
+    # As deep as where the meshes meet they may not be, if that tells the two apart.
+    depths = -least[looked]
+    depth = math.floor(LESS * float(depths[meet].min()) * GRID) / GRID
+    if meet.mean() > NESTED or (depths[~meet] < depth).mean() < TOLD_APART:
+        return [Touching(links, said + ", which these shapes cannot tell")]
+    return [Touching(links, said + ", all deeper", depth)]
 
 
 def _values(

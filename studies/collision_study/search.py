@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,12 @@ AT_ONCE = 2048
 """Answers of a dense search that are looked for at once."""
 SAFE = 2e-3
 """Margin [m] of the answers that a dense search has to find for a target to count."""
+POSTURES = 12
+"""Random hands that a robot without shipped grasps has grasps of."""
+DRAWN = 20_000
+"""Random configurations that they are taken from."""
+BALL, SMALLEST = "ball", 0.012
+"""What they hold, and its least radius [m]."""
 MICROMETRE = 1e-6
 WARM = 4
 """Targets of a batch that is solved first, so that no time holds what is done once."""
@@ -56,21 +63,24 @@ def solve_piece(piece: Piece) -> dict[str, Any]:
     goal = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.1, 0.6)])
     solids = {"table": TABLE, **_clutter(rng, piece.clutter, goal)}
     rows = []
-    for name in ik.shipped_grasps(robot.name):
-        grasps = [_moved(ik.load_grasp(name), goal, rng) for _ in range(TURNS)]
+    for known_grasp, held in _grasps(robot):
+        grasps = [_moved(known_grasp, goal, rng) for _ in range(TURNS)]
         arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
         points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
         known = blind.solve_batch(points, normals)
         kept = np.flatnonzero(known.success)
         if len(kept):
             some = [grasps[i] for i in kept]
-            rows += _solved(robot, solids, some, points[kept], normals[kept], known.q[kept], piece)
+            rows += _solved(
+                robot, solids, held, some, points[kept], normals[kept], known.q[kept], piece
+            )
     return {"targets": rows}
 
 
 def _solved(
     robot: ik.ArmHand,
     solids: dict[str, Any],
+    held: dict[str, Any],
     grasps: list[ik.Grasp],
     points: Array,
     normals: Array,
@@ -80,8 +90,8 @@ def _solved(
     """What comes of the same grasp turned in several ways, a row for each."""
     name = grasps[0].object
     poses = np.stack([grasp.object_pose for grasp in grasps if grasp.object_pose is not None])
-    held = {"kind": "object", "object": name, "xyz": poses[0][:3, 3].tolist()}
-    scene = ik.Scene({**solids, name: held}, grasped=name)
+    place = {"xyz": poses[0][:3, 3].tolist()}
+    scene = ik.Scene({**solids, name: held | place}, grasped=name)
     solver = ik.Solver(robot, scene=scene)
     solver.solve_batch(points[:WARM], normals[:WARM], object_pose=poses[:WARM])
     begin = time.process_time()
@@ -137,6 +147,35 @@ def dense(
         if len(q) and (around.rows(np.zeros(len(q), np.intp)).check(q).room >= SAFE).any():
             return True
     return False
+
+
+@cache
+def _grasps(robot: ik.ArmHand) -> list[tuple[ik.Grasp, dict[str, Any]]]:
+    """Grasps of a robot, each with what it holds: the shipped ones, else of random hands."""
+    shipped = ik.shipped_grasps(robot.name)
+    if shipped:
+        grasps = [ik.load_grasp(name) for name in shipped]
+        return [(one, {"kind": "object", "object": one.object}) for one in grasps]
+    q = robot.random(np.random.default_rng(POSTURES), DRAWN)
+    points, normals = robot.contacts(q)
+    poses = np.tile(np.eye(4), (DRAWN, 1, 1))
+    poses[:, :3, 3] = points.mean(axis=1)
+    # The ball is as large as fits between the fingertips; a point of it is checked, and its size.
+    radii = np.linalg.norm(points - poses[:, None, :3, 3], axis=2).min(axis=1) - SAFE
+    point = {"kind": "sphere", "radius": SAFE}
+    check = SceneCheck(robot, ik.Scene({BALL: point}, grasped=BALL))
+    questions = Questions(robot, tolerances_by_finger(None, robot.fingers), True)
+    around = check.around(questions.of_arrays(points, normals, None).holding(BALL, poses))
+    of_ball = np.array([BALL in names for names in around.table.names])
+    clear = around.only(~of_ball).free(q) & (radii > SMALLEST)
+    clear &= around.only(of_ball).check(q).distance + SAFE > radii
+    found = []
+    for row in np.flatnonzero(clear)[:POSTURES].tolist():
+        named = zip(robot.fingers, points[row], normals[row], strict=True)
+        contacts = {name: ik.Contact(point, normal) for name, point, normal in named}
+        grasp = ik.Grasp(contacts, object=BALL, object_pose=poses[row])
+        found.append((grasp, {"kind": "sphere", "radius": float(radii[row])}))
+    return found
 
 
 def _moved(grasp: ik.Grasp, goal: Array, rng: np.random.Generator) -> ik.Grasp:

@@ -7,24 +7,44 @@ from pathlib import Path
 
 import collision
 import pytest
-from collision_study import search
+from collision_study import falsely_free, search
 
 
 def test_a_check_is_never_free_where_others_see_a_penetration():
-    rows, sentences = collision.check(60, 32, 0)
+    rows, sentence = collision.check(60, 32, 0)
     assert [row[0] for row in rows] == ["random", "free"]
-    assert "60 random configurations" in sentences[0]
-    for sentence in sentences:
-        assert "1 um: **0**" in sentence
+    assert "1 um: **0**" in sentence
+    found = falsely_free.solve_part(falsely_free.Part(0, 0, 60))
+    assert found["checked"] == 60
+    assert 0 < found["free"] <= found["free_for_coal"]
+    assert found["falsely_free"] == 0
 
 
 def test_the_choice_is_measured_and_taken_up_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(collision, "CLUTTER", (3,))
     monkeypatch.setattr(search, "TURNS", 2)
-    words = ["--checked", "60", "--timed", "32", "--count", "1", "--searched", "64"]
-    words += ["--out", str(tmp_path / "out"), "--report", str(tmp_path / "report")]
+    words = [
+        "--robot",
+        "kuka_lwr_barrett",
+        "--checked",
+        "60",
+        "--timed",
+        "32",
+        "--count",
+        "1",
+        "--searched",
+        "64",
+    ]
+    words += [
+        "--searched",
+        "64",
+        "--out",
+        str(tmp_path / "out"),
+        "--report",
+        str(tmp_path / "report"),
+    ]
     collision.main(words)
-    (path,) = (tmp_path / "out").glob("*.json")
+    (path,) = (tmp_path / "out").glob("kuka*.json")
     targets = json.loads(path.read_text())["targets"]
     assert targets
     assert not any(one["false"] for one in targets)
