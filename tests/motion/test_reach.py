@@ -7,7 +7,7 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError
-from casadi_ik.motion.free_space import dense, motor_units
+from casadi_ik.motion.free_space import dense, free_way, motor_units
 from casadi_ik.motion.rates import rates_of
 
 
@@ -56,18 +56,28 @@ def test_straight_there_then_straight_on_then_closing(robot, grasp):
     assert np.linalg.norm(tips - points, axis=1).max() == pytest.approx(0.025, abs=0.003)
 
 
-def test_around_what_is_in_the_way(robot, grasp):
+def test_around_what_is_in_the_way(robot):
     """A ball where the straight way leads: OMPL goes around it."""
-    q0 = robot.home + 1.6 * (np.arange(14) == 0)
-    straight = ik.Solver(robot).reach(grasp, q0)
-    going = straight.motion.q[straight.motion.notes["part"] == "going"]
-    middle = going[len(going) // 2]
-    place = robot.palm(middle)[:3, 3]
+    start = robot.home + 1.6 * (np.arange(14) == 0)
+    ways = np.stack([start, robot.home])
+    place = robot.palm(ways.mean(axis=0))[:3, 3]
     solids = {"ball": {"kind": "sphere", "radius": 0.05, "xyz": place.tolist()}}
     solver = ik.Solver(robot, scene=ik.Scene(solids))
-    found = solver.reach(grasp, q0)
-    assert "OMPL" in found.reason
-    part = check_motion(robot, grasp, found, q0)
+    problem = solver._questions.of_arrays(*robot.contacts(ways[1:]), None)
+    around = solver._engine.around(problem).rows(np.zeros(1, dtype=int))
+    assert not around.free(dense(ways, motor_units(robot))).all()
+    corners, how = free_way(robot, *ways, around, seed=0)
+    assert "OMPL" in how
+    np.testing.assert_array_equal(corners[[0, -1]], ways)
+    assert around.free(dense(corners, motor_units(robot))).all()
+    inside, why = free_way(robot, ways.mean(axis=0), ways[1], around, seed=0)
+    assert (inside, why) == (None, "the start is not free")
+
+
+def test_all_of_it_is_free(robot, grasp):
+    solver = ik.Solver(robot, scene=ik.load_scene("table"))
+    found = solver.reach(grasp)
+    part = check_motion(robot, grasp, found, robot.home)
     problem = solver._questions.of_grasps([grasp], None)
     around = solver._engine.around(problem).rows(np.zeros(1, dtype=int))
     looked_at = dense(found.motion.q[part != "closing"], motor_units(robot))
