@@ -12,7 +12,10 @@ from casadi_ik.methods.registry import METHODS, register_method
 from casadi_ik.methods.screw_control.objectives import ScrewTask
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.following import FollowState, FollowStatus
+from casadi_ik.motion.motion import Motion
 from casadi_ik.motion.path import Jump
+from casadi_ik.motion.reaching import Reach, ReachStatus
+from casadi_ik.motion.retarget import Retargeter, load_retarget
 from casadi_ik.motion.tracking import Track
 from casadi_ik.problem.collision_report import CollisionReport
 from casadi_ik.problem.contact_verdict import ContactVerdict
@@ -41,9 +44,13 @@ __all__ = [
     "Follower",
     "Grasp",
     "Jump",
+    "Motion",
     "Phase",
     "Ranking",
+    "Reach",
+    "ReachStatus",
     "Reason",
+    "Retargeter",
     "Scene",
     "ScrewControl",
     "ScrewTask",
@@ -54,6 +61,7 @@ __all__ = [
     "Track",
     "Trajectory",
     "load_grasp",
+    "load_retarget",
     "load_robot",
     "load_scene",
     "logs",

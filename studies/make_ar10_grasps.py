@@ -34,6 +34,8 @@ PHALANX_GAP = 0.005  # [m] from a phalanx's axis to the object, but for the last
 PALM_GAP = 0.010  # [m] from the plane of the knuckles, y = 7.2 mm in the hand's root frame
 KNUCKLES = 0.0072  # [m]
 EDGE = 0.005  # [m] smallest distance of a contact from an edge
+ROOM = np.array([-0.15, 0.02, 0.03]), np.array([0.10, 0.15, 0.25])
+"""Corners [m] of where the object may be in the hand's root frame."""
 
 # The object's y axis, where the thumb presses, lies between the hand's y and -z; its z along -x,
 # so that the little finger is below when the object stands.
@@ -102,7 +104,9 @@ def make(
     """The text of one grasp file, or None if nothing was found."""
     item, description = load_object(recipe.name), robot.description
     scene = Scene(LOW, HIGH, recipe.up, TABLE + 0.10)
-    problem = TipPinchProblem(description, ROOT, item, recipe.sides, AXES, 0, EDGE, idle(robot))
+    problem = TipPinchProblem(
+        description, ROOT, item, recipe.sides, AXES, 0, EDGE, idle(robot), ROOM
+    )
     for pinch in problem.solve(rng, starts):
         palm, fingers = gaps(robot, item, recipe.sides, pinch)
         if pinch.residual > 1e-9 or palm < PALM_GAP or fingers < PHALANX_GAP:

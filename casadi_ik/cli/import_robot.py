@@ -24,7 +24,7 @@ from casadi_ik.importing.fitted import worst
 from casadi_ik.importing.imported import Imported
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.robots.part import PREFIX
-from casadi_ik.symbolic.closed_arms.recognise import arm_form, form_in_words
+from casadi_ik.symbolic.closed_arms.in_words import form_in_words, is_searched
 
 SAMPLES = 20
 """Postures in which kinematics are compared."""
@@ -190,7 +190,7 @@ def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> l
         normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal.tolist())
         rows.add_row(branch.name, pad.link, str(len(branch.chain)), point, normal)
     notes: list[RenderableType] = [Text(f"  {note}", "yellow") for note in lines.notes]
-    if description.arm_actuators and arm_form(description) is None:
+    if is_searched(description):
         notes.append(Text(SEARCHED, "yellow"))
     if not lines.shapes:
         notes.append(Text(SHAPELESS, "yellow"))

@@ -14,7 +14,7 @@ from casadi_ik.grasps.load import GraspFile
 from casadi_ik.methods.registry import METHODS, method_summary
 from casadi_ik.robots import load_description
 from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile
-from casadi_ik.symbolic.closed_arms.recognise import form_in_words
+from casadi_ik.symbolic.closed_arms.in_words import form_in_words
 
 
 def robots() -> Answer:

@@ -18,6 +18,7 @@ examples:
   casadi-ik log why cup.mcap 3                       solve 3 in words
   casadi-ik log plot cup.mcap --solve 3 --out 3.png
   casadi-ik log compare ours.mcap paper.mcap         two methods on the same targets
+  casadi-ik log report study/ --out report.html      a page: success, times, the hardest solves
   casadi-ik log export cup.mcap --solve 3 --out view.mcap    for Foxglove and Lichtblick
   casadi-ik log export study/ --what solves --out solves.parquet
   casadi-ik log finish torn.mcap                     repair what a killed writer has left
@@ -35,6 +36,9 @@ TABLE.parquet or TABLE.csv: rows of numbers, needs casadi-ik[dataframes].
 
 MOST = 40
 """How many rows of a table are shown unless said."""
+
+HARDEST = 200
+"""How many of a study's solves can be opened in its report unless said."""
 
 
 def add_log(commands: Any) -> None:
@@ -96,6 +100,23 @@ def _add_about_one(actions: Any) -> None:
 
 
 def _add_writers(actions: Any) -> None:
+    report = _action(actions, "report", "a study as one page (needs casadi-ik[plots])", _report)
+    report.description = (
+        "Write a page that needs nothing but a browser: success, time and iterations by method and "
+        "targets, where solves fail or meet singularities, and the hardest with their stories."
+    )
+    _file(report)
+    report.add_argument(
+        "--out", metavar="REPORT.html", type=file_name(".html"), required=True, help="where to"
+    )
+    report.add_argument("--title", metavar="TEXT", help="default: what the log is called")
+    report.add_argument(
+        "--most",
+        metavar="N",
+        type=whole(1),
+        default=HARDEST,
+        help=f"solves that can be opened (default: {HARDEST})",
+    )
     export = _action(actions, "export", "write tables, or a file for a viewer", _export)
     export.epilog = _EXPORT
     _file(export)
@@ -191,6 +212,12 @@ def _compare(arguments: argparse.Namespace) -> Answer:
     from casadi_ik.cli.log_compare import compare
 
     return compare(arguments)
+
+
+def _report(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.log_report import report
+
+    return report(arguments)
 
 
 def _export(arguments: argparse.Namespace) -> Answer:

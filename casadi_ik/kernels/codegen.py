@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 
 from casadi_ik.errors import KernelError
+from casadi_ik.kernels.arguments import looked_at_once
 
 
 @cache
@@ -79,7 +80,7 @@ def function_source(function: ca.Function) -> str:
     for line in text.splitlines():
         if line.lstrip().startswith("#error"):
             raise KernelError(f"kernel {name!r}: {line.strip().removeprefix('#error').strip()}")
-    return text
+    return looked_at_once(text)
 
 
 OWN = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from casadi_ik.kernels.arguments import HEAD, SIGNATURE, argument_sizes
 from casadi_ik.kernels.codegen import (
     define,
     driver_text,
@@ -23,19 +24,15 @@ from casadi_ik.kernels.codegen import (
 )
 from casadi_ik.kernels.lanes_lines import UnsuitedError, rewritten
 
-SIGNATURE = re.compile(r"/\* \w+:\((.*)\)->\((.*)\) \*/")
-HEAD = re.compile(r"(?:static|CASADI_SYMBOL_EXPORT) int (\w+)\(const casadi_real\*\* arg, .*\) ?\{")
-ARGUMENT = re.compile(r"\w+(\[(?:(\d+)(?:x(\d+))?(?:,(\d+)nz)?)?\])?")
-BETWEEN_ARGUMENTS = re.compile(r",(?![^\[]*\])")
 FAILURE = re.compile(
     r"\s*return (?!0;|casadi_f\d+\(arg, res, iw, w, mem\);).*|.*\) return (?!1;).*"
 )
 BRANCH = re.compile(r"\s*if \(casadi_f(\d+)\(arg\+1, res, iw, w, 0\)\) return 1;")
 BY_FIRST_ARGUMENT = re.compile(r"\s*(switch|if) \(arg\[0\] \? casadi_to_int\(\*arg\[0\]\) : 0\) \{")
-ZEROS = re.compile(r"static const casadi_real casadi_zeros\[(\d+)\]")
+ZEROS = re.compile(r"static const casadi_real casadi_(zeros|nought)\[(\d+)\]")
 MEMORY = re.compile(r"casadi_f\d+_(?:mem|checkout)")
 WORK = re.compile(r"\*sz_(arg|res) = (\d+);")
-RENAMED = ("sq", "fabs", "fmin", "fmax", "hypot", "copy", "clear", "zeros")
+RENAMED = ("sq", "fabs", "fmin", "fmax", "hypot", "copy", "clear", "zeros", "nought")
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,7 @@ def lanes_source(function: ca.Function, driver: str, lanes: int) -> str:
     text = function_source(function)
     if MEMORY.search(text):
         raise UnsuitedError(f"{name}: a function with memory of its own")
-    zeros = ZEROS.search(text)
+    zeros = {"zeros": "1", "nought": "1"} | dict(ZEROS.findall(text))
     *inner, step, entry = _functions(text)
     room = {key: int(size) for key, size in WORK.findall(text)}
     return "\n".join(
@@ -91,7 +88,7 @@ def lanes_source(function: ca.Function, driver: str, lanes: int) -> str:
             driver_text("elementary_lanes"),
             driver_text("elementary"),
             *(f"#undef casadi_{own}\n#define casadi_{own} lanes_{own}" for own in RENAMED),
-            f"static const lanes lanes_zeros[{zeros[1] if zeros else 1}];",
+            *(f"static const lanes lanes_{name}[{size}];" for name, size in zeros.items()),
             *(line for each in inner for line in _side_by_side(each, room)),
             *(line for each in (step, entry) for line in _for_vectors(each)),
             step_names(name).replace(f"STEP {name}", f"STEP lanes_{name}"),
@@ -118,16 +115,10 @@ def _functions(text: str) -> Iterator[_Function]:
 
 
 def _sizes(arguments: str) -> tuple[int, ...]:
-    """Numbers of each argument: `x` has one, `x[3]` three, `x[3x2]` six, `x[3x2,4nz]` four."""
-    sizes: list[int] = []
-    for argument in BETWEEN_ARGUMENTS.split(arguments) if arguments else ():
-        found = ARGUMENT.fullmatch(argument)
-        if found is None:
-            raise UnsuitedError(f"argument of an unknown form: {argument!r}")
-        shape, rows, columns, nonzeros = found.groups()
-        size = int(nonzeros or int(rows or 0) * int(columns or 1))
-        sizes.append(size if shape else 1)
-    return tuple(sizes)
+    sizes = argument_sizes(arguments)
+    if sizes is None:
+        raise UnsuitedError(f"arguments of an unknown form: {arguments!r}")
+    return sizes
 
 
 def _side_by_side(function: _Function, room: dict[str, int]) -> list[str]:

@@ -32,11 +32,10 @@ OPERATION = re.compile(rf"\(({OPERAND})(<=|>=|==|!=|&&|\|\||[-+*/<>])({OPERAND})
 SIGN = re.compile(rf"\({SPACE}([-!])({OPERAND})\)")
 CHOICE = re.compile(rf"\(({OPERAND})\?({OPERAND}):{SPACE}0{SPACE}\)")
 CALL = re.compile(rf"({FUNCTIONS})\(({OPERAND})(?:,({OPERAND}))?\)")
-GIVEN = re.compile(r"arg\[(\d+)\]\s*\?\s*(arg\[\1\]\[\d+\])\s*:\s*0")
 
 INNER = re.compile(r"(\s*if \()casadi_f(\d+)\(arg1, res1, iw, w, 0\)\) return 1;")
 OUTER = re.compile(r"\s*return casadi_f(\d+)\(arg, res, iw, w, mem\);")
-ASSIGNMENT = re.compile(r"(\s*)([aw]\d+(?:\[\d+\])?)\s*([-+*/]?=)(.*);")
+ASSIGNMENT = re.compile(r"(\s*)((?:[aw]|out)\d+(?:\[\d+\])?)\s*([-+*/]?=)(.*);")
 ELEMENTWISE = re.compile(r"(\s*for \(i=0, [^;()]*; i<\d+; \+\+i\) )\(\*rr\+\+\)\s*([-+*/]?=)(.*);")
 POINTER = r"(?:arg\[\d+\] \? arg\[\d+\] : casadi_zeros|\(?&?w\w*(?:[-+]\d+)?\)?|0)"
 AS_THEY_ARE = tuple(
@@ -46,6 +45,9 @@ AS_THEY_ARE = tuple(
         r"(?:const )?casadi_(?:real|int)\b(?!.*=\d)[\w\s,*=+]*;",
         rf"(?:arg1|res1)\[\d+\]={POINTER};",
         rf"wr\d+ = {POINTER};",
+        r"casadi_real aside\d+\[\d+\];",
+        r"const casadi_real \*in(\d+) = arg\[\1\] \? arg\[\1\] : casadi_nought;",
+        r"casadi_real \*out(\d+) = res\[\1\] \? res\[\1\] : aside\1;",
         r"if \(res\[(\d+)\](?:!=0)?\) res\[\1\]\[\d+\]\s*=\s*[aw]\d+;",
         rf"casadi_copy\((?:{POINTER}|arg\[\d+\]), \d+, (?:res\[\d+\]|w\d+)\);",
         rf"casadi_clear\({POINTER}, \d+\);",
@@ -81,8 +83,6 @@ def rewritten(line: str) -> str:
 
 def _value(text: str) -> str:
     """The right-hand side of an assignment: one operation."""
-    if match := GIVEN.fullmatch(text):
-        return f"arg[{match[1]}] ? {match[2]} : SPREAD(0.0)"
     if match := OPERATION.fullmatch(text):
         left, operator, right = _operand(match[1]), match[2], _operand(match[3])
         if operator in ("&&", "||"):

@@ -187,8 +187,11 @@ class Cycle:
         there = s["there"] > 0.5
         low, high = step_bounds(s, p)
         most = ca.fmin(p["fastest"], CAP * motor_scales(self.robot))
-        low = ca.fmax(p["lower"], s["goal"] + ca.if_else(there, low, -most))
-        high = ca.fmin(p["upper"], s["goal"] + ca.if_else(there, high, most))
+        # Rounding of what stops at a limit must not lead past it: both are within the limits.
+        low, high = (
+            ca.fmin(ca.fmax(s["goal"] + ca.if_else(there, step, free), p["lower"]), p["upper"])
+            for step, free in ((low, -most), (high, most))
+        )
         along = ca.if_else(there, s["moved"], 0.0)
         first = ca.fmin(ca.fmax(s["goal"] + along, low), high)
         free = p["keep"] * s["moved"] + p["drift"] * (p["posture"] - s["goal"])

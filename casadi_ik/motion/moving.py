@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,15 @@ from casadi_ik.grasps import Grasp
 from casadi_ik.methods.hand_first.method import UNBOUNDED
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.plan import FollowPlan
-from casadi_ik.motion.rates import Rates, rates_of, seconds, unbounded
+from casadi_ik.motion.rates import Rates, length, rates_of, seconds, unbounded
+from casadi_ik.motion.reaching import Reach, ReachPlan, reach
 from casadi_ik.motion.tracking import Track, track
 from casadi_ik.motion.walker import Walker
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
 
 SETTLING = 0.1
 """Seconds in which motions that contacts leave free come to their posture."""
@@ -129,6 +132,61 @@ class MovingSolver:
         walker = Walker(self._plan(start, bounds, 1.0, rates, start, math.inf, PATH_PULL), kinds)
         prefer = "limits" if q0 is None else "q0"
         return track(engine, problems, start, prefer, walker, travel, seed)
+
+    def reach(
+        self,
+        grasp: Grasp,
+        q0: ArrayLike | None = None,
+        opening: float = 0.02,
+        distance: float = 0.08,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+        period: float = 0.01,
+        seed: int = 0,
+        limit: int = 8,
+    ) -> Reach:
+        """The way from where the robot is to a grasp, in time.
+
+        It goes to a pre-grasp, where the hand is open; comes straight along the line from the palm
+        to the contacts; and closes. Solutions of the grasp are tried, nearest first, until there
+        is a way to one. With a scene all of it is checked, between its points too: the straight
+        way there if it is free, else one by OMPL; fingers touch the object only while they close.
+
+        Args:
+            grasp: A contact per finger.
+            q0: (n,) where the robot is, at rest [rad or m]; None: at home.
+            opening: How far the fingertips are from their contacts before they close [m].
+            distance: How far the hand comes straight [m].
+            velocity: As for `follow`.
+            acceleration: As for `follow`.
+            period: Time between two samples of the motion [s].
+            seed: Of starts and of a planner.
+            limit: Solutions that are tried at most.
+
+        Raises:
+            InputError: Bad numbers, or a grasp the robot cannot take.
+            MissingExtraError: toppra is not installed (extra `motion`).
+            UnsupportedError: The method is not hand-first.
+        """
+        problem, start = self._questions.of_grasps([grasp], None), self._questions.start(q0)
+        engine = self._engine.kinds_of(problem)
+        found = engine.finder.find(
+            problem, start, seed, limit, "q0", apart=0.05, around=engine.around(problem)
+        )
+        bounds, free = self._bounds(problem), unbounded(self.robot)
+        asked = ReachPlan(
+            self._plan(start, bounds, 1.0, free, start, math.inf, PATH_PULL),
+            problem,
+            rates_of(self.robot, velocity, acceleration),
+            seconds("period", period),
+            length("opening", opening),
+            length("distance", distance),
+            seed,
+        )
+        # A solve looks further for an answer that is free than a list of all does.
+        best = engine.solve(replace(problem, prefer="q0"), Run(start, seed))
+        solutions = [*best.q[best.success], *(one.q for one in found)]
+        return reach(asked, np.clip(start, *bounds), solutions[:limit])
 
     def _plan(
         self,

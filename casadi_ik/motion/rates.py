@@ -96,6 +96,21 @@ def seconds(name: str, value: Any) -> float:
     return number
 
 
+def length(name: str, value: Any) -> float:
+    """A number of metres >= 0.
+
+    Raises:
+        InputError: Something else.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not 0 <= number < math.inf:
+        raise InputError(f"{name}: found {value!r}, expected a number of metres >= 0")
+    return number
+
+
 def unbounded(robot: ArmHand) -> Rates:
     """No limits, for cycles of one second."""
     anything = UNBOUNDED * np.maximum(robot.upper - robot.lower, 1.0)

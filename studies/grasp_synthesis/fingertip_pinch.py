@@ -65,6 +65,7 @@ class TipPinchProblem:
         box_axis: int,
         edge_margin: float,
         idle: Array,
+        room: tuple[Array, Array],
     ) -> None:
         """Build it.
 
@@ -77,6 +78,7 @@ class TipPinchProblem:
             box_axis: For a box the axis whose faces are pinched.
             edge_margin: Distance of contacts from edges [m].
             idle: (n,) where all other motors stand.
+            room: (3,) corners [m] of where the object may be in the hand's root frame.
         """
         self.idle = idle
         self.motors = sorted({i for name in sides for i in robot.finger_actuators(name)})
@@ -126,8 +128,8 @@ class TipPinchProblem:
         self.found = ca.Function("found", [x], [q, rotation, place * LENGTH])
         turning = 0.0 if isinstance(item.shape, Sphere) else TURN
         bounds = np.array([patch.bounds() for patch in patches])
-        low = [np.full(k, -RANGE), [-1.5, 0.2, 0.3], np.full(3, -turning), bounds[:, 0].ravel()]
-        high = [np.full(k, RANGE), [1.0, 1.5, 2.5], np.full(3, turning), bounds[:, 1].ravel()]
+        low = [np.full(k, -RANGE), room[0] / LENGTH, np.full(3, -turning), bounds[:, 0].ravel()]
+        high = [np.full(k, RANGE), room[1] / LENGTH, np.full(3, turning), bounds[:, 1].ravel()]
         # The first tension, between the first two fingers, sets the scale of the others.
         lower = np.concatenate([*low, [1.0], np.full(len(pairs) - 1, -4.0), [0.0]])
         upper = np.concatenate([*high, [1.0], np.full(len(pairs) - 1, 4.0), [2.0]])

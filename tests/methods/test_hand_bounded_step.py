@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
+from casadi_ik.methods.common.elimination import elimination
 
 M, N, FIRST = 9, 7, 3
 
@@ -123,3 +124,53 @@ def test_a_singular_problem_is_finite(step):
 def test_clip():
     bounds = Bounded(ca.DM.zeros(2), ca.DM([-1, -1]), ca.DM([1, 1]), 0)
     np.testing.assert_array_equal(np.array(clip(ca.DM([3, -2]), bounds)).ravel(), [1, -1])
+
+
+FINGERS, JOINTS, PALM = 5, 4, 6
+
+
+def test_fingers_that_share_a_palm_alone_are_eliminated_one_by_one():
+    """The order of least fill: no pivot is coupled with more than its finger and the palm."""
+    normal = ca.sparsify(fingers().T @ fingers())
+    order = elimination(normal.sparsity(), PALM, 2)
+    assert not order.once
+    assert max(len(pivot.others) for pivot in order.each) == JOINTS - 1 + PALM
+    # Of few motors the palm comes first, once.
+    assert elimination(ca.Sparsity.dense(N, N), FIRST, 2).once
+
+
+def test_a_sparse_problem_has_the_solution_of_the_dense_one(rng):
+    count = PALM + FINGERS * JOINTS
+    J = fingers()
+    r, damping = ca.SX.sym("r", J.shape[0]), ca.SX.sym("damping")
+    value, lower, upper = (ca.SX.sym(name, count - PALM) for name in ("value", "lower", "upper"))
+    found = damped_step(J, r, damping, Bounded(value, lower, upper, PALM), 6)
+    inputs = [ca.vertcat(*J.nonzeros()), r, damping, value, lower, upper]
+    step = ca.Function("step", inputs, [found.step])
+    same, held = 0, 0
+    for _ in range(10):
+        numbers = rng.normal(size=J.nnz())
+        dense = np.array(ca.DM(J.sparsity(), numbers))
+        low, high = -rng.uniform(0, 0.3, count - PALM), rng.uniform(0, 0.3, count - PALM)
+        at, right = rng.uniform(low, high), rng.normal(size=J.shape[0])
+        s = np.array(step(numbers, right, 1e-2, at, low, high)).ravel()
+        matrix = np.vstack([dense, 0.1 * np.eye(count)])
+        free = np.full(PALM, np.inf)
+        ends = np.r_[-free, low - at] - 1e-13, np.r_[free, high - at] + 1e-13
+        expected = lsq_linear(
+            matrix, np.r_[-right, np.zeros(count)], ends, method="bvls", tol=1e-14
+        )
+        same += np.allclose(s, expected.x, atol=1e-6)
+        held += np.sum(np.isclose(at + s[PALM:], low) | np.isclose(at + s[PALM:], high))
+    assert same >= 8
+    assert held > 10
+
+
+def fingers():
+    """A Jacobian of fingers with joints of their own on a palm that moves them all."""
+    rows = []
+    for i in range(FINGERS):
+        own = [ca.SX(6, JOINTS) for _ in range(FINGERS)]
+        own[i] = ca.SX.sym(f"own{i}", 6, JOINTS)
+        rows.append(ca.horzcat(ca.SX.sym(f"palm{i}", 6, PALM), *own))
+    return ca.vertcat(*rows)

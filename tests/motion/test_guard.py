@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from moving_paths import smooth_path
+from moving_study.paths import smooth_path
 
 import casadi_ik as ik
 

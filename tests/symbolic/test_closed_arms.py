@@ -15,6 +15,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.methods.common.arm_branches import form_at
 from casadi_ik.symbolic.closed_arms.form import ClosedForm
+from casadi_ik.symbolic.closed_arms.held import held_arm
 from casadi_ik.symbolic.closed_arms.recognise import arm_form, closed_form, recognised
 from casadi_ik.symbolic.closed_arms.screws import Screws, arm_screws
 from casadi_ik.symbolic.kinematics import Pose
@@ -294,3 +295,25 @@ def test_every_arm_of_another_library_is_among_ours(name):
         for each in theirs:
             assert apart(rows[slack >= -1e-9], each).min() < 1e-5
     assert count > 60
+
+
+@pytest.mark.parametrize("name", ["panda+shadow", "ur5e+shadow", "kuka_lwr4+shadow"])
+def test_a_wrist_is_held_where_there_is_a_form_without_it(name, rng):
+    """What is left to the other joints is the palm's pose with the wrist at zero."""
+    robot = ik.load_robot(name)
+    found = held_arm(robot.description)
+    assert found is not None
+    count = len(robot.description.arm_actuators)
+    assert found.held == (count - 2, count - 1)
+    rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
+    angles = ca.SX.sym("angles", 2)
+    pose = found.seen(Pose(rotation, origin), angles)
+    seen = ca.Function("seen", [rotation, origin, angles], [pose.rotation, pose.origin])
+    for q in robot.random(rng, 5):
+        palm, held = robot.palm(q), list(found.held)
+        expected_q = q.copy()
+        expected_q[held] = 0.0
+        expected = robot.palm(expected_q)
+        left = [np.array(part) for part in seen(palm[:3, :3], palm[:3, 3], q[held])]
+        np.testing.assert_allclose(left[0], expected[:3, :3], atol=1e-12)
+        np.testing.assert_allclose(left[1].ravel(), expected[:3, 3], atol=1e-12)

@@ -11,12 +11,10 @@ sum, without the curvature of the hand, damped and within bounds: least squares 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
 
-from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
 from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.contacts.rows import ContactRows, chord, within_tolerance
@@ -54,9 +52,6 @@ DAMPING_FLOOR, DAMPING_CEILING = 1e-8, 10.0
 
 FARTHEST = 2.0
 """A step to parts larger than so many times the largest before is refused in any case."""
-
-PASSES = 2
-"""Corrections of the active set in a step."""
 
 TINY = 1e-100
 """What is divided by is at least this."""
@@ -97,54 +92,77 @@ def differs(cost: Expr, before: Expr) -> Expr:
     return ca.fabs(cost - before) > SAME * before
 
 
-def balance_step(
-    residual: Callable[[Expr], Expr],
-    jacobian: Expr,
-    bounds: Bounded,
-    contacts: ContactRows,
-    s: dict[str, Expr],
-    p: dict[str, Expr],
-) -> Balanced:
-    """One step.
+@dataclass(frozen=True, eq=False)
+class _Weighed:
+    """The contacts' errors as they count for a power."""
+
+    scaled: Expr
+    parts: Expr
+    largest: Expr
+    power: Expr
+    weights: Expr
+
+
+def _weighed(before: Expr, contacts: ContactRows, number: Expr, p: dict[str, Expr]) -> _Weighed:
+    """Of a residual, for the power of a number."""
+    scaled = _scaled(before, contacts, p)
+    parts = _lengths(scaled, contacts)
+    largest = ca.fmax(ca.mmax(parts), TINY)
+    power = sum((ca.if_else(number == i, value, 0.0) for i, value in enumerate(POWERS)), ca.SX(0))
+    return _Weighed(scaled, parts, largest, power, (parts / largest) ** (power - 2))
+
+
+def reweighted(
+    before: Expr, jacobian: Expr, contacts: ContactRows, number: Expr, p: dict[str, Expr]
+) -> tuple[Expr, Expr, Expr]:
+    """The least squares that a step solves.
 
     Args:
-        residual: Coordinates (n, 1) -> residual (size, 1) of the contacts.
-        jacobian: (size, n) its Jacobian at the bounds' value.
-        bounds: Of all coordinates, and where the step begins.
+        before: Residual (size, 1) of the contacts.
+        jacobian: (size, n) its Jacobian.
+        contacts: Their rows.
+        number: How many of `POWERS` are done.
+        p: Parameters.
+
+    Returns:
+        Residual (size, 1), Jacobian (size, n), and rows (2 f, n) that stretch it along the errors:
+        further ones, whose residual is zero.
+    """
+    weighed = _weighed(before, contacts, number, p)
+    weights, parts, scaled = weighed.weights, weighed.parts, weighed.scaled
+    rows = ca.sqrt(_each(weights, contacts))
+    slopes = _scaled(jacobian, contacts, p)
+    stretched = [
+        ca.sqrt(weights[i] * (weighed.power - 2))
+        / ca.fmax(parts[i], TINY)
+        * (scaled[own].T @ slopes[own, :])
+        for i, own in enumerate(contacts.slices)
+    ]
+    return rows * scaled, rows * slopes, ca.vertcat(*stretched)
+
+
+def balanced(
+    value: Expr, tried: Tried, contacts: ContactRows, s: dict[str, Expr], p: dict[str, Expr]
+) -> Balanced:
+    """What comes of a step.
+
+    Args:
+        value: (n, 1) where it begins.
+        tried: The step, with the residuals of the contacts.
         contacts: Their rows.
         s: State with damping, power (how many of `POWERS` are done) and spent.
         p: Parameters.
     """
-    before = residual(bounds.value)
-    scaled = _scaled(before, contacts, p)
-    parts = _lengths(scaled, contacts)
-    largest = ca.fmax(ca.mmax(parts), TINY)
-    power = sum(
-        (ca.if_else(s["power"] == i, value, 0.0) for i, value in enumerate(POWERS)), ca.SX(0)
-    )
-    weights = (parts / largest) ** (power - 2)
-    rows = ca.sqrt(_each(weights, contacts))
-    slopes = _scaled(jacobian, contacts, p)
-    stretched = [
-        ca.sqrt(weights[i] * (power - 2)) / ca.fmax(parts[i], TINY) * scaled[own].T @ slopes[own, :]
-        for i, own in enumerate(contacts.slices)
-    ]
-    damping = DAMPING * s["damping"]
-    damped = damped_step(
-        ca.vertcat(rows * slopes, *stretched),
-        ca.vertcat(rows * scaled, ca.SX.zeros(len(stretched), 1)),
-        damping,
-        bounds,
-        PASSES,
-    )
-    reached = clip(bounds.value + damped.step, bounds)
-    there = residual(reached)
-    parts_there = _lengths(_scaled(there, contacts, p), contacts)
+    weighed = _weighed(tried.before, contacts, s["power"], p)
+    weights, parts, largest = weighed.weights, weighed.parts, weighed.largest
+    power = weighed.power
+    parts_there = _lengths(_scaled(tried.there, contacts, p), contacts)
     # Bounded, since a large number to a high power is none.
     grown = ca.fmin(parts_there / largest, FARTHEST)
     total, total_there = ca.dot(weights, parts**2), ca.dot(grown ** (power - 2), parts_there**2)
     accepted = total_there < total
     left = ca.if_else(accepted, parts_there, parts)
+    damping = DAMPING * s["damping"]
     steady = ca.if_else(accepted, total_there > STEADY * total, damping > DAMPING_CEILING)
     done = s["power"] + steady
     spent = s["spent"] + 1
@@ -158,10 +176,9 @@ def balance_step(
         "power": done,
         "spent": spent,
     }
-    size = ca.mmax(ca.fabs(reached - bounds.value))
     return Balanced(
-        tried=Tried(reached, before, there, damped.promised, size),
-        q=ca.if_else(accepted, reached, bounds.value),
+        tried=tried,
+        q=ca.if_else(accepted, tried.reached, value),
         accepted=accepted,
         within=ca.mmax(left) <= 1,
         over=over,

@@ -8,8 +8,10 @@ import numpy as np
 from casadi_ik.methods.common.arm_choice import TRIALS, Wanted, choose_arm, is_allowed
 from casadi_ik.methods.common.arm_placement import NO_MARGIN
 from casadi_ik.methods.common.form_search import CHOICE, choose_form, trials
+from casadi_ik.methods.common.held_search import choices, choose_held
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.symbolic.closed_arms.held import HeldArm
 from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.srs_arm import SrsArm
@@ -19,7 +21,7 @@ TINY = 1e-9
 """Smallest range [rad] a motion is measured by."""
 
 
-def choice_stage(layouts: HandFirstLayouts, arm: ArmForm) -> ca.Function:
+def choice_stage(layouts: HandFirstLayouts, arm: ArmForm | HeldArm) -> ca.Function:
     """A trial of the stage.
 
     Where no arm is seen within limits, the placement takes over: of an S-R-S arm after the first
@@ -40,6 +42,9 @@ def choice_stage(layouts: HandFirstLayouts, arm: ArmForm) -> ca.Function:
     if isinstance(arm, SrsArm):
         found = choose_arm(arm, palm, wanted, s["spent"], s["swivel"], s["elbow"])
         taken = _taken(layouts, TRIALS, patience=1, exact=True)
+    elif isinstance(arm, HeldArm):
+        found = (*choose_held(arm, palm, wanted, s["spent"], s["swivel"]), s["elbow"])
+        taken = _taken(layouts, choices(arm), choices(arm), arm.exact)
     else:
         found = (*choose_form(arm, palm, wanted, s["spent"], s["swivel"]), s["elbow"])
         most = trials(arm, CHOICE)

@@ -31,6 +31,7 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.closed_arms.held import held_arm
 from casadi_ik.symbolic.closed_arms.recognise import arm_form
 
 UNBOUNDED = 1e3
@@ -68,7 +69,9 @@ class HandFirstMethod(LoopedMethod):
         self.options: HandFirstParameters = options
         self.rounds = options.rounds + LATER
         self._kinds = kinds or usual(len(robot.fingers))
-        self.step = HandFirstStep(robot, arm_form(robot), options.candidates, self._kinds)
+        self.step = HandFirstStep(
+            robot, arm_form(robot) or held_arm(robot), options.candidates, self._kinds
+        )
         self._ready: dict[bool, list[OneTarget]] = {True: [], False: []}
         self._kept: tuple[Any, Array] | None = None
 

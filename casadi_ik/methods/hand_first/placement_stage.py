@@ -6,37 +6,42 @@ import casadi as ca
 
 from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, NO_MARGIN, place_arm
 from casadi_ik.methods.common.form_search import PLACEMENT, THOROUGH, WINDOWS, place_form, trials
+from casadi_ik.methods.common.held_search import holds, place_held
 from casadi_ik.methods.common.nearly_closed import brought_to
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.symbolic.closed_arms.held import HeldArm
 from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
 
 
-def placement_stage(layouts: HandFirstLayouts, form: ArmForm) -> ca.Function:
+def placement_stage(layouts: HandFirstLayouts, form: ArmForm | HeldArm) -> ca.Function:
     """A trial of the stage; after the last one the least violating arm is refined."""
     state = ca.MX.sym("state", layouts.state.size)
     parameters = ca.MX.sym("parameters", layouts.parameters.size)
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
     columns = list(layouts.robot.arm_actuators)
     palm = Pose(s["palm_rotation"], s["palm_origin"])
-    lower, upper = p["lower"][columns], p["upper"][columns]
+    bounds = p["lower"][columns], p["upper"][columns]
+    hits, swivel = ca.MX(1), s["swivel"]
     if isinstance(form, SrsArm):
-        arm, margin = place_arm(form, palm, lower, upper, s["spent"])
-        hits = ca.MX(1)
+        arm, margin = place_arm(form, palm, *bounds, s["spent"])
         most = ITERATIONS, ITERATIONS
-        place, swivel = _placed(layouts, most, exact=True), s["swivel"]
+    elif isinstance(form, HeldArm):
+        candidate = s["candidate"] + s["earlier"]
+        found = place_held(form, palm, bounds, s["spent"], s["arm"], s["swivel"], candidate)
+        arm, margin, swivel = found
+        most = len(holds(form)), len(holds(form))
     else:
         window = ca.fmod(s["candidate"] + s["earlier"] / layouts.candidates, WINDOWS)
-        found = place_form(form, palm, lower, upper, s["spent"], s["swivel"], window)
-        arm, margin, swivel = found
-        hits = ca.MX(1)
-        if not form.exact:
-            arm, hits = brought_to(layouts.robot, arm, palm, p["lower"], p["upper"])
+        arm, margin, swivel = place_form(form, palm, *bounds, s["spent"], s["swivel"], window)
         most = trials(form, PLACEMENT), trials(form, THOROUGH)
-        place = _placed(layouts, most, form.exact)
+    exact = isinstance(form, SrsArm) or form.exact
+    if not exact:
+        arm, hits = brought_to(layouts.robot, arm, palm, p["lower"], p["upper"])
+    place = _placed(layouts, most, exact)
     outputs = place(state, parameters, arm, margin, swivel, hits)
     return ca.Function("placement", [state, parameters], list(outputs))
 

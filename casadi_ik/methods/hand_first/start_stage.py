@@ -5,7 +5,6 @@ from __future__ import annotations
 import casadi as ca
 
 from casadi_ik.methods.common.contact_fit import Tried
-from casadi_ik.methods.common.whole_contacts import whole_residual
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.problem.contacts.rows import chord, within_tolerance
 from casadi_ik.problem.status import Phase, Status
@@ -27,10 +26,19 @@ def start_stage(layouts: HandFirstLayouts) -> ca.Function:
     It ends with a solution, with the refinement of the whole from there, or with hand postures. A
     hand without an arm is refined in any case.
     """
+    state = ca.MX.sym("state", layouts.state.size)
+    parameters = ca.MX.sym("parameters", layouts.parameters.size)
+    residual = layouts.whole.residual(layouts.state.unpack(state)["q"], parameters)
+    outputs = _looked(layouts)(state, parameters, residual)
+    return ca.Function("start", [state, parameters], list(outputs))
+
+
+def _looked(layouts: HandFirstLayouts) -> ca.Function:
+    """What follows from the residual of the contacts where the robot is."""
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
     contacts = layouts.contacts
-    residual = whole_residual(layouts.robot, contacts, s["q"], p)
+    residual = ca.SX.sym("residual", contacts.size)
     cost = ca.sumsqr(residual)
     tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
     met = within_tolerance(*contacts.errors(residual), *tolerances)
@@ -47,4 +55,4 @@ def start_stage(layouts: HandFirstLayouts) -> ca.Function:
     status = ca.if_else(met, float(Status.SOLVED), float(Status.RUNNING))
     looked = Tried(s["q"], residual, residual, ca.SX(0), ca.SX(0))
     record = layouts.row(s, p, s["q"], Phase.REFINEMENT, status, looked)
-    return ca.Function("start", [state, parameters], shared(after, record, status))
+    return ca.Function("looked", [state, parameters, residual], shared(after, record, status))

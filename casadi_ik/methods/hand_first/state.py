@@ -13,6 +13,7 @@ from casadi_ik.methods.common.bounded_step import Bounded
 from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.methods.common.coupling_record import coupling_fields, coupling_values
 from casadi_ik.methods.common.limits import bits
+from casadi_ik.methods.common.whole_contacts import WholeContacts
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.status import Phase
@@ -117,6 +118,11 @@ class HandFirstLayouts:
                 Field("postures", (self.candidates, hand), doc="hand postures to try"),
             )
         )
+
+    @cached_property
+    def whole(self) -> WholeContacts:
+        """The contacts as a function of all motors; the stages share its functions."""
+        return WholeContacts(self.robot, self.contacts, self.parameters)
 
     @cached_property
     def record(self) -> Layout:

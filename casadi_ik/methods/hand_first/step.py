@@ -30,6 +30,7 @@ from casadi_ik.methods.common.contact_fit import (
     judge_contacts,
 )
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
+from casadi_ik.methods.common.whole_contacts import WholeStep
 from casadi_ik.methods.hand_first.balance_stage import balance_stage
 from casadi_ik.methods.hand_first.choice_stage import choice_stage
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
@@ -37,10 +38,10 @@ from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
 from casadi_ik.methods.hand_first.placement_stage import placement_stage
 from casadi_ik.methods.hand_first.start_stage import at_start, start_stage
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_rows
-from casadi_ik.methods.hand_first.whole_fit import whole_step
 from casadi_ik.problem.contacts.kinds import Kinds, suffix
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.closed_arms.held import HeldArm
 from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
@@ -54,21 +55,28 @@ class HandFirstStep:
 
     Attributes:
         layouts: State, parameters and record.
+        placed: The arm as it is placed.
+        arm: The same if no joint of it has to be held, else None.
     """
 
     def __init__(
-        self, robot: RobotDescription, arm: ArmForm | None, candidates: int, kinds: Kinds
+        self,
+        robot: RobotDescription,
+        arm: ArmForm | HeldArm | None,
+        candidates: int,
+        kinds: Kinds,
     ) -> None:
         """Remember what the graph is made of.
 
         Args:
             robot: The description.
-            arm: Its arm in closed form, or None: then the arm is searched.
+            arm: Its arm in closed form, some joints held if need be, or None: then it is searched.
             candidates: Hand postures a solve may start from.
             kinds: Of the contacts, by finger.
         """
         self.robot = robot
-        self.arm = arm
+        self.placed = arm
+        self.arm = None if isinstance(arm, HeldArm) else arm
         self.layouts = HandFirstLayouts(robot, candidates, kinds)
 
     def graph(self) -> StepGraph:
@@ -100,10 +108,10 @@ class HandFirstStep:
         if self.robot.arm_actuators:
             stages[Phase.HAND_FIT] = self._hand_fit()
             stages[Phase.ARM_PLACEMENT] = (
-                placement_stage(layouts, self.arm) if self.arm else numeric_stage(layouts)
+                placement_stage(layouts, self.placed) if self.placed else numeric_stage(layouts)
             )
-        if self.arm is not None:
-            stages[Phase.ARM_CHOICE] = choice_stage(layouts, self.arm)
+        if self.placed is not None:
+            stages[Phase.ARM_CHOICE] = choice_stage(layouts, self.placed)
         phases = [phase for phase in STAGES if phase in stages]
         cases = [stages[phase] for phase in phases]
         choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
@@ -210,7 +218,7 @@ class HandFirstStep:
         return ca.logic_and(first, p["nearest"])
 
     def _arm_stage(self, p: dict[str, Expr]) -> Expr:
-        if self.arm is None:
+        if self.placed is None:
             return ca.SX(float(Phase.ARM_PLACEMENT))
         return ca.if_else(p["nearest"], float(Phase.ARM_CHOICE), float(Phase.ARM_PLACEMENT))
 
@@ -224,9 +232,20 @@ class HandFirstStep:
         return ca.Function("start_or_refinement", [state, parameters], list(outputs))
 
     def _refinement(self) -> ca.Function:
+        layouts = self.layouts
+        state = ca.MX.sym("state", layouts.state.size)
+        parameters = ca.MX.sym("parameters", layouts.parameters.size)
+        s = layouts.state.unpack(state)
+        step = layouts.whole.fitted(s["q"], s["damping"], parameters)
+        outputs = self._refined(step)(state, parameters, *step.parts)
+        return ca.Function("refinement", [state, parameters], list(outputs))
+
+    def _refined(self, step: WholeStep) -> ca.Function:
+        """Go on from where a step leads if it gained."""
         state, parameters, s, p = self._inputs()
         contacts = self.layouts.contacts
-        tried = whole_step(self.robot, contacts, s["q"], s["damping"], p)
+        given, symbols = step.as_inputs()
+        tried = given.tried(s["q"])
         judged = judge_contacts(s, p, tried, contacts)
         q = ca.if_else(judged.accepted, tried.reached, s["q"])
         solved = ca.logic_and(judged.settled, judged.within)
@@ -256,7 +275,8 @@ class HandFirstStep:
         )
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
         record = self.layouts.row(s, p, s["q"], Phase.REFINEMENT, status, tried, judged.accepted)
-        return ca.Function("refinement", [state, parameters], shared(after, record, status))
+        inputs = [state, parameters, *symbols]
+        return ca.Function("refined", inputs, shared(after, record, status))
 
     def _left(self, judged: Judged, tried: Tried) -> Expr:
         """Residual of the contacts after a step was judged."""

@@ -44,18 +44,6 @@ def arm_form(robot: RobotDescription) -> ArmForm | None:
     return None
 
 
-def form_in_words(robot: RobotDescription) -> str:
-    """The form of a robot's arm, for a reader."""
-    if not robot.arm_actuators:
-        return "no arm"
-    form = arm_form(robot)
-    if form is None:
-        return "none, searched"
-    if isinstance(form, SrsArm):
-        return "spherical shoulder and wrist"
-    return form.kind if form.exact else f"nearly {form.kind}"
-
-
 def closed_form(robot: RobotDescription) -> ClosedForm:
     """The closed form of a robot's arm, the exact one if there are several.
 

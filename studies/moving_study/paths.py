@@ -1,4 +1,4 @@
-"""Paths that tests follow."""
+"""Paths of a robot that moves smoothly, from rest."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
+from casadi_ik.motion.rates import own_velocities
 
 EASE = 0.5
 """Seconds in which a path comes to its speed."""
@@ -33,7 +34,7 @@ def smooth_path(robot: ik.ArmHand, seed: int, count: int, period: float, share: 
         path += np.sin(2 * np.pi * rate * time + rng.uniform(0, 2 * np.pi, len(middle)))
     room = np.minimum(robot.upper - centre, centre - robot.lower)
     path *= 0.5 * room / np.abs(path).max(axis=0)
-    limits = np.array([actuator.velocity for actuator in robot.description.actuators])
+    limits = own_velocities(robot)
     speed = (np.abs(np.diff(path, axis=0)) / (period * limits)).max(axis=0)
     change = (np.abs(np.diff(path, 2, axis=0)) / (period**2 * limits / 0.25)).max(axis=0)
     return centre + path * np.minimum(1.0, share / np.maximum(speed, change))

@@ -1,0 +1,1 @@
+"""What the study of moving targets is made of."""

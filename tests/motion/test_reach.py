@@ -1,0 +1,113 @@
+"""The way to a grasp: from rest to rest, within limits, free between its points, ending in it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError
+from casadi_ik.motion.free_space import dense, free_way, motor_units
+from casadi_ik.motion.rates import rates_of
+
+
+@pytest.fixture(scope="module")
+def grasp() -> ik.Grasp:
+    return ik.load_grasp("cup")
+
+
+def check_motion(robot, grasp, found, q0):
+    motion, rates = found.motion, rates_of(robot, None, None)
+    assert found.status is ik.ReachStatus.REACHED
+    np.testing.assert_array_equal(motion.q[0], q0)
+    np.testing.assert_allclose(motion.q[-1], found.q, atol=1e-9)
+    position, angle = robot.errors(motion.q[-1], *grasp.arrays(robot.fingers))
+    assert position.max() <= 5e-3
+    assert angle.max() <= np.radians(3)
+    assert (motion.q >= robot.lower).all()
+    assert (motion.q <= robot.upper).all()
+    assert (np.abs(motion.velocity) <= rates.velocity * (1 + 1e-9)).all()
+    assert (np.abs(motion.acceleration) <= rates.acceleration * (1 + 1e-9)).all()
+    assert not motion.velocity[[0, -1]].round(6).any()
+    steps = np.diff(motion.times)[:, None]
+    assert (steps > 0).all()
+    # What stands there of rates is what the motion does.
+    between = np.diff(motion.q, axis=0) / steps
+    off = np.abs(between - (motion.velocity[1:] + motion.velocity[:-1]) / 2)
+    assert (off <= 0.6 * rates.acceleration * steps).all()
+    part = motion.notes["part"]
+    assert list(dict.fromkeys(part.tolist())) == ["going", "coming", "closing"]
+    return part
+
+
+def test_straight_there_then_straight_on_then_closing(robot, grasp):
+    found = ik.Solver(robot).reach(grasp, distance=0.1, opening=0.025)
+    part = check_motion(robot, grasp, found, robot.home)
+    assert found.clearance is None
+    motion = found.motion
+    coming = robot.palm(motion.q[part == "coming"])
+    way = coming[:, :3, 3] - coming[-1, :3, 3]
+    along = way[0] / np.linalg.norm(way[0])
+    assert np.linalg.norm(way[0]) == pytest.approx(0.1, abs=0.01)
+    assert np.linalg.norm(way - np.outer(way @ along, along), axis=1).max() < 2e-3
+    assert np.abs(coming[:, :3, :3] - coming[-1, :3, :3]).max() < 0.01
+    tips, _ = robot.contacts(motion.q[part == "coming"][-1])
+    points, _ = grasp.arrays(robot.fingers)
+    assert np.linalg.norm(tips - points, axis=1).max() == pytest.approx(0.025, abs=0.003)
+
+
+def test_around_what_is_in_the_way(robot):
+    """A ball where the straight way leads: OMPL goes around it."""
+    start = robot.home + 1.6 * (np.arange(14) == 0)
+    ways = np.stack([start, robot.home])
+    place = robot.palm(ways.mean(axis=0))[:3, 3]
+    solids = {"ball": {"kind": "sphere", "radius": 0.05, "xyz": place.tolist()}}
+    solver = ik.Solver(robot, scene=ik.Scene(solids))
+    problem = solver._questions.of_arrays(*robot.contacts(ways[1:]), None)
+    around = solver._engine.around(problem).rows(np.zeros(1, dtype=int))
+    assert not around.free(dense(ways, motor_units(robot))).all()
+    corners, how = free_way(robot, *ways, around, seed=0)
+    assert "OMPL" in how
+    np.testing.assert_array_equal(corners[[0, -1]], ways)
+    assert around.free(dense(corners, motor_units(robot))).all()
+    inside, why = free_way(robot, ways.mean(axis=0), ways[1], around, seed=0)
+    assert (inside, why) == (None, "the start is not free")
+
+
+def test_all_of_it_is_free(robot, grasp):
+    solver = ik.Solver(robot, scene=ik.load_scene("table"))
+    found = solver.reach(grasp)
+    part = check_motion(robot, grasp, found, robot.home)
+    problem = solver._questions.of_grasps([grasp], None)
+    around = solver._engine.around(problem).rows(np.zeros(1, dtype=int))
+    looked_at = dense(found.motion.q[part != "closing"], motor_units(robot))
+    assert around.free(looked_at).all()
+    assert found.clearance >= 0
+
+
+def test_what_cannot_be_reached_is_said(robot, grasp):
+    away = np.eye(4)
+    away[0, 3] = 5.0
+    found = ik.Solver(robot).reach(grasp.at(away))
+    assert (found.status, found.motion) == (ik.ReachStatus.NOT_SOLVED, None)
+    assert not found.success
+    points, _ = grasp.arrays(robot.fingers)
+    place = (points.mean(axis=0) + np.array([0.0, 0.0, 0.25])).tolist()
+    lid = {"lid": {"kind": "box", "size": [0.6, 0.6, 0.02], "xyz": place}}
+    found = ik.Solver(robot, scene=ik.Scene(lid)).reach(grasp, distance=0.3)
+    assert found.status in (ik.ReachStatus.NO_APPROACH, ik.ReachStatus.NOT_SOLVED)
+    assert found.reason
+    with pytest.raises(InputError, match="distance: found -1, expected a number of metres >= 0"):
+        ik.Solver(robot).reach(grasp, distance=-1)
+
+
+def test_it_is_written_as_a_follower_is(robot, grasp, tmp_path):
+    motion = ik.Solver(robot).reach(grasp).motion
+    for suffix in ("npz", "csv", "mcap"):
+        motion.write(tmp_path / f"way.{suffix}")
+    found = np.load(tmp_path / "way.npz")
+    np.testing.assert_array_equal(found["q"], motion.q)
+    assert found["part"].tolist() == motion.notes["part"].tolist()
+    with pytest.raises(InputError, match=r"found suffix '\.txt', expected one of \.npz, \.csv"):
+        motion.write(tmp_path / "way.txt")
+    assert len(list(tmp_path.iterdir())) == 3

@@ -1,0 +1,89 @@
+"""A study's log as one page: complete, self-contained, and safe whatever the log is called."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.cli.main import main
+
+
+class Page(HTMLParser):
+    """What a page holds."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.sources: list[str] = []
+        self.cells: list[list[str]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag == "tr":
+            self.cells.append([])
+
+    def handle_data(self, data: str) -> None:
+        if self.tags[-1:] == ["td"]:
+            self.cells[-1].append(data)
+            self.tags.append("")
+
+
+@pytest.fixture(scope="module")
+def study(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sets of targets of one method, those of one out of reach."""
+    folder = tmp_path_factory.mktemp("study")
+    rng = np.random.default_rng(6)
+    for name, scale in (("near", 1.0), ("<i>far</i>", 3.0)):
+        (folder / name).mkdir(parents=True)
+        points, normals = robot.contacts(robot.random(rng, 12))
+        path = folder / name / "0000.mcap"
+        ik.Solver(robot).solve_batch(points * scale, normals, log=path)
+    return folder
+
+
+def test_page(study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "report.html"
+    title = "<script>alert(1)</script>"
+    assert main(["log", "report", str(study), "--out", str(out), "--title", title]) == 0
+    assert "24 solves" in capsys.readouterr().out
+    text = out.read_text(encoding="utf-8")
+    page = Page(text)
+    assert "script" not in page.tags
+    assert "i" not in page.tags
+    assert all(source.startswith("data:image/png") for source in page.sources)
+    assert page.tags.count("img") == 2
+    assert page.tags.count("details") == 24
+    assert page.tags.count("svg") == 24
+    rows = {row[1]: row for row in page.cells if len(row) > 4}
+    assert rows["near"][2:4] == ["12", "100.00"]
+    assert rows["<i>far</i>"][2:4] == ["12", "0.00"]
+    # What is not solved is listed first.
+    first = text.index("<details>")
+    assert "STALLED" in text[first : first + 200]
+
+
+def test_most(study: Path, tmp_path: Path) -> None:
+    out = tmp_path / "report.html"
+    assert main(["log", "report", str(study), "--out", str(out), "--most", "5"]) == 0
+    assert Page(out.read_text(encoding="utf-8")).tags.count("details") == 5
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["nowhere.mcap", "--out", "a.html"], "nowhere.mcap"),
+        (["STUDY", "--out", "a.txt"], "expected a name ending in .html"),
+    ],
+)
+def test_refusals(words: list[str], says: str, study: Path, capsys, monkeypatch, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    named = [str(study) if word == "STUDY" else word for word in words]
+    assert main(["log", "report", *named]) == 2
+    assert says in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
