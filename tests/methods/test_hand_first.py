@@ -249,3 +249,43 @@ def test_the_trace_leaves_open_what_is_free(robot, rng, name):
     assert np.isfinite(measured["angle_error"]).all(axis=0).tolist() == [True, False, False]
     assert np.isnan(measured["position_error"][:, 2]).all()
     assert np.isnan(measured["angle_error"][:, 1:]).all()
+
+
+MISSED_BY_HOLDING = (
+    1.203796547,
+    -1.750305748,
+    2.884163381,
+    -0.086668812,
+    2.896685337,
+    1.743456462,
+    2.887481234,
+    0.173290801,
+    0.277041215,
+    -0.332445893,
+    1.269565614,
+    0.011936116,
+    -0.341106403,
+    1.559533824,
+    1.567909406,
+    -0.347972917,
+    1.565004856,
+    0.502950570,
+    0.768413391,
+    -0.339814074,
+    -0.257951918,
+    0.320823905,
+    1.038616982,
+    0.007020192,
+    -0.195713141,
+    -0.688663896,
+    1.568539825,
+)
+
+
+def test_a_wrist_at_its_limits_is_searched_where_holding_it_fails():
+    """No place that the wrist is held at in the first round brings this arm within its limits."""
+    robot = ik.load_robot("panda+shadow")
+    q = np.array(MISSED_BY_HOLDING)
+    points, normals = robot.contacts(q[None])
+    solver = ik.Solver(robot, compiled=False)
+    assert solver.solve_batch(points, normals).success.all()

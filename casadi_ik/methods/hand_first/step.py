@@ -107,9 +107,7 @@ class HandFirstStep:
         }
         if self.robot.arm_actuators:
             stages[Phase.HAND_FIT] = self._hand_fit()
-            stages[Phase.ARM_PLACEMENT] = (
-                placement_stage(layouts, self.placed) if self.placed else numeric_stage(layouts)
-            )
+            stages[Phase.ARM_PLACEMENT] = self._placement()
         if self.placed is not None:
             stages[Phase.ARM_CHOICE] = choice_stage(layouts, self.placed)
         phases = [phase for phase in STAGES if phase in stages]
@@ -119,6 +117,20 @@ class HandFirstStep:
         number = sum((i * (phase == float(stage)) for i, stage in enumerate(phases)), ca.MX(0))
         outputs = choose(number, state, parameters)
         return ca.Function(self._name, [state, parameters], list(outputs))
+
+    def _placement(self) -> ca.Function:
+        layouts, placed = self.layouts, self.placed
+        if placed is None:
+            return numeric_stage(layouts)
+        if not isinstance(placed, HeldArm):
+            return placement_stage(layouts, placed)
+        # What no place of the held joints brought within limits is searched in later rounds.
+        state = ca.MX.sym("state", layouts.state.size)
+        parameters = ca.MX.sym("parameters", layouts.parameters.size)
+        later = layouts.state.unpack(state)["earlier"] > 0
+        stages = numeric_stage(layouts), placement_stage(layouts, placed)
+        outputs = ca.Function.if_else("held_or_searched", *stages)(later, state, parameters)
+        return ca.Function("placement", [state, parameters], list(outputs))
 
     def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
         state = self.layouts.state.symbols("state")
