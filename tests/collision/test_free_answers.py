@@ -147,3 +147,18 @@ def test_a_solver_with_a_scene_can_be_copied(solver):
     copy = pickle.loads(pickle.dumps(solver))
     grasp = ik.load_grasp("cup")
     np.testing.assert_array_equal(copy.solve(grasp).q, solver.solve(grasp).q)
+
+
+def test_an_answer_is_its_targets_own(solver, robot):
+    """Whatever targets are solved with it: bit for bit, those included that have none."""
+    rng = np.random.default_rng(4)
+    points, normals = robot.contacts(robot.random(rng, 40))
+    whole = solver.solve_batch(points, normals)
+    assert (whole.status == ik.Status.COLLISION).sum() > 3
+    assert whole.success.sum() > 3
+    parts = [(points[i : i + 7], normals[i : i + 7]) for i in range(0, 40, 7)]
+    blocks = list(solver.solve_blocks(parts))
+    q = np.concatenate([block.solution.q for block in blocks])
+    np.testing.assert_array_equal(q, whole.q)
+    reports = [report for block in blocks for report in block.solution.collisions]
+    assert reports == list(whole.collisions)

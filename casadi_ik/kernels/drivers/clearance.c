@@ -94,7 +94,8 @@ static LANES_TARGET along from_solid(const clearance_job *job, const solid *one,
 /* Lower bound of the least of the convex distance along a segment in the solid's frame. */
 static LANES_TARGET lanes lowest(const clearance_job *job, const solid *one, vector c, vector h) {
   const lanes zero = SPREAD(0.0);
-  lanes low = SPREAD(-1.0), high = SPREAD(1.0), best, bound;
+  lanes low = SPREAD(-1.0), high = SPREAD(1.0), best, bound, found = zero;
+  lane_mask over = (lane_mask) zero;
   along left = from_solid(job, one, c, h, low), right = from_solid(job, one, c, h, high);
   const lane_mask falls = left.slope < zero, rises = right.slope > zero;
   const lanes ends = lanes_select(falls, right.value, left.value);
@@ -109,7 +110,10 @@ static LANES_TARGET lanes lowest(const clearance_job *job, const solid *one, vec
     lane_mask left_side;
     along here;
     bound = left.value + left.slope * (meet - low);
-    if (cut == MOST_CUTS || lanes_all(~inner | (best - bound < SPREAD(CLOSE)))) break;
+    /* What a lane comes to does not depend on how long the others take. */
+    found = lanes_select(over, found, smaller(bound, best));
+    over |= ~inner | (best - bound < SPREAD(CLOSE));
+    if (cut == MOST_CUTS || lanes_all(over)) break;
     /* Where the tangents meet; every third time the middle, since flat ends creep. */
     t = cut % 3 == 2 ? (low + high) * 0.5 : smaller(larger(meet, low), high);
     here = from_solid(job, one, c, h, t);
@@ -122,7 +126,7 @@ static LANES_TARGET lanes lowest(const clearance_job *job, const solid *one, vec
     right.value = lanes_select(left_side, right.value, here.value);
     right.slope = lanes_select(left_side, right.slope, here.slope);
   }
-  return lanes_select(inner, smaller(bound, best), ends);
+  return lanes_select(inner, found, ends);
 }
 
 /* Distance of a capsule's segment from a solid, less `radius`; where the least distances are below
