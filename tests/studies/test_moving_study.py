@@ -24,7 +24,7 @@ def test_two_paths_and_what_is_done_stays_done(tmp_path, monkeypatch: pytest.Mon
     assert row["met"] == 1
     first.write_text(json.dumps(row | {"number": 77}))
     moving.main(["--count", "2", *words])
-    assert json.loads(first.read_text())["number"] == 57
+    assert json.loads(first.read_text())["number"] == 77
     text = (report / "report.md").read_text()
     assert "| kuka_lwr_barrett | 2 | 2 | 100.00 |" in text
     assert len(json.loads((report / "metrics.json").read_text())) == 5
