@@ -103,7 +103,7 @@ def agreement(options: argparse.Namespace) -> tuple[str, list[Metric]]:
     """A sentence on agreement with coal, and its figures."""
     paths = [_path(part, options.out) for part in parts(options)]
     done = [json.loads(path.read_text(encoding="utf-8")) for path in paths if path.exists()]
-    total = {key: sum(one[key] for one in done) for key in ("checked", "free", "free_for_coal")}
+    total = {key: sum(one[key] for one in done) for key in ("checked", "free", "others")}
     false, touching = (
         sum(one[key] for one in done) for key in ("falsely_free", "falsely_touching")
     )
@@ -113,8 +113,7 @@ def agreement(options: argparse.Namespace) -> tuple[str, list[Metric]]:
         f"{len(table.radii)} capsules and {len(table.solids)} solids; "
         f"{100 * total['free'] / max(total['checked'], 1):.1f} % are free. Called free though coal "
         f"sees a penetration beyond 1 um: **{false}**. Called touching though coal sees none: "
-        f"{touching} ({100 * touching / max(total['free_for_coal'], 1):.2f} % of what is free for "
-        "coal)."
+        f"{touching} of {total['others']:,}."
     )
     name = "collision/falsely_free"
     return sentence, [Metric(name, false, "", "lower", np.nan, np.nan, total["checked"])]

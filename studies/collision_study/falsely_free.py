@@ -15,6 +15,9 @@ from collision_study.search import MICROMETRE, surroundings
 SIZE = 50_000
 """Configurations of a part."""
 
+OTHERS = 50
+"""Of so many configurations one that is not free is checked by coal as well: it takes 1.4 ms."""
+
 SCENE = {
     "table": {"kind": "box", "size": [1.6, 1.6, 0.04], "xyz": [0.0, 0.0, -0.1]},
     "post": {"kind": "cylinder", "radius": 0.06, "length": 0.6, "xyz": [0.45, 0.25, 0.3]},
@@ -50,14 +53,15 @@ def the_check() -> tuple[ik.ArmHand, Surroundings, CoalOracle]:
 
 
 def solve_part(part: Part) -> dict[str, int]:
-    """How many are free, and how many of them are not for coal, and the other way round."""
+    """How many are free, and how many of them are not for coal; of some others the other way."""
     robot, around, coal = the_check()
     q = robot.random(np.random.default_rng([part.seed, part.number]), part.size)
-    free, theirs = around.free(q), coal.penetrating(q, MICROMETRE)
+    free = around.free(q)
+    others = q[~free][: part.size // OTHERS]
     return {
         "checked": len(q),
         "free": int(free.sum()),
-        "free_for_coal": int((~theirs).sum()),
-        "falsely_free": int((free & theirs).sum()),
-        "falsely_touching": int((~free & ~theirs).sum()),
+        "falsely_free": int(coal.penetrating(q[free], MICROMETRE).sum()),
+        "others": len(others),
+        "falsely_touching": int((~coal.penetrating(others, MICROMETRE)).sum()),
     }
