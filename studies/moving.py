@@ -29,14 +29,16 @@ TRACKS = 5
 """Paths that are also followed as known ones."""
 
 
-def rows_of(robot: str, count: int, folder: Path) -> list[dict[str, Any]]:
-    """Figures of a robot's paths, those that are there already among them."""
+def rows_of(robot: str, count: int, folder: Path, done: bool = False) -> list[dict[str, Any]]:
+    """Figures of a robot's paths, those that are there already among them (or only those)."""
     place = folder / robot
     place.mkdir(parents=True, exist_ok=True)
     solver, rows = None, []
     for number in range(count):
         file = place / f"{number:04d}.json"
         if not file.exists():
+            if done:
+                break
             if solver is None:
                 solver = ready(robot)
             part = file.with_suffix(".part")
@@ -216,13 +218,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Targets that move.")
     parser.add_argument("--count", type=int, default=100, help="paths of each robot")
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS))
+    parser.add_argument("--done", action="store_true", help="report the paths that are done")
     parser.add_argument("--tracks", type=int, default=TRACKS, help="known paths of each robot")
     parser.add_argument("--folder", type=Path, default=Path("out/moving"), help="of what is done")
     parser.add_argument("--report", type=Path, default=Path("out/moving/report"), help="folder")
     options = parser.parse_args(arguments)
     found, tracks, times = {}, {}, {}
     for robot in options.robots:
-        found[robot] = rows_of(robot, options.count, options.folder)
+        found[robot] = rows_of(robot, options.count, options.folder, options.done)
         tracks[robot] = tracked(robot, options.tracks, options.folder)
         times[robot] = spent(robot, options.tracks, options.folder)
         Console().print(robot, "done")
