@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,14 +111,19 @@ def _starts(
     prefer: str,
     seed: int,
     around: Surroundings | None,
-) -> list[Array]:
+) -> Iterator[Array]:
+    """Postures that the motion may begin with, the one that a solve gives first: it is quick."""
     first = problems.rows(slice(0, 1))
     here = None if around is None else around.rows(np.zeros(1, dtype=np.intp))
+    q = engine.method.run(replace(first, prefer=prefer), q0[None], seed, trace=False).q
+    solved = bool(_solved(engine.robot, first, q, here)[0])
+    if solved:
+        yield q[0]
     found = engine.finder.find(first, q0, seed, STARTS, prefer, apart=0, around=here)
-    if found:
-        return [alternative.q for alternative in found]
-    # Not to be solved: the nearest there is.
-    return [engine.finder.trials.method.run(first, q0[None], seed, trace=False).q[0]]
+    yield from (alternative.q for alternative in found)
+    if not (found or solved):
+        # Not to be solved: the nearest there is.
+        yield q[0]
 
 
 def _run_after(path: Array, travel: Array) -> Array:

@@ -54,18 +54,11 @@ def _smooth(solver: ik.Solver, path: Array) -> dict[str, Any]:
         begin = time.perf_counter()
         q[i] = follower(*target)
         seconds[i] = time.perf_counter() - begin
-    spent = time.process_time()
-    follower.reset(path[0])
-    for target in zip(points, normals, strict=True):
-        follower(*target)
-    spent = time.process_time() - spent
     position, angle = robot.errors(q, points, normals)
     met = ((position <= 5e-3) & (angle <= np.radians(3))).all(axis=1)
     lost = int(np.argmin(met)) if not met.all() else -1
     return {
         "median": float(np.median(seconds)),
-        "p99": float(np.percentile(seconds, 99)),
-        "cpu": spent / len(path),
         "met": float(met.mean()),
         "error": float(position.max()),
         "singular": bool(
@@ -73,6 +66,17 @@ def _smooth(solver: ik.Solver, path: Array) -> dict[str, Any]:
         ),
         **_kept("smooth", follower, np.concatenate([path[:1], q])),
     }
+
+
+def calls(solver: ik.Solver, number: int) -> list[float]:
+    """CPU seconds of each call on a path."""
+    path = smooth_path(solver.robot, number, STEPS, PERIOD, SHARE)
+    follower, found = solver.follow(path[0], PERIOD), []
+    for target in zip(*solver.robot.contacts(path), strict=True):
+        begin = time.thread_time()
+        follower(*target)
+        found.append(time.thread_time() - begin)
+    return found
 
 
 def _leaping(solver: ik.Solver, number: int) -> dict[str, Any]:

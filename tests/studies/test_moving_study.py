@@ -27,4 +27,4 @@ def test_two_paths_and_what_is_done_stays_done(tmp_path, monkeypatch: pytest.Mon
     assert json.loads(first.read_text())["number"] == 77
     text = (report / "report.md").read_text()
     assert "| kuka_lwr_barrett | 2 | 2 | 100.00 |" in text
-    assert len(json.loads((report / "metrics.json").read_text())) == 7
+    assert len(json.loads((report / "metrics.json").read_text())) == 5

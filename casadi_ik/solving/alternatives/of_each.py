@@ -33,26 +33,27 @@ class Different:
             size: Numbers of a row.
             apart: Rows all of whose numbers differ by less are alike.
         """
-        self._rows = np.full((count, 1, size), np.nan)
-        self._had = np.zeros(count, dtype=np.int64)
+        self._rows = np.full((count, 0, size), np.nan)
         self._apart = apart
 
     def add(self, rows: Array, owner: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Take rows (m, size) in; (m,) whether each is unlike all before it."""
-        fresh = np.zeros(len(rows), dtype=bool)
         order = np.argsort(owner, kind="stable")
         mine = owner[order]
         rank = np.arange(len(order)) - np.searchsorted(mine, mine)
-        for place in range(int(rank.max(initial=-1)) + 1):
-            now = order[rank == place]
-            whose = owner[now]
-            # Of rows that are not there the distance is NaN, which is not near.
-            off = np.abs(self._rows[whose] - rows[now, None]).max(axis=2)
-            new = ~(off < self._apart).any(axis=1)
-            fresh[now] = new
-            now, whose = now[new], whose[new]
-            if len(whose) and self._had[whose].max() == self._rows.shape[1]:
-                self._rows = np.concatenate([self._rows, np.full_like(self._rows, np.nan)], axis=1)
-            self._rows[whose, self._had[whose]] = rows[now]
-            self._had[whose] += 1
-        return fresh
+        whose, place = np.unique(mine, return_inverse=True)
+        most, before = int(rank.max(initial=-1)) + 1, self._rows.shape[1]
+        new = np.full((len(whose), most, rows.shape[1]), np.nan)
+        new[place, rank] = rows[order]
+        every = np.concatenate([self._rows[whose], new], axis=1)
+        # Of rows that are not there the distance is NaN, which is not near.
+        near = np.abs(new[:, :, None] - every[:, None]).max(axis=3) < self._apart
+        fresh = ~near[:, :, :before].any(axis=2)
+        for i in range(1, most):
+            fresh[:, i] &= ~(near[:, i, before : before + i] & fresh[:, :i]).any(axis=1)
+        added = np.full((len(self._rows), most, rows.shape[1]), np.nan)
+        added[whose] = np.where(fresh[:, :, None], new, np.nan)
+        self._rows = np.concatenate([self._rows, added], axis=1)
+        found = np.zeros(len(rows), dtype=bool)
+        found[order] = fresh[place, rank]
+        return found
