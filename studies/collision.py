@@ -171,6 +171,13 @@ def choices(options: argparse.Namespace) -> tuple[list[list[str]], list[Metric],
     return rows, metrics, ", ".join(sorted(codes))
 
 
+def _left(options: argparse.Namespace) -> str:
+    """What was asked for and has not been run."""
+    left = [p for p in pieces(options) if not _path(p, options.out).exists()]
+    named = (f"{p.robot} with clutter {p.clutter}, place {p.number}" for p in left)
+    return f"Not run yet: {'; '.join(named)}." if left else ""
+
+
 def _row(
     robot: str, clutter: int, targets: list[dict[str, Any]], metrics: list[Metric]
 ) -> list[str]:
@@ -238,6 +245,7 @@ def main(arguments: list[str] | None = None) -> None:
         "target with everything that is looked at until it is free or given up; *batch:* "
         f"{TURNS} targets a call, *single:* one, without a diagnosis.",
         markdown_table(heads, found),
+        _left(options),
         "## Others",
         PEERS,
         "## Where this comes from",
