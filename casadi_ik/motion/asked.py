@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.grasps.pose import one_pose
 from casadi_ik.kernels import FunctionKernel
@@ -13,6 +14,7 @@ from casadi_ik.motion.plan import FollowPlan
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.contacts.kinds import Kinds
 from casadi_ik.problem.problems import Problems, Tolerance
+from casadi_ik.problem.verdict import deviations
 
 WHOLE, PLACES = "points and normals", "points"
 """What all fingers are asked for."""
@@ -115,6 +117,23 @@ class Asked:
         """Ask for no pose of the palm."""
         if "palm_weight" in self.views:
             self._fill(palm_weight=0.0)
+
+    def errors(self, robot: ArmHand, q: Array) -> tuple[Array, Array]:
+        """How far a posture (n,) is off what was asked last: (f,) [m], (f,) [rad], NaN if free."""
+        weights = self.views["weights"]
+
+        def asked(name: str, known: Array) -> Array:
+            return np.where(known[:, None], self.views[name], np.nan)[None]
+
+        more = {
+            f"{name}s": asked(f"{name}s", self.views[f"{name}s"].any(axis=1))
+            for name in self.cycle.contacts.data[2:]
+        }
+        points, normals = asked("points", weights[:, 0] > 0), asked("normals", weights[:, 1] > 0)
+        normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+        problem = Problems(points, normals, Tolerance(), enforce_limits=True, more=more)
+        position, angle, _ = deviations(robot, problem, q[None])
+        return position[0], angle[0]
 
     def lead_to(self, posture: Array) -> None:
         """Where motions lead that the contacts leave free, (n,)."""

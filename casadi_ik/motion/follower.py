@@ -231,6 +231,9 @@ class Follower:
         errors = {
             name: np.where(free[i % 2], np.nan, asked.record[name]) for i, name in enumerate(names)
         }
+        if self._stopped:
+            # What was recorded is of the step that was not made.
+            errors["position_error"], errors["angle_error"] = asked.errors(self._plan.robot, q)
         clear = None if self._guard is None else self._guard.clearance(q)
         return FollowState(
             status=self._status(errors),

@@ -36,6 +36,11 @@ def test_targets_in_a_table_are_not_followed_there(robot, solver):
     assert found.free.all()
     assert found.distance.min() < 0.03, "it never came near"
     np.testing.assert_allclose(states[-1].clearance, found.distance[-1])
+    for i in (300, 500, 700):
+        away = points - np.array([0.0, 0.0, deep[i]])
+        position, angle = robot.errors(q[i + 1], away, normals)
+        np.testing.assert_allclose(states[i].position_error, position, atol=1e-9)
+        np.testing.assert_allclose(states[i].angle_error, angle, atol=1e-6)
     statuses = [state.status for state in states]
     assert ik.FollowStatus.BLOCKED in statuses
     assert not {ik.FollowStatus.FOLLOWING} & set(statuses[480:520])
