@@ -143,7 +143,8 @@ def run(options: argparse.Namespace) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     with backend(options.jobs, None):
         parallel = joblib.Parallel(return_as="generator_unordered")
-        for piece, found in parallel(joblib.delayed(solved)(piece) for piece in todo):
+        results: Any = parallel(joblib.delayed(solved)(piece) for piece in todo)
+        for piece, found in results:
             path = _path(piece, options.out)
             part = path.with_suffix(".part")
             part.write_text(json.dumps(found), encoding="utf-8")

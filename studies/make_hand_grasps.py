@@ -132,7 +132,7 @@ def make(
         root,
         item,
         recipe.sides,
-        axes,
+        axes.tolist(),
         0,
         EDGE,
         still,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 from casadi_ik.api import Solver
 from casadi_ik.arrays import Array
@@ -14,6 +15,9 @@ from casadi_ik.batches.part import Asked, SolvedPart, solve_part
 from casadi_ik.batches.sources import Source
 from casadi_ik.errors import CasadiIKError, InputError
 from casadi_ik.grasps.pose import moved
+
+ONE: Any = 1
+"""Calls sent together; joblib's annotation knows the word "auto" only."""
 
 
 def solve_parts(
@@ -54,7 +58,7 @@ def solve_parts(
         import joblib
 
         # A batch of calls would come back, and be lost, as a whole.
-        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=ONE)
         parts = source.without(done)
         if object_pose is not None:
             parts = (replace(part, arrays=moved(part.arrays, object_pose)) for part in parts)

@@ -96,7 +96,7 @@ def _contact(vectors: dict[str, np.ndarray]) -> Contact | None:
         return None
     if DIRECTIONS in given and "points" not in given:
         return Contact(direction=given[DIRECTIONS])
-    more = {name[:-1]: given[name] for name in NAMES if name in given}
+    more: dict[str, Any] = {name[:-1]: given[name] for name in NAMES if name in given}
     return Contact(given.get("points"), given.get("normals"), **more)
 
 

@@ -15,10 +15,12 @@ from casadi_ik.robots.robot_files.tree import turned
 class Jointed(Protocol):
     """Links held together by joints: a part, or a robot."""
 
+    @property
     def root(self) -> str:
         """The base link."""
         ...
 
+    @property
     def joints(self) -> Sequence[Joint]:
         """The joints, parents before children."""
         ...

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.grasps.pose import one_pose
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.recurrence import Recurrence
@@ -53,7 +54,7 @@ class Asked:
         rest = {item.name: np.zeros(item.shape) for item in self.cycle.state}
         return self.cycle.state.pack(rest | {"q": q, "goal": q, "there": 1.0})
 
-    def _fill(self, **values: Array | float) -> None:
+    def _fill(self, **values: ArrayLike) -> None:
         for name, value in values.items():
             self.views[name][...] = value
 
@@ -122,11 +123,11 @@ class Asked:
         """How far a posture (n,) is off what was asked last: (f,) [m], (f,) [rad], NaN if free."""
         weights = self.views["weights"]
 
-        def asked(name: str, known: Array) -> Array:
+        def asked(name: str, known: Bools) -> Array:
             return np.where(known[:, None], self.views[name], np.nan)[None]
 
         more = {
-            f"{name}s": asked(f"{name}s", self.views[f"{name}s"].any(axis=1))
+            f"{name}s": asked(f"{name}s", np.any(self.views[f"{name}s"], axis=1))
             for name in self.cycle.contacts.data[2:]
         }
         points, normals = asked("points", weights[:, 0] > 0), asked("normals", weights[:, 1] > 0)

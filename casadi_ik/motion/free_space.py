@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -71,11 +72,11 @@ def free_way(
     space.setBounds(bounds)
     setup = geometric.SimpleSetup(space)
     setup.setStateValidityChecker(
-        lambda state: bool(around.free(units * np.array([[state[i] for i in range(n)]]))[0])
+        lambda state: bool(around.free(units * _numbers(state, n)[None])[0])
     )
-    states = []
+    states: list[Any] = []
     for posture in (start, end):
-        state = space.allocState()
+        state: Any = space.allocState()
         for i in range(n):
             state[i] = float(posture[i] / units[i])
         states.append(state)
@@ -88,8 +89,13 @@ def free_way(
         return None, f"the straight way is not free, and OMPL found no other in {SECONDS:g} s"
     setup.simplifySolution(SECONDS / 5)
     found = setup.getSolutionPath().getStates()
-    corners = units * np.array([[state[i] for i in range(n)] for state in found])
+    corners = units * np.array([_numbers(state, n) for state in found])
     corners[0], corners[-1] = start, end
     if not around.free(dense(corners, units)).all():
         return None, "the way that OMPL found is not free between the postures it looked at"
     return corners, "OMPL, RRT-Connect"
+
+
+def _numbers(state: Any, n: int) -> Array:
+    """A state of OMPL, whose annotations do not know that it has elements, as (n,)."""
+    return np.array([state[i] for i in range(n)])

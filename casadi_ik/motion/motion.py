@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -58,7 +59,7 @@ class Motion:
         """
         velocity = np.diff(q, axis=0, prepend=q[:1]) / period
         acceleration = np.diff(velocity, axis=0, prepend=velocity[:1]) / period
-        times = period * np.arange(len(q))
+        times = period * np.arange(len(q), dtype=float)
         return cls(robot, times, q, velocity, acceleration, notes)
 
     def write(self, path: str | Path) -> None:
@@ -81,7 +82,8 @@ class Motion:
 
     def write_to(self, path: Path) -> None:
         """Write a file that is not there yet, as `write` does but in its place."""
-        writers = dict(zip(SUFFIXES, (self._npz, self._csv, self._mcap), strict=True))
+        every = self._npz, self._csv, self._mcap
+        writers: dict[str, Callable[[Path], None]] = dict(zip(SUFFIXES, every, strict=True))
         write = writers.get(path.suffix.lower())
         if write is None:
             expected = ", ".join(SUFFIXES)
@@ -96,6 +98,7 @@ class Motion:
             velocity=self.velocity,
             acceleration=self.acceleration,
             actuators=np.array(self.robot.actuators),
+            allow_pickle=False,
             **self.notes,
         )
 

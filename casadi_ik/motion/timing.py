@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -65,7 +66,7 @@ def timed(path: Array, rates: Rates, period: float) -> Timed:
     ]
     grid = np.linspace(0.0, 1.0, max(GRID, 4 * len(kept)))
     found = algorithm.TOPPRA(asked, curve, gridpoints=grid, parametrizer="ParametrizeConstAccel")
-    way = found.compute_trajectory()
+    way: Any = found.compute_trajectory()
     assert way is not None
     count = max(2, math.ceil(way.duration / period) + 1)
     seconds = np.linspace(0.0, way.duration, count)

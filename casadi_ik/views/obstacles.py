@@ -135,7 +135,7 @@ def _mesh(solid: CollisionSolid, pose: Array, about: Array) -> pv.PolyData:
             mesh = with_edges(pv.Cube(x_length=2 * x, y_length=2 * y, z_length=2 * z))
         case Kind.CYLINDER:
             tube = pv.Cylinder(direction=(0, 0, 1), radius=x, height=2 * y, resolution=64)
-            mesh = with_edges(tube.triangulate())
+            mesh = with_edges(_triangles(tube))
         case Kind.CAPSULE:
             mesh = capsule(np.array([0, 0, -y]), np.array([0, 0, y]), x)
         case Kind.HALF_SPACE:
@@ -144,5 +144,12 @@ def _mesh(solid: CollisionSolid, pose: Array, about: Array) -> pv.PolyData:
             mesh = pv.Cube(center, 2 * PLATE, 2 * PLATE, 2 * SKIN)
         case Kind.CONVEX:
             hull = pv.PolyData(surface(solid)).delaunay_3d().extract_surface(algorithm=None)
-            mesh = with_edges(hull.triangulate())
-    return mesh.transform(pose, inplace=True)
+            mesh = with_edges(_triangles(hull))
+    mesh.transform(pose, inplace=True)
+    return mesh
+
+
+def _triangles(mesh: pv.PolyData) -> pv.PolyData:
+    found = mesh.triangulate()
+    assert isinstance(found, pv.PolyData)
+    return found

@@ -80,9 +80,10 @@ def place_held(
         The best arm (n, 1) [rad] of the trial, its margin, and its swept position.
     """
     angles, look = _held_at(arm)(trial, best, *bounds, candidate)
-    rotation, origin, *ends = _left(arm)(angles, palm.rotation, palm.origin, *bounds)
-    window = ca.fmod(candidate, WINDOWS)
-    found, margin, swept = place_form(arm.form, Pose(rotation, origin), *ends, look, around, window)
+    left = _left(arm)(angles, palm.rotation, palm.origin, *bounds)
+    rotation, origin, lower, upper = left
+    window, pose = ca.fmod(candidate, WINDOWS), Pose(rotation, origin)
+    found, margin, swept = place_form(arm.form, pose, lower, upper, look, around, window)
     joined, least = _joined(arm)(found, angles, margin, *bounds)
     return joined, least, swept
 
@@ -104,8 +105,9 @@ def choose_held(
     """
     bounds = wanted.lower, wanted.upper
     angles, near = _held_near(arm)(wanted.near, *bounds)
-    rotation, origin, *ends = _left(arm)(angles, palm.rotation, palm.origin, *bounds)
-    asked = Wanted(near, *ends, wanted.scales[list(arm.solved)])
+    left = _left(arm)(angles, palm.rotation, palm.origin, *bounds)
+    rotation, origin, lower, upper = left
+    asked = Wanted(near, lower, upper, wanted.scales[list(arm.solved)])
     found, score, swept = choose_form(arm.form, Pose(rotation, origin), asked, trial, around)
     joined, _ = _joined(arm)(found, angles, 0.0, *bounds)
     return joined, score, swept

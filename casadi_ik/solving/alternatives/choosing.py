@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
 from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.problem.problems import Problems
@@ -152,7 +152,7 @@ class _Part:
         hand = self.finder.hand
         robot = self.finder.robot
         parts = every[:, :, hand] / (robot.upper - robot.lower)[hand]
-        kept = np.isfinite(parts).all(axis=2)
+        kept: Bools = np.all(np.isfinite(parts), axis=2)
         for i in range(1, count + 1):
             apart = np.abs(parts[:, i, None] - parts[:, :i]).max(axis=2) >= DISTINCT
             kept[:, i] &= (apart | ~kept[:, :i]).all(axis=1)

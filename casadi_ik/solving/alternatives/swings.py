@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -253,9 +253,10 @@ class _Slow:
                 with_own[:, columns] = self._turned(
                     with_own[:, columns], self.starts[left][:, columns]
                 )
-                own = left, with_own, np.full((len(left), given.shape[1]), np.nan)
+                none = np.full((len(left), given.shape[1]), np.nan)
                 group = np.full(len(left), self.places.branches)
-                found = [np.concatenate(both) for both in zip(found, (*own, group), strict=True)]
+                own: list[NDArray[Any]] = [left, with_own, none, group]
+                found = [np.concatenate(both) for both in zip(found, own, strict=True)]
             np.add.at(self.tried, found[0], 1)
             taken = self._take(best, score, *found)
             owner, _, places, branch = (each[taken] for each in found)
@@ -268,7 +269,7 @@ class _Slow:
         rows = np.flatnonzero(score > -np.inf)
         return Swung(best[rows], rows // self.groups, self.tried)
 
-    def _look(self, owner: NDArray[np.intp], places: Array) -> list[Array]:
+    def _look(self, owner: NDArray[np.intp], places: Array) -> list[NDArray[Any]]:
         """Owner, configuration, place and branch of the arms within bounds at places."""
         swings, columns = self.swings, self.places.columns
         arms, reached = swings.at(self.palms, owner, places)

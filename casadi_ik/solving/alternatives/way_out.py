@@ -45,8 +45,15 @@ Free = Callable[[Problems], NDArray[np.bool_]]
 class Solving(Protocol):
     """An engine."""
 
-    robot: ArmHand
-    check: SceneCheck | None
+    @property
+    def robot(self) -> ArmHand:
+        """The robot."""
+        ...
+
+    @property
+    def check(self) -> SceneCheck | None:
+        """The scene about it."""
+        ...
 
     def solve(self, problems: Problems, run: Run) -> BatchSolution:
         """Solve targets."""
@@ -142,7 +149,9 @@ def _fewer(problems: Problems, fingers: Sequence[str], free: Free) -> tuple[str,
     facing = ~np.isnan(problems.normals[0]).all(axis=1)
     named = np.flatnonzero(placed | facing)
     # A finger with more than a point and a normal would make it a target of other kinds.
-    plain = [i for i in named if all(np.isnan(v[0, i]).all() for v in problems.more.values())]
+    plain = [
+        i for i in named.tolist() if all(np.isnan(v[0, i]).all() for v in problems.more.values())
+    ]
     if len(named) < 2:
         return ()
     return tuple(fingers[i] for i in plain if free(_without(problems, i))[0])

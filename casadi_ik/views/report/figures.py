@@ -58,9 +58,8 @@ def places(groups: Sequence[Group]) -> str:
         ("solved, singular on the way", SINGULAR, success & singular, 7),
         ("not solved", FAILED, ~success, 12),
     )
-    for axes, (title, first, second, across, up) in zip(
-        figure.subplots(1, len(VIEWS)), VIEWS, strict=True
-    ):
+    panels = figure.subplots(1, len(VIEWS))
+    for axes, (title, first, second, across, up) in zip(panels, VIEWS, strict=True):
         for label, color, rows, size in kinds:
             chosen = _some(centre[rows])
             axes.scatter(
@@ -77,7 +76,7 @@ def places(groups: Sequence[Group]) -> str:
         axes.set_ylabel(up)
         axes.set_title(title, fontsize=9, color=INK)
         _plain(axes)
-    lines, labels = axes.get_legend_handles_labels()
+    lines, labels = panels[0].get_legend_handles_labels()
     figure.legend(lines, labels, frameon=False, fontsize=8, loc="lower center", ncols=4)
     figure.tight_layout(rect=(0, 0.06, 1, 1))
     return _embedded(figure, "where solves fail and where they meet singularities")

@@ -105,7 +105,7 @@ def _group(part: MethodRows) -> Group:
         _largest(rows["angle_error"] / rows["angle_tolerance"]),
     )
     points = rows["target_points"]
-    there = np.isfinite(points).all(axis=2)
+    there: Bools = np.all(np.isfinite(points), axis=2)
     total = np.where(there[:, :, None], points, 0.0).sum(axis=1)
     counted = there.sum(axis=1)[:, None]
     return Group(
@@ -113,7 +113,7 @@ def _group(part: MethodRows) -> Group:
         name=ALL,
         solve_id=part.solve_id,
         success=rows["success"] > 0,
-        singular=rows["events"][:, singular].any(axis=1),
+        singular=np.any(rows["events"][:, singular], axis=1),
         iterations=rows["iterations"].astype(np.int64),
         restarts=rows["restarts"].astype(np.int64),
         time=rows["time"].astype(float),
