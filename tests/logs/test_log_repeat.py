@@ -99,10 +99,10 @@ def test_a_log_of_an_earlier_version(
         kept = [item for item in form.layout if item.name not in (*new, "limits_enforced")]
         return TraceFormat(Layout(tuple(kept)), form.labels)
 
-    def rows(block: SolveBlock, events: np.ndarray, layout: Layout) -> np.ndarray:
-        whole = solve_rows(block, events, solve_format(block).layout)
-        old = np.zeros(len(whole), layout.dtype)
-        for name in layout.names:
+    def rows(block: SolveBlock, events: np.ndarray, form: TraceFormat) -> np.ndarray:
+        whole = solve_rows(block, events, solve_format(block))
+        old = np.zeros(len(whole), form.layout.dtype)
+        for name in form.layout.names:
             old[name] = whole[name]
         return old
 
