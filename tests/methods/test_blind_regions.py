@@ -64,6 +64,30 @@ def test_a_fit_that_rests_in_a_valley_is_not_the_end(robot):
     assert solver.solve_batch(*robot.contacts(q)).success.all()
 
 
+GIVEN_UP = [
+    -1.0823446688711351,
+    2.093505007835794,
+    -2.9670597283903604,
+    2.0943951023931953,
+    2.5184993288908664,
+    1.7900808858143713,
+    -2.9670597283903604,
+    2.0646400459501404,
+    1.9958382699133406,
+    0.8376496860071355,
+    2.443460952792061,
+    0.08985158483199428,
+    2.443460952792061,
+    0.49739587144523323,
+]
+"""Eight of its fits end in the same place, 7 mm off; the nineteenth hand solves it."""
+
+
+def test_fits_that_end_where_others_did_do_not_end_the_search(robot):
+    batch = ik.Solver(robot).solve_batch(*robot.contacts(np.array(GIVEN_UP)[None]))
+    assert batch.success.all()
+
+
 BEYOND_THE_GAP = [
     "1.6298881 -2.147 2.79523804 2.618 1.10860363 -1.5708 3.059 0.0596 0.044728396 0.0424540268 "
     "0.0540126198 0.06 0.0575 0.0599965934 0.0415 0.06 0.0575",

@@ -17,7 +17,14 @@ from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.common.posture_table import squared_distance
 from casadi_ik.methods.hand_first.beginning import beginning
-from casadi_ik.methods.hand_first.going_on import CARRIED, NEAR, RETURNS, SURE, TINY, VARIED
+from casadi_ik.methods.hand_first.going_on import (
+    CARRIED,
+    RETURNS,
+    SURE,
+    TINY,
+    VARIED,
+    near_cost,
+)
 from casadi_ik.methods.hand_first.one_target import OneTarget
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.restarts import LATER, RUGGED, VALLEYS, Restarts
@@ -68,6 +75,7 @@ class HandFirstMethod(LoopedMethod):
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
         self.rounds = options.rounds + LATER
+        self._near = near_cost(len(robot.hand_actuators))
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(
             robot, arm_form(robot) or held_arm(robot), options.candidates, self._kinds
@@ -117,7 +125,7 @@ class HandFirstMethod(LoopedMethod):
         layout = self.step.layouts.state
         returns, cost = (states[:, layout.slice(name).start] for name in ("returns", "best_cost"))
         if number >= self.rounds - RUGGED:
-            return (returns < RETURNS) & (cost < NEAR)
+            return (returns < RETURNS) & (cost < self._near)
         # No more hands of tables if their fits come back to a minimum that just misses.
         tables = VARIED <= number < self.options.rounds
         return (returns < RETURNS) | (cost < SURE) | (not tables)

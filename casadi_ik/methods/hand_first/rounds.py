@@ -122,7 +122,7 @@ class RoundsPlan:
         hand = len(self.layouts.robot.hand_actuators)
         return {
             "SURE": going_on.SURE,
-            "NEAR_COST": going_on.NEAR,
+            "NEAR_COST": going_on.near_cost(hand),
             "AT_END": restarts.AT_END,
             "HELD": restarts.HELD,
             "NUDGE": restarts.NUDGE,
