@@ -10,7 +10,9 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.restarts import ANYWHERE, VALLEYS
+from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 
 STEPPED = [name for name in ik.METHODS if name != "ipopt"]
 
@@ -57,8 +59,7 @@ def test_steps_are_those_of_the_log(method: str, tmp_path) -> None:
 def test_steps_go_through_all_rounds(method: str, tmp_path) -> None:
     """A target out of reach takes every start there is; by hand as well as in the loop."""
     robot = ik.load_robot("kuka_lwr_barrett")
-    options = {"rounds": 3, "candidates": 2} if method == "hand-first" else {"starts": 3}
-    solver = ik.Solver(robot, method, options=options)
+    solver = ik.Solver(robot, method)
     points, normals = ik.load_grasp("sugar_box").arrays(robot.fingers)
     away = ik.Grasp(
         {
@@ -68,7 +69,10 @@ def test_steps_go_through_all_rounds(method: str, tmp_path) -> None:
     )
     solution = same_as_the_log(solver, away, tmp_path / "x.mcap")
     assert solution.status is ik.Status.STALLED
-    assert solution.restarts == (2 * (3 + VALLEYS + ANYWHERE) - 1 if method == "hand-first" else 2)
+    usual = HandFirstParameters()
+    tried = usual.candidates * (usual.rounds + VALLEYS + ANYWHERE)
+    expected = tried if method == "hand-first" else ThumbFirstParameters().starts
+    assert solution.restarts == expected - 1
 
 
 def test_state_and_parameters_are_named_and_cannot_be_spoilt(stepped_solver: ik.Solver) -> None:
