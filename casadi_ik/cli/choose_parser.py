@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from casadi_ik.cli.values import file_name, numbers, one_of, positive, whole
+from casadi_ik.cli.shared_options import add_tolerances
+from casadi_ik.cli.values import file_name, numbers, one_of, whole
 from casadi_ik.problem.preference import PREFERENCES
 
 if TYPE_CHECKING:
@@ -75,18 +76,7 @@ def add_choose(commands: Any) -> None:
     parser.add_argument(
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"
     )
-    parser.add_argument(
-        "--tolerance-position",
-        metavar="METRES",
-        type=positive,
-        help="when a contact point counts as reached (default: 0.005)",
-    )
-    parser.add_argument(
-        "--tolerance-angle",
-        metavar="RADIANS",
-        type=positive,
-        help="when a contact normal counts as reached (default: 0.0524, 3 deg)",
-    )
+    add_tolerances(parser)
     parser.add_argument(
         "--out", metavar="RANKED.json", type=file_name(), required=True, help="write the answers"
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from casadi_ik.cli.shared_options import add_tolerances
 from casadi_ik.cli.values import file_name, numbers, positive
 
 if TYPE_CHECKING:
@@ -61,18 +62,7 @@ def add_follow(commands: Any) -> None:
         help="what must not be touched: a shipped name or a YAML file (default: nothing is "
         "checked)",
     )
-    parser.add_argument(
-        "--tolerance-position",
-        metavar="METRES",
-        type=positive,
-        help="when a contact point counts as reached (default: 0.005)",
-    )
-    parser.add_argument(
-        "--tolerance-angle",
-        metavar="RADIANS",
-        type=positive,
-        help="when a contact normal counts as reached (default: 0.0524, 3 deg)",
-    )
+    add_tolerances(parser)
     parser.add_argument(
         "--q0",
         metavar="V",

@@ -14,7 +14,8 @@ from casadi_ik.cli.follow_parser import add_follow
 from casadi_ik.cli.import_parser import add_import
 from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.say import PROGRAM
-from casadi_ik.cli.values import assignment, file_name, numbers, one_of, positive, whole
+from casadi_ik.cli.shared_options import add_tolerances
+from casadi_ik.cli.values import assignment, file_name, numbers, one_of, whole
 from casadi_ik.errors import InputError
 from casadi_ik.problem.preference import PREFERENCES
 
@@ -238,18 +239,7 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"
     )
-    parser.add_argument(
-        "--tolerance-position",
-        metavar="METRES",
-        type=positive,
-        help="when a contact point counts as reached (default: 0.005)",
-    )
-    parser.add_argument(
-        "--tolerance-angle",
-        metavar="RADIANS",
-        type=positive,
-        help="when a contact normal counts as reached (default: 0.0524, 3 deg)",
-    )
+    add_tolerances(parser)
     parser.add_argument(
         "--limits",
         metavar="enforce|ignore",
