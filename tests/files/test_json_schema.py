@@ -101,7 +101,7 @@ def loaded(path: Path) -> Any:
 
 
 def small(value: Any) -> Any:
-    """The same with one mapping of a list of them, and without shapes, of which an example has some."""
+    """The same with one mapping of a list, and without shapes, which an example has."""
     if isinstance(value, dict):
         return {key: small(item) for key, item in value.items() if key != "collision"}
     if isinstance(value, list):
