@@ -43,13 +43,17 @@ class ObjectEntry(Struct, frozen=True):
 
 
 class GraspFile(Struct, frozen=True):
-    """``models/grasps/*.yaml``; all but ``contacts`` may be left out."""
+    """``models/grasps/*.yaml``; all but ``contacts``, or ``palm`` and ``posture``, may be left out.
 
-    contacts: dict[str, ContactEntry]
+    ``palm`` is where the robot's palm frame is to be.
+    """
+
+    contacts: dict[str, ContactEntry] = msgspec.field(default_factory=dict)
     robot: str = ""
     description: str = ""
     object: ObjectEntry | None = None
     posture: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    palm: Frame | None = None
 
 
 def load_grasp(name_or_path: str | Path) -> Grasp:
@@ -96,6 +100,7 @@ def grasp_of(entry: GraspFile, path: Path, name: str, where: str = "") -> Grasp:
             object=entry.object.name if entry.object else "",
             object_pose=frame_matrix(entry.object.pose) if entry.object else None,
             posture=entry.posture,
+            palm=frame_matrix(entry.palm) if entry.palm else None,
         )
     except InputError as error:
         raise DescriptionError(f"{path}: {where}{error}") from error
@@ -134,6 +139,9 @@ def _loose_numbers(entry: GraspFile) -> Iterator[tuple[str, float]]:
         if contact.tolerance is not None:
             yield f"contacts.{name}.tolerance.position", contact.tolerance.position
             yield f"contacts.{name}.tolerance.angle", contact.tolerance.angle
+    if entry.palm is not None:
+        yield from (("palm.xyz", value) for value in entry.palm.xyz)
+        yield from (("palm.rpy", value) for value in entry.palm.rpy)
     if entry.object is not None:
         yield from (("object.pose.xyz", value) for value in entry.object.pose.xyz)
         yield from (("object.pose.rpy", value) for value in entry.object.pose.rpy)

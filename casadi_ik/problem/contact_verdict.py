@@ -1,4 +1,4 @@
-"""How well one finger meets its contact."""
+"""How well one finger meets its contact, and a palm its pose."""
 
 from __future__ import annotations
 
@@ -22,3 +22,18 @@ class ContactVerdict:
     angle_error: float
     ok: bool
     tolerance: Tolerance
+
+
+@dataclass(frozen=True)
+class PalmVerdict:
+    """How well the palm is where it was asked.
+
+    Attributes:
+        position_error: Distance of its origin [m].
+        angle_error: Angle between its frame and the wanted one [rad].
+        ok: Within the largest tolerance of the fingers.
+    """
+
+    position_error: float
+    angle_error: float
+    ok: bool
