@@ -90,6 +90,10 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
     Raises:
         UnknownNameError: No shipped grasp has that name.
         DescriptionError: The file is missing or malformed; the message names file and key.
+
+    Example:
+        >>> ik.load_grasp("cup").robot
+        'kuka_lwr_barrett'
     """
     path = resolve(name_or_path, "grasps")
     entry, _ = read(path, GraspFile)
@@ -151,6 +155,10 @@ def shipped_grasps(robot: str) -> tuple[str, ...]:
 
     Raises:
         DescriptionError: A shipped file is damaged.
+
+    Example:
+        >>> "cup" in ik.shipped_grasps("kuka_lwr_barrett")
+        True
     """
     return tuple(name for name in shipped_names("grasps") if load_grasp(name).robot == robot)
 
