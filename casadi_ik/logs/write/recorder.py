@@ -2,8 +2,8 @@
 
 The iterations come as the array that the compiled loop wrote; they are copied once, into the
 chunk, and everything about them is done for a whole block of solves at once. A chunk is closed at
-a solve boundary and written with its index in one go; a crash loses at most the one chunk in
-work, 2 MiB of messages and the rest of a solve (`ChunkStream`).
+a solve boundary and written with its index in one go, while the next one is filled; a crash loses
+at most these two, 4 MiB of messages and the rest of a solve (`ChunkStream`).
 """
 
 from __future__ import annotations
