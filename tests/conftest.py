@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, Browser
 from hypothesis import settings
 from pinocchio_oracle import PinocchioRobot
 from toy_robots import copy_shipped_robot, write_coupled_robot
@@ -42,6 +44,15 @@ def oracle(robot: ik.ArmHand) -> PinocchioRobot:
 def coupled_oracle(coupled_robot: ik.ArmHand) -> PinocchioRobot:
     """The coupled robot as pinocchio reads it from the written URDF."""
     return PinocchioRobot(coupled_robot)
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """One Chromium for all tests of a process; skips where there is none."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium (on Debian: apt-get install chromium)")
+    with Browser() as started:
+        yield started
 
 
 @pytest.fixture

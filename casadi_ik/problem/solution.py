@@ -43,6 +43,13 @@ class Solution:
         collision: Why all answers touch something, if that is the status and a diagnosis was asked
             for.
         palm: How far the palm is from where it was asked; None where contacts were asked for.
+
+    Example:
+        >>> solution = solver.solve(grasp)
+        >>> solution.success, solution.q.shape == (len(solution.actuators),)
+        (True, True)
+        >>> all(contact.ok for contact in solution.contacts.values())
+        True
     """
 
     success: bool
@@ -93,6 +100,12 @@ class BatchSolution:
         palm_position_error: (k,) [m]; None where contacts were asked for, not palms.
         palm_angle_error: (k,) [rad], likewise.
         palm_ok: (k,) bool, likewise.
+
+    Example:
+        >>> points, normals = robot.contacts(robot.random(np.random.default_rng(1), 200))
+        >>> batch = solver.solve_batch(points, normals)
+        >>> batch.position_error.shape, set(batch.status_names.tolist())
+        ((200, 3), {'SOLVED'})
     """
 
     success: NDArray[np.bool_]
@@ -192,7 +205,13 @@ class BatchSolution:
         return np.array([status.name for status in sorted(Status)])[self.status - min(Status)]
 
     def solution(self, row: int) -> Solution:
-        """One row as a `Solution`."""
+        """One row as a `Solution`.
+
+        Example:
+            >>> points, normals = robot.contacts(robot.home[None])
+            >>> solver.solve_batch(points, normals).solution(0).status.name
+            'SOLVED'
+        """
         verdicts = zip(
             self.position_error[row].tolist(),
             self.angle_error[row].tolist(),
