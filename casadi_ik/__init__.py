@@ -19,7 +19,7 @@ from casadi_ik.motion.reaching import Reach, ReachStatus
 from casadi_ik.motion.retarget import Retargeter, load_retarget
 from casadi_ik.motion.tracking import Track
 from casadi_ik.problem.collision_report import CollisionReport
-from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.contact_verdict import ContactVerdict, PalmVerdict
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
 from casadi_ik.problem.ranking import Choice, Ranking
 from casadi_ik.problem.solution import BatchSolution, Solution
@@ -46,6 +46,7 @@ __all__ = [
     "Grasp",
     "Jump",
     "Motion",
+    "PalmVerdict",
     "Phase",
     "Ranking",
     "Reach",

@@ -16,7 +16,13 @@ from casadi_ik.files.shipped import resolve, shipped_names
 
 
 class HandFrame(Struct, frozen=True):
-    """Where the data set's frame of the hand is, in the frame of one of the robot's links."""
+    """Where the data set's frame of the hand is, in the frame of one of the robot's links.
+
+    Attributes:
+        link: The robot's link.
+        xyz: Origin of the data set's frame in the link's [m].
+        rpy: Its axes, turned about the fixed axes of the link's frame [rad].
+    """
 
     link: str
     xyz: Point = (0.0, 0.0, 0.0)
@@ -24,10 +30,15 @@ class HandFrame(Struct, frozen=True):
 
 
 class ConventionFile(Struct, frozen=True):
-    """``models/datasets/*.yaml``.
+    """How a data set has a hand: ``models/datasets/*.yaml``.
 
-    ``joints`` has the names of the data set, in the order of its arrays, and the robot's joints or
-    motors; a minus sign before one: it turns the other way.
+    Attributes:
+        layouts: In which layouts.
+        description: One sentence.
+        source: Where that is from, and how it was checked.
+        frame: Where the data set's frame of the hand is.
+        joints: The data set's names, in the order of its arrays, and the robot's joints or motors;
+            a minus sign before one: it turns the other way.
     """
 
     layouts: list[str]

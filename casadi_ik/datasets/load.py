@@ -72,6 +72,13 @@ def load_candidates(
         UnsupportedError: The robot has not the hand of the data.
         UnknownNameError: No such robot, layout, convention or object.
         InputError: No rigid object_pose, or another word than those of `take`.
+
+    Example:
+        >>> points, normals = robot.contacts(robot.random(np.random.default_rng(2), 20))
+        >>> np.savez("targets.npz", points=points, normals=normals)
+        >>> ranked = solver.choose(ik.load_candidates("targets.npz", robot), limit=3)
+        >>> ranked.candidates, len(ranked)
+        (20, 3)
     """
     held = load_robot(robot) if isinstance(robot, str) else robot
     file = Path(path)

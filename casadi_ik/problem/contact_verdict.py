@@ -37,6 +37,13 @@ class PalmVerdict:
         position_error: Distance of its origin [m].
         angle_error: Angle between its frame and the wanted one [rad].
         ok: Within the largest tolerance of the fingers.
+
+    Example:
+        >>> motors = [name for name in robot.actuators if name.startswith("bh_")]
+        >>> posture = dict(zip(motors, robot.home[-len(motors):]))
+        >>> palm = solver.solve(ik.Grasp(palm=robot.palm(robot.home), posture=posture)).palm
+        >>> palm.ok, palm.position_error < 1e-6
+        (True, True)
     """
 
     position_error: float
