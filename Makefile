@@ -6,13 +6,15 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 OUT := out/demo
 SOLVE := $(BIN)/casadi-ik solve cup --scene table --log $(OUT)/cup.mcap --out $(OUT)/cup.json
 PAPER := $(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup_paper.mcap
+SPHINX := $(BIN)/sphinx-build -E -q -W --keep-going -b html -c docs . out/docs
 
-.PHONY: help demo test lint bench notebooks clean
+.PHONY: help demo test lint docs bench notebooks clean
 
 help:
 	@echo "make demo       set up and solve the grasp of a real object, by our method and the paper's"
 	@echo "make test       set up and run the tests"
-	@echo "make lint       style, types, layers"
+	@echo "make lint       style, types, layers, documentation"
+	@echo "make docs       build the documentation site: out/docs/index.html"
 	@echo "make bench      timings on this machine"
 	@echo "make notebooks  execute the notebooks in place"
 	@echo "make clean      remove .venv and outputs"
@@ -28,8 +30,12 @@ $(VENV)/demo.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/dev.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
-	$(PIP) install --quiet -c constraints.txt -e ".[test,lint]"
-	touch $@ $(VENV)/demo.stamp
+	$(PIP) install --quiet -c constraints.txt -e ".[test,lint,docs]"
+	touch $@ $(VENV)/demo.stamp $(VENV)/docs.stamp
+
+$(VENV)/docs.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
+	$(PIP) install --quiet -c constraints.txt -e ".[docs]"
+	touch $@
 
 # The grasp of a real object by the default method, then by the paper's, and the two side by side.
 demo: $(VENV)/demo.stamp
@@ -47,6 +53,12 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
+	$(SPHINX)
+
+# Of pages and docstrings as they are; notebooks with the outputs that are stored in them.
+docs: $(VENV)/docs.stamp
+	$(SPHINX)
+	@echo "out/docs/index.html"
 
 # Where the other solvers are installed (pip install -e ".[peers]") they are measured too.
 bench: $(VENV)/dev.stamp

@@ -43,6 +43,11 @@ class Solver(MovingSolver, ChoosingSolver):
         limits: "enforce" or "ignore".
         options: What was set of the method's own parameters.
         scene: What answers must not touch; None: collisions are not checked.
+
+    Example:
+        >>> solver = ik.Solver(robot, tolerance=ik.Tolerance(position=1e-3, angle=np.deg2rad(1)))
+        >>> solver.solve(grasp).success
+        True
     """
 
     def __init__(
@@ -145,7 +150,12 @@ class Solver(MovingSolver, ChoosingSolver):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Everything that determines a solve but target, start and seed; as kept in the log."""
+        """Everything that determines a solve but target, start and seed; as kept in the log.
+
+        Example:
+            >>> solver.parameters["method"], solver.parameters["limits"]
+            ('hand-first', 'enforce')
+        """
         return {
             "method": self.method,
             "tolerance": {name: dataclasses.asdict(one) for name, one in self.tolerances.items()},
@@ -184,6 +194,14 @@ class Solver(MovingSolver, ChoosingSolver):
             UnknownNameError: A fixed actuator that the robot does not have.
             UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
+
+        Example:
+            >>> solution = solver.solve(grasp, q0=robot.home)
+            >>> solution.status.name, solution.q.shape
+            ('SOLVED', (14,))
+            >>> held = solver.solve(grasp, fixed={"lwr_joint_3": 0.2})
+            >>> print(round(held.q[2], 6))
+            0.2
         """
         problems = self._questions.of_grasps(
             [grasp], fixed, self._engine.preference(prefer, q0 is not None)
@@ -236,6 +254,12 @@ class Solver(MovingSolver, ChoosingSolver):
 
         Raises:
             InputError: Bad shapes or values; the message names row and finger. Else as `solve`.
+
+        Example:
+            >>> points, normals = robot.contacts(robot.random(np.random.default_rng(0), 1000))
+            >>> batch = solver.solve_batch(points, normals)
+            >>> batch.q.shape, bool(batch.success.all())
+            ((1000, 14), True)
         """
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
@@ -280,6 +304,12 @@ class Solver(MovingSolver, ChoosingSolver):
 
         Raises:
             InputError: Bad q0, seed or jobs, or a block of the wrong shape; else as `solve_batch`.
+
+        Example:
+            >>> rng = np.random.default_rng(0)
+            >>> blocks = (robot.contacts(robot.random(rng, 500)) for _ in range(3))
+            >>> [int(block.solution.success.sum()) for block in solver.solve_blocks(blocks)]
+            [500, 500, 500]
         """
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
@@ -302,6 +332,11 @@ class Solver(MovingSolver, ChoosingSolver):
         Raises:
             InputError: As for `solve`.
             UnsupportedError: The method cannot be stepped; the message says why.
+
+        Example:
+            >>> stepper = solver.stepper(grasp)
+            >>> type(stepper).__name__
+            'Stepper'
         """
         preferred = self._engine.preference(None, q0 is not None)
         problems = self._questions.of_grasps([grasp], None, preferred)
@@ -312,5 +347,12 @@ class Solver(MovingSolver, ChoosingSolver):
 
         Raises:
             UnsupportedError: The method is not hand-first, or the solver has a scene.
+
+        Example:
+            >>> fast = solver.fast()
+            >>> points, normals = robot.contacts(robot.home)
+            >>> q, status = fast(points, normals, robot.home)
+            >>> ik.Status(status).name
+            'SOLVED'
         """
         return FastSolver(self._engine, self._questions)

@@ -1,4 +1,4 @@
-"""What can be said behind `casadi-ik export` and `casadi-ik compile`."""
+"""What can be said behind `casadi-ik export`, `casadi-ik compile` and `casadi-ik schemas`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from casadi_ik.cli.values import one_of
+from casadi_ik.cli.values import one_of, whole
 
 if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
@@ -19,7 +19,9 @@ examples:
 DIR becomes a project that needs nothing but a C compiler (--target wasm: a browser or node):
 library, header, example, a test of 1,000 stored targets, a benchmark, README. It solves one target
 at a time, in doubles; its answers are bit for bit those of this package. An earlier export in DIR
-is replaced; any other folder that is not empty is refused.
+is replaced; any other folder that is not empty is refused. With --scene, being solved includes
+that nothing touches; where the answer does, the other ways are looked at in which the arm can hold
+the hand (other hands are not).
 
 exit codes: 0 written, 2 bad input (nothing is written)
 """
@@ -34,9 +36,19 @@ compiled later; also for a machine without a compiler that shares CASADI_IK_CACH
 exit codes: 0 done, 2 bad input
 """
 
+_SCHEMAS = """\
+example:
+  casadi-ik schemas --out .schemas
+
+Then an editor with a YAML language server completes and checks a file whose first line is, say,
+  # yaml-language-server: $schema=.schemas/grasp.json
+
+exit codes: 0 written, 2 bad input
+"""
+
 
 def add_export(commands: Any) -> None:
-    """Add `export` and `compile` to the commands."""
+    """Add `export`, `compile` and `schemas` to the commands."""
     parser = commands.add_parser(
         "export",
         help="write a robot's solver as plain C or WebAssembly",
@@ -59,6 +71,12 @@ def add_export(commands: Any) -> None:
         help="plain C (default), or a WebAssembly module for JavaScript (needs "
         "casadi-ik[compiler])",
     )
+    parser.add_argument(
+        "--scene",
+        metavar="CAPACITY",
+        type=whole(1),
+        help="collisions are checked: the robot with itself, and with so many solids at most",
+    )
     parser.set_defaults(run=_export)
     parser = commands.add_parser(
         "compile",
@@ -70,6 +88,15 @@ def add_export(commands: Any) -> None:
         "robots", metavar="ROBOT", nargs="+", help="a shipped name, ARM+HAND, or a YAML file"
     )
     parser.set_defaults(run=_compile)
+    parser = commands.add_parser(
+        "schemas",
+        help="write JSON Schemas of robot, grasp, scene and other files, for editors",
+        description="Write JSON Schemas of the files that people write, with which editors "
+        "complete keys.",
+        epilog=_SCHEMAS,
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    parser.set_defaults(run=_schemas)
 
 
 def _export(arguments: argparse.Namespace) -> Answer:
@@ -82,3 +109,9 @@ def _compile(arguments: argparse.Namespace) -> Answer:
     from casadi_ik.cli.export import compile_ahead
 
     return compile_ahead(arguments)
+
+
+def _schemas(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.schemas import schemas
+
+    return schemas(arguments)

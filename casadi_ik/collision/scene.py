@@ -8,19 +8,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
 from casadi_ik.collision.hulls import hull, mesh_points
+from casadi_ik.collision.scene_file import (
+    BoxEntry,
+    CapsuleEntry,
+    ConvexEntry,
+    CylinderEntry,
+    HalfSpaceEntry,
+    MeshEntry,
+    ObjectEntry,
+    SceneFile,
+    SolidEntry,
+    SphereEntry,
+)
 from casadi_ik.collision.solids import Solid, box, capsule, cylinder, half_space, of_object
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.reading import (
-    Angles,
     Frame,
-    Point,
-    Struct,
     convert,
     frame_matrix,
     read,
@@ -28,98 +36,10 @@ from casadi_ik.files.reading import (
     refuse_non_finite,
 )
 from casadi_ik.files.shipped import resolve
-from casadi_ik.files.units import Length, in_si
+from casadi_ik.files.units import in_si
 from casadi_ik.grasps.objects import load_object
 from casadi_ik.grasps.pose import checked_pose
-from casadi_ik.robots.collision import Touching, TouchingEntry
-
-
-class _Entry(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", kw_only=True
-):
-    xyz: Point = (0.0, 0.0, 0.0)
-    rpy: Angles = (0.0, 0.0, 0.0)
-    margin: Length | None = None
-
-
-class BoxEntry(_Entry, frozen=True, tag="box", kw_only=True):
-    """A box about its pose's origin."""
-
-    size: tuple[Length, Length, Length]
-
-
-class SphereEntry(_Entry, frozen=True, tag="sphere", kw_only=True):
-    """A ball."""
-
-    radius: Length
-
-
-class CylinderEntry(_Entry, frozen=True, tag="cylinder", kw_only=True):
-    """A cylinder along z."""
-
-    radius: Length
-    length: Length
-
-
-class CapsuleEntry(_Entry, frozen=True, tag="capsule", kw_only=True):
-    """A capsule along z; ``length`` is that of its segment, without the caps."""
-
-    radius: Length
-    length: Length
-
-
-class HalfSpaceEntry(_Entry, frozen=True, tag="half-space", kw_only=True):
-    """All below the plane z = 0 of its pose."""
-
-
-class MeshEntry(_Entry, frozen=True, tag="mesh", kw_only=True):
-    """The convex hull of a mesh."""
-
-    file: str
-    scale: float = 1.0
-
-
-class ConvexEntry(_Entry, frozen=True, tag="convex", kw_only=True):
-    """The convex hull of points."""
-
-    points: list[Point]
-
-
-class ObjectEntry(_Entry, frozen=True, tag="object", kw_only=True):
-    """An object by its shipped name or the path of its file."""
-
-    object: str
-
-
-SolidEntry = (
-    BoxEntry
-    | SphereEntry
-    | CylinderEntry
-    | CapsuleEntry
-    | HalfSpaceEntry
-    | MeshEntry
-    | ConvexEntry
-    | ObjectEntry
-)
-
-
-class MarginEntry(Struct, frozen=True):
-    """Two of links and solids, and how far they have to be apart whatever else is said."""
-
-    links: tuple[str, str]
-    margin: Length
-
-
-class SceneFile(Struct, frozen=True):
-    """``models/scenes/*.yaml``."""
-
-    solids: dict[str, SolidEntry] = msgspec.field(default_factory=dict)
-    margin: Length = 0.0
-    grasped: str | None = None
-    margins: list[MarginEntry] = msgspec.field(default_factory=list)
-    touching: list[TouchingEntry] = msgspec.field(default_factory=list)
-    name: str = ""
-    description: str = ""
+from casadi_ik.robots.collision import Touching
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +70,12 @@ class Scene:
             [m].
         touching: Links that may touch an item or each other, and why.
         name: What it is called.
+
+    Example:
+        >>> post = {"kind": "cylinder", "radius": 0.02, "length": 1, "xyz": [0.5, 0.4, 0.5]}
+        >>> scene = ik.Scene({"post": post}, margin=0.001)
+        >>> ik.Solver(robot, scene=scene).solve(grasp).status.name
+        'SOLVED'
     """
 
     def __init__(
@@ -233,6 +159,12 @@ class Scene:
         Raises:
             UnknownNameError: There is no such item.
             InputError: No pose.
+
+        Example:
+            >>> pose = np.eye(4)
+            >>> pose[2, 3] = -0.5
+            >>> print(ik.load_scene("table").moved("table", pose).items["table"].pose[2, 3])
+            -0.5
         """
         if name not in self.items:
             known = ", ".join(self.items) or "none"
@@ -251,6 +183,11 @@ class Scene:
         Raises:
             UnknownNameError: Neither.
             InputError: No pose.
+
+        Example:
+            >>> scene = ik.load_scene("table").holding("cup", np.eye(4))
+            >>> scene.grasped
+            'cup'
         """
         place = checked_pose(pose, f"pose of {name!r}")
         known = self.items.get(name)
@@ -276,6 +213,10 @@ def load_scene(name_or_path: str | Path) -> Scene:
         UnknownNameError: No shipped scene has that name.
         DescriptionError: The file is missing or malformed; the message names file and key.
         MissingExtraError: It has a mesh, and what builds hulls is not installed.
+
+    Example:
+        >>> ik.load_scene("table")
+        <Scene table: table, margin 0 m>
     """
     return Scene._of_file(resolve(name_or_path, "scenes"))
 

@@ -37,7 +37,12 @@ class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Frame(Struct, frozen=True):
-    """A pose relative to the parent: xyz [m], then rpy about the fixed axes [rad] (as URDF)."""
+    """A pose relative to the parent: xyz, then rpy about the fixed axes (as URDF).
+
+    Attributes:
+        xyz: Origin in the parent's frame [m].
+        rpy: Angles about the parent's fixed axes x, y, z [rad].
+    """
 
     xyz: Point = (0.0, 0.0, 0.0)
     rpy: Angles = (0.0, 0.0, 0.0)

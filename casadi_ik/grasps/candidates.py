@@ -13,7 +13,14 @@ from casadi_ik.grasps.load import GraspFile, ObjectEntry, grasp_of, load_grasp
 
 
 class CandidatesFile(Struct, frozen=True):
-    """Grasps in a list; ``object`` and ``robot`` are those of all that name no other."""
+    """Grasps in a list, of which one is to be chosen.
+
+    Attributes:
+        candidates: Grasps.
+        robot: Of all that name no other.
+        description: One sentence.
+        object: Of all that name no other.
+    """
 
     candidates: list[GraspFile]
     robot: str = ""

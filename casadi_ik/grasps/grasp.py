@@ -41,6 +41,12 @@ class Contact:
     Raises:
         InputError: A wrong shape, a number that is not finite, a zero direction, a tangent that is
             not orthogonal to the normal, or a tolerance that is none.
+
+    Example:
+        >>> contact = ik.Contact([0.5, 0.1, 0.6], normal=[0, -2, 0])
+        >>> print(contact.normal)
+        [ 0. -1.  0.]
+        >>> sliding = ik.Contact([0.5, 0.1, 0.6], line=[0, 0, 1])  # anywhere on an upright line
     """
 
     point: Array
@@ -94,6 +100,12 @@ class Contact:
 
         Raises:
             InputError: No rigid motion.
+
+        Example:
+            >>> pose = np.eye(4)
+            >>> pose[:3, 3] = [1.0, 0.0, 0.0]
+            >>> print(ik.Contact([0.0, 0.0, 0.5]).at(pose).point)
+            [1.  0.  0.5]
         """
         motion = one_pose(pose)
         turn = motion[:3, :3]
@@ -119,6 +131,16 @@ class Grasp:
 
     Raises:
         InputError: No contact at all.
+
+    Example:
+        >>> pinch = ik.Grasp(
+        ...     {
+        ...         "thumb": ik.Contact([-0.70, 0.05, 0.42], [-0.42, -0.91, 0.0]),
+        ...         "finger_2": ik.Contact([-0.70, -0.01, 0.45], [-0.42, 0.91, 0.0]),
+        ...     }
+        ... )
+        >>> sorted(pinch.contacts)
+        ['finger_2', 'thumb']
     """
 
     contacts: Mapping[str, Contact]
@@ -157,6 +179,13 @@ class Grasp:
 
         Raises:
             InputError: Another shape, a number that is not finite, or no rigid motion.
+
+        Example:
+            >>> pose = np.eye(4)
+            >>> pose[2, 3] = 0.01  # 1 cm higher
+            >>> higher = grasp.at(pose)
+            >>> print(np.round(higher.contacts["thumb"].point - grasp.contacts["thumb"].point, 6))
+            [0.   0.   0.01]
         """
         motion = one_pose(pose)
         place = self.object_pose
@@ -171,6 +200,12 @@ class Grasp:
         """The contacts as the object sees them, to be placed by `at`.
 
         A grasp that does not say where its object is counts as given in the object's frame.
+
+        Example:
+            >>> seen = grasp.in_object_frame()
+            >>> bool(np.allclose(seen.at(grasp.object_pose).contacts["thumb"].point,
+            ...                  grasp.contacts["thumb"].point))
+            True
         """
         return self if self.object_pose is None else self.at(inverse(self.object_pose))
 
@@ -185,6 +220,11 @@ class Grasp:
 
         Raises:
             InputError: The grasp has a contact for a finger that is not among them.
+
+        Example:
+            >>> points, normals = grasp.arrays(robot.fingers)
+            >>> points.shape, normals.shape
+            ((3, 3), (3, 3))
         """
         for name in self.contacts:
             if name not in fingers:
@@ -207,6 +247,10 @@ class Grasp:
 
         Returns:
             (f, 3) by name ("tangents", "lines", "planes"), NaN where free; only what any has.
+
+        Example:
+            >>> grasp.more(robot.fingers)  # points and normals are all that it asks for
+            {}
         """
         found: dict[str, Array] = {}
         for finger, contact in self.contacts.items():

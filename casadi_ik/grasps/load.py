@@ -17,14 +17,30 @@ from casadi_ik.grasps.tolerance import Tolerance
 
 
 class ToleranceEntry(Struct, frozen=True):
-    """When a contact counts as reached; what is left out is as everywhere."""
+    """When a contact counts as reached; what is left out is as everywhere.
+
+    Attributes:
+        position: Largest distance of the points [m].
+        angle: Largest angle between the normals [rad].
+    """
 
     position: Length = Tolerance.position
     angle: Turn = Tolerance.angle
 
 
 class ContactEntry(Struct, frozen=True):
-    """A finger's contact; ``direction`` stands alone, everything else needs a point."""
+    """A finger's contact; ``direction`` stands alone, everything else needs a point.
+
+    Attributes:
+        point: Where the fingertip touches, in the robot's base frame (an object's, if its pose is
+            said elsewhere) [m].
+        normal: Which way the pad faces: out of the fingertip, into the object; left out: any.
+        tolerance: When it counts as reached; left out: as for all.
+        tangent: Where the second axis of the contact frame points; it needs a normal.
+        line: Direction of a line through the point on which the fingertip may be anywhere.
+        plane: Normal of a plane through the point in which the fingertip may be anywhere.
+        direction: Which way the pad faces wherever it is; it stands alone.
+    """
 
     point: Point | None = None
     normal: Vector | None = None
@@ -36,14 +52,27 @@ class ContactEntry(Struct, frozen=True):
 
 
 class ObjectEntry(Struct, frozen=True):
-    """The object that is grasped and where it is."""
+    """The object that is grasped and where it is.
+
+    Attributes:
+        name: A shipped object, or the path of an object file.
+        pose: Of the object in the robot's base frame.
+    """
 
     name: str
     pose: Frame = Frame()
 
 
 class GraspFile(Struct, frozen=True):
-    """``models/grasps/*.yaml``; all but ``contacts`` may be left out."""
+    """A grasp: ``models/grasps/*.yaml``.
+
+    Attributes:
+        contacts: By finger; a finger left out is free.
+        robot: The robot it was made for: a shipped name, ARM+HAND, or a path.
+        description: One sentence.
+        object: What is grasped, and where it is.
+        posture: Position by actuator of the hand that it was made from [rad or m].
+    """
 
     contacts: dict[str, ContactEntry]
     robot: str = ""
@@ -61,6 +90,10 @@ def load_grasp(name_or_path: str | Path) -> Grasp:
     Raises:
         UnknownNameError: No shipped grasp has that name.
         DescriptionError: The file is missing or malformed; the message names file and key.
+
+    Example:
+        >>> ik.load_grasp("cup").robot
+        'kuka_lwr_barrett'
     """
     path = resolve(name_or_path, "grasps")
     entry, _ = read(path, GraspFile)
@@ -122,6 +155,10 @@ def shipped_grasps(robot: str) -> tuple[str, ...]:
 
     Raises:
         DescriptionError: A shipped file is damaged.
+
+    Example:
+        >>> "cup" in ik.shipped_grasps("kuka_lwr_barrett")
+        True
     """
     return tuple(name for name in shipped_names("grasps") if load_grasp(name).robot == robot)
 

@@ -18,14 +18,28 @@ from casadi_ik.grasps.shapes import Shape
 
 
 class MassEntry(Struct, frozen=True):
-    """A mass [kg] and where it is from."""
+    """A mass [kg] and where it is from.
+
+    Attributes:
+        value: [kg].
+        source: Tags of `sources`.
+    """
 
     value: Mass
     source: str
 
 
 class ObjectFile(Struct, frozen=True):
-    """``models/objects/*.yaml``."""
+    """An object: ``models/objects/*.yaml``.
+
+    Attributes:
+        name: What it is called.
+        description: One sentence.
+        frame: Where its frame is, in words; z points up when it stands.
+        shape: Centred in its frame.
+        mass: And where that is from.
+        sources: Where numbers are from, by tag.
+    """
 
     name: str
     description: str

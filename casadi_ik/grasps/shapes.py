@@ -67,7 +67,11 @@ class Primitive(
 
 
 class Sphere(Primitive, frozen=True, tag="sphere", kw_only=True):
-    """A ball of a diameter [m]."""
+    """A ball.
+
+    Attributes:
+        diameter: [m].
+    """
 
     diameter: Length
 
@@ -85,7 +89,12 @@ class Sphere(Primitive, frozen=True, tag="sphere", kw_only=True):
 
 
 class Cylinder(Primitive, frozen=True, tag="cylinder", kw_only=True):
-    """A circular cylinder along z: diameter and height [m]."""
+    """A circular cylinder along z.
+
+    Attributes:
+        diameter: [m].
+        height: [m].
+    """
 
     diameter: Length
     height: Length
@@ -100,7 +109,13 @@ class Cylinder(Primitive, frozen=True, tag="cylinder", kw_only=True):
 
 
 class EllipticCylinder(Primitive, frozen=True, tag="elliptic-cylinder", kw_only=True):
-    """An elliptic cylinder along z: full axes along x (width) and y (depth), height [m]."""
+    """An elliptic cylinder along z.
+
+    Attributes:
+        width: Full axis along x [m].
+        depth: Full axis along y [m].
+        height: [m].
+    """
 
     width: Length
     depth: Length
@@ -117,7 +132,11 @@ class EllipticCylinder(Primitive, frozen=True, tag="elliptic-cylinder", kw_only=
 
 
 class Box(Primitive, frozen=True, tag="box", kw_only=True):
-    """A box with edges along x, y and z: size [m]."""
+    """A box with edges along x, y and z.
+
+    Attributes:
+        size: Along x, y and z [m].
+    """
 
     size: tuple[Length, Length, Length]
 

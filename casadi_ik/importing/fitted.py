@@ -12,7 +12,7 @@ from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.importing.boxes import FittedBox, fit_boxes
 from casadi_ik.importing.capsules import LEAST_SAVING, FittedCapsule, cut, excess, fit
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.robots.collision import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
+from casadi_ik.robots.collision_entries import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
 
 GRID = 1e4
 """What is fitted is rounded up to a tenth of a millimetre."""

@@ -7,7 +7,8 @@ from pathlib import Path
 from casadi_ik.importing.fitted import fitted
 from casadi_ik.importing.surfaces import Surface, checked_surfaces
 from casadi_ik.importing.touching import may_touch
-from casadi_ik.robots.collision import ShapeEntry, Touching
+from casadi_ik.robots.collision import Touching
+from casadi_ik.robots.collision_entries import ShapeEntry
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.robots.part import PREFIX
 from casadi_ik.robots.robot_files.read import read_tree

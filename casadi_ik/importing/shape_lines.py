@@ -9,7 +9,8 @@ import msgspec
 import numpy as np
 
 from casadi_ik.importing.words import one_line, scalar
-from casadi_ik.robots.collision import ShapeEntry, Touching
+from casadi_ik.robots.collision import Touching
+from casadi_ik.robots.collision_entries import ShapeEntry
 
 WIDTH = 98
 """Characters of a line, as far as a shape can be broken."""

@@ -14,7 +14,8 @@ from casadi_ik.collision.distances import segment_distances
 from casadi_ik.importing.fitted import GRID
 from casadi_ik.importing.posture import Jointed, Postures
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.robots.collision import ShapeEntry, Touching, capsules_of
+from casadi_ik.robots.collision import Touching, capsules_of
+from casadi_ik.robots.collision_entries import ShapeEntry
 from casadi_ik.robots.description import Actuator, Joint
 
 SAMPLES = 2000

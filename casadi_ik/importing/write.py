@@ -12,7 +12,8 @@ from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.importing.pads import Pad
 from casadi_ik.importing.shape_lines import collision_lines
 from casadi_ik.importing.words import one_line, scalar
-from casadi_ik.robots.collision import ShapeEntry, Touching
+from casadi_ik.robots.collision import Touching
+from casadi_ik.robots.collision_entries import ShapeEntry
 
 MADE = (
     "# Shapes as in the files; meshes are held by capsules or boxes, which stand out by `excess`."

@@ -16,6 +16,11 @@ class ContactVerdict:
         angle_error: Angle from the normal [rad]; NaN if it is free.
         ok: Within tolerance (what is free is).
         tolerance: What it was compared with.
+
+    Example:
+        >>> verdict = solution.contacts["thumb"]
+        >>> verdict.ok, verdict.position_error < verdict.tolerance.position
+        (True, True)
     """
 
     position_error: float

@@ -43,6 +43,13 @@ class Solution:
         closest: That pair: two links, or a link and a solid of the scene.
         collision: Why all answers touch something, if that is the status and a diagnosis was asked
             for.
+
+    Example:
+        >>> solution = solver.solve(grasp)
+        >>> solution.success, solution.q.shape == (len(solution.actuators),)
+        (True, True)
+        >>> all(contact.ok for contact in solution.contacts.values())
+        True
     """
 
     success: bool
@@ -106,6 +113,12 @@ class BatchSolution:
             given: collisions were not checked.
         closest: The pair of each target; empty if no scene was given.
         collisions: Why all answers touch something, by target; empty if no scene was given.
+
+    Example:
+        >>> points, normals = robot.contacts(robot.random(np.random.default_rng(1), 200))
+        >>> batch = solver.solve_batch(points, normals)
+        >>> batch.position_error.shape, set(batch.status_names.tolist())
+        ((200, 3), {'SOLVED'})
     """
 
     success: NDArray[np.bool_]
@@ -202,7 +215,13 @@ class BatchSolution:
         return np.array([status.name for status in sorted(Status)])[self.status - min(Status)]
 
     def solution(self, row: int) -> Solution:
-        """One row as a `Solution`."""
+        """One row as a `Solution`.
+
+        Example:
+            >>> points, normals = robot.contacts(robot.home[None])
+            >>> solver.solve_batch(points, normals).solution(0).status.name
+            'SOLVED'
+        """
         verdicts = zip(
             self.position_error[row].tolist(),
             self.angle_error[row].tolist(),

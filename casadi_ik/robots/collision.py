@@ -12,76 +12,23 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix
-from casadi_ik.files.units import Length
+from casadi_ik.files.reading import Frame, Point, frame_matrix
+from casadi_ik.robots.collision_entries import (
+    BoxEntry,
+    CapsuleEntry,
+    CollisionEntry,
+    CylinderEntry,
+    ShapeEntry,
+    SphereEntry,
+)
 from casadi_ik.robots.robot_files.srdf_file import srdf_pairs
 
 MOST_AROUND = 4
 """Capsules across a side of a box or a cylinder, at the most."""
-
-
-class _Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
-    """A shape; ``excess`` says by how much it is larger than the mesh it holds."""
-
-
-class SphereEntry(_Shape, frozen=True, tag="sphere", kw_only=True):
-    """A ball about a point of the link."""
-
-    radius: Length
-    center: Point = (0.0, 0.0, 0.0)
-    excess: Length = 0.0
-
-
-class CapsuleEntry(_Shape, frozen=True, tag="capsule", kw_only=True):
-    """All within the radius of the segment between two points of the link."""
-
-    ends: tuple[Point, Point]
-    radius: Length
-    excess: Length = 0.0
-
-
-class BoxEntry(_Shape, frozen=True, tag="box", kw_only=True):
-    """A box about its own frame's origin."""
-
-    size: tuple[Length, Length, Length]
-    xyz: Point = (0.0, 0.0, 0.0)
-    rpy: Angles = (0.0, 0.0, 0.0)
-    excess: Length = 0.0
-
-
-class CylinderEntry(_Shape, frozen=True, tag="cylinder", kw_only=True):
-    """A cylinder along z about its own frame's origin."""
-
-    radius: Length
-    length: Length
-    xyz: Point = (0.0, 0.0, 0.0)
-    rpy: Angles = (0.0, 0.0, 0.0)
-    excess: Length = 0.0
-
-
-ShapeEntry = SphereEntry | CapsuleEntry | BoxEntry | CylinderEntry
-
-
-class TouchingEntry(Struct, frozen=True):
-    """Two links that may touch, and why; with ``depth`` by no more than that."""
-
-    links: tuple[str, str]
-    reason: str
-    depth: Length | None = None
-
-
-class CollisionEntry(Struct, frozen=True):
-    """The key ``collision`` of a description; ``srdf`` names a file with pairs that may touch."""
-
-    links: dict[str, list[ShapeEntry]] = msgspec.field(default_factory=dict)
-    touching: list[TouchingEntry] = msgspec.field(default_factory=list)
-    source: str = ""
-    srdf: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.robots.checks import check_couplings
-from casadi_ik.robots.collision import NO_SHAPES, CollisionEntry, Shapes, link_shapes
+from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
+from casadi_ik.robots.collision_entries import CollisionEntry
 from casadi_ik.robots.couplings import Coupling, Linear
 from casadi_ik.robots.description import Actuator, Joint, frozen
 from casadi_ik.robots.part import HandPart, Part

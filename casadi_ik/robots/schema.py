@@ -6,12 +6,25 @@ import msgspec
 
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, Vector
 from casadi_ik.files.units import AnyValue, JointRate, JointValue
-from casadi_ik.robots.collision import CollisionEntry
+from casadi_ik.robots.collision_entries import CollisionEntry
 from casadi_ik.robots.couplings import Coupling
 
 
 class JointEntry(Struct, frozen=True):
-    """A joint; ``coupling`` absent means that it is its own actuator."""
+    """A joint; ``coupling`` absent means that it is its own actuator.
+
+    Attributes:
+        name: Of the joint; an actuator of a joint that follows none has it too.
+        parent: Link that it is on.
+        child: Link that it moves.
+        axis: Direction in the child's frame about which (prismatic: along which) the child moves.
+        limits: Lower and upper end [rad or m].
+        source: Tags of `sources` that its numbers are from.
+        type: revolute, prismatic or fixed.
+        origin: The child's frame in the parent's while the joint reads zero.
+        velocity: Its limit [rad/s or m/s]; left out: not known.
+        coupling: What it follows; left out: it has a motor of its own.
+    """
 
     name: str
     parent: str
@@ -26,7 +39,14 @@ class JointEntry(Struct, frozen=True):
 
 
 class ActuatorEntry(Struct, frozen=True):
-    """A motor; limits and velocity are the joint's where it drives a joint of the same name."""
+    """A motor; limits and velocity are the joint's where it drives a joint of the same name.
+
+    Attributes:
+        limits: Lower and upper end [rad or m]; left out: the joint's of the same name.
+        velocity: Its limit [rad/s or m/s]; left out: the joint's.
+        unit: rad or m, where no joint has its name.
+        source: Tags of `sources` that its numbers are from.
+    """
 
     limits: tuple[JointValue, JointValue] | None = None
     velocity: JointRate | None = None
@@ -35,7 +55,14 @@ class ActuatorEntry(Struct, frozen=True):
 
 
 class LinkFrame(Struct, frozen=True):
-    """A frame on a link."""
+    """A frame on a link.
+
+    Attributes:
+        link: Name of the link.
+        xyz: Origin in the link's frame [m].
+        rpy: Angles about the fixed axes x, y, z [rad], as in URDF.
+        source: Tags of `sources` that its numbers are from.
+    """
 
     link: str
     xyz: Point = (0.0, 0.0, 0.0)
@@ -44,10 +71,17 @@ class LinkFrame(Struct, frozen=True):
 
 
 class ContactEntry(Struct, frozen=True):
-    """The contact frame of a finger; ``normal`` is the outward pad normal in that frame.
+    """The contact frame of a finger: where its pad touches and which way that faces.
 
-    ``tangent`` is the pad's second axis; left out, it is the frame's x axis. Either is made
-    orthogonal to the normal.
+    Normal and tangent are made orthogonal.
+
+    Attributes:
+        link: Link that the pad is on.
+        normal: Direction out of the pad, away from the finger, in the contact frame.
+        source: Tags of `sources` that its numbers are from.
+        xyz: Where the pad touches, in the link's frame [m].
+        rpy: Angles of the contact frame about the link's fixed axes [rad].
+        tangent: The pad's second axis; left out: the frame's x axis.
     """
 
     link: str
@@ -59,7 +93,18 @@ class ContactEntry(Struct, frozen=True):
 
 
 class ArmFile(Struct, frozen=True):
-    """``models/arms/*.yaml``; ``home`` is where an arm stands whose robot does not say."""
+    """An arm: ``models/arms/*.yaml``.
+
+    Attributes:
+        name: What it is called.
+        root: Link that all others hang on.
+        tip: Frame that a hand is mounted on.
+        joints: From root to tip, in any order.
+        sources: Where numbers are from, by tag.
+        description: What it is, the first sentence by itself.
+        home: Position by joint where it stands if its robot does not say [rad or m].
+        collision: Shapes of its links.
+    """
 
     name: str
     root: str
@@ -72,10 +117,24 @@ class ArmFile(Struct, frozen=True):
 
 
 class HandFile(Struct, frozen=True):
-    """``models/hands/*.yaml``.
+    """A hand: ``models/hands/*.yaml``.
 
-    ``thumb``, ``mount`` (the hand's root on the arm's tip) and ``home`` hold for a robot that is
-    put together by name; others say them themselves.
+    ``thumb``, ``mount`` and ``home`` hold for a robot that is put together by name; others say
+    them themselves.
+
+    Attributes:
+        name: What it is called.
+        root: Link that all others hang on.
+        palm: Frame of the palm: z away from it, y towards the thumb.
+        joints: In any order.
+        fingers: Contact frame by finger.
+        sources: Where numbers are from, by tag.
+        actuators: Motors by name; left out: one for each joint without coupling.
+        description: What it is, the first sentence by itself.
+        thumb: Finger that is placed first.
+        mount: The hand's root on an arm's tip.
+        home: Position by actuator [rad or m].
+        collision: Shapes of its links.
     """
 
     name: str
@@ -95,7 +154,12 @@ class HandFile(Struct, frozen=True):
 class ArmFromFile(Struct, frozen=True):
     """An arm in somebody's file: the chain from ``root`` to ``tip``.
 
-    ``locked`` joints stand still at a value; ``limits`` go before the file's.
+    Attributes:
+        file: URDF, xacro or MJCF; a path counts from the description.
+        tip: Link that a hand is mounted on; left out: the only end of the chain.
+        root: Link that it begins with; left out: the file's.
+        locked: Joints that stand still, and where [rad or m].
+        limits: Limits by joint that go before the file's [rad or m].
     """
 
     file: str
@@ -106,7 +170,15 @@ class ArmFromFile(Struct, frozen=True):
 
 
 class HandFromFile(Struct, frozen=True):
-    """A hand in somebody's file, or a whole robot: what is above ``palm`` moves the hand."""
+    """A hand in somebody's file, or a whole robot: what is above ``palm`` moves the hand.
+
+    Attributes:
+        file: URDF, xacro or MJCF; a path counts from the description.
+        palm: Link of the palm, or a frame on it.
+        root: Link that it begins with; left out: the file's.
+        locked: Joints that stand still, and where [rad or m].
+        limits: Limits by joint that go before the file's [rad or m].
+    """
 
     file: str
     palm: str | LinkFrame | None = None
@@ -116,7 +188,15 @@ class HandFromFile(Struct, frozen=True):
 
 
 class PadEntry(Struct, frozen=True):
-    """The contact frame of a finger of a `HandFromFile`; see `ContactEntry`."""
+    """The contact frame of a finger of a `HandFromFile`; see `ContactEntry`.
+
+    Attributes:
+        link: Link that the pad is on.
+        normal: Direction out of the pad, away from the finger, in the contact frame.
+        xyz: Where the pad touches, in the link's frame [m].
+        rpy: Angles of the contact frame about the link's fixed axes [rad].
+        tangent: The pad's second axis; left out: the frame's x axis.
+    """
 
     link: str
     normal: Vector
@@ -126,9 +206,20 @@ class PadEntry(Struct, frozen=True):
 
 
 class ArmHandFile(Struct, frozen=True):
-    """``models/arm_hands/*.yaml``: an arm (or none), a hand, and what joins them.
+    """A robot: an arm (or none), a described hand, and what joins them.
 
-    ``hand`` is a shipped name, a path, or the hand itself.
+    Attributes:
+        name: What the robot is called.
+        hand: A shipped name, a path, or the hand itself.
+        fingers: The hand's fingers that take part, in their order.
+        thumb: Finger that is placed first; the paper's methods need one.
+        arm: A shipped name, a path, or an arm in somebody's file; left out: the hand stands on a
+            fixed base.
+        mount: The hand's root on the arm's tip.
+        home: Position by actuator where the robot is taken to stand [rad or m].
+        sources: Where numbers are from, by tag.
+        description: What it is, the first sentence by itself.
+        collision: Shapes of its links; these go before those of its parts.
     """
 
     name: str
@@ -144,9 +235,21 @@ class ArmHandFile(Struct, frozen=True):
 
 
 class ImportedFile(Struct, frozen=True):
-    """An arm-hand whose hand is in somebody's file: either ``hand`` or ``robot``, which has an arm.
+    """A robot whose hand is in somebody's file: either ``hand`` or ``robot``, which has an arm.
 
-    The fingers are described here, since no file says where a pad is.
+    Attributes:
+        name: What the robot is called.
+        fingers: Contact frame by finger, since no file says where a pad is.
+        hand: A hand in a file of its own.
+        robot: A whole robot in one file; then there is no `arm`.
+        thumb: Finger that is placed first; the paper's methods need one.
+        arm: A shipped name, a path, or an arm in somebody's file; left out: the hand stands on a
+            fixed base.
+        mount: The hand's root on the arm's tip.
+        home: Position by actuator where the robot is taken to stand [rad or m].
+        sources: Where numbers are from, by tag.
+        description: What it is, the first sentence by itself.
+        collision: Shapes of its links; these go before those of its parts.
     """
 
     name: str

@@ -15,6 +15,7 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.files.in_background import InBackground
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.clearance import SceneCheck, Surroundings
@@ -38,7 +39,6 @@ from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.solved_part import SolvedPart, judged
 from casadi_ik.solving.workers import workers
-from casadi_ik.solving.write_behind import WriteBehind
 
 MANIPULABILITY = "manipulability"
 """The preference that is seen to after the solve."""
@@ -241,11 +241,11 @@ class Engine:
         if recorder is not None and (measures := self.method.trace_format.measures) is not None:
             measures.prepare()
         batches = []
-        with WriteBehind() as behind:
+        with InBackground() as background:
             for part in self._parts(problems, starts, run):
                 if recorder is not None:
                     form = self.method.trace_format
-                    behind.do(partial(part.record, recorder, form, run.seed))
+                    background.do(partial(part.record, recorder, form, run.seed))
                 batches.append(part.batch)
         return BatchSolution.joined(batches)
 

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from casadi_ik.importing.shape_lines import collision_lines
-from casadi_ik.robots.collision import ShapeEntry, Touching
+from casadi_ik.robots.collision import Touching
+from casadi_ik.robots.collision_entries import ShapeEntry
 
 
 def write(

@@ -18,13 +18,8 @@ from casadi_ik.importing import imported
 from casadi_ik.importing.shape_lines import collision_lines
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.robots import load_description
-from casadi_ik.robots.collision import (
-    BoxEntry,
-    CapsuleEntry,
-    CollisionEntry,
-    Touching,
-    capsules_of,
-)
+from casadi_ik.robots.collision import Touching, capsules_of
+from casadi_ik.robots.collision_entries import BoxEntry, CapsuleEntry, CollisionEntry
 
 PLACE = '<origin xyz="0 0 0.02" rpy="0.3 0.2 0.1"/>'
 SIMPLE = {

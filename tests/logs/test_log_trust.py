@@ -127,7 +127,7 @@ def test_a_cut_log(whole: Path, seed: int) -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 @pytest.mark.parametrize("after", [0.0, 0.05, 0.2])
 def test_a_killed_writer(tmp_path: Path, after: float) -> None:
-    """All but the chunk being filled is there."""
+    """All but the chunk being filled and the one being written is there."""
     path = tmp_path / "killed.mcap"
     command = [sys.executable, "-c", WRITER, str(path), str(Path(__file__).parent)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
@@ -143,7 +143,7 @@ def test_a_killed_writer(tmp_path: Path, after: float) -> None:
     solves = log.solves().solve_id
     np.testing.assert_array_equal(solves, np.arange(len(solves)))
     of_a_solve = sum(chunk.uncompressed_size for chunk in read_contents(path).chunks) / len(solves)
-    assert (recorded - len(solves)) * of_a_solve < CHUNK_SIZE + of_a_solve
+    assert (recorded - len(solves)) * of_a_solve < 2 * (CHUNK_SIZE + of_a_solve)
     assert len(solves) <= recorded + 20
     assert len(log.iterations()) == 400 * len(solves)
     assert log.iterations(solve=41).rows.tobytes() == make_block(400, first=41).rows.tobytes()

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from mcap.records import Channel, Schema
 
 from casadi_ik.errors import LogError
+from casadi_ik.files.in_background import InBackground
 from casadi_ik.logs.mcap.chunk import Run, chunk_bytes, definitions
 from casadi_ik.logs.mcap.file import McapFile
 from casadi_ik.logs.mcap.message_bytes import fill
@@ -23,8 +25,9 @@ CHUNK_SIZE = 2**21
 class ChunkStream:
     """Writes messages to a file, chunk by chunk.
 
-    A chunk is on the disk before the next one is begun. Of what `add` has taken a killed process
-    loses the chunk that is being filled, less than `CHUNK_SIZE`, and no more.
+    A chunk is compressed and written while the next one is filled, and is on the disk before that
+    one is. Of what `add` has taken a killed process loses these two, less than twice `CHUNK_SIZE`
+    and a solve, and no more.
     """
 
     def __init__(
@@ -45,10 +48,17 @@ class ChunkStream:
         self._waiting: list[Messages] = []
         self._size = 0
         self._new: tuple[list[Schema], list[Channel]] = ([], [])
+        self._background = InBackground()
 
     @property
     def closed(self) -> bool:
-        """Whether nothing more can be written."""
+        """Whether nothing more can be written.
+
+        Raises:
+            LogError: Nothing can, since a chunk could not be written; said once.
+        """
+        if self._file.closed:
+            self._background.wait()
         return self._file.closed
 
     def define(self, schema: Schema, channel: Channel) -> None:
@@ -79,7 +89,8 @@ class ChunkStream:
         """Take messages of the same solves on several channels.
 
         Raises:
-            LogError: A chunk could not be written; the chunks before can be read.
+            LogError: A chunk, perhaps of an earlier call, could not be written; the chunks before
+                can be read.
         """
         count, start = len(parts[0].ends), 0
         size = np.sum([part.ends * part.size for part in parts], axis=0)
@@ -99,14 +110,18 @@ class ChunkStream:
         Raises:
             LogError: It could not be written; the chunks before can be read.
         """
-        if self._file.closed:
-            return
-        if self._waiting:
-            self._write()
-        self._finish()
+        try:
+            if self._waiting and not self.closed:
+                self._write()
+            self._background.wait()
+            if not self._file.closed:
+                self._finish()
+        finally:
+            self._background.end()
 
     def discard(self) -> None:
         """Give up what waits; a file that has nothing else goes away, any other is finished."""
+        self._background.end()
         if not self._file.closed and self._file.position:
             with contextlib.suppress(LogError):
                 self._finish()
@@ -133,8 +148,10 @@ class ChunkStream:
         return data, runs
 
     def _write(self) -> None:
-        """Make a chunk of what waits, and write it."""
-        data, runs = self._gathered()
+        """Make a chunk of what waits, and have it written."""
+        self._background.do(partial(self._put, *self._gathered()))
+
+    def _put(self, data: np.ndarray, runs: list[Run]) -> None:
         pieces = self._unwritten()
         position = self._file.position + sum(map(len, pieces))
         written, index = chunk_bytes(data.data, runs, self._compression, position)

@@ -15,7 +15,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.files.reading import Frame, frame_matrix, roll_pitch_yaw
-from casadi_ik.robots.collision import (
+from casadi_ik.robots.collision_entries import (
     BoxEntry,
     CapsuleEntry,
     CylinderEntry,

@@ -59,6 +59,11 @@ class Alternative:
             in the middle of the range, 0 at a limit.
         manipulability: Yoshikawa's measure of the arm [m^3]; 0 for a hand without an arm.
         distance: Euclidean distance from q0, every actuator as a part of its range.
+
+    Example:
+        >>> first, second = solver.solve_all(grasp, limit=2)
+        >>> first.margin >= second.margin, first.q.shape
+        (True, (14,))
     """
 
     q: Array

@@ -1,4 +1,4 @@
-"""Recording a part of a batch while the next one is solved."""
+"""Work that goes on in the background: written in order while the next is made."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from types import TracebackType
 from typing import Self
 
 
-class WriteBehind:
+class InBackground:
     """One thread that does jobs in their order, at most one behind.
 
-    To check, compress and write a log takes as long as to solve what it holds; both run in
+    To check, compress and write a log takes as long as to solve what it holds; all of it runs in
     compiled code that holds no lock of the interpreter. The thread is made with the second job, so
-    that a single solve does without.
+    that a single solve, or a log of one chunk, does without.
     """
 
     def __init__(self) -> None:
@@ -27,12 +27,13 @@ class WriteBehind:
             self._first = False
             job()
             return
-        self._wait()
+        self.wait()
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, "casadi_ik_log")
         self._pending = self._pool.submit(job)
 
-    def _wait(self) -> None:
+    def wait(self) -> None:
+        """Wait until nothing is left to do; raises what the last job has raised."""
         pending, self._pending = self._pending, None
         if pending is not None:
             pending.result()
@@ -49,7 +50,13 @@ class WriteBehind:
         """Wait for the last job; what it raises counts unless something else has been raised."""
         try:
             if error is None:
-                self._wait()
+                self.wait()
         finally:
-            if self._pool is not None:
-                self._pool.shutdown()
+            self.end()
+
+    def end(self) -> None:
+        """Wait for the last job, whatever becomes of it, and end the thread."""
+        self._pending = None
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None

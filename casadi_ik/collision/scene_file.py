@@ -1,0 +1,151 @@
+"""What may stand in a scene file."""
+
+from __future__ import annotations
+
+import msgspec
+
+from casadi_ik.files.reading import Angles, Point, Struct
+from casadi_ik.files.units import Length
+from casadi_ik.robots.collision_entries import TouchingEntry
+
+
+class _Entry(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", kw_only=True
+):
+    """What every solid of a scene has.
+
+    Attributes:
+        xyz: Its origin in the robot's base frame [m].
+        rpy: Angles about the base's fixed axes x, y, z [rad].
+        margin: Distance to keep from it [m]; left out: the scene's.
+    """
+
+    xyz: Point = (0.0, 0.0, 0.0)
+    rpy: Angles = (0.0, 0.0, 0.0)
+    margin: Length | None = None
+
+
+class BoxEntry(_Entry, frozen=True, tag="box", kw_only=True):
+    """A box about its pose's origin.
+
+    Attributes:
+        size: Along its own x, y and z [m].
+    """
+
+    size: tuple[Length, Length, Length]
+
+
+class SphereEntry(_Entry, frozen=True, tag="sphere", kw_only=True):
+    """A ball.
+
+    Attributes:
+        radius: [m].
+    """
+
+    radius: Length
+
+
+class CylinderEntry(_Entry, frozen=True, tag="cylinder", kw_only=True):
+    """A cylinder along z.
+
+    Attributes:
+        radius: [m].
+        length: [m].
+    """
+
+    radius: Length
+    length: Length
+
+
+class CapsuleEntry(_Entry, frozen=True, tag="capsule", kw_only=True):
+    """A capsule along z.
+
+    Attributes:
+        radius: [m].
+        length: Of its segment, without the caps [m].
+    """
+
+    radius: Length
+    length: Length
+
+
+class HalfSpaceEntry(_Entry, frozen=True, tag="half-space", kw_only=True):
+    """All below the plane z = 0 of its pose."""
+
+
+class MeshEntry(_Entry, frozen=True, tag="mesh", kw_only=True):
+    """The convex hull of a mesh.
+
+    Attributes:
+        file: A path, counted from the scene's file.
+        scale: Factor of its coordinates.
+    """
+
+    file: str
+    scale: float = 1.0
+
+
+class ConvexEntry(_Entry, frozen=True, tag="convex", kw_only=True):
+    """The convex hull of points.
+
+    Attributes:
+        points: Some that it is the hull of, in its own frame [m].
+    """
+
+    points: list[Point]
+
+
+class ObjectEntry(_Entry, frozen=True, tag="object", kw_only=True):
+    """An object.
+
+    Attributes:
+        object: A shipped object, or the path of an object file.
+    """
+
+    object: str
+
+
+SolidEntry = (
+    BoxEntry
+    | SphereEntry
+    | CylinderEntry
+    | CapsuleEntry
+    | HalfSpaceEntry
+    | MeshEntry
+    | ConvexEntry
+    | ObjectEntry
+)
+
+
+class MarginEntry(Struct, frozen=True):
+    """Two of links and solids, and how far they have to be apart whatever else is said.
+
+    Attributes:
+        links: Names of links or solids.
+        margin: Distance to keep [m].
+    """
+
+    links: tuple[str, str]
+    margin: Length
+
+
+class SceneFile(Struct, frozen=True):
+    """A scene: ``models/scenes/*.yaml``.
+
+    Attributes:
+        solids: What stands there, by name.
+        margin: Distance to keep, also between links [m].
+        grasped: Name of the solid that is grasped: links with a contact may touch it.
+        margins: Distances of two, before the solid's and the scene's.
+        touching: Pairs that may touch.
+        name: What it is called; left out: as its file.
+        description: One sentence.
+    """
+
+    solids: dict[str, SolidEntry] = msgspec.field(default_factory=dict)
+    margin: Length = 0.0
+    grasped: str | None = None
+    margins: list[MarginEntry] = msgspec.field(default_factory=list)
+    touching: list[TouchingEntry] = msgspec.field(default_factory=list)
+    name: str = ""
+    description: str = ""

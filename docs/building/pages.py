@@ -1,0 +1,59 @@
+"""Parts of pages that are made from the package: `<!-- here: NAME ARGUMENTS -->` in a page.
+
+On a line of its own such a comment is replaced by the Markdown that the function of that name
+makes of the arguments. In the repository the page reads on without it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
+
+from building.api import documented, index_of_names, readable
+from building.results import results_table
+
+HERE = re.compile(r"^<!-- here: ([a-z-]+) ?(.*?) ?-->$", re.MULTILINE)
+ROOT = Path(__file__).parents[2]
+
+
+def _other_pages(*known: str) -> str:
+    """The pages in docs/ that no page of the site's map names."""
+    text = (ROOT / "docs" / "index.md").read_text()
+    named = set(re.findall(r"^(?:.*<)?(?:/docs/)?([a-z_0-9/]+)>?$", text, re.MULTILINE))
+    pages = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
+    others = [name for name in pages if name not in {"index", *named, *known}]
+    if not others:
+        return ""
+    return "\n".join(["```{toctree}", ":hidden:", ":caption: More", *others, "```"])
+
+
+PARTS: dict[str, Callable[..., str]] = {
+    "api": documented,
+    "names": index_of_names,
+    "other-pages": _other_pages,
+    "results": results_table,
+}
+
+
+def _expand(app: Sphinx, docname: str, source: list[str]) -> None:
+    del app
+
+    def part(match: re.Match[str]) -> str:
+        name, arguments = match[1], match[2].split()
+        if name not in PARTS:
+            raise ExtensionError(f"{docname}: found <!-- here: {name} -->, known: {list(PARTS)}")
+        return PARTS[name](*arguments)
+
+    if docname.startswith("docs/"):
+        source[0] = HERE.sub(part, source[0])
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Tell Sphinx of it."""
+    app.connect("source-read", _expand)
+    app.connect("autodoc-process-docstring", readable, priority=900)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,79 @@
+"""The documentation site: `make docs` builds it, offline, with warnings as errors.
+
+The sources are the repository's own folders (docs, notebooks, reports of studies), so that a
+relative link means the same on the site as in the tree.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE), str(HERE.parent)]
+
+project = "casadi_ik"
+author = "The casadi_ik developers"
+copyright = author  # noqa: A001  (Sphinx's own name)
+root_doc = "docs/index"
+language = "en"
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "myst_nb",
+    "sphinx_copybutton",
+    "building.mathml",
+    "building.pages",
+]
+include_patterns = [
+    "docs/**.md",
+    "notebooks/*.ipynb",
+    "studies/results/**.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    "CHANGELOG.md",
+]
+exclude_patterns = [".*", "**/.*", "out", "build", "dist", "casadi_ik", "models", "tests"]
+
+# Notebooks are executed by the tests; here they are shown as they were stored.
+nb_execution_mode = "off"
+nb_merge_streams = True
+myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+myst_dmath_double_inline = True
+
+# `name` in a docstring is a link where it is a public name, and code where not.
+default_role = "py:obj"
+nitpicky = True
+nitpick_ignore_regex = [("py:obj", r".*"), ("py:class", r".*"), ("py:data", r".*")]
+autodoc_member_order = "bysource"
+autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+python_maximum_signature_line_length = 80
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False
+add_module_names = False
+
+html_title = "casadi_ik"
+html_theme = "furo"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_extra_path = ["extra"]
+html_copy_source = False
+html_show_sphinx = False
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
+html_theme_options = {
+    "light_css_variables": {
+        "color-brand-primary": "#0b5c8a",
+        "color-brand-content": "#0b6aa2",
+    },
+    "dark_css_variables": {
+        "color-brand-primary": "#6cc3f5",
+        "color-brand-content": "#6cc3f5",
+    },
+}
+html_math_renderer = "mathml"

@@ -1,0 +1,201 @@
+"""The schemas that editors use say what the readers accept, no more and no less."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+
+import casadi_ik as ik
+from casadi_ik.cli.main import main
+from casadi_ik.cli.schemas import FILES, schema_of
+from casadi_ik.errors import DescriptionError
+from casadi_ik.files.reading import convert
+from casadi_ik.files.units import check_units, in_si
+from casadi_ik.robots.load import _imports
+from casadi_ik.robots.schema import ArmHandFile, ImportedFile
+
+ROOT = Path(__file__).parents[2]
+MODELS = ROOT / "models"
+FOLDERS = {
+    "robot": "arm_hands",
+    "arm": "arms",
+    "hand": "hands",
+    "grasp": "grasps",
+    "object": "objects",
+    "scene": "scenes",
+}
+HAND = {"file": "h.urdf", "palm": {"link": "p", "xyz": ["1 mm", 0, 0]}, "locked": {"a": "3 deg"}}
+EXAMPLES: dict[str, Any] = {
+    "robot": {
+        "name": "mine",
+        "arm": {"file": "a.urdf", "tip": "flange", "limits": {"j": ["-90 deg", 1.5]}},
+        "hand": HAND,
+        "mount": {"xyz": [0, 0, "95 mm"]},
+        "thumb": "t",
+        "fingers": {"t": {"link": "l", "xyz": ["12 mm", 0, 0], "normal": [1, 0, 0]}},
+        "home": {"j": "20 deg"},
+        "collision": {
+            "links": {
+                "l": [
+                    {"kind": "capsule", "ends": [[0, 0, 0], [0, 0, "5 cm"]], "radius": "9 mm"},
+                    {"kind": "box", "size": [1, 1, 1], "rpy": [0, "90 deg", 0]},
+                ]
+            },
+            "touching": [{"links": ["l", "p"], "reason": "always", "depth": "3 mm"}],
+        },
+    },
+    "candidates": {
+        "object": {"name": "cup", "pose": {"xyz": [0, 0, "1 m"]}},
+        "candidates": [{"contacts": {"t": {"point": [0, 0, 1], "normal": [0, 0, 1]}}}],
+    },
+    "scene": {
+        "margin": "2 mm",
+        "solids": {
+            "post": {"kind": "cylinder", "radius": "2 cm", "length": 1, "margin": None},
+            "wall": {"kind": "half-space", "rpy": ["90 deg", 0, 0]},
+            "part": {"kind": "mesh", "file": "part.stl", "scale": 0.001},
+            "cup": {"kind": "object", "object": "cup"},
+            "rock": {"kind": "convex", "points": [[0, 0, "1 mm"], [1, 1, 1]]},
+        },
+        "grasped": "cup",
+        "margins": [{"links": ["a", "b"], "margin": "5 mm"}],
+    },
+    "retarget": {"fingers": {"t": 4}, "rpy": [0, 0, "90 deg"], "low_pass": 0.3},
+}
+
+
+@cache
+def checker(kind: str) -> jsonschema.Draft7Validator:
+    schema = schema_of(kind)
+    jsonschema.Draft7Validator.check_schema(schema)
+    return jsonschema.Draft7Validator(schema)
+
+
+def reads(kind: str, data: Any) -> bool:
+    """What the reader of that kind of file says."""
+    type_ = FILES[kind][0]
+    if kind == "robot":
+        type_ = ImportedFile if _imports(data) else ArmHandFile
+    try:
+        convert(in_si(data), type_, Path("file"))
+        check_units(data, type_, Path("file"))
+    except DescriptionError:
+        return False
+    return True
+
+
+def shipped(kind: str) -> list[Path]:
+    return sorted((MODELS / FOLDERS[kind]).glob("*.yaml"))
+
+
+def loaded(path: Path) -> Any:
+    return yaml.load(path.read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+
+
+def small(value: Any) -> Any:
+    """The same with one mapping of a list, and without shapes, which an example has."""
+    if isinstance(value, dict):
+        return {key: small(item) for key, item in value.items() if key != "collision"}
+    if isinstance(value, list):
+        return [small(item) for item in value[: 1 if isinstance(value[0], dict) else 3]]
+    return value
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where anything stands in nested data; of long lists the first item speaks for all."""
+    if path:
+        yield path
+    items = value.items() if isinstance(value, dict) else ()
+    if isinstance(value, list):
+        items = list(enumerate(value))[:1]
+    for key, item in items:
+        yield from places(item, (*path, key))
+
+
+def changed(data: Any, path: tuple[Any, ...]) -> Iterator[Any]:
+    """The data with what stands at a place left out, renamed, or something else."""
+    *way, last = path
+
+    def copied() -> tuple[Any, Any]:
+        whole = copy.deepcopy(data)
+        inner = whole
+        for key in way:
+            inner = inner[key]
+        return whole, inner
+
+    whole, inner = copied()
+    del inner[last]
+    yield whole
+    if isinstance(last, str):
+        whole, inner = copied()
+        inner[f"{last}_"] = inner.pop(last)
+        yield whole
+    # In which unit a joint's limits are is a matter of its type, which a schema does not see.
+    units = ("1 kg",) if {"limits", "velocity"} & {*path} else ("3 deg", "3 mm", "1 kg")
+    for other in ("some text", *units, 0.5, None, [1, 2], {"some": "mapping"}):
+        whole, inner = copied()
+        inner[last] = other
+        yield whole
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_stored_schemas_are_those_of_the_types(kind: str) -> None:
+    stored = json.loads((MODELS / "schemas" / f"{kind}.json").read_text())
+    assert stored == json.loads(json.dumps(schema_of(kind)))
+
+
+def test_the_command_writes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["schemas", "--out", str(tmp_path / "new")]) == 0
+    assert sorted(path.stem for path in (tmp_path / "new").iterdir()) == sorted(FILES)
+    assert "grasp.json" in capsys.readouterr().out.replace("\n", "")
+    (tmp_path / "file").write_text("")
+    assert main(["schemas", "--out", str(tmp_path / "file")]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_shipped_files_validate(kind: str) -> None:
+    assert shipped(kind)
+    for path in shipped(kind):
+        errors = list(checker(kind).iter_errors(loaded(path)))
+        assert not errors, f"{path}: {errors[0].message}"
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_schema_and_reader_agree(kind: str) -> None:
+    """Every key left out, misspelt, or with another value: both take it, or neither does."""
+    some = [EXAMPLES[kind]] if kind in EXAMPLES else []
+    if kind in FOLDERS:
+        smallest = min(shipped(kind), key=lambda path: path.stat().st_size)
+        some.append(small(loaded(smallest)))
+    taken = refused = 0
+    for data in some:
+        assert reads(kind, data)
+        assert checker(kind).is_valid(data)
+        for path in places(data):
+            for other in changed(data, path):
+                expected = reads(kind, other)
+                assert checker(kind).is_valid(other) == expected, (path, other)
+                taken, refused = taken + expected, refused + (not expected)
+    assert taken > 10
+    assert refused > 30
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_every_key_is_explained(kind: str) -> None:
+    for name, one in schema_of(kind)["definitions"].items():
+        for key, said in one.get("properties", {}).items():
+            assert "const" in said or said.get("description"), f"{name}.{key}"
+
+
+def test_every_file_of_the_catalogue_is_of_a_kind() -> None:
+    for folder in FOLDERS.values():
+        assert ik.shipped_names(folder)
