@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.collision_report import CollisionReport, Pair
@@ -69,6 +70,23 @@ class Solution:
     closest: Pair | None = None
     collision: CollisionReport | None = None
     palm: PalmVerdict | None = None
+
+    def view(self, robot: ArmHand | None = None, **options: Any) -> Any:
+        """Show it in the browser, and in a notebook; needs the extra `view`.
+
+        Args:
+            robot: The robot that was solved for; None: the shipped one of that name.
+            options: As `casadi_ik.viewing.view_grasp` has them; `grasp` is what was asked for
+                (without it the contacts that are reached are shown), `scene` what stands about.
+
+        Returns:
+            The running `casadi_ik.viewing.Viewer`.
+
+        Raises:
+            MissingExtraError: viser is not installed.
+            UnknownNameError: No shipped robot has that name: give the robot.
+        """
+        return (robot or load_robot(self.robot)).view(self.q, **options)
 
 
 @dataclass(frozen=True, eq=False)

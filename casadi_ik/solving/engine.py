@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -130,6 +131,12 @@ class Engine:
             UnsupportedError: The method is not hand-first.
         """
         return FreeFinder(self.finder, self.compiled)
+
+    def about(self, check: SceneCheck) -> Engine:
+        """The engine with another scene; all that was worked out for the robot stays."""
+        other = copy(self)
+        vars(other).update(check=check, _others=type(self)._others.func(other))
+        return other
 
     def around(self, problems: Problems) -> Surroundings | None:
         """What targets are checked against; None: nothing."""
