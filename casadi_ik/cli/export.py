@@ -36,7 +36,8 @@ def export(arguments: argparse.Namespace) -> Answer:
     check_folder(arguments.out)
     robot = load_robot(arguments.robot)
     prefix = checked_prefix(arguments.prefix, robot.name)
-    files = (wasm_project if arguments.target == "wasm" else c_project)(robot, prefix)
+    made = wasm_project if arguments.target == "wasm" else c_project
+    files = made(robot, prefix, arguments.scene)
     write_folder(arguments.out, files)
     size = sum(len(content) for content in files.values())
     pairs = {

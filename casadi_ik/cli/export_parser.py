@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from casadi_ik.cli.values import one_of
+from casadi_ik.cli.values import one_of, whole
 
 if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
@@ -19,7 +19,9 @@ examples:
 DIR becomes a project that needs nothing but a C compiler (--target wasm: a browser or node):
 library, header, example, a test of 1,000 stored targets, a benchmark, README. It solves one target
 at a time, in doubles; its answers are bit for bit those of this package. An earlier export in DIR
-is replaced; any other folder that is not empty is refused.
+is replaced; any other folder that is not empty is refused. With --scene, being solved includes
+that nothing touches; where the answer does, the other ways are looked at in which the arm can hold
+the hand (other hands are not).
 
 exit codes: 0 written, 2 bad input (nothing is written)
 """
@@ -68,6 +70,12 @@ def add_export(commands: Any) -> None:
         default="c",
         help="plain C (default), or a WebAssembly module for JavaScript (needs "
         "casadi-ik[compiler])",
+    )
+    parser.add_argument(
+        "--scene",
+        metavar="CAPACITY",
+        type=whole(1),
+        help="collisions are checked: the robot with itself, and with so many solids at most",
     )
     parser.set_defaults(run=_export)
     parser = commands.add_parser(

@@ -12,6 +12,8 @@ from pathlib import Path
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.exporting.scene import SceneSources
+from casadi_ik.exporting.scene_targets import IN_TEST_C, SceneTargets
 from casadi_ik.exporting.solver import SolverSources, hand_first
 from casadi_ik.exporting.targets import COUNT, Example, example, targets_header, written
 from casadi_ik.exporting.template import filled
@@ -75,15 +77,17 @@ class Exported:
         example: What the example solves.
         marks: What stands for the marks of the templates.
         sources: Headers and C files by path.
+        scene: What its targets are solved in; None: the export knows no scene.
     """
 
     solver: Solver
     example: Example
     marks: dict[str, str]
     sources: dict[str, str]
+    scene: SceneTargets | None
 
 
-def exported(robot: ArmHand, prefix: str) -> Exported:
+def exported(robot: ArmHand, prefix: str, capacity: int | None = None) -> Exported:
     """The solver of a robot as source code.
 
     Raises:
@@ -95,7 +99,9 @@ def exported(robot: ArmHand, prefix: str) -> Exported:
             "export: its test needs answers from compiled code, and there is no C compiler here; "
             "pip install 'casadi-ik[compiler]' brings one"
         )
-    sources = SolverSources(robot, method, prefix, next(iter(solver.tolerances.values())))
+    scene = None if capacity is None else SceneSources.of(robot, method, prefix, capacity)
+    tolerance = next(iter(solver.tolerances.values()))
+    sources = SolverSources(robot, method, prefix, tolerance, scene)
     shown = example(robot)
     marks = sources.substitutes | {
         "EXAMPLE_WHAT": shown.what,
@@ -111,16 +117,26 @@ def exported(robot: ArmHand, prefix: str) -> Exported:
         f"src/{prefix}_tables.c": sources.tables(),
         **{f"src/{prefix}_{part.name}.c": part.text for part in sources.parts},
     }
-    return Exported(solver, shown, marks, files)
+    if scene is not None:
+        files[f"src/{prefix}_scene.c"] = scene.source()
+    about = None if capacity is None else SceneTargets(solver, capacity)
+    return Exported(solver, shown, marks, files, about)
 
 
-def c_project(robot: ArmHand, prefix: str) -> dict[str, str | bytes]:
+def tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
+    """What a test has in addition where there is a scene."""
+    if project.scene is None:
+        return dict.fromkeys(pieces, "")
+    return {name: piece.replace("@P", project.marks["PREFIX"]) for name, piece in pieces.items()}
+
+
+def c_project(robot: ArmHand, prefix: str, capacity: int | None = None) -> dict[str, str | bytes]:
     """The files of a project in C, by path.
 
     Raises:
         UnsupportedError: The robot's solver cannot be exported.
     """
-    project = exported(robot, prefix)
+    project = exported(robot, prefix, capacity)
     files = {
         f"include/{prefix}.hpp": "solver.hpp",
         "example/main.c": "main.c",
@@ -130,10 +146,11 @@ def c_project(robot: ArmHand, prefix: str) -> dict[str, str | bytes]:
         "Makefile": "Makefile",
         "README.md": "README.md",
     }
+    marks = project.marks | tested(project, IN_TEST_C)
     return {
         **project.sources,
-        **{path: filled(name, project.marks) for path, name in files.items()},
-        "test/targets.h": targets_header(project.solver),
+        **{path: filled(name, marks) for path, name in files.items()},
+        "test/targets.h": targets_header(project.solver, project.scene),
     }
 
 

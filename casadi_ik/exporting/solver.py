@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,17 +12,19 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.exporting.generated import standing_alone
+from casadi_ik.exporting.scene import SceneSources, without_scene
 from casadi_ik.exporting.template import filled
 from casadi_ik.kernels import FunctionKernel, LoopKernel
-from casadi_ik.kernels.codegen import define, driver_text
+from casadi_ik.kernels.codegen import define, driver_text, row_major
 from casadi_ik.kernels.constants import define_arrays
+from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.lookup import TILE
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.rounds import RoundsPlan, source_text
 from casadi_ik.methods.registry import build_method
 from casadi_ik.problem.problems import Problems, Tolerance
 
-SIGNATURE = re.compile(r"EXPORT int casadi_ik_\w+\((\w+) \*job\)")
+SIGNATURE = re.compile(r"EXPORT (?:LANES_TARGET )?int casadi_ik_\w+\((\w+) \*job\)")
 
 
 @dataclass(frozen=True)
@@ -51,12 +53,14 @@ class SolverSources:
         method: Hand-first for it.
         prefix: What every name in it begins with.
         tolerance: When a contact counts as reached, unless set otherwise.
+        scene: What it knows of collisions; None: nothing.
     """
 
     robot: ArmHand
     method: HandFirstMethod
     prefix: str
     tolerance: Tolerance
+    scene: SceneSources | None = None
 
     @cached_property
     def plan(self) -> RoundsPlan:
@@ -72,7 +76,7 @@ class SolverSources:
         # The record of an iteration is never asked for.
         loop = define(plan.solve.constants | {"N_RECORD": 0, "ROW_BYTES": 0})
         loop += "#define store_row(record, row) ((void) (record), (void) (row))\n"
-        return (
+        parts = (
             self._part("look_up", "lookup", lookup.key, define(lookup.constants), rows + TILE),
             self._part("begin", "map", plan.begin),
             self._part("solve", "loop", plan.solve, loop, 2 * n_state),
@@ -80,21 +84,36 @@ class SolverSources:
             self._part("valley", "map", plan.hands.valley),
             self._part("judge", "map", plan.judge),
         )
+        return parts + self._scene_parts()
+
+    def _scene_parts(self) -> tuple[Part, ...]:
+        scene = self.scene
+        if scene is None:
+            return ()
+        placed, constants, room = scene.near
+        near = self._part("near", "clearance", placed, constants, room)
+        place = filled("place.c", {"PREFIX": self.prefix})
+        parts = (replace(near, text=near.text + place),)
+        if scene.arms is not None:
+            parts += (self._part("palm", "map", scene.palm), self._part("arms", "map", scene.arms))
+        return parts
 
     def _part(
         self,
         name: str,
         driver: str,
-        kernel: FunctionKernel | LoopKernel,
+        kernel: FunctionKernel | LoopKernel | FunctionGraph,
         constants: str = "",
         extra: int = 0,
     ) -> Part:
-        function: Any = kernel.function
+        of_graph = isinstance(kernel, FunctionGraph)
+        function: Any = row_major(kernel.function) if of_graph else kernel.function
         if driver == "map":
-            constants = define(kernel.constants)
+            constants = define({"N_IN": function.n_in(), "N_OUT": function.n_out()})
         if driver == "lookup":
             extra += function.numel_out(0)
-        text = driver_text("marks") if driver == "loop" else ""
+        before = {"loop": "marks", "clearance": "lanes_alone"}.get(driver)
+        text = driver_text(before) if before else ""
         text += driver_text(driver)
         # In Python a driver has its memory from the heap; here it is handed to it.
         own = f"int {self.prefix}_{name}_kernel(\\1 *job, {self.prefix}_memory *memory)"
@@ -120,6 +139,7 @@ class SolverSources:
         robot, sizes = self.robot, self.plan.sizes
         w, arg, res, iw = (max(sizes) for sizes in zip(*(p.work for p in self.parts), strict=True))
         jobs = "".join(driver_text(f"{name}_job") for name in ("loop", "map", "lookup"))
+        jobs += self.scene.jobs() if self.scene else ""
         parts = "".join(
             f"int {self.prefix}_{p.name}_kernel({p.job} *job, {self.prefix}_memory *memory);\n"
             for p in self.parts
@@ -128,7 +148,8 @@ class SolverSources:
             f"#define {p.name.upper()}(work) {self.prefix}_{p.name}_kernel(work, &job->memory)\n"
             for p in self.parts
         )
-        return {
+        about = without_scene() if self.scene is None else self.scene.substitutes()
+        return about | {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
             "ROBOT": plain(robot.name),

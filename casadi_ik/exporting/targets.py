@@ -10,6 +10,7 @@ import numpy as np
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.exporting.scene_targets import SceneTargets
 from casadi_ik.grasps.load import load_grasp, shipped_grasps
 from casadi_ik.kernels.constants import number, numbers
 
@@ -50,7 +51,7 @@ def example(robot: ArmHand) -> Example:
     return Example("Solves what the fingertips touch at home.", *robot.contacts(robot.home))
 
 
-def stored(solver: Solver) -> list[dict[str, Any]]:
+def stored(solver: Solver, scene: SceneTargets | None = None) -> list[dict[str, Any]]:
     """`COUNT` targets and the answers to them; q0 None: at home, and far from limits is wanted."""
     robot = solver.robot
     rng = np.random.default_rng(SEED)
@@ -73,26 +74,30 @@ def stored(solver: Solver) -> list[dict[str, Any]]:
                 "iterations": int(batch.iterations[i]),
                 "restarts": int(batch.restarts[i]),
             }
-    return found
+    return found if scene is None else [scene.answered(target) for target in found]
 
 
-def targets_header(solver: Solver) -> str:
+def targets_header(solver: Solver, scene: SceneTargets | None = None) -> str:
     """A C header with the `stored` targets."""
     robot = solver.robot
     f, n = len(robot.fingers), len(robot.actuators)
     rows = []
-    for target in stored(solver):
+    for target in stored(solver, scene):
         whole = (target["q0"] is not None, *(target[name] for name in WHOLE))
         q0 = target["q0"] or robot.home.tolist()
         arrays = map(numbers, (target["points"], target["normals"], q0, target["q"]))
+        if scene is not None:
+            clearance = target["clearance"]
+            arrays = (*arrays, "NAN" if clearance is None else number(clearance))
         rows.append("{" + ", ".join([*(str(int(value)) for value in whole), *arrays]) + "},\n")
     return (
         "/* Targets, and what the Python package answers. */\n"
         f"enum {{ TARGETS = {COUNT} }};\n\n"
         "typedef struct {\n  int near, status, iterations, restarts;\n"
-        f"  double points[{3 * f}], normals[{3 * f}], q0[{n}], q[{n}];\n}} target;\n\n"
+        f"  double points[{3 * f}], normals[{3 * f}], q0[{n}], q[{n}];\n"
+        f"{'' if scene is None else '  double clearance;' + chr(10)}}} target;\n\n"
         "static const target targets[TARGETS] = {\n" + "".join(rows) + "};\n"
-    )
+    ) + ("" if scene is None else "\n" + scene.header())
 
 
 def written(array: Array) -> str:

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import KernelError, MissingExtraError
-from casadi_ik.exporting.project import Exported, exported
+from casadi_ik.exporting.project import Exported, exported, tested
+from casadi_ik.exporting.scene_targets import IN_TEST_MJS
 from casadi_ik.exporting.targets import stored
 from casadi_ik.exporting.template import filled
 
@@ -22,7 +23,9 @@ COMMAND = (
 )
 
 
-def wasm_project(robot: ArmHand, prefix: str) -> dict[str, str | bytes]:
+def wasm_project(
+    robot: ArmHand, prefix: str, capacity: int | None = None
+) -> dict[str, str | bytes]:
     """The files of a module with its wrapper, by path.
 
     Raises:
@@ -32,14 +35,18 @@ def wasm_project(robot: ArmHand, prefix: str) -> dict[str, str | bytes]:
     """
     if importlib.util.find_spec("ziglang") is None:
         raise MissingExtraError("--target wasm needs ziglang: pip install 'casadi-ik[compiler]'")
-    project = exported(robot, prefix)
-    marks = project.marks | {
-        "LOWER_JSON": json.dumps(robot.lower.tolist()),
-        "UPPER_JSON": json.dumps(robot.upper.tolist()),
-        "HOME_JSON": json.dumps(robot.home.tolist()),
-        "EXAMPLE_POINTS_JSON": _numbers(project.example.points.ravel().tolist()),
-        "EXAMPLE_NORMALS_JSON": _numbers(project.example.normals.ravel().tolist()),
-    }
+    project = exported(robot, prefix, capacity)
+    marks = (
+        project.marks
+        | tested(project, IN_TEST_MJS)
+        | {
+            "LOWER_JSON": json.dumps(robot.lower.tolist()),
+            "UPPER_JSON": json.dumps(robot.upper.tolist()),
+            "HOME_JSON": json.dumps(robot.home.tolist()),
+            "EXAMPLE_POINTS_JSON": _numbers(project.example.points.ravel().tolist()),
+            "EXAMPLE_NORMALS_JSON": _numbers(project.example.normals.ravel().tolist()),
+        }
+    )
     files = {
         f"{prefix}.js": "solver.js",
         f"{prefix}.d.ts": "solver.d.ts",
@@ -48,10 +55,12 @@ def wasm_project(robot: ArmHand, prefix: str) -> dict[str, str | bytes]:
         "README.md": "README_wasm.md",
     }
     package = {"name": prefix, "type": "module", "main": f"{prefix}.js"}
+    about = {} if project.scene is None else {"scene.json": project.scene.json()}
     return {
+        **about,
         **{path: filled(name, marks) for path, name in files.items()},
         "package.json": json.dumps(package) + "\n",
-        "targets.json": json.dumps(stored(project.solver)) + "\n",
+        "targets.json": json.dumps(stored(project.solver, project.scene)) + "\n",
         f"{prefix}.wasm": _module(project),
     }
 

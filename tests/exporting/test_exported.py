@@ -10,10 +10,13 @@ from pathlib import Path
 
 import pytest
 
+import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.exporting.generated import standing_alone
 from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
+from casadi_ik.exporting.scene_targets import SceneTargets
 from casadi_ik.exporting.solver import plain
+from casadi_ik.exporting.targets import stored
 
 STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -27,9 +30,17 @@ needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 
 @pytest.fixture(scope="module")
 def project(robot, tmp_path_factory) -> Path:
-    """The project of the shipped robot."""
+    """The project of the shipped robot, with a scene."""
     out = tmp_path_factory.mktemp("exported") / "solver"
-    write_folder(out, c_project(robot, "arm"))
+    write_folder(out, c_project(robot, "arm", 8))
+    return out
+
+
+@pytest.fixture(scope="module")
+def plain_project(tmp_path_factory) -> Path:
+    """The project of a hand, without a scene."""
+    out = tmp_path_factory.mktemp("exported") / "hand"
+    write_folder(out, c_project(ik.load_robot("ar10"), "arm"))
     return out
 
 
@@ -48,7 +59,7 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
         compiled(project, *SANITIZERS, text, *objects, "-o", program, "-lm")
     done = subprocess.run([project / "stored"], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "1000 targets, 990 solved" in done.stdout
+    assert "1000 targets, 386 solved" in done.stdout
     shown = subprocess.run([project / "shown"], capture_output=True, text=True)
     assert shown.returncode == 0
     assert "solved after" in shown.stdout
@@ -63,8 +74,21 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
     assert foreign <= LIBM | COMPILERS
 
 
+def test_in_a_scene_arms_swing_out_of_the_way(robot):
+    """Or the comparison of stored answers would say nothing of the choice among arms."""
+    solver = ik.Solver(robot)
+    targets = SceneTargets(solver, 8)
+    before = stored(solver)[:200]
+    after = [targets.answered(target) for target in before]
+    moved = [b["q"] != a["q"] for b, a in zip(before, after, strict=True)]
+    assert sum(moved) > 20
+    ends = {ik.Status(target["status"]).name for target in after}
+    assert {"SOLVED", "COLLISION"} <= ends
+
+
 @needs_gcc
-def test_no_state_outside_the_struct(project):
+def test_no_state_outside_the_struct(plain_project):
+    project = plain_project
     compiled(project, "-O1", "-c", "src/arm_look_up.c", "src/arm_solver.c", "src/arm_valley.c")
     listed = subprocess.run(
         ["nm", "-P", "arm_look_up.o", "arm_solver.o", "arm_valley.o"],
@@ -111,6 +135,8 @@ def test_module_in_node(tmp_path, capsys):
     [
         (["--method", "ipopt"], "'ipopt' cannot be exported, expected one of hand-first"),
         (["--prefix", "2nd arm"], "--prefix: found '2nd arm', expected"),
+        (["--scene", "0"], "--scene: found '0', expected a whole number >= 1"),
+        (["--scene", "2000"], "--scene: found 2000, expected at most 1000 solids"),
         (["--target", "fpga"], "--target: found 'fpga', expected one of c, wasm"),
     ],
 )

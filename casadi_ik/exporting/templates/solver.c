@@ -15,12 +15,13 @@ typedef @PREFIX@_solver rounds;
 const char *const @PREFIX@_finger_names[] = {@FINGER_NAMES@};
 const char *const @PREFIX@_motor_names[] = {@MOTOR_NAMES@};
 
+@SCENE_LOOK@
 void @PREFIX@_init(@PREFIX@_solver *solver) {
   memset(solver, 0, sizeof *solver);
   memcpy(solver->terms, TERMS, sizeof TERMS);
   solver->rounds = ROUNDS;
   solver->status = @GUARD@_BAD_INPUT;
-}
+@SCENE_INIT@}
 
 void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, double position, double angle) {
   int i;
@@ -47,7 +48,9 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const double *points, const double *
 }
 
 int @PREFIX@_run(@PREFIX@_solver *solver, int64_t iterations) {
+  const int under_way = solver->status == @GUARD@_RUNNING;
   if (rounds_run(solver, iterations) != DONE) solver->status = @GUARD@_INVALID;
+  if (under_way && solver->status == @GUARD@_SOLVED) look_about(solver);
   return (int) solver->status;
 }
 

@@ -38,20 +38,20 @@ enum {
 extern const char *const @PREFIX@_finger_names[@GUARD@_FINGERS];
 extern const char *const @PREFIX@_motor_names[@GUARD@_MOTORS];
 extern const double @PREFIX@_lower[@GUARD@_MOTORS], @PREFIX@_upper[@GUARD@_MOTORS];
-
+@SCENE_TYPES@
 /* Room that the parts of a solver work in, one after the other. */
 typedef struct {
   double w[@W@];
   const double *arg[@ARG@];
   double *res[@RES@];
   long long int iw[@IW@];
-} @PREFIX@_memory;
+@SCENE_ROOM@} @PREFIX@_memory;
 
 /* A solver. Read the answer: q, position_error, angle_error, beyond (by how much the worst motor or
  * joint is beyond its limits, negative within), iterations, restarts, status. Leave the rest. */
 typedef struct {
 @STRUCT@
-  @PREFIX@_memory memory;
+@SCENE_FIELDS@  @PREFIX@_memory memory;
 } @PREFIX@_solver;
 
 /* Makes a solver ready: tolerances @POSITION_TOLERANCE@ m and @ANGLE_TOLERANCE@ rad, the robot's limits. */
@@ -83,7 +83,7 @@ int @PREFIX@_solve(@PREFIX@_solver *solver, const double *points, const double *
 /* Where the fingertips are and which way they face: three numbers a finger each. The solver's
  * memory is used, nothing else of it. */
 void @PREFIX@_contacts(@PREFIX@_solver *solver, const double *q, double *points, double *normals);
-
+@SCENE_CALLS@
 #ifdef __cplusplus
 }
 #endif

@@ -6,7 +6,7 @@ export const motors = Object.freeze([@MOTOR_NAMES@]);
 export const lower = Object.freeze(@LOWER_JSON@);
 export const upper = Object.freeze(@UPPER_JSON@);
 export const home = Object.freeze(@HOME_JSON@);
-
+@SCENE_SHAPES_JS@
 export const Status = Object.freeze({
   BAD_INPUT: -2,
   INVALID: -1,
@@ -14,7 +14,7 @@ export const Status = Object.freeze({
   SOLVED: 1,
   STALLED: 2,
   ITERATION_LIMIT: 3,
-});
+@SCENE_STATUS_JS@});
 
 async function compiled(source) {
   if (source instanceof WebAssembly.Module) return source;
@@ -87,7 +87,7 @@ export class Solver {
     this._wasm.contacts();
     return { points: this._points.slice(), normals: this._normals.slice() };
   }
-
+@SCENE_JS@
   _ask(points, normals, q0) {
     filled(this._points, points, "points");
     filled(this._normals, normals, "normals");
@@ -102,6 +102,6 @@ export class Solver {
       angleError: this._angleError.slice(),
       iterations: this._wasm.iterations(),
       restarts: this._wasm.restarts(),
-    };
+@SCENE_ANSWER_JS@    };
   }
 }

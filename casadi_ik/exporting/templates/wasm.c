@@ -42,3 +42,4 @@ void set_tolerance(int finger, double position, double angle) {
 void set_range(int motor, double lower, double upper) {
   @PREFIX@_set_range(&solver, motor, lower, upper);
 }
+@SCENE_WASM@

@@ -112,7 +112,7 @@ static LANES_TARGET lanes lowest(const clearance_job *job, const solid *one, vec
     bound = left.value + left.slope * (meet - low);
     /* What a lane comes to does not depend on how long the others take. */
     found = lanes_select(over, found, smaller(bound, best));
-    over |= ~inner | (best - bound < SPREAD(CLOSE));
+    over |= lanes_not(inner) | (best - bound < SPREAD(CLOSE));
     if (cut == MOST_CUTS || lanes_all(over)) break;
     /* Where the tangents meet; every third time the middle, since flat ends creep. */
     t = cut % 3 == 2 ? (low + high) * 0.5 : smaller(larger(meet, low), high);
@@ -214,7 +214,7 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
       }
       if (job->every) {
         for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
-          job->every[(job->next + lane) * job->n_pairs + pair] = distance[lane];
+          job->every[(job->next + lane) * job->n_pairs + pair] = lanes_at(distance, lane);
         }
       }
       nearer = distance < least;
@@ -226,8 +226,8 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
       }
     }
     for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
-      job->least[job->next + lane] = least[lane];
-      job->closest[job->next + lane] = (int64_t) who[lane];
+      job->least[job->next + lane] = lanes_at(least, lane);
+      job->closest[job->next + lane] = (int64_t) lanes_at(who, lane);
     }
   }
   give_back(&space);

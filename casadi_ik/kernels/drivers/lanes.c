@@ -34,6 +34,8 @@ typedef int64_t lane_mask __attribute__((vector_size(LANES * sizeof(double))));
 #endif
 #define TRUTH(mask) ((lanes) ((lane_mask) (mask) & (lane_mask) SPREAD(1.0)))
 #define IS(x) ((lane_mask) ((x) != SPREAD(0.0)))
+#define lanes_not(mask) (~(mask))
+#define lanes_at(x, lane) ((x)[lane])
 
 LANES_INLINE lanes lanes_select(lane_mask mask, lanes yes, lanes no) {
   return (lanes) ((mask & (lane_mask) yes) | (~mask & (lane_mask) no));

@@ -5,29 +5,37 @@
  * one is free. Places about that one are then looked at in the same way, on its branch only. Where
  * nothing is free, places between the given ones are looked at before the hand is given up.
  *
- * The compiled kernels are called by pointers.
+ * The compiled kernels are called by pointers. A solver that stands alone (FREESTANDING) says how,
+ * and where the memory is: KERNEL, CALL, ROOM, GIVE_BACK, OWN_MEMORY.
  */
 #include <math.h>
 #include <stdint.h>
-#include <stdlib.h>
 #include <string.h>
 
+#ifndef FREESTANDING
+#include <stdlib.h>
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
 #else
 #define EXPORT __attribute__((visibility("default")))
 #endif
-
 enum { DONE = 0, SLICE_OVER = 1, NO_MEMORY = -1 };
+#define KERNEL(name, work) int (*name)(work *)
+#define CALL(kernel, work) kernel(work)
+#define ROOM(bytes) calloc(bytes, 1)
+#define GIVE_BACK(room) free(room)
+#define OWN_MEMORY
+#endif
+
 enum { FAR_FROM_LIMITS, NEAR_START, MEASURED, CLEAREST };
 enum { PALM = 12, LEVELS = 2 };
 
 #define TURN 6.283185307179586
 
 typedef struct {
-  int (*arms)(map_job *);      /* rotation, origin, freedom -> the arm of every side, their slacks */
-  int (*measure)(map_job *);   /* q -> how good it is; for MEASURED */
-  int (*check)(clearance_job *);
+  KERNEL(arms, map_job);       /* rotation, origin, freedom -> the arm of every side, their slacks */
+  KERNEL(measure, map_job);    /* q -> how good it is; for MEASURED */
+  KERNEL(check, clearance_job);
   clearance_job *clear;        /* what is checked; NULL: nothing is */
   int64_t lanes;               /* configurations that are checked side by side */
   int64_t order;
@@ -51,6 +59,7 @@ typedef struct {
   double *chosen;              /* rows of n_groups arms */
   double *score;               /* rows of n_groups: of the arm alone; -inf: there is none */
   int64_t *tried;              /* arms within bounds */
+  OWN_MEMORY
 } swings_job;
 
 /* Arms that were found, and what becomes of them. */
@@ -65,7 +74,6 @@ typedef struct {
   pool all, near;
   double *samples, *rows, *least;
   int64_t *closest, *picked;
-  void *memory;
 } scratch;
 
 static int64_t most_arms(const swings_job *job, int near) {
@@ -74,16 +82,21 @@ static int64_t most_arms(const swings_job *job, int near) {
   return places * job->n_sides + 1;
 }
 
-static int lay_out(const swings_job *job, scratch *space) {
-  const int64_t sides = job->n_sides, wide = job->n_arm + 1;
+static int64_t more_arms(const swings_job *job) {
+  return most_arms(job, 0) > most_arms(job, 1) ? most_arms(job, 0) : most_arms(job, 1);
+}
+
+static size_t room(const swings_job *job) {
+  const int64_t wide = job->n_arm + 1, most = more_arms(job);
+  const int64_t numbers = 2 * most * (wide + 4) + most * (PALM + job->n_free)
+                        + (most + job->lanes) * job->n_q + 3 * job->lanes;
+  return (size_t) numbers * sizeof(double) + 2 * (size_t) most;
+}
+
+static void lay_out(const swings_job *job, scratch *space, char *next) {
+  const int64_t wide = job->n_arm + 1, most = more_arms(job);
   pool *pools[] = {&space->all, &space->near};
-  const int64_t most = most_arms(job, 0) > most_arms(job, 1) ? most_arms(job, 0) : most_arms(job, 1);
-  const size_t numbers = (size_t) (2 * most * (wide + 4) + most * (PALM + job->n_free)
-                                   + (most + job->lanes) * job->n_q + 3 * job->lanes + 2 * sides);
-  char *next = calloc(numbers * sizeof(double) + 2 * (size_t) most, 1);
   int i;
-  if (!next) return NO_MEMORY;
-  space->memory = next;
 #define TAKE(where, type, size) \
   (where) = (type *) next;      \
   next += (size_t) (size) * sizeof(type)
@@ -103,11 +116,10 @@ static int lay_out(const swings_job *job, scratch *space) {
     TAKE(pools[i]->used, char, most);
   }
 #undef TAKE
-  return DONE;
 }
 
-static int mapped(int (*kernel)(map_job *), const double *in, int64_t wide, double *out,
-                  int64_t wide_out, int64_t count) {
+static int mapped(const swings_job *job, KERNEL(kernel, map_job), const double *in, int64_t wide,
+                  double *out, int64_t wide_out, int64_t count) {
   const double *inputs[1];
   double *outputs[1];
   map_job map = {0};
@@ -120,7 +132,8 @@ static int mapped(int (*kernel)(map_job *), const double *in, int64_t wide, doub
   map.output_steps = &wide_out;
   map.count = count;
   map.slice = 1.0;
-  do code = kernel(&map);
+  (void) job;
+  do code = CALL(kernel, &map);
   while (code == SLICE_OVER);
   return code;
 }
@@ -193,7 +206,7 @@ static int look(const swings_job *job, scratch *space, int64_t hand, pool *to, i
     }
   }
   to->count = 0;
-  code = mapped(job->arms, space->samples, wide, to->found, size, count);
+  code = mapped(job, job->arms, space->samples, wide, to->found, size, count);
   if (code != DONE) return code;
   for (s = 0; s < count; ++s) {
     const double *slack = to->found + s * size + job->n_sides * job->n_arm;
@@ -213,7 +226,8 @@ static int measured(const swings_job *job, scratch *space, int64_t hand, pool *o
   for (i = 0; i < of->count; ++i) {
     configuration(job, hand, of->found + of->arm[i], space->rows + i * job->n_q);
   }
-  return of->count ? mapped(job->measure, space->rows, job->n_q, of->score, 1, of->count) : DONE;
+  if (!of->count) return DONE;
+  return mapped(job, job->measure, space->rows, job->n_q, of->score, 1, of->count);
 }
 
 /* The first in the asked order that is free, of a group, and better than what is there; or -1. */
@@ -254,7 +268,7 @@ static int pick(const swings_job *job, scratch *space, int64_t hand, pool *from,
     clear->closest = space->closest;
     clear->count = count;
     clear->next = 0;
-    do code = job->check(clear);
+    do code = CALL(job->check, clear);
     while (code == SLICE_OVER);
     if (code != DONE) return code;
     for (n = 0; n < count; ++n) {
@@ -330,8 +344,10 @@ static int swing(const swings_job *job, scratch *space, int64_t hand, int level,
 EXPORT int casadi_ik_swings(swings_job *job) {
   scratch space;
   int64_t hand, i;
-  int done = 0, code = lay_out(job, &space);
-  if (code != DONE) return code;
+  char *block = ROOM(room(job));
+  int done = 0, code = DONE;
+  if (!block) return NO_MEMORY;
+  lay_out(job, &space, block);
   for (hand = 0; hand < job->count && code == DONE; ++hand) {
     int level, any = 0;
     job->tried[hand] = 0;
@@ -342,6 +358,6 @@ EXPORT int casadi_ik_swings(swings_job *job) {
     }
     done = any;
   }
-  free(space.memory);
+  GIVE_BACK(block);
   return code;
 }

@@ -85,7 +85,7 @@ class ArmSwings:
         """
         self._robot, self._measure = robot, measure
         self._columns = list(robot.description.arm_actuators)
-        self.places = places = _places(robot, arm)
+        self.places = places = arm_places(robot, arm)
         name = ca.Function.fix_name(f"{robot.name}_all_arms")
         graph = arms_graph(arm, name, recipe(name, robot.description))
         self._arms = MeasureKernel(graph, compiled)
@@ -181,7 +181,8 @@ def _first_hands(swung: Swung, of_one: NDArray[np.intp] | None) -> Swung:
     return Swung(swung.q[kept], swung.owner[kept], tried)
 
 
-def _places(robot: ArmHand, arm: ArmForm) -> ArmPlaces:
+def arm_places(robot: ArmHand, arm: ArmForm) -> ArmPlaces:
+    """Where the arms of a robot are looked at."""
     columns = list(robot.description.arm_actuators)
     sides, first, last = len(SIDES), 0.0, TURN
     swept = True

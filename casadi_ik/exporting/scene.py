@@ -1,0 +1,274 @@
+"""The part of an exported solver that knows what stands about the robot, and the robot itself."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.collision.model import CollisionModel, own_solids
+from casadi_ik.collision.scene import Scene
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.exporting.template import filled
+from casadi_ik.kernels.codegen import define, driver_text
+from casadi_ik.kernels.constants import define_arrays, number
+from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.function_kernel import FunctionKernel
+from casadi_ik.kernels.robot_kernels import RobotKernels
+from casadi_ik.kernels.swing_kernel import ArmPlaces
+from casadi_ik.methods.common.arm_branches import arms_graph
+from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.problem.clearance import ROUNDING, SceneCheck
+from casadi_ik.solving.alternatives.swings import arm_places
+
+MOST = 1000
+"""The largest capacity: each solid costs kilobytes."""
+
+SOLID = re.compile(r"typedef struct \{[^}]*\} solid;\n", re.DOTALL)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSources:
+    """What a scene adds to the sources of a solver.
+
+    Attributes:
+        robot: With shapes.
+        method: Hand-first for it.
+        prefix: What every name begins with.
+        capacity: How many solids may stand about.
+        check: The robot's shapes with itself alone.
+    """
+
+    robot: ArmHand
+    method: HandFirstMethod
+    prefix: str
+    capacity: int
+    check: SceneCheck
+
+    @classmethod
+    def of(
+        cls, robot: ArmHand, method: HandFirstMethod, prefix: str, capacity: int
+    ) -> SceneSources:
+        """Find the pairs.
+
+        Raises:
+            UnsupportedError: The robot has no shapes, or that is too large a scene.
+        """
+        if capacity > MOST:
+            raise UnsupportedError(f"--scene: found {capacity}, expected at most {MOST} solids")
+        return cls(robot, method, prefix, capacity, SceneCheck(robot, Scene()))
+
+    @property
+    def model(self) -> CollisionModel:
+        """The robot's shapes and pairs."""
+        return self.check.model
+
+    @cached_property
+    def places(self) -> ArmPlaces | None:
+        """Where arms are looked at; None where they have no closed form."""
+        arm = self.method.step.arm
+        return None if arm is None else arm_places(self.robot, arm)
+
+    @property
+    def near(self) -> tuple[FunctionKernel, str, int]:
+        """The placing of shapes, its constants, and the numbers that its driver works with."""
+        n, capsules, own = len(self.robot.actuators), len(self.model.capsules), self._own
+        constants = define({"N_Q": n, "N_CAPSULES": capsules, "N_OWN": own})
+        room = n + 6 * capsules + 12 * (own + self.capacity)
+        return self.check.kernel.placed, constants, room
+
+    @property
+    def arms(self) -> FunctionGraph | None:
+        """All arms of a palm; None where they have no closed form."""
+        arm = self.method.step.arm
+        return None if arm is None else arms_graph(arm, "all_arms", "")
+
+    @property
+    def palm(self) -> FunctionKernel:
+        """Where the palm is."""
+        return RobotKernels(self.robot.description).palm
+
+    @property
+    def _own(self) -> int:
+        return len(self.robot.description.shapes.solids)
+
+    @property
+    def _most_pairs(self) -> int:
+        return len(self.model.pairs) + self.capacity * len(self.model.capsules)
+
+    @property
+    def room(self) -> int:
+        """Numbers that the choice among arms works with (`room` of drivers/swings.c)."""
+        if self.places is None:
+            return 1
+        p, n = self.places, len(self.robot.actuators)
+        most = max(*map(len, p.levels), len(p.closer)) * p.sides + 1
+        free, arm = p.levels[0].shape[1], len(p.columns)
+        return 2 * most * (arm + 5) + most * (12 + free) + (most + 1) * n + 3 + (most + 3) // 4
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of all links."""
+        return tuple(self.model.bodies)
+
+    def substitutes(self) -> dict[str, str]:
+        """What stands for the marks that a scene brings."""
+        marks = {
+            "PREFIX": self.prefix,
+            "GUARD": self.prefix.upper(),
+            "CAPACITY": str(self.capacity),
+            "SOLIDS": str(max(self._own + self.capacity, 1)),
+            "PLACED": str(6 * len(self.model.capsules) + 12 * self._own),
+            "CAPSULES": str(len(self.model.capsules)),
+            "OWN_SOLIDS": str(self._own),
+            "LINKS": str(len(self.links)),
+            "ROUNDING": number(ROUNDING),
+            "MOST_PAIRS": str(max(self._most_pairs, 1)),
+            "SCENE_CONSTANTS": self._constants(),
+            "SWINGS": "" if self.places is None else driver_text("swings"),
+            "LINK_NAMES": ", ".join(json.dumps(link, ensure_ascii=False) for link in self.links),
+            "SHAPES_JSON": json.dumps(self.shapes()),
+        }
+        wasm, js, types = (
+            filled(name, marks) for name in ("scene_wasm.c", "scene.js", "scene.d.ts")
+        )
+        return {
+            "SCENE_TYPES": filled("scene_types.h", marks),
+            "SCENE_CALLS": filled("scene_calls.h", marks),
+            "SCENE_FIELDS": (
+                "  double clearance; /* [m], negative: something touches */\n"
+                "  int64_t nearest[2]; /* places in the list of links; -1 - number: a solid */\n"
+                f"  {self.prefix}_scene scene;\n"
+            ),
+            "SCENE_ROOM": f"  double room[{self.room}];\n",
+            "SCENE_LOOK": filled("scene_look.c", marks),
+            "SCENE_INIT": f"  {self.prefix}_scene_init(solver);\n",
+            "SCENE_WASM": wasm,
+            "SCENE_JS": js,
+            "SCENE_DTS": types,
+            "SCENE_SHAPES_JS": filled("scene_shapes.js", marks),
+            "SCENE_SHAPES_DTS": filled("scene_shapes.d.ts", marks),
+            "SCENE_STATUS_TYPE": " | 6",
+            "SCENE_STATUS_JS": "  COLLISION: 6,\n",
+            "SCENE_STATUS_DTS": (
+                "  /** Contacts and limits are met, but something touches. */\n"
+                "  readonly COLLISION: 6;\n"
+            ),
+            "SCENE_ANSWER_JS": (
+                "      clearance: this._wasm.least(),\n      closest: this.closest(),\n"
+            ),
+            "SCENE_ANSWER_DTS": (
+                "  /** Smallest distance [m] and its pair: links, or a link and `solid N`. */\n"
+                "  clearance: number;\n  closest: readonly [string, string] | null;\n"
+            ),
+        }
+
+    def source(self) -> str:
+        """The file of the scene."""
+        marks = {
+            "PREFIX": self.prefix,
+            "GUARD": self.prefix.upper(),
+            "SCENE_CONSTANTS": self._constants(),
+            "SWINGS": "" if self.places is None else driver_text("swings"),
+        }
+        return filled("scene.c", marks)
+
+    def jobs(self) -> str:
+        """What the parts of a solver know of distances."""
+        text, count = SOLID.subn(
+            f"typedef {self.prefix}_solid solid;\n", driver_text("clearance_job")
+        )
+        assert count == 1
+        return text + (
+            f"int {self.prefix}_place_kernel(const double *q, double *places, "
+            f"{self.prefix}_memory *memory);\n"
+            f"void {self.prefix}_scene_init({self.prefix}_solver *solver);\n"
+            f"int {self.prefix}_free({self.prefix}_solver *solver, const double *lower, "
+            "const double *upper, int near, double *q);\n"
+        )
+
+    def shapes(self) -> dict[str, Any]:
+        """The robot's shapes as JSON has them."""
+        shapes = self.robot.description.shapes
+        return {
+            "capsules": [
+                {"link": one.link, "radius": one.radius, "shown": one.covers < 0}
+                for one in self.model.capsules
+            ],
+            "solids": [
+                {"link": one.link, "kind": one.kind, "size": one.size.tolist()}
+                for one in shapes.solids
+            ],
+        }
+
+    def _constants(self) -> str:
+        model, robot = self.model, self.robot
+        links = {name: i for i, name in enumerate(self.links)}
+        own, shapes = own_solids(robot.description), robot.description.shapes.solids
+        touching = self.check.bodies_of_fingers
+        pairs, capsules = model.pairs, model.capsules
+        moving = np.array([one.link in model.moving for one in capsules], dtype=int)
+        crossing = [int(not model.moving.isdisjoint(model.names(i, j))) for i, j in pairs.tolist()]
+        arrays: dict[str, Array] = {
+            "RADII": model.radii,
+            "HALVES": model.halves,
+            "LINK": np.array([links[one.link] for one in capsules]),
+            "FIXED": np.array([int(model.is_fixed(one.link)) for one in capsules]),
+            "MOVING": moving,
+            "TOUCHES": np.array(
+                [[int(one.link in touching[f]) for one in capsules] for f in robot.fingers]
+            ),
+            "PAIRS": pairs if len(pairs) else np.zeros((1, 2), dtype=int),
+            "PAIR_MOVING": np.array(crossing or [0]),
+            "OFFSETS": model.offsets if len(pairs) else np.zeros(1),
+            "OWN_KIND": np.array([int(one.kind) for one in own] or [0]),
+            "OWN_SIZE": np.array([one.size for one in own] or [np.zeros(3)]),
+            "OWN_REACH": np.array([one.reach for one in own] or [0.0]),
+            "OWN_LINK": np.array([links[one.link] for one in shapes] or [0]),
+        }
+        whole = {
+            "N_CAPSULES": len(capsules),
+            "N_OWN": len(own),
+            "N_PAIRS": len(pairs),
+            "HAS_CLOSED_ARM": int(self.places is not None),
+        }
+        text = f"#define ROUNDING {number(ROUNDING)}\n"
+        if self.places is not None:
+            p = self.places
+            whole |= {
+                "N_ARM": len(p.columns),
+                "N_FREE": p.levels[0].shape[1],
+                "N_SIDES": p.sides,
+                "N_PLACES": len(p.levels[0]),
+                "N_MORE_PLACES": len(p.levels[1]),
+                "N_CLOSER": len(p.closer),
+            }
+            text += f"#define ALLOWED {number(p.allowed)}\n"
+            text += f"#define ARM_COLUMNS {{{', '.join(map(str, p.columns.tolist()))}}}\n"
+            arrays |= {
+                "PLACES": p.levels[0].ravel(),
+                "MORE_PLACES": p.levels[1].ravel() if p.levels[1].size else np.zeros(1),
+                "CLOSER": p.closer if len(p.closer) else np.zeros(1),
+                "ARM_LOW": p.low,
+                "ARM_RANGE": p.high - p.low,
+            }
+        return define(whole) + text + define_arrays(arrays)
+
+
+WITHOUT = (
+    *("SCENE_TYPES", "SCENE_CALLS", "SCENE_FIELDS", "SCENE_ROOM", "SCENE_INIT", "SCENE_WASM"),
+    *("SCENE_JS", "SCENE_DTS", "SCENE_SHAPES_JS", "SCENE_SHAPES_DTS", "SCENE_STATUS_JS"),
+    *("SCENE_STATUS_TYPE", "SCENE_STATUS_DTS", "SCENE_ANSWER_JS", "SCENE_ANSWER_DTS"),
+)
+"""Marks that stand for nothing where there is no scene."""
+
+
+def without_scene() -> dict[str, str]:
+    """What stands for the marks where an export knows no scene."""
+    return dict.fromkeys(WITHOUT, "") | {"SCENE_LOOK": "#define look_about(solver) ((void) 0)\n"}

@@ -1,0 +1,18 @@
+
+/* Puts solid `number` of @GUARD@_SCENE into the scene, or takes it out (@GUARD@_NOTHING). pose: rotation row by
+ * row, then the origin (12 numbers). grasped: links whose pads are in contact may touch it. Being
+ * solved includes that nothing touches: the robot itself neither, also with nothing about it. Where
+ * the answer touches, the arm's other ways to hold the hand are looked at, which may take as long as
+ * so many solves; if none is free the status is @GUARD@_COLLISION. */
+int @PREFIX@_set_solid(@PREFIX@_solver *solver, int number, int kind, const double *size,
+                       const double *pose, int grasped);
+
+/* The distance to keep [m], 0 unless set. */
+void @PREFIX@_set_margin(@PREFIX@_solver *solver, double margin);
+
+/* How far a configuration is from touching [m]; solver->nearest are the two. */
+double @PREFIX@_clearance(@PREFIX@_solver *solver, const double *q);
+
+/* Where the robot's shapes are: six numbers a capsule (middle of its segment, and from there to its
+ * end), then twelve a solid (rotation row by row, origin). */
+void @PREFIX@_shapes(@PREFIX@_solver *solver, const double *q, double *places);

@@ -1,0 +1,30 @@
+
+/* What may stand about: how many solids at most, and their kinds. */
+enum {
+  @GUARD@_SCENE = @CAPACITY@,
+  @GUARD@_NOTHING = -1,
+  @GUARD@_HALF_SPACE = 0, /* all below z = 0 of its pose */
+  @GUARD@_CAPSULE = 1,    /* along z; size: radius, length without the caps; a ball has length 0 */
+  @GUARD@_BOX = 2,        /* size: its edges */
+  @GUARD@_CYLINDER = 3    /* along z; size: radius, length */
+};
+enum { @GUARD@_COLLISION = 6 /* contacts and limits are met, but something touches */ };
+
+/* The robot's own shapes: capsules, then boxes and cylinders. */
+enum { @GUARD@_CAPSULES = @CAPSULES@, @GUARD@_OWN_SOLIDS = @OWN_SOLIDS@, @GUARD@_LINKS = @LINKS@ };
+extern const char *const @PREFIX@_link_names[@GUARD@_LINKS];
+
+typedef struct {
+  int64_t kind;
+  double size[3], reach;
+  int64_t first, planes;
+} @PREFIX@_solid;
+
+typedef struct {
+  double margin;
+  @PREFIX@_solid solids[@SOLIDS@];
+  double poses[12 * @GUARD@_SCENE];
+  int32_t grasped[@GUARD@_SCENE], pairs[2 * @MOST_PAIRS@];
+  double offsets[@MOST_PAIRS@];
+  int64_t n_held, n_pairs;
+} @PREFIX@_scene;

@@ -1,0 +1,25 @@
+
+static double places[@PLACED@ + 1], size[3], pose[12];
+
+EXPORTED(places_at) double *places_at(void);
+EXPORTED(size_at) double *size_at(void);
+EXPORTED(pose_at) double *pose_at(void);
+EXPORTED(shapes) void shapes(void);
+EXPORTED(clearance) double clearance(void);
+EXPORTED(least) double least(void);
+EXPORTED(closest) int closest(int which);
+EXPORTED(set_solid) int set_solid(int number, int kind, int grasped);
+EXPORTED(set_margin) void set_margin(double margin);
+
+double *places_at(void) { return places; }
+double *size_at(void) { return size; }
+double *pose_at(void) { return pose; }
+/* Of the configuration in q0. */
+void shapes(void) { @PREFIX@_shapes(&solver, q0, places); }
+double clearance(void) { return @PREFIX@_clearance(&solver, q0); }
+double least(void) { return solver.clearance; }
+int closest(int which) { return (int) solver.nearest[which]; }
+int set_solid(int number, int kind, int grasped) {
+  return @PREFIX@_set_solid(&solver, number, kind, size, pose, grasped);
+}
+void set_margin(double margin) { @PREFIX@_set_margin(&solver, margin); }

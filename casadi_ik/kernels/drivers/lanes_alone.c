@@ -1,0 +1,14 @@
+/* What lanes.c is, for one solve at a time in plain C: for solvers that stand alone. */
+#define LANES 1
+#define LANES_TARGET
+#define LANES_INLINE static inline
+#define SPREAD(x) (x)
+#define lanes_select(mask, yes, no) ((mask) ? (yes) : (no))
+#define lanes_all(mask) (mask)
+#define lanes_not(mask) (!(mask))
+#define lanes_at(x, lane) ((void) (lane), (x))
+#define lanes_fabs(x) fabs(x)
+#define lanes_sqrt(x) sqrt(x)
+
+typedef double lanes;
+typedef int lane_mask;
