@@ -5,7 +5,7 @@ loads when the robot is chosen; three.js comes from the npm registry (`npm ci`, 
 package-lock.json) and is bundled. What comes out are plain files: they work from any file host, and
 from disk::
 
-    python docs/page/build.py --out out/page
+    python page/build.py --out out/page
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ SPANS = 20_000
 """Random configurations, from which it is known how far fingertips reach, and apart."""
 
 
-def of_grasps(robot: ik.ArmHand) -> list[dict[str, Any]]:
+def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
     """The robot's shipped grasps whose objects an export can have in its scene."""
     found = []
-    for name in shipped_grasps(robot.name):
-        grasp = ik.load_grasp(name)
+    for file in shipped_grasps(name):
+        grasp = ik.load_grasp(file)
         points, normals = grasp.arrays(robot.fingers)
-        if grasp.object is None or grasp.object_pose is None or np.isnan(points).any():
+        if grasp.object is None or grasp.object_pose is None or grasp.more(robot.fingers):
             continue
         parts = of_object(load_object(grasp.object).shape)
         if len(parts) >= CAPACITY or any(solid.kind is Kind.CONVEX for solid, _ in parts):
@@ -73,15 +73,15 @@ def of_grasps(robot: ik.ArmHand) -> list[dict[str, Any]]:
             )
         found.append(
             {
-                "name": name,
+                "name": file,
                 "object": grasp.object.replace("_", " "),
-                "points": points.tolist(),
-                "normals": normals.tolist(),
+                "points": [None if np.isnan(p).any() else p.tolist() for p in points],
+                "normals": [None if np.isnan(n).any() else n.tolist() for n in normals],
                 "solids": solids,
             }
         )
     if not found:
-        raise SystemExit(f"{robot.name}: no shipped grasp for the page")
+        raise SystemExit(f"{name}: no shipped grasp for the page")
     return found
 
 
@@ -99,18 +99,23 @@ def reached(robot: ik.ArmHand) -> dict[str, Any]:
     }
 
 
-def about(robot: ik.ArmHand, title: str) -> dict[str, Any]:
+def about(robot: ik.ArmHand, name: str) -> dict[str, Any]:
     """What the page has to know of a robot beside its solver."""
-    joints = robot.description.joints
-    arm = [joint.child for joint in joints if joint.part == "arm"]
     return {
         "name": robot.name,
-        "title": title,
-        "arm": [robot.description.root, *arm],
+        "title": ROBOTS.get(name, name),
+        "arm": arm_links(robot),
         "prismatic": [bool(kind == "m") for kind in units(robot)],
-        "grasps": of_grasps(robot),
+        "grasps": of_grasps(robot, name),
         **reached(robot),
     }
+
+
+def arm_links(robot: ik.ArmHand) -> list[str]:
+    """Links up to what the arm's last motor moves; what is fixed to that is the hand's."""
+    joints = [joint for joint in robot.description.joints if joint.part == "arm"]
+    last = max((i for i, joint in enumerate(joints) if joint.type != "fixed"), default=-1)
+    return [robot.description.root, *(joint.child for joint in joints[: last + 1])]
 
 
 def units(robot: ik.ArmHand) -> list[str]:
@@ -137,13 +142,19 @@ def bundle(entry: Path, out: Path, *more: str) -> None:
     )
 
 
-def build_robot(name: str, out: Path) -> dict[str, Any]:
-    """A robot's script; what the page says of it before it is loaded."""
+def build_robot(name: str, out: Path, keep: Path | None) -> dict[str, Any]:
+    """A robot's script; what the page says of it before it is loaded.
+
+    Args:
+        name: Of the robot.
+        out: Folder of the page.
+        keep: Where the exported module stays, if it shall.
+    """
     robot = ik.load_robot(name)
     prefix = checked_prefix(None, name)
-    data = about(robot, ROBOTS.get(name, name))
+    data = about(robot, name)
     with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder) / "solver"
+        place = (keep or Path(folder)) / prefix
         write_folder(place, wasm_project(robot, prefix, CAPACITY))
         (place / "about.json").write_text(json.dumps(data), encoding="utf-8")
         entry = place / "entry.js"
@@ -177,13 +188,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS), metavar="ROBOT")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the exported modules here")
     arguments = parser.parse_args()
     if shutil.which("npm") is None:
         raise SystemExit("the page needs node and npm, to bundle three.js")
     out = arguments.out.resolve()
     (out / "robots").mkdir(parents=True, exist_ok=True)
     run("npm", "ci", "--no-audit", "--no-fund", "--silent")
-    robots = [build_robot(name, out) for name in arguments.robots]
+    robots = [build_robot(name, out, arguments.keep) for name in arguments.robots]
     bundle(HERE / "src" / "main.js", out / "page.js", f"--define:ROBOTS={json.dumps(robots)}")
     for name in ("index.html", "page.css"):
         shutil.copy(HERE / "src" / name, out / name)

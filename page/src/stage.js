@@ -62,6 +62,7 @@ export class Stage {
     lit.far = 6 * radius;
     lit.updateProjectionMatrix();
     this.controls.update();
+    this.camera.updateMatrixWorld();
     this.draw();
   }
 

@@ -33,10 +33,11 @@ export function reason(robot, question, answer, motors) {
   if (found.length) return `Out of reach: ${found.sort((x, y) => y[0] - x[0])[0][1]}.`;
   let worst = 0;
   answer.positionError.forEach((error, i) => {
-    const off = (k) => answer.positionError[k] / 5e-3 + answer.angleError[k] / 0.0524;
+    const off = (k) => (answer.positionError[k] || 0) / 5e-3 + (answer.angleError[k] || 0) / 0.0524;
     if (off(i) > off(worst)) worst = i;
   });
   const ends = motors.length ? `; at a limit: ${motors.slice(0, 3).map(plain).join(", ")}` : "";
-  const miss = `${plain(fingers[worst])} misses by ${mm(answer.positionError[worst])} and ${degrees(answer.angleError[worst])}`;
+  const turned = Number.isNaN(answer.angleError[worst]) ? "" : ` and ${degrees(answer.angleError[worst])}`;
+  const miss = `${plain(fingers[worst])} misses by ${mm(answer.positionError[worst])}${turned}`;
   return `No arm and hand was found that meets all contacts: at best ${miss}${ends}.`;
 }

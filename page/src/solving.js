@@ -1,12 +1,12 @@
 // Questions to a robot's solver, and how long it takes.
-const LONG = 1.0;
 
-// Clocks of browsers tick in tenths of a millisecond: the same target is solved as often as takes
-// about LONG [ms], and the time of one is the mean.
+// Clocks of browsers tick in tenths of a millisecond: to tell what a solve takes, the same target is
+// solved for so long [ms].
+const LONG = 25;
+
 export class Solving {
   constructor(robot, solver) {
     Object.assign(this, { robot, solver });
-    this.count = 1;
     this.warm();
   }
 
@@ -34,15 +34,27 @@ export class Solving {
       if (one) solver.setSolid(i, one.kind, one.size, one.pose, one.grasped);
       else solver.setSolid(i, robot.Kind.NOTHING);
     }
-    const flat = [points.flat(), normals.flat(), near ?? undefined];
     const begun = performance.now();
-    let answer;
-    for (let i = 0; i < this.count; ++i) answer = solver.solve(...flat);
-    const spent = performance.now() - begun;
-    const time = (1e3 * spent) / this.count;
-    answer = { ...answer, time, counted: this.count, spent };
-    this.count = Math.max(1, Math.min(64, Math.round(spent > 0 ? (this.count * LONG) / spent : 64)));
-    return answer;
+    const answer = solver.solve(points.flat(), normals.flat(), near ?? undefined);
+    return { ...answer, time: 1e3 * (performance.now() - begun), counted: 1 };
+  }
+
+  // Time [us] of solving the same target again and again: the median over lots.
+  timed(points, normals, near) {
+    const flat = [points.flat(), normals.flat(), near ?? undefined];
+    const end = performance.now() + LONG, lots = [];
+    let counted = 0;
+    do {
+      const begun = performance.now();
+      let count = 0;
+      do {
+        for (let i = 0; i < 4; ++i) this.solver.solve(...flat);
+        count += 4;
+      } while (performance.now() - begun < 1);
+      lots.push((1e3 * (performance.now() - begun)) / count);
+      counted += count;
+    } while (performance.now() < end);
+    return { time: lots.sort((a, b) => a - b)[lots.length >> 1], counted };
   }
 
   // Motors that are at an end of their range.

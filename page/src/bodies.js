@@ -132,22 +132,26 @@ export class ContactMark extends THREE.Group {
   // `size` [m]: the radius of the ball.
   place(point, normal, tip, size, held) {
     this.length = 7 * size;
-    const end = point.clone().addScaledVector(normal, this.length);
+    this.shaft.visible = this.tip.visible = Boolean(normal);
+    if (normal) this.turn(point, normal, size);
     const big = held ? 1.3 * size : size;
     this.ball.position.copy(point);
     this.rim.position.copy(point);
     this.ball.scale.setScalar(big);
     this.rim.scale.setScalar(big);
-    this.shaft.position.copy(point);
-    this.shaft.scale.set(0.22 * size, 7 * size, 0.22 * size);
-    this.shaft.quaternion.setFromUnitVectors(UP, normal);
-    this.tip.position.copy(end);
-    this.tip.scale.setScalar(0.75 * size);
-    this.tip.quaternion.copy(this.shaft.quaternion);
     const line = this.miss.geometry.attributes.position;
     line.setXYZ(0, ...point.toArray());
     line.setXYZ(1, ...tip.toArray());
     line.needsUpdate = true;
-    this.end = end;
+  }
+
+  turn(point, normal, size) {
+    this.end = point.clone().addScaledVector(normal, this.length);
+    this.shaft.position.copy(point);
+    this.shaft.scale.set(0.22 * size, this.length, 0.22 * size);
+    this.shaft.quaternion.setFromUnitVectors(UP, normal);
+    this.tip.position.copy(this.end);
+    this.tip.scale.setScalar(0.75 * size);
+    this.tip.quaternion.copy(this.shaft.quaternion);
   }
 }

@@ -54,20 +54,21 @@ export class Panel {
     const badge = by("status");
     badge.textContent = solved ? "solved" : touches ? "touches" : "not reached";
     badge.className = `badge ${solved ? "good" : touches ? "warn" : "bad"}`;
-    by("time").textContent = answer.time < 1000 ? `${answer.time.toFixed(answer.time < 100 ? 1 : 0)} µs` : `${(answer.time / 1000).toFixed(1)} ms`;
-    by("share").title = `mean of ${answer.counted} solves of this target; a frame has 16,700 µs`;
+    this.time(answer);
     const why = by("reason");
     why.hidden = solved;
     if (!solved) why.textContent = reason(robot, question, answer, solving.atEnds(answer.q));
     [...by("fingers").rows].forEach((row, i) => {
       const off = answer.positionError[i], turned = answer.angleError[i];
-      const good = off <= MET.position * 1.000001 && turned <= MET.angle * 1.000001;
-      row.cells[1].textContent = millimetres(off);
-      row.cells[2].textContent = degrees(turned);
-      row.cells[3].textContent = good ? "✓" : "✗";
+      // What is free is NaN.
+      const good = !(off > MET.position * 1.000001) && !(turned > MET.angle * 1.000001);
+      row.cells[1].textContent = Number.isNaN(off) ? "free" : millimetres(off);
+      row.cells[2].textContent = Number.isNaN(turned) ? "free" : degrees(turned);
+      row.cells[3].textContent = Number.isNaN(off) ? "" : good ? "✓" : "✗";
       row.cells[3].className = good ? "good" : "bad";
     });
-    const names = answer.closest?.map((name) => plain(question.called(name)));
+    const judged = (solved || touches) && answer.closest;
+    const names = judged ? judged.map((name) => plain(question.called(name))) : null;
     by("clearance").textContent = names ? `${millimetres(answer.clearance)}, ${names.join(" – ")}` : "–";
     by("iterations").textContent = `${answer.iterations}, ${answer.restarts} restarts`;
     [...by("motors").children].forEach((row, i) => {
@@ -76,5 +77,11 @@ export class Panel {
       row.children[1].classList.toggle("end", Math.min(part, 1 - part) < 1e-3);
       row.lastChild.textContent = about.prismatic[i] ? millimetres(answer.q[i]) : degrees(answer.q[i]);
     });
+  }
+
+  time({ time, counted }) {
+    const digits = time < 100 ? 1 : 0;
+    by("time").textContent = time < 1000 ? `${time.toFixed(digits)} µs` : `${(time / 1000).toFixed(1)} ms`;
+    by("share").title = counted > 1 ? `median over lots of in all ${counted} solves of this target` : "one solve";
   }
 }
