@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Generator, Iterable, Mapping
+from copy import copy
 from os import PathLike
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
+from casadi_ik.grasps.pose import one_pose
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.write.opening import recorder_of
 from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
 from casadi_ik.motion.moving import MovingSolver
-from casadi_ik.problem.clearance import SceneCheck
+from casadi_ik.problem.clearance import Clearances, SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
@@ -40,6 +43,11 @@ class Solver(MovingSolver, ChoosingSolver):
         limits: "enforce" or "ignore".
         options: What was set of the method's own parameters.
         scene: What answers must not touch; None: collisions are not checked.
+
+    Example:
+        >>> solver = ik.Solver(robot, tolerance=ik.Tolerance(position=1e-3, angle=np.deg2rad(1)))
+        >>> solver.solve(grasp).success
+        True
     """
 
     def __init__(
@@ -102,9 +110,52 @@ class Solver(MovingSolver, ChoosingSolver):
     def __repr__(self) -> str:
         return f"<Solver {self.method} on {self.robot.name}, limits {self.limits}>"
 
+    def moved(self, name: str, pose: ArrayLike) -> Solver:
+        """The same solver with something in its scene elsewhere, in less than a millisecond.
+
+        Args:
+            name: Of an item of the scene.
+            pose: (4, 4) of it in the base frame.
+
+        Raises:
+            InputError: The solver has no scene, or this is no pose.
+            UnknownNameError: The scene has no such item.
+            DescriptionError: It would stand in the robot's base.
+        """
+        check = self._engine.check
+        if check is None:
+            raise InputError(f"{name!r} cannot be moved: the solver has no scene")
+        other = copy(self)
+        moved = check.moved(name, one_pose(pose))
+        other.scene, other._engine = moved.scene, self._engine.about(moved)
+        other._asked = (*self._asked[:-1], moved.scene)
+        return other
+
+    def check(self, q: ArrayLike, grasp: Grasp) -> Clearances | None:
+        """How far configurations are from touching anything they must not touch.
+
+        Args:
+            q: (n,) or (k, n) actuator positions [rad or m].
+            grasp: Its fingers may touch what is grasped.
+
+        Returns:
+            Clearances of the k configurations (one for a single q); None without a scene.
+
+        Raises:
+            InputError: Bad q, or a grasp that the robot cannot take.
+        """
+        problems = self._questions.of_grasps([grasp], None)
+        around = self._engine.around(problems)
+        return around and around.check(np.atleast_2d(self.robot.configuration(q)))
+
     @property
     def parameters(self) -> dict[str, Any]:
-        """Everything that determines a solve but target, start and seed; as kept in the log."""
+        """Everything that determines a solve but target, start and seed; as kept in the log.
+
+        Example:
+            >>> solver.parameters["method"], solver.parameters["limits"]
+            ('hand-first', 'enforce')
+        """
         return {
             "method": self.method,
             "tolerance": {name: dataclasses.asdict(one) for name, one in self.tolerances.items()},
@@ -143,6 +194,14 @@ class Solver(MovingSolver, ChoosingSolver):
             UnknownNameError: A fixed actuator that the robot does not have.
             UnsupportedError: The method cannot keep actuators fixed, or cannot prefer this.
             LogError: The log cannot be written.
+
+        Example:
+            >>> solution = solver.solve(grasp, q0=robot.home)
+            >>> solution.status.name, solution.q.shape
+            ('SOLVED', (14,))
+            >>> held = solver.solve(grasp, fixed={"lwr_joint_3": 0.2})
+            >>> print(round(held.q[2], 6))
+            0.2
         """
         problems = self._questions.of_grasps(
             [grasp], fixed, self._engine.preference(prefer, q0 is not None)
@@ -195,6 +254,12 @@ class Solver(MovingSolver, ChoosingSolver):
 
         Raises:
             InputError: Bad shapes or values; the message names row and finger. Else as `solve`.
+
+        Example:
+            >>> points, normals = robot.contacts(robot.random(np.random.default_rng(0), 1000))
+            >>> batch = solver.solve_batch(points, normals)
+            >>> batch.q.shape, bool(batch.success.all())
+            ((1000, 14), True)
         """
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
@@ -239,6 +304,12 @@ class Solver(MovingSolver, ChoosingSolver):
 
         Raises:
             InputError: Bad q0, seed or jobs, or a block of the wrong shape; else as `solve_batch`.
+
+        Example:
+            >>> rng = np.random.default_rng(0)
+            >>> blocks = (robot.contacts(robot.random(rng, 500)) for _ in range(3))
+            >>> [int(block.solution.success.sum()) for block in solver.solve_blocks(blocks)]
+            [500, 500, 500]
         """
         held = self._questions.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
@@ -261,6 +332,11 @@ class Solver(MovingSolver, ChoosingSolver):
         Raises:
             InputError: As for `solve`.
             UnsupportedError: The method cannot be stepped; the message says why.
+
+        Example:
+            >>> stepper = solver.stepper(grasp)
+            >>> type(stepper).__name__
+            'Stepper'
         """
         preferred = self._engine.preference(None, q0 is not None)
         problems = self._questions.of_grasps([grasp], None, preferred)
@@ -271,5 +347,12 @@ class Solver(MovingSolver, ChoosingSolver):
 
         Raises:
             UnsupportedError: The method is not hand-first, or the solver has a scene.
+
+        Example:
+            >>> fast = solver.fast()
+            >>> points, normals = robot.contacts(robot.home)
+            >>> q, status = fast(points, normals, robot.home)
+            >>> ik.Status(status).name
+            'SOLVED'
         """
         return FastSolver(self._engine, self._questions)

@@ -13,6 +13,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.arrays import real_array
 from casadi_ik.kernels.robot_kernels import RobotKernels
+from casadi_ik.on_demand import on_demand
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
 
 
@@ -21,6 +22,14 @@ class ArmHand:
 
     Attributes:
         description: The frozen data behind it.
+
+    Example:
+        >>> robot.name, robot.fingers, robot.thumb
+        ('kuka_lwr_barrett', ('thumb', 'finger_2', 'finger_3'), 'thumb')
+        >>> len(robot.actuators), robot.actuators[7]
+        (14, 'bh_spread')
+        >>> bool(np.all((robot.lower <= robot.home) & (robot.home <= robot.upper)))
+        True
     """
 
     def __init__(self, description: RobotDescription) -> None:
@@ -103,6 +112,13 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
+
+        Example:
+            >>> joints = robot.joints(robot.home)  # one motor spreads two fingers
+            >>> len(robot.actuators), len(joints)
+            (14, 15)
+            >>> print(round(np.rad2deg(joints["lwr_joint_2"]), 6))
+            30.0
         """
         (theta,) = self._kernels.joints(self.configuration(q))
         return _by_name(self.description.joint_names, theta)
@@ -120,6 +136,10 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
+
+        Example:
+            >>> robot.toggle_margins(robot.home)  # no lead screws here; the AR10 has some
+            {}
         """
         configuration = self.configuration(q)
         names, kernel = self._kernels.toggle_margins
@@ -140,6 +160,11 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
+
+        Example:
+            >>> points, normals = robot.contacts(robot.home)
+            >>> points.shape, bool(np.allclose(np.linalg.norm(normals, axis=1), 1))
+            ((3, 3), True)
         """
         points, normals = self._kernels.contacts(self.configuration(q))
         return points, normals
@@ -159,6 +184,11 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
+
+        Example:
+            >>> frames = robot.contact_frames(robot.home)
+            >>> bool(np.allclose(frames[:, :3, 0], robot.contacts(robot.home)[1]))
+            True
         """
         return self.frames_at(self.configuration(q))
 
@@ -180,6 +210,12 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
+
+        Example:
+            >>> points, normals = robot.contacts(robot.home)
+            >>> position, angle = robot.errors(robot.home, points + [0, 0, 0.01], normals)
+            >>> print(np.round(1e3 * position, 6))
+            [10. 10. 10.]
         """
         position, angle, _ = self.deviations(
             self.configuration(q), np.asarray(points), np.asarray(normals)
@@ -197,6 +233,12 @@ class ArmHand:
         Returns:
             Distances [m] (f,) or (k, f), angles [rad] the same, and () or (k,) by how much the
             worst actuator or joint is beyond its limits [rad or m].
+
+        Example:
+            >>> points, normals = robot.contacts(robot.home)
+            >>> position, angle, beyond = robot.deviations(robot.home, points, normals)
+            >>> bool(position.max() < 1e-9 and beyond <= 0)
+            True
         """
         position, angle, beyond = self._kernels.deviations(q, points, normals)
         # A kernel's single number has no dimension of its own, even that of a single finger.
@@ -210,6 +252,10 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
+
+        Example:
+            >>> bool(robot.beyond_limits(robot.home) <= 0)
+            True
         """
         (beyond,) = self._kernels.beyond(self.configuration(q))
         return beyond
@@ -219,6 +265,10 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
+
+        Example:
+            >>> robot.palm(robot.home).shape
+            (4, 4)
         """
         (pose,) = self._kernels.palm(self.configuration(q))
         return pose
@@ -234,6 +284,10 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
+
+        Example:
+            >>> robot.links(robot.home)["lwr_flange"].shape
+            (4, 4)
         """
         (poses,) = self._kernels.links(self.configuration(q))
         names = self.description.links
@@ -241,12 +295,38 @@ class ArmHand:
         return {name: stacked[..., i, :, :] for i, name in enumerate(names)}
 
     def random(self, rng: np.random.Generator, count: int) -> Array:
-        """(count, n) configurations uniform within the limits."""
+        """(count, n) configurations uniform within the limits.
+
+        Example:
+            >>> robot.random(np.random.default_rng(0), 100).shape
+            (100, 14)
+        """
         return rng.uniform(self.lower, self.upper, (count, len(self.actuators)))
 
     def urdf(self) -> str:
-        """The robot as URDF text, see `casadi_ik.robots.to_urdf`."""
+        """The robot as URDF text, see `casadi_ik.robots.to_urdf`.
+
+        Example:
+            >>> robot.urdf().count("<joint ") >= 15
+            True
+        """
         return self._urdf
+
+    def view(self, q: ArrayLike | None = None, **options: Any) -> Any:
+        """Show the robot in the browser, and in a notebook; needs the extra `view`.
+
+        Args:
+            q: (n,) where it is [rad or m]; None is `home`.
+            options: As `casadi_ik.viewing.view_grasp` has them: grasp, scene, host, port.
+
+        Returns:
+            The running `casadi_ik.viewing.Viewer`.
+
+        Raises:
+            MissingExtraError: viser is not installed.
+            InputError: See `configuration`.
+        """
+        return on_demand("casadi_ik.viewing").view_grasp(self, q=self.configuration(q), **options)
 
     @cached_property
     def _urdf(self) -> str:
@@ -267,6 +347,10 @@ def load_robot(name_or_path: str | Path) -> ArmHand:
     Raises:
         UnknownNameError: No shipped robot has that name.
         DescriptionError: The file is missing or malformed; the message names file and key.
+
+    Example:
+        >>> ik.load_robot("panda+allegro_right")
+        <ArmHand panda+allegro_right: 23 actuators, fingers ('thumb', 'index', 'middle', 'ring')>
     """
     return ArmHand(load_description(name_or_path))
 

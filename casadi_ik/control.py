@@ -43,6 +43,14 @@ class ScrewControl:
         task: What the fingertip is to do.
         gain: [1/s]; `gain * period` of the error is removed in a step.
         period: Time between two steps [s].
+
+    Example:
+        >>> ar10 = ik.load_robot("ar10")  # sliders in metres
+        >>> control = ik.ScrewControl(ar10, ik.ScrewTask("pose", "index"), gain=0.5)
+        >>> goal = control.target(ar10.home + 0.001)
+        >>> run = control.run(ar10.home, goal, steps=30)
+        >>> bool(run.error_norm[-1] < 1e-3 * run.error_norm[0])
+        True
     """
 
     def __init__(
@@ -125,6 +133,12 @@ class ScrewControl:
 
         Raises:
             InputError: Wrong shape or numbers.
+
+        Example:
+            >>> ar10 = ik.load_robot("ar10")
+            >>> control = ik.ScrewControl(ar10, ik.ScrewTask("pose", "index"))
+            >>> {name: value.shape for name, value in control.target(ar10.home).items()}
+            {'pose': (8,)}
         """
         fulfilled = _target_kernel(self._step, self._compiled)(self._posture(q, "q"))
         names = [field.name for field in self.task.target_fields]
@@ -153,6 +167,12 @@ class ScrewControl:
         Raises:
             InputError: Bad start or target.
             LogError: The log cannot be written.
+
+        Example:
+            >>> ar10 = ik.load_robot("ar10")
+            >>> control = ik.ScrewControl(ar10, ik.ScrewTask("pose", "index"))
+            >>> control.run(ar10.home, control.target(ar10.home), steps=5).times.shape
+            (6,)
         """
         if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
             raise InputError(f"steps: found {steps!r}, expected an integer >= 1")

@@ -49,6 +49,13 @@ class CasadiIKError(Exception):
     """Base of every error that casadi_ik raises on purpose.
 
     Its text is printable and short, whatever the file holds that it speaks of.
+
+    Example:
+        >>> try:
+        ...     ik.load_robot("no_such_robot")
+        ... except ik.CasadiIKError as error:
+        ...     print(type(error).__name__)
+        UnknownNameError
     """
 
     def __str__(self) -> str:

@@ -70,6 +70,12 @@ class Scene:
             [m].
         touching: Links that may touch an item or each other, and why.
         name: What it is called.
+
+    Example:
+        >>> post = {"kind": "cylinder", "radius": 0.02, "length": 1, "xyz": [0.5, 0.4, 0.5]}
+        >>> scene = ik.Scene({"post": post}, margin=0.001)
+        >>> ik.Solver(robot, scene=scene).solve(grasp).status.name
+        'SOLVED'
     """
 
     def __init__(
@@ -153,6 +159,12 @@ class Scene:
         Raises:
             UnknownNameError: There is no such item.
             InputError: No pose.
+
+        Example:
+            >>> pose = np.eye(4)
+            >>> pose[2, 3] = -0.5
+            >>> print(ik.load_scene("table").moved("table", pose).items["table"].pose[2, 3])
+            -0.5
         """
         if name not in self.items:
             known = ", ".join(self.items) or "none"
@@ -171,6 +183,11 @@ class Scene:
         Raises:
             UnknownNameError: Neither.
             InputError: No pose.
+
+        Example:
+            >>> scene = ik.load_scene("table").holding("cup", np.eye(4))
+            >>> scene.grasped
+            'cup'
         """
         place = checked_pose(pose, f"pose of {name!r}")
         known = self.items.get(name)
@@ -196,6 +213,10 @@ def load_scene(name_or_path: str | Path) -> Scene:
         UnknownNameError: No shipped scene has that name.
         DescriptionError: The file is missing or malformed; the message names file and key.
         MissingExtraError: It has a mesh, and what builds hulls is not installed.
+
+    Example:
+        >>> ik.load_scene("table")
+        <Scene table: table, margin 0 m>
     """
     return Scene._of_file(resolve(name_or_path, "scenes"))
 

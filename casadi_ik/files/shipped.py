@@ -21,7 +21,14 @@ def models_folder() -> Path:
 
 
 def shipped_names(kind: str) -> tuple[str, ...]:
-    """Names of the shipped descriptions of a kind ("arms", "hands", "arm_hands", ...)."""
+    """Names of the shipped descriptions of a kind ("arms", "hands", "arm_hands", ...).
+
+    Example:
+        >>> ik.shipped_names("scenes")
+        ('table',)
+        >>> len(ik.shipped_names("arms")), len(ik.shipped_names("hands"))
+        (21, 15)
+    """
     return tuple(sorted(path.stem for path in (models_folder() / kind).glob("*.yaml")))
 
 

@@ -18,6 +18,10 @@ class Tolerance:
 
     Raises:
         InputError: Not a positive finite number.
+
+    Example:
+        >>> ik.Tolerance(position=1e-3, angle=np.deg2rad(1)).position
+        0.001
     """
 
     position: float = 5e-3

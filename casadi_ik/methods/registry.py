@@ -113,6 +113,15 @@ def register_method(
 
     Raises:
         InputError: The name is taken, or an argument is not what it has to be.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True)
+        ... class Parameters:
+        ...     damping: float = 0.1
+        >>> def build(robot, parameters, compiled):
+        ...     raise NotImplementedError("make a `LoopedMethod`: docs/add_a_method.md")
+        >>> ik.register_method("mine", "what it does", Parameters, build)
     """
     if not (isinstance(name, str) and name):
         raise InputError(f"name: found {name!r}, expected the name of a method")

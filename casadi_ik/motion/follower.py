@@ -34,6 +34,15 @@ class Follower:
         period: Time from cycle to cycle [s].
         velocity: (n,) limits that are kept [rad/s or m/s].
         acceleration: (n,) limits that are kept [rad/s^2 or m/s^2].
+
+    Example:
+        >>> follower = solver.follow(q0=robot.home, period=0.001)
+        >>> points, normals = robot.contacts(robot.home)
+        >>> for _ in range(50):
+        ...     points = points + [0.0, 0.0, 1e-4]
+        ...     q = follower(points, normals)
+        >>> follower.state.status.name
+        'FOLLOWING'
     """
 
     def __init__(self, plan: FollowPlan) -> None:
@@ -77,6 +86,12 @@ class Follower:
 
         Raises:
             InputError: Wrong shape or numbers.
+
+        Example:
+            >>> follower = solver.follow(q0=robot.home)
+            >>> follower.reset(solution.q)
+            >>> bool(np.allclose(follower.state.q, solution.q))
+            True
         """
         inside = self._inside(q)
         self._asked.run.state[:] = self._asked.state_at(inside)
@@ -95,6 +110,12 @@ class Follower:
 
         Raises:
             InputError: Wrong shape or numbers.
+
+        Example:
+            >>> follower = solver.follow(q0=solution.q)
+            >>> follower.branch(solver.solve_all(grasp, limit=2)[1].q)
+            >>> follower(grasp).shape
+            (14,)
         """
         n, state, goal = self._n, self._asked.run.state, self._inside(q)
         state[2 * n : 3 * n], state[3 * n] = goal, 0.0

@@ -10,7 +10,12 @@ from casadi_ik.problem.collision_report import Pair
 
 
 class FollowStatus(Enum):
-    """How a cycle went."""
+    """How a cycle went.
+
+    Example:
+        >>> ik.FollowStatus.LATE.name
+        'LATE'
+    """
 
     FOLLOWING = "following"
     """Every contact is within tolerance."""
@@ -43,6 +48,13 @@ class FollowState:
         clearance: Distance of the pair nearest to being too near [m]; None without a scene.
         closest: That pair.
         cycles: How many there were.
+
+    Example:
+        >>> follower = solver.follow(q0=solution.q)
+        >>> q = follower(grasp)
+        >>> state = follower.state
+        >>> bool(state.position_error.max() < 5e-3), state.cycles
+        (True, 1)
     """
 
     status: FollowStatus

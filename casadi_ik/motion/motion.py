@@ -33,6 +33,11 @@ class Motion:
         velocity: (k, n) [rad/s or m/s].
         acceleration: (k, n) [rad/s^2 or m/s^2].
         notes: More that belongs to the times, (k, ...) by name; in npz files only.
+
+    Example:
+        >>> times, q = np.array([0.0, 0.1]), np.stack([robot.home, robot.home])
+        >>> motion = ik.Motion(robot, times, q, 0 * q, 0 * q)
+        >>> motion.write("still.csv")
     """
 
     robot: ArmHand

@@ -72,6 +72,11 @@ class MovingSolver:
 
         Raises:
             InputError: Bad numbers.
+
+        Example:
+            >>> follower = solver.follow(q0=solution.q, period=0.001)
+            >>> follower(grasp).shape, follower.state.status.name
+            ((14,), 'FOLLOWING')
         """
         start = self._questions.start(q0)
         rates = rates_of(self.robot, velocity, acceleration)
@@ -116,12 +121,22 @@ class MovingSolver:
         Raises:
             InputError: No grasp, bad q0, period or velocity, or a grasp the robot cannot take.
             UnsupportedError: The method is not hand-first.
+
+        Example:
+            >>> up = np.eye(4)
+            >>> up[2, 3] = 0.002
+            >>> track = solver.track([grasp, grasp.at(up), grasp.at(up @ up)])
+            >>> track.q.shape, bool(track.success.all()), track.jumps
+            ((3, 14), True, ())
         """
         if not grasps:
             raise InputError("grasps: found none, expected at least one")
         if period is None and velocity is not None:
             raise InputError("velocity: given without a period, expected both")
-        problems = self._questions.of_grasps(grasps, fixed)
+        # A palm that is given counts as the contacts that it leads to.
+        problems = replace(self._questions.of_grasps(grasps, fixed), palms=None)
+        if problems.fixed is not None and problems.fixed.ndim > 1:
+            problems = replace(problems, fixed=self._questions.held(fixed))
         engine, start = self._engine.kinds_of(problems), self._questions.start(q0)
         _ = engine.finder
         ((kinds, _, _),) = by_kinds(problems.rows(slice(0, 1)))
@@ -167,13 +182,18 @@ class MovingSolver:
             InputError: Bad numbers, or a grasp the robot cannot take.
             MissingExtraError: toppra is not installed (extra `motion`).
             UnsupportedError: The method is not hand-first.
+
+        Example:
+            >>> found = solver.reach(grasp, q0=robot.home)
+            >>> found.status.name, bool(found.motion.times[-1] > 0)
+            ('REACHED', True)
         """
         problem, start = self._questions.of_grasps([grasp], None), self._questions.start(q0)
         engine = self._engine.kinds_of(problem)
         found = engine.finder.find(
             problem, start, seed, limit, "q0", apart=0.05, around=engine.around(problem)
         )
-        bounds, free = self._bounds(problem), unbounded(self.robot)
+        bounds, free = self._bounds(None), unbounded(self.robot)
         asked = ReachPlan(
             self._plan(start, bounds, 1.0, free, start, math.inf, PATH_PULL),
             problem,

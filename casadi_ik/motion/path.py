@@ -42,6 +42,12 @@ class Jump:
         size: By how much [rad or m].
         at_limit: The motors that stand at a limit where the continuous motion ends; none if it
             ends for another reason, such as a singular arm.
+
+    Example:
+        >>> away = np.diag([-1.0, -1.0, 1.0, 1.0])  # the other side of the robot, at once
+        >>> jump = solver.track([grasp, grasp.at(away)]).jumps[0]
+        >>> jump.index, jump.actuator in robot.actuators
+        (1, True)
     """
 
     index: int

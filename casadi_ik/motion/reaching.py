@@ -23,7 +23,12 @@ PARTS = ("going", "coming", "closing")
 
 
 class ReachStatus(Enum):
-    """How it went."""
+    """How it went.
+
+    Example:
+        >>> solver.reach(grasp).status is ik.ReachStatus.REACHED
+        True
+    """
 
     REACHED = "reached"
     """There is a motion, and what was to be checked is free all the way."""
@@ -47,6 +52,11 @@ class Reach:
         q: (n,) the solution of the grasp that it ends with; None likewise.
         clearance: Smallest distance on the way before the hand closes [m]; None without a scene.
         tried: Solutions of the grasp that were looked at.
+
+    Example:
+        >>> found = solver.reach(grasp)
+        >>> found.success, bool(np.allclose(found.motion.q[-1], found.q))
+        (True, True)
     """
 
     status: ReachStatus

@@ -60,6 +60,12 @@ def load_retarget(path: str | Path) -> Retarget:
 
     Raises:
         DescriptionError: The file is missing or malformed; the message names file and key.
+
+    Example:
+        >>> text = "fingers: {thumb: 4, finger_2: 8, finger_3: 12}"
+        >>> _ = Path("hand.yaml").write_text(text)
+        >>> ik.load_retarget("hand.yaml").fingers["thumb"]
+        4
     """
     found, _ = read(Path(path), Retarget)
     problem = _problem(found)
@@ -117,7 +123,15 @@ class Wanted:
 
 
 class Retargeter:
-    """Turns the frames of one stream into what a robot is to do."""
+    """Turns the frames of one stream into what a robot is to do.
+
+    Example:
+        >>> config = ik.load_retarget("hand.yaml")
+        >>> retargeter = ik.Retargeter(config, robot, robot.home)
+        >>> wanted = retargeter(keypoints)
+        >>> wanted.points.shape, wanted.palm.shape
+        ((3, 3), (4, 4))
+    """
 
     def __init__(self, config: Retarget, robot: ArmHand, q0: ArrayLike | None = None) -> None:
         """Take the robot where it is.

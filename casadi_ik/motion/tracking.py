@@ -35,6 +35,11 @@ class Track:
         jumps: Where the motion could not be continued.
         clearance: (k,) distance of the pair nearest to being too near [m]; None without a scene.
         time: Seconds spent on the whole motion.
+
+    Example:
+        >>> track = solver.track([grasp, grasp])
+        >>> track.q.shape, bool(track.success.all())
+        ((2, 14), True)
     """
 
     q: Array

@@ -48,6 +48,12 @@ class CollisionReport:
         without_self: Whether one of them is free of the scene, the robot itself left out.
         way_out: What else would do; None if that was not looked for: it is where one grasp is
             solved and a diagnosis asked for.
+
+    Example:
+        >>> wall = {"kind": "box", "size": [3, 3, 3], "xyz": [-1.8, 0, 1.0]}  # the cup is inside
+        >>> blocked = ik.Solver(robot, scene=ik.Scene({"wall": wall})).solve(grasp)
+        >>> blocked.status.name, "wall" in blocked.collision.pair
+        ('COLLISION', True)
     """
 
     pair: Pair

@@ -17,7 +17,12 @@ Point = tuple[float, float, float]
 
 
 class Reason(StrEnum):
-    """Why a grasp is not solved: established by a proof, else what is likely."""
+    """Why a grasp is not solved: established by a proof, else what is likely.
+
+    Example:
+        >>> far.diagnosis.reason is ik.Reason.REACH
+        True
+    """
 
     HAND = "the contacts do not fit the hand, wherever the palm is"
     REACH = "the hand fits the contacts, but the arm does not reach there"
@@ -158,6 +163,12 @@ class Diagnosis:
         q: (n,) that configuration; a solution if the reason is `REACHABLE`.
         time: Seconds the diagnosis took; in a batch its share. Without the search for remedies.
         lazy: Where the remedies come from.
+
+    Example:
+        >>> far.status.name, far.diagnosis.reason.name, far.diagnosis.hand.fits
+        ('UNREACHABLE', 'REACH', True)
+        >>> print(far.diagnosis.lines[0])  # doctest: +ELLIPSIS
+        the hand fits the contacts, but the arm does not reach there...
     """
 
     reason: Reason

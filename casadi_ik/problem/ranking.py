@@ -20,6 +20,11 @@ class Choice:
             limits as a part of half its range ("limits"); minus the distance from q0, every
             actuator as a part of its range ("q0"); of the arm [m^3] ("manipulability"); room
             beyond the margins of the scene [m] ("clearance"); or what the given function says.
+
+    Example:
+        >>> best = solver.choose([grasp], prefer="limits")[0]
+        >>> best.candidate, best.solution.success
+        (0, True)
     """
 
     candidate: int
@@ -38,6 +43,13 @@ class Ranking(Sequence[Choice]):
         failures: How many have none, by reason: the name of a `Status`, and of a COLLISION the pair
             that is in the way. Most frequent first.
         prefer: What they were ranked by.
+
+    Example:
+        >>> ranked = solver.choose([grasp, ik.load_grasp("apple")], limit=2, prefer="limits")
+        >>> len(ranked), ranked.candidates, dict(ranked.failures)
+        (2, 2, {})
+        >>> print(ranked.lines[0])
+        2 of 2 candidates have an answer
     """
 
     entries: tuple[Choice, ...]

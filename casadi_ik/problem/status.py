@@ -11,7 +11,12 @@ from casadi_ik.kernels import REPEATED, RUNNING
 
 
 class Status(IntEnum):
-    """How a solve ended. Not converging is a status, never an exception."""
+    """How a solve ended. Not converging is a status, never an exception.
+
+    Example:
+        >>> ik.Status.SOLVED.name, int(ik.Status.SOLVED)
+        ('SOLVED', 1)
+    """
 
     INVALID = -1
     """A number was no longer finite; the last finite configuration is returned."""
@@ -51,7 +56,12 @@ class Status(IntEnum):
 
 
 class Phase(IntEnum):
-    """What an iteration is working on."""
+    """What an iteration is working on.
+
+    Example:
+        >>> ik.Phase.HAND_FIT.label
+        'hand-fit'
+    """
 
     THUMB_REACHING = 1
     HAND_ALIGNMENT = 2

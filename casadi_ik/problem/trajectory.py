@@ -24,6 +24,13 @@ class Trajectory:
         sigma: (s + 1,) smallest singular value of the Jacobian over half ranges.
         status: `SOLVED` if the error norm fell below the tolerance, else `ITERATION_LIMIT`, or
             `INVALID`.
+
+    Example:
+        >>> ar10 = ik.load_robot("ar10")
+        >>> control = ik.ScrewControl(ar10, ik.ScrewTask("pose", "index"))
+        >>> run = control.run(ar10.home, control.target(ar10.home), steps=3)
+        >>> run.q.shape, bool(run.error_norm[-1] < 1e-9)
+        ((4, 10), True)
     """
 
     times: Array

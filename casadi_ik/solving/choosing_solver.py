@@ -53,6 +53,11 @@ class ChoosingSolver:
 
         Raises:
             InputError: Bad limit, preference, distance or q0, or a grasp the robot cannot take.
+
+        Example:
+            >>> several = solver.solve_all(grasp, limit=4, prefer="manipulability")
+            >>> len(several), several[0].manipulability >= several[1].manipulability
+            (4, True)
         """
         problems = self._questions.of_grasps([grasp], fixed)
         finder = self._engine.kinds_of(problems).finder
@@ -96,6 +101,11 @@ class ChoosingSolver:
             InputError: No candidates, no rigid object_pose, bad q0, limit, preference or distance,
                 or a grasp the robot cannot take.
             UnsupportedError: The method is not hand-first.
+
+        Example:
+            >>> ranked = solver.choose([grasp, ik.load_grasp("apple")], limit=3, prefer="limits")
+            >>> len(ranked), ranked.answered, ranked[0].score >= ranked[1].score
+            (3, 2, True)
         """
         return choose(
             self._engine,

@@ -18,7 +18,12 @@ from casadi_ik.problem.trace import (
 
 
 class EventKind(IntEnum):
-    """What happened; "value against threshold" is what the event's two numbers are."""
+    """What happened; "value against threshold" is what the event's two numbers are.
+
+    Example:
+        >>> ik.logs.EventKind.LIMIT_HIT.name
+        'LIMIT_HIT'
+    """
 
     NEAR_SINGULAR = 0
     """A Jacobian's smallest singular value has fallen below its threshold."""

@@ -30,6 +30,10 @@ class EventRules:
         oscillation_progress: Relative fall of the error over the window that counts as progress.
         clearance: Clearance below which something is touched [m]; a log with a scene takes the
             scene's margin.
+
+    Example:
+        >>> ik.logs.EventRules(release=3.0).release
+        3.0
     """
 
     singular: Mapping[str, float] = field(default_factory=dict)

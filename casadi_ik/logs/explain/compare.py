@@ -57,6 +57,11 @@ def side_by_side(first: OneSolve, second: OneSolve) -> list[Line]:
 
     Raises:
         InputError: They are not of the same target.
+
+    Example:
+        >>> one = ik.logs.one_solve(ik.logs.open("cup.mcap"))
+        >>> len(ik.logs.side_by_side(one, one)) > 0
+        True
     """
     keys = [
         target_key(each.target_points, each.target_normals, each.target_more)
@@ -181,6 +186,11 @@ def matched(logs: Sequence[Log], first: str, second: str) -> Matched:
 
     Raises:
         LogError: A log is damaged.
+
+    Example:
+        >>> log = ik.logs.open("cup.mcap")
+        >>> type(ik.logs.matched([log], "hand-first", "hand-first")).__name__
+        'Matched'
     """
     one, other = _endings(logs, first), _endings(logs, second)
     return Matched(first, second, tuple((one[key], other[key]) for key in one if key in other))

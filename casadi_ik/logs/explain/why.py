@@ -39,6 +39,11 @@ class Explanation:
         fingers: Which finger lagged, and how.
         met: Singularities, limits, stalls and oscillations, and when.
         verdict: How it stood at the end.
+
+    Example:
+        >>> story = ik.logs.explain(ik.logs.one_solve(ik.logs.open("cup.mcap")))
+        >>> isinstance(story.headline, str), len(story.phases) > 0
+        (True, True)
     """
 
     headline: str
@@ -53,6 +58,11 @@ def explain(solve: OneSolve) -> Explanation:
 
     Args:
         solve: The solve; without a trace only how it ended can be said.
+
+    Example:
+        >>> story = ik.logs.explain(ik.logs.one_solve(ik.logs.open("cup.mcap")))
+        >>> bool(story.verdict)
+        True
     """
     outcome = "solved" if solve.success else f"not solved ({solve.status})"
     headline = (

@@ -27,6 +27,10 @@ class LogClock:
     Attributes:
         t0: Log time of solve 0, iteration 0 [ns since the Unix epoch].
         slot: Log time between two solves [ns].
+
+    Example:
+        >>> ik.logs.LogClock(t0=0).slot > 0
+        True
     """
 
     t0: int = T0

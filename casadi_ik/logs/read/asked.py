@@ -36,6 +36,11 @@ class Asked:
         fixed: Actuators that were held, and where [rad or m].
         prefer: Which of several solutions was wanted; None: the method cannot choose, or the log
             is of an earlier version.
+
+    Example:
+        >>> asked = ik.logs.one_solve(ik.logs.open("cup.mcap")).asked
+        >>> asked.limits, asked.seed, bool(np.allclose(asked.start, robot.home))
+        ('enforce', 0, True)
     """
 
     tolerances: tuple[Tolerance, ...]

@@ -27,6 +27,11 @@ class LogInfo:
             after their last complete chunk is lost.
         left_out: Files in which nothing is whole: their writer was killed before its first chunk.
         differs: Entries of the metadata in which the shards differ, and what they say.
+
+    Example:
+        >>> info = ik.logs.open("cup.mcap").info()
+        >>> info.robot, info.counts["hand-first"]["solve"]
+        ('kuka_lwr_barrett', 1)
     """
 
     paths: tuple[Path, ...]

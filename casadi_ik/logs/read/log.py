@@ -32,6 +32,10 @@ def open_log(path: Paths) -> Log:
     Raises:
         LogError: A file is missing, is no MCAP file, is damaged, or is not a log of casadi_ik; or
             the files are not of one robot, or a method is not of one kind in all of them.
+
+    Example:
+        >>> ik.logs.open("cup.mcap").methods
+        ('hand-first',)
     """
     return Log(*open_shards(path))
 
@@ -54,6 +58,11 @@ class Log:
         methods: What methods there are.
         metadata: Where the log comes from, of the first file.
         left_out: Files in which nothing is whole.
+
+    Example:
+        >>> log = ik.logs.open("cup.mcap")
+        >>> log.methods
+        ('hand-first',)
     """
 
     def __init__(self, shards: Sequence[Shard], left_out: Sequence[Path] = ()) -> None:
@@ -79,7 +88,12 @@ class Log:
         return f"<Log of {len(self.shards)} file(s), methods {', '.join(self.methods) or 'none'}>"
 
     def info(self) -> LogInfo:
-        """What is in it."""
+        """What is in it.
+
+        Example:
+            >>> ik.logs.open("cup.mcap").info().robot
+            'kuka_lwr_barrett'
+        """
         counts = {
             method: {
                 kind: sum(shard.count(method, kind) for shard in self.shards)
@@ -128,6 +142,10 @@ class Log:
         Raises:
             UnknownNameError: No such method, status, event or phase.
             LogError: The log is damaged, or a solve is in it twice.
+
+        Example:
+            >>> len(ik.logs.open("cup.mcap").solves(status="SOLVED").array())
+            1
         """
         wanted = filters.numbers(solve)
         parts = [self._joined.solves(name) for name in self._methods(method)]
@@ -170,6 +188,11 @@ class Log:
         Raises:
             UnknownNameError: No such method, status, event, phase or field.
             LogError: The log is damaged, or a solve is in it twice.
+
+        Example:
+            >>> rows = ik.logs.open("cup.mcap").iterations(solve=0).array()
+            >>> len(rows) == solution.iterations, rows["q"].shape[1]
+            (True, 14)
         """
         return self._rows("iteration", method, solve, status, event, phase, fields)
 
@@ -187,6 +210,10 @@ class Log:
         Raises:
             UnknownNameError: No such method, status, event or phase.
             LogError: The log is damaged.
+
+        Example:
+            >>> "kind" in ik.logs.open("cup.mcap").events().names
+            True
         """
         return self._rows("event", method, solve, status, event, phase, None)
 

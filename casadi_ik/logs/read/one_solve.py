@@ -102,6 +102,11 @@ class OneSolve:
         number: Its number there; random numbers follow from it and the seed.
         clearance: Of the answer [m]; None if the solver had no scene.
         closest: The pair that is nearest to being too near; None as well if there is nothing.
+
+    Example:
+        >>> one = ik.logs.one_solve(ik.logs.open("cup.mcap"))
+        >>> one.success, one.status, one.fingers
+        (True, 'SOLVED', ('thumb', 'finger_2', 'finger_3'))
     """
 
     method: str
@@ -185,6 +190,10 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
     Raises:
         UnknownNameError: There is no such solve, or it is not said which of several.
         LogError: The log is damaged.
+
+    Example:
+        >>> ik.logs.one_solve(ik.logs.open("cup.mcap"), 0).method
+        'hand-first'
     """
     table = log.solves(solve=solve, method=method)
     found = [part for part in table.parts if len(part)]

@@ -37,6 +37,11 @@ class MethodRows:
         units: Unit by field, "" if dimensionless.
         shard: (k,) which of `shards` each row comes from; None where that is not told.
         shards: Names of the shards of the log.
+
+    Example:
+        >>> part = ik.logs.open("cup.mcap").iterations().part
+        >>> part.method, bool(len(part.rows) == solution.iterations)
+        ('hand-first', True)
     """
 
     method: str
@@ -68,6 +73,11 @@ class Table:
     Attributes:
         kind: "solve", "iteration" or "event".
         parts: The rows by method.
+
+    Example:
+        >>> table = ik.logs.open("cup.mcap").solves()
+        >>> table.kind, len(table.array())
+        ('solve', 1)
     """
 
     kind: str

@@ -48,6 +48,9 @@ def finish_log(path: str | os.PathLike[str]) -> Finished:
     Raises:
         LogError: The file is missing, cannot be written, is still being written, is no MCAP file,
             or is damaged elsewhere than at its end. Then it has not been changed.
+
+    Example:
+        >>> finished = ik.logs.finish_log("cup.mcap")  # whole already: nothing is changed
     """
     path = Path(path)
     try:

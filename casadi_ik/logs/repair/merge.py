@@ -71,6 +71,11 @@ def merge_logs(
     Raises:
         LogError: A shard is missing, damaged or incomplete, contradicts the first, or holds a
             solve that another holds too; or the target cannot be written.
+
+    Example:
+        >>> merged = ik.logs.merge_logs(["cup.mcap"], "all.mcap")
+        >>> ik.logs.open("all.mcap").methods
+        ('hand-first',)
     """
     if not isinstance(shards, str | os.PathLike) and not shards:
         raise LogError("merge: found no shards, expected at least one")

@@ -21,6 +21,11 @@ class Keep:
         singular: All in which a Jacobian was near singular or ill-conditioned.
         sample: Share of all solves, whatever became of them, from 0 to 1.
         seed: Of the sample; with the solve's number it decides, whatever else is in the log.
+
+    Example:
+        >>> keep = ik.logs.Keep(sample=0.01)  # all that fail, and one in a hundred of the others
+        >>> keep.failed, keep.sample
+        (True, 0.01)
     """
 
     failed: bool = True

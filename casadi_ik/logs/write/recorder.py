@@ -40,6 +40,7 @@ from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.trace import CLEARANCE, TraceFormat
 
 Compression = Literal["none", "lz4", "zstd"]
+"""How the chunks of a log are compressed; zstd is level 1."""
 
 URDF_ATTACHMENT = "robot.urdf"
 """Name of the attachment that holds the robot description."""
@@ -62,6 +63,13 @@ class McapRecorder:
     Use it as a context manager. Leaving it with an exception gives up what has not reached the
     disk; a log that has nothing on the disk is gone, one that has is finished. What stood at the
     path stays until the first chunk is written.
+
+    Example:
+        >>> points, normals = robot.contacts(robot.random(np.random.default_rng(0), 20))
+        >>> with ik.logs.McapRecorder("two.mcap", robot_name=robot.name) as recorder:
+        ...     batch = solver.solve_batch(points, normals, log=recorder)
+        >>> len(ik.logs.open("two.mcap").solves().array())
+        20
     """
 
     def __init__(

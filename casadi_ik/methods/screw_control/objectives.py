@@ -34,6 +34,10 @@ class ScrewTask:
             well; None is the robot's base.
         axis: Normal of the plane of "planar-pose", in the frame of the target; None is the axis of
             the finger's last joint, with all joints at zero.
+
+    Example:
+        >>> ik.ScrewTask("distance", "thumb", relative_to="finger_2").kind
+        'distance'
     """
 
     kind: str

@@ -42,6 +42,11 @@ class ArmBranch:
             None for an arm without one. S-R-S: the angle of the elbow about the line from shoulder
             to wrist, a whole turn if none is out. Other arms of seven joints: the position of the
             joint that is swept, see `ClosedForm.swept_joint`.
+
+    Example:
+        >>> branch = solver.solve_all(grasp, limit=1)[0].branch
+        >>> branch.elbow in (-1, 1), branch.swivel[0] <= branch.swivel[1]
+        (True, True)
     """
 
     shoulder: int

@@ -1,0 +1,110 @@
+"""Every public name has an example in its docstring, and every example does what it says."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.methods import registry
+
+WITHOUT = {
+    "METHODS",  # a tuple of names
+    "logs",  # a module; its names have their own
+    "logs.Compression",  # three words
+    "logs.detect_events",  # takes what a recorder is given while a batch runs
+}
+METHODS_TOO = ("ArmHand", "Solver", "Grasp", "Contact", "Scene", "ScrewControl", "logs.Log")
+"""Classes of which every method has an example of its own, apart from those named here."""
+PLAIN = {
+    "ArmHand.configuration",  # checks and copies
+    "ArmHand.frames_at",  # contact_frames without checks
+    "ScrewControl.stepper",  # as Solver.stepper
+    "logs.Log.attachment",
+    "logs.Log.sources",
+}
+
+
+def public_names() -> list[str]:
+    return [*ik.__all__, *(f"logs.{name}" for name in ik.logs.__all__)]
+
+
+def found(name: str) -> Any:
+    thing: Any = ik
+    for part in name.split("."):
+        thing = inspect.getattr_static(thing, part)
+    return thing
+
+
+def methods_of(name: str) -> list[str]:
+    """Public methods of a class, inherited ones too."""
+    thing = found(name)
+    return [
+        f"{name}.{one}"
+        for one in dir(thing)
+        if not one.startswith("_") and inspect.isfunction(inspect.getattr_static(thing, one))
+    ]
+
+
+def documented() -> list[str]:
+    return public_names() + [
+        method
+        for name in public_names()
+        if inspect.isclass(found(name)) and not issubclass(found(name), (str, int))
+        for method in methods_of(name)
+    ]
+
+
+def text_of(name: str) -> str:
+    return inspect.getdoc(found(name)) or ""
+
+
+def test_every_public_name_has_an_example() -> None:
+    names = [*public_names(), *(one for name in METHODS_TOO for one in methods_of(name))]
+    without = [name for name in names if name not in WITHOUT | PLAIN and ">>>" not in text_of(name)]
+    assert not without
+    assert all(">>>" not in text_of(name) for name in PLAIN), "has one after all"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("examples")
+
+
+@pytest.fixture(scope="module")
+def names(folder: Path) -> dict[str, Any]:
+    """What the examples use without saying so; the page of the interface shows how it is made."""
+    robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
+    solver = ik.Solver(robot)
+    away = np.eye(4)
+    away[0, 3] = -1.0
+    (folder / "hand.yaml").write_text("fingers: {thumb: 4, finger_2: 8, finger_3: 12}")
+    return {
+        "ik": ik,
+        "np": np,
+        "Path": Path,
+        "robot": robot,
+        "solver": solver,
+        "grasp": grasp,
+        "solution": solver.solve(grasp, log=folder / "cup.mcap"),
+        "far": solver.solve(grasp.at(away)),
+        "keypoints": 0.05 * np.random.default_rng(0).normal(size=(21, 3)),
+    }
+
+
+def test_examples(names: dict[str, Any], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+    parser = doctest.DocTestParser()
+    report: list[str] = []
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    for name in documented():
+        example = parser.get_doctest(text_of(name), dict(names), name, None, 0)
+        runner.run(example, out=report.append, clear_globs=False)
+    assert runner.tries > 150
+    assert runner.failures == 0, "".join(report)
