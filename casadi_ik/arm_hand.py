@@ -13,6 +13,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps.arrays import real_array
 from casadi_ik.kernels.robot_kernels import RobotKernels
+from casadi_ik.on_demand import on_demand
 from casadi_ik.robots import RobotDescription, load_description, to_urdf
 
 
@@ -310,6 +311,22 @@ class ArmHand:
             True
         """
         return self._urdf
+
+    def view(self, q: ArrayLike | None = None, **options: Any) -> Any:
+        """Show the robot in the browser, and in a notebook; needs the extra `view`.
+
+        Args:
+            q: (n,) where it is [rad or m]; None is `home`.
+            options: As `casadi_ik.viewing.view_grasp` has them: grasp, scene, host, port.
+
+        Returns:
+            The running `casadi_ik.viewing.Viewer`.
+
+        Raises:
+            MissingExtraError: viser is not installed.
+            InputError: See `configuration`.
+        """
+        return on_demand("casadi_ik.viewing").view_grasp(self, q=self.configuration(q), **options)
 
     @cached_property
     def _urdf(self) -> str:

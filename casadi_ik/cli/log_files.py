@@ -19,6 +19,7 @@ from casadi_ik.cli.report import fields, files
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
 from casadi_ik.logs.mcap.data_section import NothingWrittenError
 from casadi_ik.logs.read.files import log_files
+from casadi_ik.logs.read.same_robot import check_robot
 from casadi_ik.logs.repair.finish import finish_log
 from casadi_ik.logs.repair.merge import merge_logs
 
@@ -40,7 +41,7 @@ def export(arguments: argparse.Namespace) -> Answer:
 
 def _view(arguments: argparse.Namespace, out: Path) -> Answer:
     with located("log export", (MissingExtraError,)):
-        from casadi_ik.logs.viewer.export import check_robot, write_view
+        from casadi_ik.logs.viewer.export import write_view
     from casadi_ik.logs.viewer.layout import layout_of, write_layout
 
     layout = out.with_suffix(".layout.json")

@@ -16,6 +16,7 @@ from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.say import PROGRAM
 from casadi_ik.cli.shared_options import add_tolerances
 from casadi_ik.cli.values import assignment, file_name, numbers, one_of, whole
+from casadi_ik.cli.view_parser import add_view
 from casadi_ik.errors import InputError
 from casadi_ik.problem.preference import PREFERENCES
 
@@ -127,6 +128,7 @@ def build_parser() -> Parser:
             run=run
         )
     add_log(commands)
+    add_view(commands)
     return parser
 
 

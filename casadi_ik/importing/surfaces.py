@@ -175,7 +175,7 @@ def mesh_file(name: str, path: Path) -> Path | None:
 def _of_coal(shape: Any) -> Surface | None:
     kind = type(shape).__name__
     if kind == "Box":
-        return _box(np.asarray(shape.halfSide))
+        return box_shape(np.asarray(shape.halfSide))
     if kind in ("Sphere", "Capsule", "Cylinder"):
         return round_shape(float(shape.radius), float(getattr(shape, "halfLength", 0.0)), kind)
     if not hasattr(shape, "vertices") or not hasattr(shape, "num_tris"):
@@ -188,7 +188,8 @@ def _of_coal(shape: Any) -> Surface | None:
     return Surface(points, np.array(triangles, dtype=np.int64).reshape(-1, 3))
 
 
-def _box(half: Array) -> Surface:
+def box_shape(half: Array) -> Surface:
+    """A box about the origin by half its edges (3,)."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
@@ -241,7 +242,7 @@ def _of_geom(mujoco: Any, model: Any, geom: int) -> Surface | None:
     kind, size = int(model.geom_type[geom]), np.array(model.geom_size[geom])
     types = mujoco.mjtGeom
     if kind == types.mjGEOM_BOX:
-        return _box(size)
+        return box_shape(size)
     if kind == types.mjGEOM_SPHERE:
         return round_shape(size[0], 0.0, "Sphere")
     if kind == types.mjGEOM_CAPSULE:

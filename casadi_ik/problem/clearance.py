@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -210,6 +211,22 @@ class SceneCheck:
         (placed,) = self.kernel.placed(robot.home)
         check_base(self.model, scene, placed)
         self._table(scene, frozenset())
+
+    def moved(self, name: str, pose: Array) -> SceneCheck:
+        """The same with an item of the scene at another (4, 4) pose: its pairs are the same.
+
+        Raises:
+            UnknownNameError: There is no such item.
+            InputError: No pose.
+            DescriptionError: It stands in the robot's base there.
+        """
+        other = copy(self)
+        other.scene = self.scene.moved(name, pose)
+        (placed,) = self.kernel.placed(self.robot.home)
+        check_base(self.model, other.scene, placed)
+        other._held, other._tables = {}, {}
+        other._table(other.scene, frozenset())
+        return other
 
     def _as_it_stands(self, model: CollisionModel) -> CollisionModel:
         """Without links that touch always; those that touch at home may overlap as much as there.

@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -131,6 +132,12 @@ class Engine:
         """
         return FreeFinder(self.finder, self.compiled)
 
+    def about(self, check: SceneCheck) -> Engine:
+        """The engine with another scene; all that was worked out for the robot stays."""
+        other = copy(self)
+        vars(other).update(check=check, _others=type(self)._others.func(other))
+        return other
+
     def around(self, problems: Problems) -> Surroundings | None:
         """What targets are checked against; None: nothing."""
         return None if self.check is None else self.check.around(problems)
@@ -174,6 +181,8 @@ class Engine:
                 return other.quick(problems, run)
         method, robot = self._quick, self.robot
         if method is None or problems.prefer in (MANIPULABILITY, CLEARANCE):
+            return None
+        if problems.palms is not None:
             return None
         start = run.start(robot)
         if start.ndim != 1:
@@ -227,6 +236,8 @@ class Engine:
         Raises:
             InputError: Bad q0, or targets the method cannot take.
         """
+        if problems.palms is not None:
+            _ = self._hand_first  # no other method keeps every target's hand where it is
         starts, recorder = run.starts(self.robot, len(problems)), run.recorder
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
         for kinds, _, _ in by_kinds(problems):
@@ -320,9 +331,8 @@ class Engine:
         found: dict[int, Diagnosis] = {}
         for kinds, of_kinds, some in by_kinds(unbiased):
             chosen = rows if of_kinds is None else rows[of_kinds]
-            diagnoses = self.of_kinds(kinds).diagnostician.diagnose(
-                some, starts[chosen], q[chosen] if own else None
-            )
+            ends = q[chosen] if own else None
+            diagnoses = self.of_kinds(kinds).diagnostician.diagnose(some, starts[chosen], ends)
             found |= zip(chosen.tolist(), diagnoses, strict=True)
         for row, why in found.items():
             if own and why.reason is Reason.REACHABLE:

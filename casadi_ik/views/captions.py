@@ -8,15 +8,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from casadi_ik import palette
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Grasp
 from casadi_ik.problem.solution import Solution
 from casadi_ik.views.picture import FAINT, INK
 
-OBJECT_COLOR = "#8cc4e8"
-TARGET_COLOR = "#f0b400"
-MET_COLOR, MISSED_COLOR = "#1f9d55", "#d62f3c"
-NEAREST_COLOR = "#e00000"
+OBJECT_COLOR = palette.OBJECT
+TARGET_COLOR = palette.TARGET
+MET_COLOR, MISSED_COLOR = palette.MET, palette.MISSED
+NEAREST_COLOR = palette.NEAREST
 
 
 def label_fingers(axes: Axes, places: dict[str, Array], solution: Solution, grasp: Grasp) -> None:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
+from casadi_ik import palette
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.logs import Table
@@ -18,7 +19,7 @@ from casadi_ik.problem.problems import Tolerance
 from casadi_ik.views.picture import DPI, FAINT, INK, new_figure, save_picture
 from casadi_ik.views.strips import draw_strip, events_strip, limits_strip, mark_events, runs
 
-COLORS = ("#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6", "#c2334d", "#0f8b8d")
+COLORS = palette.LINES
 """Of the lines of a panel; where there are more of them, dashes tell the rounds apart."""
 
 DASHES = ("-", (0, (4, 1.2)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)))
@@ -26,7 +27,7 @@ DASHES = ("-", (0, (4, 1.2)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)))
 LONG = 400
 """From so many iterations on, lines are thin: thick ones would fill the panel."""
 
-PHASE_COLORS = ("#f3f1ec", "#fbecd9", "#deebf7", "#e3f2e1")
+PHASE_COLORS = palette.PHASES
 """By the code of the phase."""
 
 FIELDS = {

@@ -11,12 +11,13 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from casadi_ik import palette
 from casadi_ik.errors import PictureError
 
 DPI = 160
 """Dots per inch of a picture unless said."""
 
-INK, FAINT = "#2b333b", "#7a848e"
+INK, FAINT = palette.INK, palette.FAINT
 """Colours of text."""
 
 

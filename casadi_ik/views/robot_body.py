@@ -10,13 +10,14 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.views.shapes import Solid, capsule, drum, stretched
 
-ARM_COLOR, ARM_JOINT_COLOR = "#e8944a", "#5f6975"
-HAND_COLOR, PALM_COLOR, HAND_JOINT_COLOR = "#65727f", "#414c58", "#333c46"
+ARM_COLOR, ARM_JOINT_COLOR = palette.ARM, palette.ARM_JOINT
+HAND_COLOR, PALM_COLOR, HAND_JOINT_COLOR = palette.HAND, palette.PALM, palette.HAND_JOINT
 
 ARM_RADIUS = 0.048
 """Of the arm's tubes [m]."""

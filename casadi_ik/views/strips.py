@@ -8,19 +8,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from casadi_ik import palette
 from casadi_ik.logs import Table
 from casadi_ik.logs.events.traces import bits_of
 from casadi_ik.views.picture import INK
 
 LIMIT_COLOR = "#c2334d"
 
-EVENT_COLORS = {
-    "NEAR_SINGULAR": "#8e4ec6",
-    "ILL_CONDITIONED": "#b48ad6",
-    "STALL": "#2b333b",
-    "OSCILLATION": "#0f8b8d",
-    "RESTART": "#2f6db3",
-}
+EVENT_COLORS = palette.EVENTS
 """Of the events that are marked; the others show as phases and limits."""
 
 Span = tuple[float, float]

@@ -277,9 +277,13 @@ class HandFirstMethod(LoopedMethod):
 
     def _terms_of(self, problems: Problems) -> Array:
         bounds = problems.bounds(self.robot, UNBOUNDED)
-        nearest = [float(problems.prefer == NEAREST)]
-        tolerances = problems.position_tolerance, problems.angle_tolerance
-        return np.concatenate([*tolerances, *bounds, nearest])
+        nearest = np.array([float(problems.prefer == NEAREST)])
+        every = problems.position_tolerance, problems.angle_tolerance, *bounds, nearest
+        if bounds[0].ndim == 1:
+            return np.concatenate(every)
+        # Each target has bounds of its own.
+        rows = (np.broadcast_to(part, (len(problems), part.shape[-1])) for part in every)
+        return np.concatenate(list(rows), axis=1)
 
     @cached_property
     def first(self) -> FunctionKernel:

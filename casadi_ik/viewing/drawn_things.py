@@ -1,0 +1,135 @@
+"""The object and what stands about the robot, on a page, to be dragged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from casadi_ik import palette
+from casadi_ik.arrays import Array
+from casadi_ik.collision.scene import Item
+from casadi_ik.errors import UnknownNameError
+from casadi_ik.grasps import load_object
+from casadi_ik.grasps.pose import inverse
+from casadi_ik.importing.surfaces import Surface
+from casadi_ik.viewing.asked import Asked
+from casadi_ik.viewing.bodies import body_of, sharp
+from casadi_ik.viewing.frames import pose_of, quaternion
+
+OBJECT = "object"
+"""What the object is called among the things that can be dragged."""
+
+SIZE = 0.16
+"""Of the control of a thing [m]."""
+
+
+class DrawnThings:
+    """The object that is grasped and the items of the scene."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        asked: Asked,
+        moved: Callable[[str, Array], None],
+        selected: Callable[[str], None],
+    ) -> None:
+        """Draw them.
+
+        Args:
+            server: The page.
+            asked: What is asked first.
+            moved: Told of a thing and its new (4, 4) pose when it is dragged.
+            selected: Told of a thing that is clicked.
+        """
+        self._controls: dict[str, viser.TransformControlsHandle] = {}
+        surface = _object_surface(asked.object)
+        if surface is not None and asked.object_pose is not None:
+            self._add(server, OBJECT, [(surface, palette.OBJECT, 0.4)], moved, selected)
+        for name, item in () if asked.scene is None else asked.scene.items.items():
+            if name != asked.object:
+                parts = [(one, palette.SCENE, 0.8) for one in _item_surfaces(item)]
+                self._add(server, name, parts, moved, selected)
+        self.place(asked)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What can be dragged."""
+        return tuple(self._controls)
+
+    def place(self, asked: Asked, dragged: str = "") -> None:
+        """Put everything where it is; what is being dragged is where the hand has it."""
+        for name, control in self._controls.items():
+            if name == dragged:
+                continue
+            if name == OBJECT and asked.object_pose is not None:
+                pose = asked.object_pose
+            elif asked.scene is not None and name in asked.scene.items:
+                pose = asked.scene.items[name].pose
+            else:
+                continue
+            control.position, control.wxyz = pose[:3, 3], quaternion(pose[:3, :3])
+
+    def select(self, name: str) -> None:
+        """Give one thing its arrows and rings to be dragged by."""
+        for other, control in self._controls.items():
+            off = other != name
+            control.disable_axes = control.disable_sliders = control.disable_rotations = off
+
+    def _add(
+        self,
+        server: viser.ViserServer,
+        name: str,
+        parts: list[tuple[Surface, str, float]],
+        moved: Callable[[str, Array], None],
+        selected: Callable[[str], None],
+    ) -> None:
+        control = server.scene.add_transform_controls(
+            f"/things/{name}",
+            scale=SIZE,
+            line_width=3.0,
+            depth_test=False,
+            disable_axes=True,
+            disable_sliders=True,
+            disable_rotations=True,
+        )
+        self._controls[name] = control
+
+        @control.on_update
+        async def _(_: Any) -> None:
+            moved(name, pose_of(control.position, control.wxyz))
+
+        for i, (surface, color, opacity) in enumerate(parts):
+            mesh = server.scene.add_mesh_simple(
+                f"/things/{name}/{i}",
+                surface.points.astype(np.float32),
+                surface.triangles.astype(np.uint32),
+                color=palette.rgb(color),
+                opacity=opacity,
+                cast_shadow=name == OBJECT,
+                receive_shadow=0.3,
+            )
+
+            @mesh.on_click
+            async def _(_: Any) -> None:
+                selected(name)
+
+
+def _object_surface(name: str) -> Surface | None:
+    if not name:
+        return None
+    try:
+        points, triangles = load_object(name).mesh(48)
+    except UnknownNameError:
+        return None
+    return sharp(Surface(points, np.asarray(triangles, dtype=np.int64)))
+
+
+def _item_surfaces(item: Item) -> list[Surface]:
+    about = inverse(item.pose)[:3, 3]
+    return [
+        body_of(solid, inverse(place)[:3] @ np.append(about, 1.0)).moved(place)
+        for solid, place in item.parts
+    ]

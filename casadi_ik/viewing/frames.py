@@ -1,0 +1,67 @@
+"""Poses as matrices and as the page has them: position and quaternion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+
+
+def quaternions(rotations: Array) -> Array:
+    """(k, 4) unit quaternions, scalar first, of rotations (k, 3, 3)."""
+    r = rotations
+    # Four times the squares of the parts; the largest is taken, so that nothing is divided by zero.
+    x, y, z = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    squares = np.stack([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z], axis=1)
+    a, b, c = (r[:, i, j] - r[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    d, e, f = (r[:, i, j] + r[:, j, i] for i, j in ((1, 0), (0, 2), (2, 1)))
+    rows = np.stack(
+        [
+            np.stack([squares[:, 0], a, b, c], axis=1),
+            np.stack([a, squares[:, 1], d, e], axis=1),
+            np.stack([b, d, squares[:, 2], f], axis=1),
+            np.stack([c, e, f, squares[:, 3]], axis=1),
+        ],
+        axis=1,
+    )
+    chosen = rows[np.arange(len(r)), squares.argmax(axis=1)]
+    return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+
+
+def quaternion(rotation: Array) -> Array:
+    """(4,) of one rotation (3, 3)."""
+    return quaternions(rotation[None])[0]
+
+
+def pose_of(position: Array, wxyz: Array) -> Array:
+    """(4, 4) of a position (3,) and a quaternion (4,)."""
+    w, x, y, z = np.asarray(wxyz, dtype=float) / np.linalg.norm(wxyz)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = position
+    return pose
+
+
+def facing(point: Array, normal: Array, like: Array | None = None) -> Array:
+    """(4, 4) pose at a point whose x axis is a direction, otherwise turned as little as may be.
+
+    Args:
+        point: (3,) [m].
+        normal: (3,) any length but zero.
+        like: (3, 3) what it is turned from; None: the base frame.
+    """
+    x = normal / np.linalg.norm(normal)
+    axes = (np.eye(3) if like is None else like).T
+    y = axes[1] - x * (x @ axes[1])
+    if np.linalg.norm(y) < 1e-3:
+        y = axes[2] - x * (x @ axes[2])
+    if np.linalg.norm(y) < 1e-3:
+        y = axes[0] - x * (x @ axes[0])
+    y /= np.linalg.norm(y)
+    pose = np.eye(4)
+    pose[:3] = np.column_stack([x, y, np.cross(x, y), point])
+    return pose

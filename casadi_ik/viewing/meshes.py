@@ -1,0 +1,40 @@
+"""The meshes of a robot's files, by link of the robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.files.reading import read_yaml
+from casadi_ik.importing.surfaces import Surface, checked_surfaces
+from casadi_ik.robots.part import PREFIX
+
+
+def robot_meshes(robot: ArmHand, path: Path) -> dict[str, Surface]:
+    """What the files that a description points to show of its links.
+
+    Args:
+        robot: The robot of the description.
+        path: The description.
+
+    Returns:
+        By link its surface in its frame; links of which no file has a shape are left out.
+
+    Raises:
+        CasadiIKError: The description cannot be read.
+    """
+    raw, links = read_yaml(path), set(robot.description.links)
+    found: dict[str, Surface] = {}
+    for key in ("arm", "hand", "robot"):
+        entry = raw.get(key)
+        if not isinstance(entry, dict) or "file" not in entry:
+            continue
+        file = path.parent / Path(str(entry["file"])).expanduser()
+        prefix = PREFIX if key == "hand" else ""
+        # A name that arm and hand both have is prefixed in the hand.
+        named = {link.removeprefix(prefix) if prefix else link: link for link in links}
+        named |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}
+        surfaces, _ = checked_surfaces(file, list(named))
+        for link, surface in surfaces.items():
+            found.setdefault(named[link], surface)
+    return found

@@ -1,0 +1,90 @@
+"""A page that is served: where it is, how it ends, how a notebook shows it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from casadi_ik.errors import InputError
+
+HOST = "127.0.0.1"
+"""Only this machine sees a page unless more is asked for."""
+
+PORT = 8080
+"""The first that is tried."""
+
+TRIED = 100
+"""Ports that are tried where none is asked for."""
+
+
+class Viewer:
+    """A running page; every browser that opens it sees and moves the same robot.
+
+    Attributes:
+        url: Where it is.
+        page: What is on it.
+    """
+
+    def __init__(self, server: viser.ViserServer, page: Any, stop: Callable[[], None]) -> None:
+        """Take what runs."""
+        self._server, self._stop, self.page = server, stop, page
+        self.url = f"http://{_shown(server.get_host())}:{server.get_port()}"
+
+    def __repr__(self) -> str:
+        return f"<Viewer {self.url}>"
+
+    def _repr_html_(self) -> str:
+        """In a notebook: the page itself."""
+        return f'<iframe src="{self.url}" width="100%" height="600" frameborder="0"></iframe>'
+
+    def stop(self) -> None:
+        """End the page."""
+        self._stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def wait(self) -> None:
+        """Go on until somebody interrupts, then end the page."""
+        with contextlib.suppress(KeyboardInterrupt):
+            self._server.sleep_forever()
+        self.stop()
+
+
+def serve(host: str = HOST, port: int | None = None) -> viser.ViserServer:
+    """An empty page.
+
+    Args:
+        host: Who may see it: the address it is served at; "0.0.0.0" is everybody in the network.
+        port: Of the address; None: the first free one from 8080 on.
+
+    Raises:
+        InputError: The port is taken, or nothing can be served there.
+    """
+    wanted = range(PORT, PORT + TRIED) if port is None else (port,)
+    free = next((one for one in wanted if _is_free(host, one)), None)
+    if free is None:
+        found = f"{port}" if port is not None else f"{PORT} to {PORT + TRIED - 1}"
+        raise InputError(f"port: found {found}, which cannot be had at {host}; expected a free one")
+    with contextlib.redirect_stdout(io.StringIO()):
+        return viser.ViserServer(host=host, port=free, verbose=False)
+
+
+def _is_free(host: str, port: int) -> bool:
+    try:
+        with socket.create_server((host, port)):
+            return True
+    except OSError as error:
+        if isinstance(error, socket.gaierror):
+            raise InputError(
+                f"host: found {host!r}, expected an address of this machine"
+            ) from error
+        return False
+
+
+def _shown(host: str) -> str:
+    return "127.0.0.1" if host in ("0.0.0.0", "") else host

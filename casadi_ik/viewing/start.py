@@ -1,0 +1,83 @@
+"""Pages that begin: a grasp, a log, pads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from numpy.typing import ArrayLike
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.collision.scene import Scene
+from casadi_ik.errors import InputError
+from casadi_ik.grasps import Grasp
+from casadi_ik.importing.surfaces import Surface
+from casadi_ik.logs.read.one_solve import OneSolve
+from casadi_ik.viewing.asked import Asked, Settings, asked_of
+from casadi_ik.viewing.grasp_page import GraspPage
+from casadi_ik.viewing.log_page import LogPage
+from casadi_ik.viewing.log_track import track_of
+from casadi_ik.viewing.server import HOST, Viewer, serve
+
+
+def view_grasp(
+    robot: ArmHand,
+    grasp: Grasp | None = None,
+    *,
+    q: ArrayLike | None = None,
+    scene: Scene | None = None,
+    settings: Settings | None = None,
+    meshes: Mapping[str, Surface] | None = None,
+    candidates: Mapping[str, Callable[[], tuple[Asked, Array]]] | None = None,
+    host: str = HOST,
+    port: int | None = None,
+) -> Viewer:
+    """A page on which contacts, the object and what stands about are dragged.
+
+    Args:
+        robot: The robot.
+        grasp: What is asked; None: the contacts that the robot has at q.
+        q: (n,) where the robot begins [rad or m]; None: at home. With a grasp it is solved from
+            there, unless q meets the contacts already.
+        scene: What stands about; None: nothing is checked.
+        settings: How it is solved.
+        meshes: What the robot's files show, by link.
+        candidates: Other questions to choose from, by name: each gives it, and a start.
+        host: Who may see it; "0.0.0.0": everybody in the network.
+        port: Where; None: the first free one from 8080 on.
+
+    Raises:
+        InputError: A finger that the robot has not, or a port that cannot be had.
+        CasadiIKError: The scene does not fit the robot.
+    """
+    start = robot.configuration(q)
+    asked = asked_of(robot, grasp, start, scene, settings)
+    server = serve(host, port)
+    try:
+        page = GraspPage(server, robot, asked, start, meshes, candidates, solved=q is None)
+    except BaseException:
+        server.stop()
+        raise
+    return Viewer(server, page, page.stop)
+
+
+def view_log(
+    *solves: tuple[OneSolve, ArmHand], host: str = HOST, port: int | None = None
+) -> Viewer:
+    """A page on which one solve plays, or two side by side.
+
+    Args:
+        solves: Each with the robot that it was solved for.
+        host: As for `view_grasp`.
+        port: As for `view_grasp`.
+
+    Raises:
+        LogError: The log has kept no iterations.
+        InputError: None or more than two, or a port that cannot be had.
+    """
+    if not 1 <= len(solves) <= 2:
+        raise InputError(f"found {len(solves)} solves, expected one or two")
+    tracks = [track_of(*one) for one in solves]
+    server = serve(host, port)
+    page = LogPage(server, tracks)
+    return Viewer(server, page, page.stop)

@@ -1,0 +1,160 @@
+"""Questions of a page: what a drag makes of them, what is saved."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.files.reading import Frame, frame_matrix
+from casadi_ik.viewing.asked import asked_of
+from casadi_ik.viewing.bodies import arrow, body_of, sharp
+from casadi_ik.viewing.frames import facing, pose_of, quaternions
+from casadi_ik.viewing.grasp_text import grasp_text
+from casadi_ik.viewing.newest import Newest
+
+
+def turned(x: float, y: float, z: float, *angles: float) -> np.ndarray:
+    return frame_matrix(Frame((x, y, z), angles or (0.3, -0.2, 0.9)))
+
+
+def test_quaternions_are_those_of_rotations_of_any_angle(rng: np.random.Generator) -> None:
+    axes = rng.normal(size=(200, 3))
+    angles = np.concatenate([rng.uniform(-np.pi, np.pi, 196), [0.0, np.pi, -np.pi, 1e-9]])
+    half = angles[:, None] / 2
+    wxyz = np.hstack(
+        [np.cos(half), np.sin(half) * axes / np.linalg.norm(axes, axis=1, keepdims=True)]
+    )
+    poses = np.array([pose_of(np.zeros(3), one) for one in wxyz])
+    again = np.array([pose_of(np.zeros(3), one) for one in quaternions(poses[:, :3, :3])])
+    assert np.allclose(again, poses, atol=1e-12)
+
+
+def test_a_control_faces_along_the_normal(rng: np.random.Generator) -> None:
+    for normal in (*rng.normal(size=(20, 3)), *np.eye(3), *-np.eye(3)):
+        pose = facing(np.ones(3), normal)
+        assert np.allclose(pose[:3, 0], normal / np.linalg.norm(normal))
+        assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(pose[:3, :3]) > 0
+
+
+def test_dragging_a_control_moves_all_that_the_contact_asks_for(robot: ik.ArmHand) -> None:
+    contact = ik.Contact([0.5, 0.1, 0.6], [0, 0, 1], line=[1, 0, 0])
+    asked = asked_of(robot, ik.Grasp({"thumb": contact}), None)
+    step = turned(0.1, 0.0, -0.1)
+    moved = asked.with_control("thumb", step @ asked.held["thumb"].control)
+    found, expected = moved.grasp.contacts["thumb"], contact.at(step)
+    for name in ("point", "normal", "line"):
+        assert np.allclose(getattr(found, name), getattr(expected, name))
+    assert list(moved.grasp.contacts) == ["thumb"]
+
+
+def test_contacts_move_with_the_object(robot: ik.ArmHand) -> None:
+    grasp = ik.load_grasp("cup")
+    asked, pose = asked_of(robot, grasp, None), turned(-0.7, 0.2, 0.5)
+    moved = asked
+    for share in (0.25, 0.5, 1.0):  # in steps, as a drag comes
+        here = pose.copy()
+        here[:3, 3] = share * pose[:3, 3] + (1 - share) * grasp.object_pose[:3, 3]
+        moved = moved.with_object(here)
+    expected = grasp.in_object_frame().at(pose)
+    for finger, contact in expected.contacts.items():
+        assert np.allclose(moved.grasp.contacts[finger].point, contact.point, atol=1e-9)
+        assert np.allclose(moved.grasp.contacts[finger].normal, contact.normal, atol=1e-9)
+
+
+def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
+    asked = asked_of(robot, ik.load_grasp("cup"), None)
+    for finger in robot.fingers[:-1]:
+        asked = asked.with_use(finger, used=False, normal=True)
+    last = robot.fingers[-1]
+    assert set(asked.grasp.contacts) == {last}
+    assert set(asked.with_use(last, used=False, normal=True).grasp.contacts) == {last}
+    loose = asked.with_use(last, used=True, normal=False).grasp.contacts[last]
+    assert loose.normal is None
+
+
+def test_what_is_saved_is_read_back(robot: ik.ArmHand, tmp_path: Path) -> None:
+    shipped = ik.load_grasp("cup")
+    special = ik.Contact([1 / 3, 0.1, -0.2], [0, 0, 1], ik.Tolerance(1e-3, 0.02), tangent=[1, 0, 0])
+    contacts = dict(shipped.contacts) | {
+        "finger_2": special,
+        "finger_3": ik.Contact(direction=[0.0, 1.0, 0.5]),
+    }
+    grasp = ik.Grasp(contacts, "kuka_lwr_barrett", "mine", "cup", turned(0.1, 0.2, 0.3))
+    path = tmp_path / "mine.yaml"
+    path.write_text(grasp_text(grasp, "a comment"), encoding="utf-8")
+    again = ik.load_grasp(path)
+    assert (again.robot, again.object, again.name) == (grasp.robot, grasp.object, "mine")
+    assert np.allclose(again.object_pose, grasp.object_pose, atol=1e-12)
+    for finger, contact in grasp.contacts.items():
+        found = again.contacts[finger]
+        for name in ("point", "normal", "tangent", "line", "plane"):
+            one, other = getattr(contact, name), getattr(found, name)
+            assert (one is None) == (other is None)
+            assert one is None or np.allclose(one, other, atol=1e-15, equal_nan=True)
+        assert found.tolerance == contact.tolerance
+
+
+def test_only_the_newest_change_of_a_key_is_done() -> None:
+    begun, go_on, done = threading.Event(), threading.Event(), []
+
+    def first() -> None:
+        begun.set()
+        go_on.wait(10)
+        done.append("first")
+
+    work = Newest(lambda: done.append("drawn"), (lambda: done.append("later"),))
+    work.put("thumb", first)
+    assert begun.wait(10)
+    for i in range(5):
+        work.put("thumb", lambda i=i: done.append(f"thumb {i}"))
+    work.put("cup", lambda: done.append("cup"))
+    go_on.set()
+    assert work.settle(10)
+    # The first was under way; of the five that waited the last is done, and drawn once with "cup".
+    assert done == ["first", "drawn", "thumb 4", "cup", "drawn", "later"]
+    assert work.dropped == 4
+    work.stop()
+
+
+def test_a_change_that_fails_does_not_end_the_page(caplog: pytest.LogCaptureFixture) -> None:
+    done = []
+    work = Newest(lambda: done.append("drawn"))
+    work.put("bad", lambda: 1 / 0)
+    assert work.settle(10)
+    work.put("good", lambda: done.append("good"))
+    assert work.settle(10)
+    assert done == ["drawn", "good", "drawn"]
+    assert "ZeroDivisionError" in caplog.text
+    work.stop()
+
+
+def test_bodies_are_closed_and_wind_outwards() -> None:
+    scene = ik.Scene(
+        {
+            "box": {"kind": "box", "size": [0.1, 0.2, 0.3]},
+            "drum": {"kind": "cylinder", "radius": 0.1, "length": 0.2},
+            "ball": {"kind": "sphere", "radius": 0.1},
+            "banana": {"kind": "object", "object": "banana"},
+            "can": {"kind": "object", "object": "mustard_bottle"},
+        }
+    )
+    bodies = [body_of(s, np.zeros(3)) for item in scene.items.values() for s, _ in item.parts]
+    for body in [*bodies, arrow(0.05, 0.005)]:
+        a, b, c = (body.points[body.triangles[:, i]] for i in range(3))
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+        assert volume > 0
+        # What is closed has no area in sum.
+        assert np.allclose(np.cross(b - a, c - a).sum(axis=0), 0, atol=1e-9)
+
+
+def test_edges_are_sharp_and_round_sides_are_not() -> None:
+    from casadi_ik.importing.surfaces import box_shape, round_shape
+
+    assert len(sharp(box_shape(np.ones(3))).points) == 24
+    ball = round_shape(1.0, 0.0, "Sphere")
+    assert len(sharp(ball).points) <= len(ball.points)

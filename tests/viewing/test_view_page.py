@@ -1,0 +1,159 @@
+"""The page on which contacts are dragged; its handlers are called as a browser calls them."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import InputError
+from casadi_ik.viewing import Viewer, view_grasp
+from casadi_ik.viewing.asked import Settings
+from casadi_ik.viewing.drawn_things import OBJECT
+
+
+def shifted(pose: np.ndarray, *by: float) -> np.ndarray:
+    moved = pose.copy()
+    moved[:3, 3] += by
+    return moved
+
+
+def test_the_page_begins_solved_and_serves_this_machine_only(cup: Viewer) -> None:
+    page = cup.page
+    assert page.answer.success
+    assert page.answer.clearance is not None
+    assert page.answer.closest is not None
+    assert cup.url.startswith("http://127.0.0.1:")
+    assert cup.url in cup._repr_html_()
+    port = int(cup.url.rpartition(":")[2])
+    with socket.create_connection(("127.0.0.1", port), 5) as connection:
+        assert connection.getpeername()[0] == "127.0.0.1"
+    with pytest.raises(InputError, match=f"port: found {port}"):
+        view_grasp(page.robot, port=port)
+
+
+def test_a_dragged_contact_is_reached(cup: Viewer) -> None:
+    page, robot = cup.page, cup.page.robot
+    before = page.answer.q
+    page.drag_control("thumb", shifted(page.asked.held["thumb"].control, 0.004, 0.008, 0.004))
+    assert page.work.settle()
+    assert page.answer.success
+    tip = robot.contacts(page.answer.q)[0][robot.fingers.index("thumb")]
+    wanted = page.asked.grasp.contacts["thumb"].point
+    assert np.linalg.norm(tip - wanted) <= page.asked.settings.tolerance.position
+    # The nearest answer: no motor goes far for a centimetre.
+    assert np.abs(page.answer.q - before).max() < 0.5
+
+
+def test_a_dragged_normal_is_faced(cup: Viewer) -> None:
+    page, robot = cup.page, cup.page.robot
+    normal = page.asked.grasp.contacts["thumb"].normal + np.array([0.0, 0.0, 0.12])
+    page.drag_normal("thumb", normal)
+    assert page.work.settle()
+    assert page.answer.success
+    faced = robot.contacts(page.answer.q)[1][robot.fingers.index("thumb")]
+    assert faced @ normal / np.linalg.norm(normal) >= np.cos(np.deg2rad(3.0))
+
+
+def test_an_unreachable_contact_shows_why_and_what_is_nearest(cup: Viewer) -> None:
+    page, robot = cup.page, cup.page.robot
+    page.drag_thing(OBJECT, shifted(page.asked.object_pose, -0.6, 0.0, 0.0))
+    assert page.work.settle()
+    answer = page.answer
+    assert not answer.success
+    assert answer.headline == "UNREACHABLE"
+    assert any("too far for the arm" in line for line in answer.lines)
+    # What is drawn is the nearest configuration, and the verdict is that of what is drawn.
+    points, normals = page.asked.grasp.arrays(robot.fingers)
+    position, _ = robot.errors(answer.q, points, normals)
+    shown = [answer.contacts[finger].position_error for finger in robot.fingers]
+    assert np.allclose(position, shown)
+    assert "too far for the arm" in page._panel._verdict.content
+
+
+def test_the_object_takes_its_contacts_along(cup: Viewer) -> None:
+    page = cup.page
+    before = {name: one.point for name, one in page.asked.grasp.contacts.items()}
+    page.drag_thing(OBJECT, shifted(page.asked.object_pose, 0.02, -0.03, 0.04))
+    assert page.work.settle()
+    assert page.answer.success
+    for name, contact in page.asked.grasp.contacts.items():
+        assert np.allclose(contact.point - before[name], [0.02, -0.03, 0.04])
+
+
+def test_a_dragged_table_is_what_answers_keep_off(cup: Viewer) -> None:
+    page = cup.page
+    pose = page.asked.scene.items["table"].pose
+    page.drag_thing("table", shifted(pose, -1.3, 0.0, 0.36))
+    assert page.work.settle()
+    scene = page.asked.scene
+    fresh = ik.Solver(page.robot, scene=scene)
+    clear = fresh.check(page.answer.q, page.asked.grasp)
+    assert clear is not None
+    assert float(clear.distance[0]) == pytest.approx(page.answer.clearance, abs=1e-12)
+    assert page.answer.success == bool(clear.free[0]) is False
+    assert page.answer.headline == "COLLISION"
+    assert any("answers touch something" in line for line in page.answer.lines)
+    # Into the robot's foot it cannot go: the page says so, and goes on.
+    page.drag_thing("table", shifted(pose, 0.0, 0.0, 0.07))
+    assert page.work.settle()
+    assert page.answer.headline == "NOT ASKED"
+    page.drag_thing("table", pose)
+    assert page.work.settle()
+    assert page.answer.success
+
+
+def test_all_solutions_can_be_gone_through(cup: Viewer) -> None:
+    page = cup.page
+    # Listed once nothing moves, so after the drag is answered.
+    page.drag_control("thumb", shifted(page.asked.held["thumb"].control, 0.0, 0.0, 0.001))
+    assert page.work.settle()
+    assert len(page.solutions) > 1
+    shown = []
+    for number in range(len(page.solutions)):
+        page.show_solution(number)
+        assert page.work.settle()
+        assert page.answer.success
+        shown.append(page.answer.q)
+    apart = [np.abs(a - b).max() for i, a in enumerate(shown) for b in shown[:i]]
+    assert min(apart) > 0.01
+    assert f"{len(shown)} of {len(shown)}" in page._panel._solution.content
+
+
+def test_motors_moved_by_hand_are_judged_and_not_solved(cup: Viewer) -> None:
+    page = cup.page
+    q = page.answer.q.copy()
+    q[0] += 0.2
+    page.drag_motors(q)
+    assert page.work.settle()
+    assert np.array_equal(page.answer.q, q)
+    assert page.answer.headline == "NOT MET"
+    assert all(one.position_error > 5e-3 for one in page.answer.contacts.values())
+
+
+def test_settings_are_those_that_it_is_solved_with(cup: Viewer) -> None:
+    page = cup.page
+    tight = ik.Tolerance(1e-6, 1e-6)
+    tightly = Settings(tolerance=tight, prefer="limits")
+    page.change("settings", lambda a: replace(a, settings=tightly))
+    assert page.work.settle()
+    assert page.answer.success
+    assert {one.tolerance for one in page.answer.contacts.values()} == {tight}
+    assert max(one.position_error for one in page.answer.contacts.values()) <= 1e-6
+
+
+def test_a_solver_moves_what_stands_about_it(robot: ik.ArmHand) -> None:
+    solver, grasp = ik.Solver(robot, scene=ik.load_scene("table")), ik.load_grasp("cup")
+    pose = shifted(solver.scene.items["table"].pose, -1.3, 0.0, 0.36)
+    moved = solver.moved("table", pose)
+    fresh = ik.Solver(robot, scene=solver.scene.moved("table", pose))
+    one, other = moved.solve(grasp), fresh.solve(grasp)
+    assert np.array_equal(one.q, other.q)
+    assert one.clearance == other.clearance
+    assert one.status is ik.Status.COLLISION
+    assert solver.solve(grasp).success
+    with pytest.raises(InputError, match="has no scene"):
+        ik.Solver(robot).moved("table", pose)
