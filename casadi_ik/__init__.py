@@ -5,6 +5,7 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.collision.scene import Scene, load_scene
 from casadi_ik.control import ScrewControl
+from casadi_ik.datasets import load_candidates
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
@@ -18,7 +19,7 @@ from casadi_ik.motion.reaching import Reach, ReachStatus
 from casadi_ik.motion.retarget import Retargeter, load_retarget
 from casadi_ik.motion.tracking import Track
 from casadi_ik.problem.collision_report import CollisionReport
-from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.contact_verdict import ContactVerdict, PalmVerdict
 from casadi_ik.problem.diagnosis import Diagnosis, Reason
 from casadi_ik.problem.ranking import Choice, Ranking
 from casadi_ik.problem.solution import BatchSolution, Solution
@@ -45,6 +46,7 @@ __all__ = [
     "Grasp",
     "Jump",
     "Motion",
+    "PalmVerdict",
     "Phase",
     "Ranking",
     "Reach",
@@ -60,6 +62,7 @@ __all__ = [
     "Tolerance",
     "Track",
     "Trajectory",
+    "load_candidates",
     "load_grasp",
     "load_retarget",
     "load_robot",

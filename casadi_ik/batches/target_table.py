@@ -38,7 +38,7 @@ class TargetTable:
             InputError: No Parquet file, columns missing or not of numbers, or no rows.
             UnsupportedError: polars is not installed.
         """
-        pl, frame = _polars(), self._scanned()
+        pl, frame = polars_module(), self._scanned()
         try:
             schema = frame.collect_schema()
             count = int(frame.select(pl.len()).collect().item())
@@ -62,7 +62,7 @@ class TargetTable:
 
     def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, Array]]:
         """Arrays (up to size, f, 3) by name, one block after the other; as `TargetFile.blocks`."""
-        pl, frame, count = _polars(), self._scanned(), self.rows()
+        pl, frame, count = polars_module(), self._scanned(), self.rows()
         start = 0
         while start < count:
             rows = min(size(), count - start)
@@ -84,10 +84,15 @@ class TargetTable:
         }
 
     def _scanned(self) -> polars.LazyFrame:
-        return _polars().scan_parquet(self.path)
+        return polars_module().scan_parquet(self.path)
 
 
-def _polars() -> Any:
+def polars_module() -> Any:
+    """The library that reads Parquet.
+
+    Raises:
+        UnsupportedError: It is not installed.
+    """
     try:
         import polars as pl
     except ImportError as error:

@@ -7,13 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
 from casadi_ik.api import Solver
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.batches.target_file import TargetFile
 from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import (
@@ -26,15 +23,9 @@ from casadi_ik.cli.question import (
 )
 from casadi_ik.cli.report import clearance, duration, files, headline, table
 from casadi_ik.cli.solve import as_json
-from casadi_ik.errors import DescriptionError
-from casadi_ik.grasps import Contact, Grasp
-from casadi_ik.grasps.candidates import load_candidates
-from casadi_ik.problem.contacts.arrays import NAMES
-from casadi_ik.problem.problems import DIRECTIONS
+from casadi_ik.datasets import load_candidates
+from casadi_ik.grasps import Grasp
 from casadi_ik.problem.ranking import Ranking
-
-BLOCK = 4096
-"""Rows of an npz file that are read at once."""
 
 
 def choose(arguments: argparse.Namespace) -> Answer:
@@ -46,7 +37,14 @@ def choose(arguments: argparse.Namespace) -> Answer:
     path, out = Path(arguments.candidates), arguments.out
     robot = the_robot(arguments.robot)
     q0, pose = the_start(arguments, robot), the_object_pose(arguments)
-    grasps = the_candidates(path, robot)
+    grasps = load_candidates(
+        path,
+        robot,
+        arguments.layout,
+        arguments.hand,
+        take=arguments.take,
+        grasped=arguments.object,
+    )
     check_outputs([("--out", out)], inputs=[path])
     solver = Solver(robot, tolerance=the_tolerance(arguments), scene=the_scene(arguments))
     with located(str(path)):
@@ -55,49 +53,6 @@ def choose(arguments: argparse.Namespace) -> Answer:
     write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
     report = _report(path.name, solver, ranking, grasps, out)
     return Answer(report, Exit.DONE if ranking.entries else Exit.NOT_SOLVED)
-
-
-def the_candidates(path: Path, robot: ArmHand) -> tuple[Grasp, ...]:
-    """The grasps of a file or a folder.
-
-    Raises:
-        InputError: It is missing, empty or malformed, or has fingers that the robot has not.
-    """
-    if path.suffix == ".npz":
-        return tuple(_of_arrays(path, robot.fingers))
-    if not path.exists():
-        raise DescriptionError(f"{path}: no such file or folder, expected candidates")
-    grasps = load_candidates(path)
-    for grasp in grasps:
-        with located(f"{path}: {grasp.name}"):
-            grasp.arrays(robot.fingers)
-    return grasps
-
-
-def _of_arrays(path: Path, fingers: tuple[str, ...]) -> list[Grasp]:
-    found: list[Grasp] = []
-    for block in TargetFile(path, len(fingers)).blocks(lambda: BLOCK):
-        for row in range(len(block["points"])):
-            with located(f"{path}: row {len(found)}"):
-                given = {name: rows[row] for name, rows in block.items()}
-                contacts = {
-                    finger: contact
-                    for i, finger in enumerate(fingers)
-                    if (contact := _contact({name: v[i] for name, v in given.items()})) is not None
-                }
-                found.append(Grasp(contacts))
-    return found
-
-
-def _contact(vectors: dict[str, np.ndarray]) -> Contact | None:
-    """What an npz file says of a finger; None where that is free."""
-    given = {name: vector for name, vector in vectors.items() if not np.isnan(vector).all()}
-    if not given:
-        return None
-    if DIRECTIONS in given and "points" not in given:
-        return Contact(direction=given[DIRECTIONS])
-    more: dict[str, Any] = {name[:-1]: given[name] for name in NAMES if name in given}
-    return Contact(given.get("points"), given.get("normals"), **more)
 
 
 def _ranked(ranking: Ranking, grasps: tuple[Grasp, ...]) -> dict[str, Any]:

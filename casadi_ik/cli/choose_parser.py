@@ -12,6 +12,9 @@ from casadi_ik.problem.preference import PREFERENCES
 if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
 
+LAYOUT_NAMES = ("getagrip", "dexgraspnet", "bodex", "dexgraspbench", "dexonomy", "table")
+"""Said here again: the parser does not wait for the package that reads them."""
+
 _EXAMPLES = """\
 examples:
   casadi-ik choose candidates.yaml --robot panda+allegro_right --scene table --out ranked.json
@@ -24,6 +27,11 @@ CANDIDATES is one of
       - contacts: ...
   a folder of grasp files
   an npz file with points and normals (k, f, 3), as for `casadi-ik batch`
+  an npy file of getagrip, dexgraspnet, bodex, dexgraspbench or dexonomy: palms and hands are as
+    they are there, only the arm is looked for (--take contacts: only the fingertips are)
+  a table (.csv, .npz, .parquet) with columns x y z, qw qx qy qz or roll pitch yaw (where the
+    robot's palm frame is to be) and the hand's joints by name
+Nothing in a file is run. docs/choosing.md says what is in them.
 
 RANKED.json holds the answers, best first, each with the number of its candidate and its score, and
 how many candidates have none, by reason.
@@ -49,6 +57,31 @@ def add_choose(commands: Any) -> None:
         nargs="+",
         help="where the object is: x y z [m] roll pitch yaw [rad] in the base frame; candidates "
         "that do not say where theirs is are in its frame",
+    )
+    parser.add_argument(
+        "--layout",
+        metavar="L",
+        type=one_of(*LAYOUT_NAMES),
+        help=f"of the file: {', '.join(LAYOUT_NAMES)} (default: told from it)",
+    )
+    parser.add_argument(
+        "--hand",
+        metavar="FILE",
+        help="what the file calls the hand's joints and where it has the hand's frame: a shipped "
+        "name or a YAML file (default: the shipped one that fits the robot)",
+    )
+    parser.add_argument(
+        "--take",
+        metavar="palm|contacts",
+        type=one_of("palm", "contacts"),
+        default="palm",
+        help="what a palm and a posture of a data set or table are taken for (default: palm)",
+    )
+    parser.add_argument(
+        "--object",
+        metavar="NAME",
+        help="what a data set or table grasps: a shipped name or a YAML file; of --take contacts "
+        "only the pads that touch it count",
     )
     parser.add_argument(
         "--scene",

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from casadi_ik.api import Solver
 from casadi_ik.cli.batch_totals import BatchTotals
+from casadi_ik.problem.contact_verdict import PalmVerdict
 from casadi_ik.problem.solution import Solution
 from casadi_ik.problem.status import Status
 
@@ -94,6 +95,8 @@ def solution_report(
         parts.append(_indented(warning, "yellow"))
     if not solution.success:
         parts += [_indented(line, "yellow") for line in reasons(solver, solution)]
+    if solution.palm is not None:
+        parts.append(_palm(solution.palm))
     parts += [_contacts(solution), _actuators(solver, solution)]
     if solver.limits == "ignore" and not solution.limits_ok:
         count = len(_beyond(solver, solution))
@@ -184,6 +187,12 @@ def duration(seconds: float) -> str:
     if seconds >= 1e-3:
         return f"{seconds * 1e3:.3g} ms"
     return f"{seconds * 1e6:.3g} us"
+
+
+def _palm(palm: PalmVerdict) -> Text:
+    """How far the palm is from where the grasp has it."""
+    off = f"  palm off by {palm.position_error * 1e3:.3g} mm, "
+    return Text(f"{off}{math.degrees(palm.angle_error):.3g} deg", "" if palm.ok else "red")
 
 
 def _contacts(solution: Solution) -> Table:

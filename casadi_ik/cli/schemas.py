@@ -13,6 +13,7 @@ from casadi_ik.cli.answer import Answer
 from casadi_ik.cli.outputs import writing
 from casadi_ik.cli.report import headline
 from casadi_ik.collision.scene_file import SceneFile
+from casadi_ik.datasets.conventions import ConventionFile
 from casadi_ik.files.json_schema import json_schema
 from casadi_ik.files.writing import written_whole
 from casadi_ik.grasps.candidates import CandidatesFile
@@ -25,11 +26,12 @@ FILES: dict[str, tuple[Any, str]] = {
     "robot": (ArmHandFile | ImportedFile, "A robot: an arm, a hand, and what joins them"),
     "arm": (ArmFile, "An arm, described in full"),
     "hand": (HandFile, "A hand, described in full"),
-    "grasp": (GraspFile, "A grasp: a contact per finger"),
+    "grasp": (GraspFile, "A grasp: a contact per finger, or a palm and a posture"),
     "candidates": (CandidatesFile, "Grasps, of which one is to be chosen"),
     "scene": (SceneFile, "A scene: what answers must not touch"),
     "object": (ObjectFile, "An object to be grasped"),
     "retarget": (Retarget, "How a person's hand moves a robot's"),
+    "dataset": (ConventionFile, "How a data set has a hand: its joints and its frame"),
 }
 """By kind of file its type, and a title."""
 

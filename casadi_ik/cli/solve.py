@@ -112,7 +112,9 @@ def as_json(solution: Solution) -> dict[str, Any]:
             for finger, contact in solution.contacts.items()
         },
         "diagnosis": None if solution.diagnosis is None else _diagnosis(solution.diagnosis),
-    } | ({} if solution.clearance is None else _checked(solution, solution.clearance))
+        **({} if solution.palm is None else {"palm": _plain(solution.palm)}),
+        **({} if solution.clearance is None else _checked(solution, solution.clearance)),
+    }
 
 
 def _checked(solution: Solution, clearance: float) -> dict[str, Any]:

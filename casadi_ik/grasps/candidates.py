@@ -28,7 +28,7 @@ class CandidatesFile(Struct, frozen=True):
     object: ObjectEntry | None = None
 
 
-def load_candidates(path: Path) -> tuple[Grasp, ...]:
+def load_grasp_files(path: Path) -> tuple[Grasp, ...]:
     """Load grasps.
 
     Args:

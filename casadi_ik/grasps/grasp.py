@@ -119,18 +119,22 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class Grasp:
-    """A contact per finger; a finger left out is free.
+    """A contact per finger, a finger left out is free; or a palm and the posture of its hand.
 
     Attributes:
-        contacts: Contact by finger name.
+        contacts: Contact by finger name; none where a palm is given.
         robot: Name (or path) of the robot the grasp was made for; "" if not said.
         name: What it is called, for reports.
         object: Name of the shipped object it grasps; "" if not said.
         object_pose: (4, 4) pose of that object in the base frame, or None.
-        posture: A hand posture by actuator that realises the contacts, where one is known.
+        posture: A hand posture by actuator that realises the contacts, where one is known; with a
+            palm the posture to take, a number for every motor that moves a finger [rad or m].
+        palm: (4, 4) pose of the robot's palm frame in the base frame: then the hand is as the
+            posture has it, and only the arm is looked for. None: the contacts say all.
 
     Raises:
-        InputError: No contact at all.
+        InputError: No contact at all, a palm that is no rigid motion, has no posture or has
+            contacts beside it.
 
     Example:
         >>> pinch = ik.Grasp(
@@ -143,15 +147,22 @@ class Grasp:
         ['finger_2', 'thumb']
     """
 
-    contacts: Mapping[str, Contact]
+    contacts: Mapping[str, Contact] = field(default_factory=dict)
     robot: str = ""
     name: str = ""
     object: str = ""
     object_pose: Array | None = None
     posture: Mapping[str, float] = field(default_factory=dict)
+    palm: Array | None = None
 
     def __post_init__(self) -> None:
-        if not self.contacts:
+        if self.palm is not None:
+            object.__setattr__(self, "palm", _frozen(one_pose(self.palm, "palm").copy()))
+            if self.contacts:
+                raise InputError("palm: found it beside contacts, expected one of them")
+            if not self.posture:
+                raise InputError("posture: missing, expected one for the hand of the palm")
+        elif not self.contacts:
             raise InputError("contacts: empty, expected at least one finger")
         for finger, contact in self.contacts.items():
             if not isinstance(contact, Contact):
@@ -162,7 +173,7 @@ class Grasp:
 
     def __reduce__(self) -> tuple[type[Grasp], tuple[Any, ...]]:
         """Its fields; the mapping that cannot be changed is made anew."""
-        held = self.robot, self.name, self.object, self.object_pose, dict(self.posture)
+        held = self.robot, self.name, self.object, self.object_pose, dict(self.posture), self.palm
         return type(self), (dict(self.contacts), *held)
 
     def at(self, pose: ArrayLike) -> Grasp:
@@ -175,7 +186,7 @@ class Grasp:
                 given.
 
         Returns:
-            The contacts, and the object where there is one, in the base frame.
+            The contacts or the palm, and the object where there is one, in the base frame.
 
         Raises:
             InputError: Another shape, a number that is not finite, or no rigid motion.
@@ -194,7 +205,8 @@ class Grasp:
         elif self.object:
             place = motion
         contacts = {finger: contact.at(motion) for finger, contact in self.contacts.items()}
-        return replace(self, contacts=contacts, object_pose=place)
+        palm = None if self.palm is None else motion @ self.palm
+        return replace(self, contacts=contacts, object_pose=place, palm=palm)
 
     def in_object_frame(self) -> Grasp:
         """The contacts as the object sees them, to be placed by `at`.

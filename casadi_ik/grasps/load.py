@@ -71,14 +71,17 @@ class GraspFile(Struct, frozen=True):
         robot: The robot it was made for: a shipped name, ARM+HAND, or a path.
         description: One sentence.
         object: What is grasped, and where it is.
-        posture: Position by actuator of the hand that it was made from [rad or m].
+        posture: Position by actuator of the hand that it was made from [rad or m]; with a palm the
+            posture to take.
+        palm: Instead of contacts where the robot's palm frame is to be.
     """
 
-    contacts: dict[str, ContactEntry]
+    contacts: dict[str, ContactEntry] = msgspec.field(default_factory=dict)
     robot: str = ""
     description: str = ""
     object: ObjectEntry | None = None
     posture: dict[str, AnyValue] = msgspec.field(default_factory=dict)
+    palm: Frame | None = None
 
 
 def load_grasp(name_or_path: str | Path) -> Grasp:
@@ -129,6 +132,7 @@ def grasp_of(entry: GraspFile, path: Path, name: str, where: str = "") -> Grasp:
             object=entry.object.name if entry.object else "",
             object_pose=frame_matrix(entry.object.pose) if entry.object else None,
             posture=entry.posture,
+            palm=frame_matrix(entry.palm) if entry.palm else None,
         )
     except InputError as error:
         raise DescriptionError(f"{path}: {where}{error}") from error
@@ -171,6 +175,9 @@ def _loose_numbers(entry: GraspFile) -> Iterator[tuple[str, float]]:
         if contact.tolerance is not None:
             yield f"contacts.{name}.tolerance.position", contact.tolerance.position
             yield f"contacts.{name}.tolerance.angle", contact.tolerance.angle
+    if entry.palm is not None:
+        yield from (("palm.xyz", value) for value in entry.palm.xyz)
+        yield from (("palm.rpy", value) for value in entry.palm.rpy)
     if entry.object is not None:
         yield from (("object.pose.xyz", value) for value in entry.object.pose.xyz)
         yield from (("object.pose.rpy", value) for value in entry.object.pose.rpy)

@@ -133,7 +133,10 @@ class MovingSolver:
             raise InputError("grasps: found none, expected at least one")
         if period is None and velocity is not None:
             raise InputError("velocity: given without a period, expected both")
-        problems = self._questions.of_grasps(grasps, fixed)
+        # A palm that is given counts as the contacts that it leads to.
+        problems = replace(self._questions.of_grasps(grasps, fixed), palms=None)
+        if problems.fixed is not None and problems.fixed.ndim > 1:
+            problems = replace(problems, fixed=self._questions.held(fixed))
         engine, start = self._engine.kinds_of(problems), self._questions.start(q0)
         _ = engine.finder
         ((kinds, _, _),) = by_kinds(problems.rows(slice(0, 1)))
@@ -190,7 +193,7 @@ class MovingSolver:
         found = engine.finder.find(
             problem, start, seed, limit, "q0", apart=0.05, around=engine.around(problem)
         )
-        bounds, free = self._bounds(problem), unbounded(self.robot)
+        bounds, free = self._bounds(None), unbounded(self.robot)
         asked = ReachPlan(
             self._plan(start, bounds, 1.0, free, start, math.inf, PATH_PULL),
             problem,

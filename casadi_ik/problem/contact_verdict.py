@@ -1,4 +1,4 @@
-"""How well one finger meets its contact."""
+"""How well one finger meets its contact, and a palm its pose."""
 
 from __future__ import annotations
 
@@ -27,3 +27,25 @@ class ContactVerdict:
     angle_error: float
     ok: bool
     tolerance: Tolerance
+
+
+@dataclass(frozen=True)
+class PalmVerdict:
+    """How well the palm is where it was asked.
+
+    Attributes:
+        position_error: Distance of its origin [m].
+        angle_error: Angle between its frame and the wanted one [rad].
+        ok: Within the largest tolerance of the fingers.
+
+    Example:
+        >>> motors = [name for name in robot.actuators if name.startswith("bh_")]
+        >>> posture = dict(zip(motors, robot.home[-len(motors):]))
+        >>> palm = solver.solve(ik.Grasp(palm=robot.palm(robot.home), posture=posture)).palm
+        >>> palm.ok, palm.position_error < 1e-6
+        (True, True)
+    """
+
+    position_error: float
+    angle_error: float
+    ok: bool

@@ -30,13 +30,14 @@ class Problems:
         enforce_limits: Whether limits are part of being solved.
         first_row: Number of the first target in the whole batch; with the seed it decides the
             random numbers of a target, so that a part of a batch gets those of the whole.
-        fixed: (n,) positions of locked actuators, NaN where one may move; None: all may.
+        fixed: (n,) or (k, n) positions of locked actuators, NaN where one may move; None: all may.
         more: (k, f, 3) what contacts have beside point and normal ("tangents", "lines",
             "planes"), NaN where free; nothing that is free everywhere.
         picked: (k,) numbers of the targets where they are not one after the other.
         prefer: Which of several solutions is wanted, one of `PREFERENCES`, or `NO_PREFERENCE`.
         object: Name of what is grasped, for collisions; "": not said.
         object_pose: (k, 4, 4) where it is in the base frame; None: where the scene has it.
+        palms: (k, 4, 4) where the palm has to be, base frame; None: where the contacts put it.
     """
 
     points: Array
@@ -50,6 +51,7 @@ class Problems:
     prefer: str = "limits"
     object: str = ""
     object_pose: Array | None = None
+    palms: Array | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -93,6 +95,7 @@ class Problems:
         more = {name: array[rows] for name, array in self.more.items()} if self.more else self.more
         picked = None if self.picked is None else self.picked[rows]
         pose = None if self.object_pose is None else self.object_pose[rows]
+        fixed = self.fixed if self.fixed is None or self.fixed.ndim == 1 else self.fixed[rows]
         return replace(
             self,
             points=points,
@@ -101,6 +104,8 @@ class Problems:
             more=more,
             picked=picked,
             object_pose=pose,
+            fixed=fixed,
+            palms=None if self.palms is None else self.palms[rows],
         )
 
     def holding(self, name: str, object_pose: ArrayLike) -> Problems:
@@ -127,7 +132,9 @@ class Problems:
         return self.more[name] if name in self.more else np.full_like(self.points, np.nan)
 
     def bounds(self, robot: RobotDescription, unbounded: float) -> tuple[Array, Array]:
-        """Bounds (n,) that a method has to keep to: limits, or what the mechanisms permit.
+        """Bounds that a method has to keep to: limits, or what the mechanisms permit.
+
+        (n,), or (k, n) where targets lock different positions.
 
         Args:
             robot: The robot.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +13,9 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp, Tolerance
+from casadi_ik.grasps.pose import checked_pose
 from casadi_ik.problem.contacts.arrays import more_arrays
+from casadi_ik.problem.palm_targets import hand_posture, held_too, touched
 from casadi_ik.problem.problems import DIRECTIONS, Problems, fixed_array, target_arrays
 
 
@@ -99,6 +101,8 @@ class Questions:
         for grasp in grasps:
             if not isinstance(grasp, Grasp):
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
+        if any(grasp.palm is not None for grasp in grasps):
+            return self._of_palm_grasps(grasps, fixed, prefer)
         # Contacts are checked when they are made.
         arrays = [grasp.arrays(fingers) for grasp in grasps]
         more = [grasp.more(fingers) for grasp in grasps]
@@ -124,6 +128,48 @@ class Questions:
             prefer=prefer,
             object=grasps[0].object,
             object_pose=_object_poses(grasps),
+        )
+
+    def _of_palm_grasps(
+        self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None, prefer: str
+    ) -> Problems:
+        palms = [grasp.palm for grasp in grasps if grasp.palm is not None]
+        if len(palms) < len(grasps):
+            raise InputError("grasps: found palms and contacts, expected the same in all")
+        postures = np.array([hand_posture(self.robot, grasp.posture) for grasp in grasps])
+        problems = self.of_palms(np.stack(palms), postures, fixed, prefer)
+        named, poses = grasps[0].object, _object_poses(grasps)
+        return replace(problems, object=named, object_pose=poses)
+
+    def of_palms(
+        self,
+        palms: ArrayLike,
+        postures: Array,
+        fixed: Mapping[str, float] | None,
+        prefer: str = "limits",
+    ) -> Problems:
+        """Palms that are given with the postures of their hands: only the arm is unknown.
+
+        Args:
+            palms: (k, 4, 4) poses of the robot's palm frame in the base frame.
+            postures: (k, n) as `hand_posture` gives them.
+            fixed: Other held actuators by name.
+            prefer: See `Problems`.
+
+        Raises:
+            InputError: No rigid motions, or a motor of the hand among the held ones.
+        """
+        poses = checked_pose(palms, "palms")
+        points, normals = touched(self.robot, poses, postures)
+        held = held_too(postures, self.held(fixed) if fixed else None, self.robot.actuators)
+        return Problems(
+            points,
+            normals,
+            self._usual,
+            self.enforce_limits,
+            fixed=held,
+            prefer=prefer,
+            palms=poses,
         )
 
     @cached_property

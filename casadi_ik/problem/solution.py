@@ -14,7 +14,7 @@ from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.collision_report import CollisionReport, Pair
-from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.contact_verdict import ContactVerdict, PalmVerdict
 from casadi_ik.problem.diagnosis import Diagnosis
 from casadi_ik.problem.status import Status
 
@@ -43,6 +43,7 @@ class Solution:
         closest: That pair: two links, or a link and a solid of the scene.
         collision: Why all answers touch something, if that is the status and a diagnosis was asked
             for.
+        palm: How far the palm is from where it was asked; None where contacts were asked for.
 
     Example:
         >>> solution = solver.solve(grasp)
@@ -68,6 +69,7 @@ class Solution:
     clearance: float | None = None
     closest: Pair | None = None
     collision: CollisionReport | None = None
+    palm: PalmVerdict | None = None
 
     def view(self, robot: ArmHand | None = None, **options: Any) -> Any:
         """Show it in the browser, and in a notebook; needs the extra `view`.
@@ -113,6 +115,9 @@ class BatchSolution:
             given: collisions were not checked.
         closest: The pair of each target; empty if no scene was given.
         collisions: Why all answers touch something, by target; empty if no scene was given.
+        palm_position_error: (k,) [m]; None where contacts were asked for, not palms.
+        palm_angle_error: (k,) [rad], likewise.
+        palm_ok: (k,) bool, likewise.
 
     Example:
         >>> points, normals = robot.contacts(robot.random(np.random.default_rng(1), 200))
@@ -141,6 +146,9 @@ class BatchSolution:
     clearance: Array | None = None
     closest: tuple[Pair | None, ...] = ()
     collisions: tuple[CollisionReport | None, ...] = ()
+    palm_position_error: Array | None = None
+    palm_angle_error: Array | None = None
+    palm_ok: NDArray[np.bool_] | None = None
 
     @classmethod
     def invalid(
@@ -250,4 +258,11 @@ class BatchSolution:
             clearance=None if self.clearance is None else float(self.clearance[row]),
             closest=self.closest[row] if self.closest else None,
             collision=self.collisions[row] if self.collisions else None,
+            palm=self._palm(row),
         )
+
+    def _palm(self, row: int) -> PalmVerdict | None:
+        position, angle, ok = self.palm_position_error, self.palm_angle_error, self.palm_ok
+        if position is None or angle is None or ok is None:
+            return None
+        return PalmVerdict(float(position[row]), float(angle[row]), bool(ok[row]))

@@ -25,6 +25,15 @@ TOLERANCE_SLACK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
+class PalmVerdicts:
+    """How far k palms are from where they have to be: (k,) [m], (k,) [rad], (k,) near enough."""
+
+    position_error: Array
+    angle_error: Array
+    ok: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
 class Verdict:
     """How k configurations meet their targets; arrays as in `BatchSolution`."""
 
@@ -32,12 +41,13 @@ class Verdict:
     angle_error: Array
     ok: NDArray[np.bool_]
     limits_ok: NDArray[np.bool_]
+    palm: PalmVerdicts | None = None
 
     @property
     def all_ok(self) -> NDArray[np.bool_]:
-        """(k,) whether every contact is met."""
+        """(k,) whether every contact is met, and the palm where one is given."""
         met: NDArray[np.bool_] = np.logical_and.reduce(self.ok, axis=1)
-        return met
+        return met if self.palm is None else met & self.palm.ok
 
     def solved(self, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether every contact is met and, if asked, the robot's limits are kept."""
@@ -71,7 +81,30 @@ def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
     if not ok.all():
         # Free is what the target leaves out; an error that is NaN for another reason is no success.
         ok = (placed | np.isnan(points[..., 0])) & (faced | np.isnan(normals[..., 0]))
-    return Verdict(position, angle, ok, beyond <= LIMIT_SLACK)
+    return Verdict(position, angle, ok, beyond <= LIMIT_SLACK, judge_palms(robot, problems, q))
+
+
+def judge_palms(robot: ArmHand, problems: Problems, q: Array) -> PalmVerdicts | None:
+    """Compare palms with where they have to be; None where contacts alone decide.
+
+    Args:
+        robot: The robot.
+        problems: k targets, or one that all configurations are compared with. A palm counts as
+            reached within the largest tolerance of the fingers.
+        q: (k, n) configurations; NaN gives NaN.
+    """
+    if problems.palms is None:
+        return None
+    found = np.full((len(q), 4, 4), np.nan)
+    finite = np.isfinite(q).all(axis=1)
+    if finite.any():
+        found[finite] = robot.palm(q[finite])
+    wanted = problems.palms
+    position = np.linalg.norm(found[:, :3, 3] - wanted[:, :3, 3], axis=1)
+    angle = _turn(found[:, :3, :3], np.broadcast_to(wanted[:, :3, :3], (len(q), 3, 3)))
+    most, slack = problems.largest_tolerance, 1 + TOLERANCE_SLACK
+    ok = (position <= most.position * slack) & (angle <= most.angle * slack)
+    return PalmVerdicts(position, angle, ok)
 
 
 def judge_one(robot: ArmHand, problems: Problems, q: Array) -> SolvedVerdict | None:

@@ -15,7 +15,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
-from casadi_ik.grasps.pose import moved, one_pose
+from casadi_ik.grasps.pose import inverse, moved, one_pose
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.preference import preference
@@ -127,7 +127,7 @@ def _asked(
         if not isinstance(grasp, Grasp):
             raise InputError(f"grasps[{number}]: found {type(grasp).__name__}, expected a Grasp")
         own = tuple((name, one.tolerance) for name, one in grasp.contacts.items())
-        key = own, grasp.object, grasp.object_pose is None
+        key = own, grasp.object, grasp.object_pose is None, grasp.palm is None
         groups.setdefault(key, []).append(number)
     for numbers in groups.values():
         some = [grasps[number] for number in numbers]
@@ -152,7 +152,12 @@ def _placed(problems: Problems, grasps: Sequence[Grasp], pose: Array | None) -> 
     points, normals = arrays.pop("points"), arrays.pop("normals")
     named = grasps[0].object
     at = np.broadcast_to(pose, (len(grasps), 4, 4)) if named or places else None
-    return replace(problems, points=points, normals=normals, more=arrays, object_pose=at)
+    palms = problems.palms
+    if palms is not None:
+        palms = pose @ (np.stack([inverse(place) for place in places]) @ palms if places else palms)
+    return replace(
+        problems, points=points, normals=normals, more=arrays, object_pose=at, palms=palms
+    )
 
 
 class _Ranked:

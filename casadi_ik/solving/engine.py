@@ -182,6 +182,8 @@ class Engine:
         method, robot = self._quick, self.robot
         if method is None or problems.prefer in (MANIPULABILITY, CLEARANCE):
             return None
+        if problems.palms is not None:
+            return None
         start = run.start(robot)
         if start.ndim != 1:
             return None
@@ -234,6 +236,8 @@ class Engine:
         Raises:
             InputError: Bad q0, or targets the method cannot take.
         """
+        if problems.palms is not None:
+            _ = self._hand_first  # no other method keeps every target's hand where it is
         starts, recorder = run.starts(self.robot, len(problems)), run.recorder
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
         for kinds, _, _ in by_kinds(problems):
@@ -327,9 +331,8 @@ class Engine:
         found: dict[int, Diagnosis] = {}
         for kinds, of_kinds, some in by_kinds(unbiased):
             chosen = rows if of_kinds is None else rows[of_kinds]
-            diagnoses = self.of_kinds(kinds).diagnostician.diagnose(
-                some, starts[chosen], q[chosen] if own else None
-            )
+            ends = q[chosen] if own else None
+            diagnoses = self.of_kinds(kinds).diagnostician.diagnose(some, starts[chosen], ends)
             found |= zip(chosen.tolist(), diagnoses, strict=True)
         for row, why in found.items():
             if own and why.reason is Reason.REACHABLE:

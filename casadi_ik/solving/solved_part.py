@@ -75,7 +75,7 @@ def judged(
         around: What the answers must not touch; None: nothing is checked.
     """
     verdict = judge(robot, problems, outcome.q)
-    success = verdict.solved(problems.enforce_limits)
+    success, palm = verdict.solved(problems.enforce_limits), verdict.palm
     clear = None if around is None else around.check(outcome.q)
     touching = None if clear is None else success & ~clear.free
     if clear is not None:
@@ -107,4 +107,7 @@ def judged(
         clearance=None if clear is None else clear.distance,
         closest=() if clear is None else tuple(map(clear.pair, range(len(outcome.q)))),
         collisions=() if clear is None else (None,) * len(outcome.q),
+        palm_position_error=None if palm is None else palm.position_error,
+        palm_angle_error=None if palm is None else palm.angle_error,
+        palm_ok=None if palm is None else palm.ok,
     )

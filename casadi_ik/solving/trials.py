@@ -36,6 +36,15 @@ class Bounds:
         """Configurations moved into the bounds."""
         return np.clip(q, self.lower, self.upper)
 
+    def of(self, rows: Rows) -> Bounds:
+        """Those of some targets; those that all share are of each."""
+        return self if self.lower.ndim == 1 else Bounds(self.lower[rows], self.upper[rows])
+
+    @property
+    def first(self) -> Bounds:
+        """(n,) of the first target; the arm has the same in all."""
+        return self if self.lower.ndim == 1 else Bounds(self.lower[0], self.upper[0])
+
     def tiled(self, count: int) -> Bounds:
         """The same bounds for k configurations."""
         return Bounds(np.tile(self.lower, (count, 1)), np.tile(self.upper, (count, 1)))
@@ -68,7 +77,7 @@ class Trials:
         return self.method.step.layouts.parameters
 
     def limits(self, problems: Problems) -> Bounds:
-        """The bounds (n,) that a solution has to keep."""
+        """The bounds that solutions have to keep, (n,) or (k, n), see `Problems.bounds`."""
         return Bounds(*problems.bounds(self.robot.description, UNBOUNDED))
 
     def search(self, problems: Problems, start: Array, bounds: Bounds) -> Array:
@@ -152,7 +161,7 @@ class Descent:
         """
         trials = self.trials
         states, parameters = self._states[targets], self._parameters[targets]
-        bounds = bounds or trials.limits(self.problems)
+        bounds = bounds or trials.limits(self.problems).of(targets)
         start = bounds.clip(q)
         states[:, trials.state.slice("q")] = start
         states[:, trials.state.slice("best_q")] = start

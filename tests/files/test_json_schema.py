@@ -31,6 +31,7 @@ FOLDERS = {
     "grasp": "grasps",
     "object": "objects",
     "scene": "scenes",
+    "dataset": "datasets",
 }
 HAND = {"file": "h.urdf", "palm": {"link": "p", "xyz": ["1 mm", 0, 0]}, "locked": {"a": "3 deg"}}
 EXAMPLES: dict[str, Any] = {

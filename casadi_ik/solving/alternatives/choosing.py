@@ -144,7 +144,7 @@ class _Part:
         count, n = postures.shape[1], q.shape[1]
         owner = np.repeat(rows, count)
         asked = self.problems.rows(owner)
-        starts = self.limits.clip(self.starts[owner])
+        starts = self.limits.of(owner).clip(self.starts[owner])
         flat = postures.reshape(-1, postures.shape[2])
         ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat))
         ends[~self.trials.solved(asked, ends, asked.enforce_limits)] = np.nan
@@ -202,7 +202,7 @@ class _Part:
         swings = self.finder.swings
         assert swings is not None
         around = None if self.around is None else self.around.rows(owner)
-        bounds = self.limits.lower, self.limits.upper
+        bounds = self.limits.first.lower, self.limits.first.upper
         starts = self.starts[owner]
         swung = swings.choose(q, starts, bounds, self.prefer, around, room, True, closer)
         if around is None or self.prefer != CLEARANCE:

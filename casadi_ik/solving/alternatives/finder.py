@@ -147,7 +147,7 @@ class AlternativeFinder:
             raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
         preference(prefer, started=True)
         apart = checked_distance(apart)
-        limits = self.trials.limits(problems)
+        limits = self.trials.limits(problems).first
         found: list[_Found] = []
         for number, q in enumerate(self._postures(problems, q0, limits)):
             found += self._arms(problems, q, number, limits, q0, seed, prefer, around)
@@ -173,7 +173,7 @@ class AlternativeFinder:
             seed: Of the starts of arms without a closed form.
             prefer: One of `PREFERENCES`.
         """
-        limits = self.trials.limits(problems)
+        limits = self.trials.limits(problems).first
         found = self._arms(problems, q, 0, limits, q0, seed, prefer)
         every = np.stack([q, *(item.q for item in found)])
         solved = self.trials.solved(problems, every, problems.enforce_limits)

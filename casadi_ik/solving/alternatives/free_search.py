@@ -180,7 +180,7 @@ class FreeSearch:
         swung = swings.choose(
             q,
             self.starts[owner],
-            (self.limits.lower, self.limits.upper),
+            (self.limits.first.lower, self.limits.first.upper),
             asked,
             around.rows(owner),
             room,
@@ -201,7 +201,7 @@ class FreeSearch:
             postures = method.postures(some, number)
             count = postures.shape[1]
             owner = np.repeat(rows, count)
-            starts = self.limits.clip(self.starts[owner])
+            starts = self.limits.of(owner).clip(self.starts[owner])
             flat = postures.reshape(-1, postures.shape[2])
             asked = self.problems.rows(owner)
             ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat))
@@ -221,7 +221,7 @@ class FreeSearch:
         )
         last = self.hands[0][0]
         starts[::2, hand] = last[owner[::2]][:, hand]
-        ends = self._descent.run(owner, self.limits.clip(starts))
+        ends = self._descent.run(owner, self.limits.of(owner).clip(starts))
         yield self._solved(ends, owner)
 
     def _solved(self, q: Array, owner: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
@@ -262,7 +262,7 @@ class FreeSearch:
             owner = np.repeat(rows, len(STEPS))
             steps = np.tile(STEPS, len(rows))[:, None]
             there = self.nearest[owner] + steps * (way * ranges).repeat(len(STEPS), axis=0)
-            ends = self._descent.run(owner, self.limits.clip(there))
+            ends = self._descent.run(owner, self.limits.of(owner).clip(there))
             self.take(*self._solved(ends, owner))
             rows = rows[~self.free[rows] & (self.room[rows] > (1 - GAIN) * before)]
 

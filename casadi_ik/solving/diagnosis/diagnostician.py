@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +88,13 @@ class Diagnostician:
             nearest: (k, n) what hand-first came to; None if another method was asked.
         """
         self.method.prepare()
+        if problems.fixed is not None and problems.fixed.ndim > 1:
+            # Hands that are held differently have nothing in common.
+            return [
+                self.diagnose(_held_alone(problems, row), q0[row : row + 1], near)[0]
+                for row in range(len(problems))
+                for near in [None if nearest is None else nearest[row : row + 1]]
+            ]
         known = np.zeros(len(problems), dtype=bool)
         clock = _Clock(np.zeros(len(problems)))
         if nearest is None:
@@ -285,6 +293,13 @@ def _enough(problems: Problems, fair: Verdict) -> list[Tolerance]:
     position = np.nanmax(fair.position_error, axis=1, initial=least.position)
     angle = np.nanmax(fair.angle_error, axis=1, initial=least.angle)
     return [Tolerance(*pair) for pair in zip(position.tolist(), angle.tolist(), strict=True)]
+
+
+def _held_alone(problems: Problems, row: int) -> Problems:
+    """One of several targets whose hands are held differently; its contacts place the palm."""
+    one = problems.rows(slice(row, row + 1))
+    assert one.fixed is not None
+    return replace(one, fixed=one.fixed[0], palms=None)
 
 
 def _reachable(

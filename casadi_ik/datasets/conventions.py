@@ -1,0 +1,164 @@
+"""What a data set calls a hand's joints, and where it has the hand's frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.datasets.hand_poses import HandPoses
+from casadi_ik.errors import DescriptionError, UnsupportedError
+from casadi_ik.files.reading import Angles, Point, Struct, frame_matrix, read
+from casadi_ik.files.shipped import resolve, shipped_names
+
+
+class HandFrame(Struct, frozen=True):
+    """Where the data set's frame of the hand is, in the frame of one of the robot's links.
+
+    Attributes:
+        link: The robot's link.
+        xyz: Origin of the data set's frame in the link's [m].
+        rpy: Its axes, turned about the fixed axes of the link's frame [rad].
+    """
+
+    link: str
+    xyz: Point = (0.0, 0.0, 0.0)
+    rpy: Angles = (0.0, 0.0, 0.0)
+
+
+class ConventionFile(Struct, frozen=True):
+    """How a data set has a hand: ``models/datasets/*.yaml``.
+
+    Attributes:
+        layouts: In which layouts.
+        description: One sentence.
+        source: Where that is from, and how it was checked.
+        frame: Where the data set's frame of the hand is.
+        joints: The data set's names, in the order of its arrays, and the robot's joints or motors;
+            a minus sign before one: it turns the other way.
+    """
+
+    layouts: list[str]
+    description: str
+    source: str
+    frame: HandFrame
+    joints: dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Convention:
+    """How the data of a hand are read as those of a robot's.
+
+    Attributes:
+        name: Where it is written down.
+        link: The robot's link in whose frame the data set's frame is.
+        pose: (4, 4) of that frame in the link's.
+        joints: Names of the data set, in the order of its arrays: the robot's joint, and 1 or -1.
+    """
+
+    name: str
+    link: str
+    pose: Array
+    joints: dict[str, tuple[str, float]]
+
+    def fits(self, robot: ArmHand) -> bool:
+        """Whether the robot has this hand."""
+        description = robot.description
+        names = {joint for joint, _ in self.joints.values()}
+        known = {*description.joint_names, *description.actuator_names}
+        return self.link in description.links and names <= known
+
+    def positions(self, given: HandPoses) -> dict[str, Array]:
+        """Positions (k,) of the robot's joints and motors, by name.
+
+        Raises:
+            DescriptionError: Names that the data set does not have, or another number of joints.
+        """
+        names = given.names or tuple(self.joints)
+        width = given.joints.shape[1]
+        if len(names) != width:
+            raise DescriptionError(
+                f"{given.where}: joints: found {width}, expected {len(names)}: {', '.join(names)}"
+            )
+        for name in names:
+            if name not in self.joints:
+                raise DescriptionError(
+                    f"{given.where}: {name}: no such joint, expected {', '.join(self.joints)}"
+                )
+        missing = [name for name in self.joints if name not in names]
+        if missing:
+            raise DescriptionError(f"{given.where}: {missing[0]}: missing, expected a position")
+        found: dict[str, Array] = {}
+        for i, name in enumerate(names):
+            joint, sign = self.joints[name]
+            found[joint] = sign * given.joints[:, i]
+        return found
+
+
+def load_convention(name_or_path: str | Path) -> Convention:
+    """A convention: a shipped one by name, or a file of one's own.
+
+    Raises:
+        UnknownNameError: No shipped convention has that name.
+        DescriptionError: The file is missing or malformed.
+    """
+    path = resolve(name_or_path, "datasets")
+    entry, _ = read(path, ConventionFile)
+    joints: dict[str, tuple[str, float]] = {}
+    for name, said in entry.joints.items():
+        joint = said.removeprefix("-")
+        if joint in (other for other, _ in joints.values()):
+            raise DescriptionError(f"{path}: joints.{name}: {joint} is named twice")
+        joints[name] = joint, -1.0 if said.startswith("-") else 1.0
+    pose = frame_matrix(entry.frame)
+    if not np.isfinite(pose).all():
+        raise DescriptionError(f"{path}: frame: expected finite numbers")
+    return Convention(path.stem, entry.frame.link, pose, joints)
+
+
+def convention_for(robot: ArmHand, layout: str, hand: str | Path | None) -> Convention:
+    """The convention of a layout for the hand of a robot.
+
+    Args:
+        robot: The robot.
+        layout: Of the file.
+        hand: A convention by name or path; None: the shipped one that fits.
+
+    Raises:
+        UnsupportedError: None is shipped that fits, or the one that is named does not.
+        UnknownNameError: See `load_convention`.
+        DescriptionError: See there.
+    """
+    if hand is not None:
+        named = load_convention(hand)
+        if not named.fits(robot):
+            raise UnsupportedError(
+                f"{named.name}: robot {robot.name!r} has no link {named.link!r}, or not its joints"
+            )
+        return named
+    shipped = [name for name in shipped_names("datasets") if layout in _layouts(name)]
+    for name in shipped:
+        found = load_convention(name)
+        if found.fits(robot):
+            return found
+    raise UnsupportedError(
+        f"layout {layout}: no hand of it is that of robot {robot.name!r}; known: "
+        f"{', '.join(shipped)} (or say by a file of your own what its joints are called)"
+    )
+
+
+def of_robot(robot: ArmHand, names: tuple[str, ...]) -> Convention:
+    """The convention of a table that uses the robot's own names, and its palm frame."""
+    description = robot.description
+    joints: dict[str, tuple[str, float]] = {name: (name, 1.0) for name in names}
+    return Convention(
+        robot.name, description.palm_link, np.asarray(description.palm_placement), joints
+    )
+
+
+def _layouts(name: str) -> list[str]:
+    entry, _ = read(resolve(name, "datasets"), ConventionFile)
+    return entry.layouts

@@ -1,0 +1,166 @@
+"""The layouts of other people's grasps: what stands where in their files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.datasets.hand_poses import HandPoses, of_fixed_axes, of_quaternions
+from casadi_ik.datasets.unpickling import Packed, read_npy
+from casadi_ik.errors import DescriptionError
+from casadi_ik.grasps.pose import inverse
+
+STAGE = 1
+"""Of the stages pregrasp, grasp and squeeze: the second."""
+
+TRANSLATION, TURN = ("WRJTx", "WRJTy", "WRJTz"), ("WRJRx", "WRJRy", "WRJRz")
+"""Where DexGraspNet has the pose of a hand among its joints."""
+
+
+def getagrip(path: Path, content: Any) -> HandPoses:
+    """A dictionary of arrays: trans (k, 3), rot (k, 3, 3), joint_angles (k, 16).
+
+    Postures are those before the fingers close.
+    """
+    where, found = str(path), _mapping(path, content)
+    position, rotation, joints = (
+        numbers(where, found, name) for name in ("trans", "rot", "joint_angles")
+    )
+    return HandPoses(where, position, rotation, joints)
+
+
+def dexgraspnet(path: Path, content: Any) -> HandPoses:
+    """A list of dictionaries with qpos: translation, angles about fixed axes, joints by name."""
+    entries = content if isinstance(content, list) else [content]
+    if not entries:
+        raise DescriptionError(f"{path}: found no grasps, expected at least one")
+    rows: list[list[float]] = []
+    names: tuple[str, ...] = ()
+    for i, entry in enumerate(entries):
+        where = f"{path}: row {i}"
+        qpos = entry.get("qpos") if isinstance(entry, dict) else None
+        if not isinstance(qpos, dict):
+            raise DescriptionError(f"{where}: qpos: missing, expected numbers by joint")
+        for key in (*TRANSLATION, *TURN):
+            if key not in qpos:
+                raise DescriptionError(f"{where}: qpos.{key}: missing, expected a number")
+        if not names:
+            names = tuple(str(key) for key in qpos if key not in (*TRANSLATION, *TURN))
+        order = (*TRANSLATION, *TURN, *names)
+        if set(qpos) != set(order):
+            odd = sorted(map(str, set(qpos) ^ set(order)))[0]
+            raise DescriptionError(f"{where}: qpos.{odd}: expected the joints of row 0")
+        rows.append([_number(f"{where}: qpos.{key}", qpos[key]) for key in order])
+    values = np.array(rows)
+    return HandPoses(str(path), values[:, :3], of_fixed_axes(values[:, 3:6]), values[:, 6:], names)
+
+
+def bodex(path: Path, content: Any) -> HandPoses:
+    """A dictionary: robot_pose (1, k, stages, 7 + joints), the pose as x y z, w x y z."""
+    where, found = str(path), _mapping(path, content)
+    rows = numbers(where, found, "robot_pose")
+    if rows.ndim != 4 or rows.shape[0] != 1 or rows.shape[2] <= STAGE or rows.shape[3] <= 7:
+        raise DescriptionError(
+            f"{path}: robot_pose: found shape {rows.shape}, expected (1, k, stages, 7 + joints)"
+        )
+    return _of_rows(where, rows[0, :, STAGE], _object_pose(where, found))
+
+
+def dexgraspbench(path: Path, content: Any) -> HandPoses:
+    """A dictionary: grasp_qpos (7 + joints) or (k, 7 + joints), the pose as x y z, w x y z."""
+    where, found = str(path), _mapping(path, content)
+    rows = np.atleast_2d(numbers(where, found, "grasp_qpos"))
+    if rows.ndim != 2 or rows.shape[1] <= 7:
+        raise DescriptionError(
+            f"{path}: grasp_qpos: found shape {rows.shape}, expected (k, 7 + joints)"
+        )
+    return _of_rows(where, rows, _object_pose(where, found))
+
+
+LAYOUTS: Mapping[str, Callable[[Path, Any], HandPoses]] = {
+    "getagrip": getagrip,
+    "dexgraspnet": dexgraspnet,
+    "bodex": bodex,
+    "dexgraspbench": dexgraspbench,
+    "dexonomy": dexgraspbench,
+}
+"""Of npy files, by name."""
+
+MARKS = {"joint_angles": "getagrip", "robot_pose": "bodex", "grasp_qpos": "dexgraspbench"}
+"""Keys that tell layouts from one another."""
+
+
+def read_layout(path: Path, layout: str | None) -> tuple[HandPoses, str]:
+    """Grasps of an npy file, and their layout.
+
+    Args:
+        path: The file.
+        layout: One of `LAYOUTS`; None: told from the file's keys.
+
+    Raises:
+        DescriptionError: It is not of the layout, or of none.
+    """
+    content = read_npy(path)
+    if layout is None:
+        keys = content if isinstance(content, dict) else {}
+        layout = next((found for mark, found in MARKS.items() if mark in keys), None)
+        if isinstance(content, list) or "qpos" in keys:
+            layout = "dexgraspnet"
+    if layout is None:
+        raise DescriptionError(f"{path}: its layout is none of {', '.join(LAYOUTS)}")
+    return LAYOUTS[layout](path, content), layout
+
+
+def numbers(where: str, found: Mapping[str, Any], key: str) -> Array:
+    """An array of a file.
+
+    Raises:
+        DescriptionError: There is none of that name, or one of other things than numbers.
+    """
+    if key not in found:
+        known = ", ".join(str(name) for name in found)
+        raise DescriptionError(f"{where}: {key}: missing, expected an array; found {known}")
+    value = found[key]
+    if isinstance(value, Packed):
+        value = value.value
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+        raise DescriptionError(f"{where}: {key}: expected an array of numbers")
+    return value.astype(np.float64)
+
+
+def _mapping(path: Path, content: Any) -> Mapping[str, Any]:
+    if not isinstance(content, dict):
+        raise DescriptionError(f"{path}: found no dictionary of arrays, expected one")
+    return content
+
+
+def _number(where: str, value: Any) -> float:
+    if isinstance(value, Packed) and value.value is not None and value.value.size == 1:
+        value = value.value.item()
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise DescriptionError(f"{where}: expected a number")
+    return float(value)
+
+
+def _object_pose(where: str, found: Mapping[str, Any]) -> Array:
+    """(4, 4) where the object is in the frame of the poses; where none is said, in its origin."""
+    if "obj_pose" not in found:
+        return np.eye(4)
+    row = numbers(where, found, "obj_pose").reshape(-1)
+    if row.shape != (7,):
+        raise DescriptionError(f"{where}: obj_pose: found {row.size} numbers, expected 7")
+    held = HandPoses(
+        f"{where}: obj_pose", row[None, :3], of_quaternions(row[None, 3:]), np.zeros((1, 0))
+    )
+    return held.poses[0]
+
+
+def _of_rows(where: str, rows: Array, object_pose: Array) -> HandPoses:
+    """Rows (k, 7 + joints) with poses as x y z, w x y z."""
+    held = HandPoses(where, rows[:, :3], of_quaternions(rows[:, 3:7]), rows[:, 7:])
+    poses = inverse(object_pose) @ held.poses
+    return HandPoses(where, poses[:, :3, 3], poses[:, :3, :3], held.joints)

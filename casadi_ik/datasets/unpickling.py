@@ -1,0 +1,222 @@
+"""Numpy files with Python objects in them, read without running what they say.
+
+A pickle is a program. Here it may build plain containers, texts and numbers, and numpy arrays,
+types and scalars: whatever else it names is refused, and of numpy's own machinery nothing runs that
+it could hand over anything to: arrays are put together from their bytes here.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from casadi_ik.errors import DescriptionError
+
+MOST = 2**29
+"""Bytes of a file."""
+
+TYPES = re.compile(r"^[<>|=]?([biufcSUO]\d{0,5}|b1|\?)$")
+"""Element types that arrays may have."""
+
+
+class Packed:
+    """An array of a pickle: its elements are there once it has been told them.
+
+    Attributes:
+        value: The array of numbers or texts; None where it holds objects.
+        items: The objects, in order.
+        shape: Of the array.
+    """
+
+    def __init__(self) -> None:
+        self.value: np.ndarray | None = None
+        self.items: list[Any] = []
+        self.shape: tuple[int, ...] = ()
+
+    def __setstate__(self, state: Any) -> None:
+        """Take version, shape, type, order and elements."""
+        _, shape, kind, by_columns, data = state
+        if not (isinstance(kind, _Kind) and all(isinstance(n, int) and n >= 0 for n in shape)):
+            raise pickle.UnpicklingError("an array without a type or a shape")
+        self.shape, count = tuple(shape), math.prod(shape)
+        if kind.holds_objects:
+            if not isinstance(data, list) or len(data) != count:
+                raise pickle.UnpicklingError("an array of objects that are not there")
+            self.items = data
+            return
+        self.value = _numbers(data, kind.dtype, self.shape, bool(by_columns))
+
+
+class _Kind:
+    """The element type of an array."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __setstate__(self, state: Any) -> None:
+        order = state[1] if isinstance(state, tuple) and len(state) > 1 else None
+        if order not in ("<", ">", "|", "="):
+            raise pickle.UnpicklingError("a type without an order of bytes")
+        self.text = order + self.text.lstrip("<>|=")
+
+    @property
+    def holds_objects(self) -> bool:
+        return "O" in self.text
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return np.dtype(self.text)
+
+
+def _kind(text: Any, *_: Any) -> _Kind:
+    if not (isinstance(text, str) and TYPES.match(text)):
+        raise pickle.UnpicklingError(f"arrays of type {text!r}")
+    return _Kind(text)
+
+
+def _numbers(data: Any, dtype: np.dtype[Any], shape: tuple[int, ...], by_columns: bool) -> Any:
+    if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
+        raise pickle.UnpicklingError("an array whose bytes are not as many as its shape says")
+    flat = np.frombuffer(data, dtype) if data else np.zeros(0, dtype)
+    return flat.reshape(shape, order="F" if by_columns else "C").copy()
+
+
+def _scalar(kind: Any, data: Any) -> Any:
+    if not isinstance(kind, _Kind) or kind.holds_objects:
+        raise pickle.UnpicklingError("a scalar without a type")
+    return _numbers(data, kind.dtype, (), False).item()
+
+
+def _rebuilt(_: Any, shape: Any, __: Any) -> Packed:
+    if shape != (0,):
+        raise pickle.UnpicklingError("an array in another way than numpy writes it")
+    return Packed()
+
+
+def _from_buffer(data: Any, kind: Any, shape: Any, order: Any) -> Packed:
+    packed = Packed()
+    held = bytes(data.raw()) if isinstance(data, pickle.PickleBuffer) else bytes(data)
+    packed.__setstate__((1, shape, kind, order == "F", held))
+    return packed
+
+
+def _encoded(text: Any, encoding: Any) -> bytes:
+    if not isinstance(text, str) or encoding != "latin1":
+        raise pickle.UnpicklingError("a text in an odd encoding")
+    return text.encode("latin1")
+
+
+class _Named:
+    """What a pickle may name, and call if it is something to call; it cannot be changed."""
+
+    __slots__ = ("_does",)
+
+    def __init__(self, does: Callable[..., Any] | None = None) -> None:
+        self._does = does
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._does is None:
+            raise pickle.UnpicklingError("a call of an array's class")
+        return self._does(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError("a change of what builds arrays")
+
+
+ALLOWED: dict[str, _Named] = {
+    "ndarray": _Named(),
+    "dtype": _Named(_kind),
+    "_reconstruct": _Named(_rebuilt),
+    "scalar": _Named(_scalar),
+    "_frombuffer": _Named(_from_buffer),
+}
+"""What of numpy a pickle may name, by its last name, and what it gets."""
+
+
+ENCODED = _Named(_encoded)
+"""How pickles of Python 2 write bytes."""
+
+
+class _Reader(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if module.split(".")[0] == "numpy" and name in ALLOWED:
+            return ALLOWED[name]
+        if (module, name) == ("_codecs", "encode"):
+            return ENCODED
+        raise pickle.UnpicklingError(f"{module}.{name}")
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise pickle.UnpicklingError(f"things kept elsewhere: {pid}")
+
+
+def read_npy(path: Path) -> Any:
+    """What an npy file holds.
+
+    Args:
+        path: The file.
+
+    Returns:
+        An array of numbers; or what was pickled: dictionaries, lists, texts, numbers and `Packed`
+        arrays. A single object in an array without dimensions comes out by itself.
+
+    Raises:
+        DescriptionError: It cannot be read, is damaged, or its pickle names anything else than
+            arrays, containers, texts and numbers.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MOST:
+            raise DescriptionError(f"{path}: found {size} bytes, expected {MOST} at most")
+        with path.open("rb") as file:
+            return _content(path, file)
+    except OSError as error:
+        raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _content(path: Path, file: BinaryIO) -> Any:
+    try:
+        version = np.lib.format.read_magic(file)
+        read = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }.get(version)
+        if read is None:
+            raise DescriptionError(f"{path}: found npy version {version}, expected 1.0 or 2.0")
+        shape, by_columns, dtype = read(file)
+        rest = file.read()
+        if not dtype.hasobject:
+            return _numbers(rest, dtype, shape, by_columns)
+        found = _Reader(io.BytesIO(rest)).load()
+    except pickle.UnpicklingError as error:
+        raise DescriptionError(
+            f"{path}: its pickle holds {_line(error)}, expected arrays, containers, texts and "
+            "numbers only"
+        ) from error
+    except (
+        ValueError,
+        TypeError,
+        AttributeError,
+        IndexError,
+        KeyError,
+        EOFError,
+        MemoryError,
+        OverflowError,
+        RecursionError,
+        UnicodeError,
+    ) as error:
+        raise DescriptionError(f"{path}: damaged, expected an npy file: {_line(error)}") from error
+    if isinstance(found, Packed) and found.value is None:
+        return found.items[0] if found.shape == () else found.items
+    return found
+
+
+def _line(error: Exception) -> str:
+    """What it says, in one line."""
+    return " ".join(str(error).split())

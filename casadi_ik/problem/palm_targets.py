@@ -1,0 +1,82 @@
+"""Palms that are given, with the posture of the hand: what that says of every fingertip."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.problem.hand_motors import hand_motors
+
+ROUNDING = 1e-6
+"""A posture may be so far beyond a limit [rad or m]; it is then at the limit."""
+
+
+def hand_posture(robot: ArmHand, posture: Mapping[str, float], name: str = "posture") -> Array:
+    """(n,) positions of all motors that move fingers; NaN for the others.
+
+    Args:
+        robot: The robot.
+        posture: Position by actuator [rad or m].
+        name: What to call it in an error.
+
+    Raises:
+        UnknownNameError: No such actuator.
+        InputError: One that is missing or moves no finger, or not a number within limits.
+    """
+    motors = hand_motors(robot.description)
+    values = np.full(len(robot.actuators), np.nan)
+    for key, value in posture.items():
+        if key not in motors:
+            error = InputError if key in robot.actuators else UnknownNameError
+            found = "moves no finger" if key in robot.actuators else "no such actuator"
+            raise error(f"{name}.{key}: {found}, expected {', '.join(motors)}")
+        i = robot.actuators.index(key)
+        low, high = robot.lower[i], robot.upper[i]
+        number = isinstance(value, (int, float, np.integer, np.floating))
+        if not (number and low - ROUNDING <= value <= high + ROUNDING):
+            raise InputError(
+                f"{name}.{key}: found {value!r}, expected a number from {low:g} to {high:g}"
+            )
+        values[i] = min(max(float(value), low), high)
+    missing = [key for key in motors if key not in posture]
+    if missing:
+        raise InputError(f"{name}.{missing[0]}: missing, expected a number for every finger motor")
+    return values
+
+
+def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array]:
+    """Where fingertips are if hands of given postures have their palms at poses.
+
+    Args:
+        robot: The robot.
+        palms: (k, 4, 4) poses of its palm frame in the base frame.
+        postures: (k, n) as `hand_posture` gives them.
+
+    Returns:
+        Contact points (k, f, 3) [m] and normals (k, f, 3), base frame.
+    """
+    q = np.where(np.isnan(postures), robot.home, postures)
+    points, normals = robot.contacts(q)
+    here = robot.palm(q)
+    turn = palms[:, :3, :3] @ np.swapaxes(here[:, :3, :3], 1, 2)
+    points = (points - here[:, None, :3, 3]) @ np.swapaxes(turn, 1, 2) + palms[:, None, :3, 3]
+    return points, normals @ np.swapaxes(turn, 1, 2)
+
+
+def held_too(postures: Array, fixed: Array | None, actuators: Sequence[str]) -> Array:
+    """(k, n) what is held by postures and by the caller.
+
+    Raises:
+        InputError: The caller holds a motor of the hand.
+    """
+    if fixed is None:
+        return postures
+    both = ~np.isnan(fixed) & ~np.isnan(postures).all(axis=0)
+    if both.any():
+        name = actuators[int(np.flatnonzero(both)[0])]
+        raise InputError(f"fixed.{name}: the grasp's posture holds it already")
+    return np.where(np.isnan(postures), fixed, postures)

@@ -1,0 +1,212 @@
+"""Small files in the layouts of grasp data sets, made from hands of this project.
+
+    python studies/make_grasp_sets.py FOLDER
+
+None of the data sets ships in a package. The layouts are those of their repositories, named in
+`models/datasets/*.yaml`; the grasps are random postures at random poses, seeded, so that what is
+read back can be compared with what was written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import casadi_ik as ik
+from casadi_ik.arrays import Array
+from casadi_ik.datasets.conventions import Convention, load_convention
+from casadi_ik.files.reading import roll_pitch_yaw
+from casadi_ik.grasps.pose import inverse
+from casadi_ik.problem.hand_motors import finger_joints, hand_motors
+
+ROBOTS = {
+    "allegro": "panda+allegro_right",
+    "leap": "panda+leap",
+    "shadow": "ur5e+shadow",
+}
+COUNT = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """A file, and what it says.
+
+    Attributes:
+        path: The file.
+        robot: Whose hand it is.
+        q: (k, n) what the robot's motors are at, hand and arm.
+        palms: (k, 4, 4) where the palm frame is, in the object's frame.
+    """
+
+    path: Path
+    robot: ik.ArmHand
+    q: Array
+    palms: Array
+
+
+def made(name: str, folder: Path, seed: int = 0, robot: ik.ArmHand | None = None) -> Written:
+    """Write a file for a shipped convention, or "table" for tables.
+
+    Args:
+        name: Of the convention, with ".csv", ".npz" or ".parquet" where it is a table.
+        folder: Where to.
+        seed: Of postures and poses.
+        robot: Whose hand; None: one that has the convention's.
+    """
+    stem, _, kind = name.partition(".")
+    layout, _, hand = stem.partition("_")
+    held = robot or ik.load_robot(ROBOTS.get(hand, "kuka_lwr_barrett"))
+    rng = np.random.default_rng(seed)
+    q = held.random(rng, COUNT)
+    palms = np.tile(np.eye(4), (COUNT, 1, 1))
+    palms[:, :3, :3] = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
+    palms[:, :3, 0] *= np.linalg.det(palms[:, :3, :3])[:, None]
+    palms[:, :3, 3] = rng.uniform(-0.15, 0.15, (COUNT, 3))
+    path = folder / (f"{stem}.{kind}" if kind else f"{stem}.npy")
+    if layout == "table":
+        motors = hand_motors(held.description)
+        values = q[:, [held.actuators.index(name) for name in motors]]
+        if kind == "npz":
+            joints = tuple(n for n in finger_joints(held.description) if n not in motors)
+            motors, values = (*motors, *joints), np.hstack([values, _joints(held, q, joints)])
+        _table(path, palms, motors, values)
+    else:
+        convention = load_convention(stem)
+        links = held.links(q)[convention.link]
+        frames = palms @ np.stack([inverse(pose) for pose in held.palm(q)]) @ links
+        frames = frames @ convention.pose
+        WRITERS[layout](path, frames, convention, _theirs(convention, held, q))
+    return Written(path, held, q, palms)
+
+
+def _joints(robot: ik.ArmHand, q: Array, names: tuple[str, ...]) -> Array:
+    found = robot.joints(q)
+    return np.stack([found[name] for name in names], axis=1)
+
+
+def _theirs(convention: Convention, robot: ik.ArmHand, q: Array) -> Array:
+    signs = np.array([sign for _, sign in convention.joints.values()])
+    return signs * _joints(robot, q, tuple(name for name, _ in convention.joints.values()))
+
+
+def _getagrip(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
+    """Dictionary of arrays; the fingers' directions are those of the palm's frame."""
+    del convention
+    turns = np.repeat(frames[:, None, :3, :3], 4, axis=1)
+    arrays = {
+        "trans": frames[:, :3, 3],
+        "rot": frames[:, :3, :3],
+        "joint_angles": joints,
+        "grasp_orientations": turns,
+    }
+    np.save(path, np.array({name: a.astype(np.float32) for name, a in arrays.items()}))
+
+
+def _dexgraspnet(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
+    entries = []
+    for frame, row in zip(frames, joints, strict=True):
+        qpos = dict(zip(convention.joints, row.tolist(), strict=True))
+        angles = roll_pitch_yaw(frame[:3, :3])
+        qpos |= zip(("WRJRx", "WRJRy", "WRJRz"), angles.tolist(), strict=True)
+        qpos |= zip(("WRJTx", "WRJTy", "WRJTz"), frame[:3, 3].tolist(), strict=True)
+        entries.append({"qpos": qpos, "scale": 0.06})
+    np.save(path, np.array(entries, dtype=object))
+
+
+OBJECT = np.array([0.3, -0.1, 0.05, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+"""Where the object is in files that say so: x y z, w x y z (a quarter turn about z)."""
+
+
+def _rows(frames: Array, joints: Array) -> Array:
+    """(k, 7 + joints), the poses those of hands about the object where it is."""
+    placed = np.eye(4)
+    placed[:3, :3], placed[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], OBJECT[:3]
+    poses = placed @ frames
+    return np.hstack([poses[:, :3, 3], _quaternions(poses[:, :3, :3]), joints])
+
+
+def _bodex(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
+    del convention
+    rows = _rows(frames, joints).astype(np.float32)
+    stages = np.stack([0.5 * rows, rows, 2.0 * rows], axis=1)
+    held = {"robot_pose": stages[None], "obj_pose": OBJECT[None], "obj_scale": np.array([0.06])}
+    np.save(path, np.array(held, dtype=object))
+
+
+def _dexgraspbench(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
+    del convention
+    rows = _rows(frames, joints).astype(np.float32)
+    stages = {"pregrasp_qpos": 0.5 * rows, "grasp_qpos": rows, "squeeze_qpos": 2.0 * rows}
+    held = stages | {"obj_pose": OBJECT, "obj_scale": np.float64(0.06), "obj_path": "assets"}
+    np.save(path, np.array(held, dtype=object))
+
+
+def _table(path: Path, palms: Array, names: tuple[str, ...], joints: Array) -> None:
+    columns = dict(zip("xyz", palms[:, :3, 3].T, strict=True))
+    if path.suffix == ".csv":
+        turns = _quaternions(palms[:, :3, :3])
+        columns |= zip(("qw", "qx", "qy", "qz"), turns.T, strict=True)
+    else:
+        angles = np.stack([roll_pitch_yaw(palm[:3, :3]) for palm in palms])
+        columns |= zip(("roll", "pitch", "yaw"), angles.T, strict=True)
+    columns |= zip(names, joints.T, strict=True)
+    if path.suffix == ".npz":
+        np.savez(path, **columns)  # pyright: ignore[reportArgumentType]
+        return
+    if path.suffix == ".parquet":
+        import polars as pl
+
+        pl.DataFrame(columns).write_parquet(path)
+        return
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(np.stack(list(columns.values()), axis=1).tolist())
+
+
+def _quaternions(rotations: Array) -> Array:
+    """(k, 4) w x y z: eigenvectors of a symmetric matrix (Bar-Itzhack 2000)."""
+    found = []
+    for r in rotations:
+        k = np.array(
+            [
+                [r[0, 0] - r[1, 1] - r[2, 2], 0.0, 0.0, 0.0],
+                [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], 0.0, 0.0],
+                [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], 0.0],
+                [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], np.trace(r)],
+            ]
+        )
+        x, y, z, w = np.linalg.eigh(k)[1][:, -1]
+        found.append([w, x, y, z])
+    return np.array(found)
+
+
+WRITERS: dict[str, Callable[[Path, Array, Convention, Array], None]] = {
+    "getagrip": _getagrip,
+    "dexgraspnet": _dexgraspnet,
+    "bodex": _bodex,
+    "dexgraspbench": _dexgraspbench,
+}
+
+TABLES = ("table.csv", "table.npz", "table.parquet")
+
+
+def main() -> None:
+    """Write one file of each kind."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in (*ik.shipped_names("datasets"), *TABLES):
+        print(made(name, folder).path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,289 @@
+"""Other people's grasps: what is written in a layout is read as it was; nothing in it is run."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from make_grasp_sets import TABLES, made
+
+import casadi_ik as ik
+from casadi_ik.datasets.conventions import load_convention
+from casadi_ik.datasets.hands import link_poses
+from casadi_ik.errors import DescriptionError, UnknownNameError, UnsupportedError
+from casadi_ik.problem.hand_motors import hand_motors
+
+PUBLISHED = json.loads((Path(__file__).parent / "published_hands.json").read_text())
+KUKA = "kuka_lwr_barrett"
+
+
+@pytest.mark.parametrize("name", [*ik.shipped_names("datasets"), *TABLES])
+def test_round_trip(name: str, tmp_path: Path) -> None:
+    """Palms, postures and fingertips of a file are those that it was made from."""
+    if name.endswith(".parquet"):
+        pytest.importorskip("polars")
+    written = made(name, tmp_path)
+    robot, motors = written.robot, hand_motors(written.robot.description)
+    columns = [robot.actuators.index(motor) for motor in motors]
+    grasps = ik.load_candidates(written.path, robot)
+    assert len(grasps) == len(written.q)
+    for grasp, q, palm in zip(grasps, written.q, written.palms, strict=True):
+        assert grasp.palm == pytest.approx(palm, abs=2e-6)
+        assert list(grasp.posture) == list(motors)
+        assert list(grasp.posture.values()) == pytest.approx(q[columns].tolist(), abs=2e-6)
+    points, normals = robot.contacts(written.q)
+    back = written.palms @ np.linalg.inv(robot.palm(written.q))
+    points = points @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
+    normals = normals @ np.swapaxes(back[:, :3, :3], 1, 2)
+    for i, grasp in enumerate(ik.load_candidates(written.path, robot, take="contacts")):
+        found = grasp.arrays(robot.fingers)
+        assert found[0] == pytest.approx(points[i], abs=3e-6)
+        assert found[1] == pytest.approx(normals[i], abs=3e-6)
+
+
+@pytest.mark.parametrize("name", sorted(PUBLISHED))
+def test_conventions_agree_with_the_published_hands(name: str) -> None:
+    """Where the last joints of the fingers are by another library in the published model."""
+    published, convention = PUBLISHED[name], load_convention(name)
+    hand = {"allegro": "panda+allegro_right", "leap": "panda+leap", "shadow": "ur5e+shadow"}
+    described = ik.load_robot(hand[name.split("_")[1]]).description
+    joints = {
+        convention.joints[key][0]: np.array([convention.joints[key][1] * value])
+        for key, value in published["joints"].items()
+    }
+    poses = link_poses(described, joints, 1)
+    back = np.linalg.inv(poses[convention.link][0] @ convention.pose)
+    children = {joint.name: joint.child for joint in described.joints}
+    # The little finger of DexGraspNet's model begins 1.7 mm beside the hand's.
+    within = 2e-3 if name == "dexgraspnet_shadow" else 1.5e-4
+    for theirs, place in published["last"].items():
+        ours = back @ poses[children[convention.joints[theirs][0]]][0]
+        assert ours[:3, 3] == pytest.approx(place, abs=within), theirs
+
+
+def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
+    """`solve`, `solve_all`, `choose` and YAML take a palm and a posture as given."""
+    robot = ik.load_robot(KUKA)
+    solver = ik.Solver(robot)
+    q = robot.random(np.random.default_rng(3), 6)
+    motors = hand_motors(robot.description)
+    columns = [robot.actuators.index(motor) for motor in motors]
+    grasps = [
+        ik.Grasp(palm=pose, posture=dict(zip(motors, row[columns].tolist(), strict=True)))
+        for pose, row in zip(robot.palm(q), q, strict=True)
+    ]
+    for grasp, row in zip(grasps, q, strict=True):
+        solution = solver.solve(grasp)
+        assert solution.success
+        assert solution.palm is not None
+        assert solution.palm.ok
+        assert solution.palm.position_error < 1e-4
+        assert solution.q[columns] == pytest.approx(row[columns], abs=1e-9)
+        assert robot.palm(solution.q) == pytest.approx(grasp.palm, abs=1e-3)
+    place = np.eye(4)
+    place[:3, 3] = 0.1, -0.2, 0.05
+    ranked = solver.choose([grasp.at(np.linalg.inv(place)) for grasp in grasps], place, limit=40)
+    assert ranked.answered == len(grasps)
+    for one in ranked:
+        assert robot.palm(one.solution.q) == pytest.approx(grasps[one.candidate].palm, abs=1e-3)
+    rpy = [0.3, -0.2, 1.0]
+    text = "\n".join(f"  {name}: {value!r}" for name, value in grasps[0].posture.items())
+    (tmp_path / "palm.yaml").write_text(
+        f"palm: {{xyz: [0.4, 0, 0.5], rpy: {rpy}}}\nposture:\n{text}\n"
+    )
+    loaded = ik.load_grasp(tmp_path / "palm.yaml")
+    assert solver.solve(loaded).palm is not None
+    far = grasps[0].at(np.block([[np.eye(3), np.array([[3.0], [0], [0]])], [0, 0, 0, 1.0]]))
+    missed = solver.solve(far)
+    assert missed.status is ik.Status.UNREACHABLE
+    assert missed.palm is not None
+    assert not missed.palm.ok
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"palm": np.eye(4)}, "posture: missing"),
+        ({"palm": np.diag([2.0, 1, 1, 1]), "posture": {"a": 1.0}}, "palm: its first three columns"),
+        (
+            {
+                "palm": np.eye(4),
+                "posture": {"a": 1.0},
+                "contacts": {"thumb": ik.Contact([0, 0, 1])},
+            },
+            "palm: found it beside contacts",
+        ),
+    ],
+)
+def test_bad_palms(given: dict[str, Any], says: str) -> None:
+    with pytest.raises(ik.CasadiIKError, match=says):
+        ik.Grasp(**given)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda p: p.pop("bh_spread"), r"posture\.bh_spread: missing"),
+        (lambda p: p.update(bh_spred=0.1), r"posture\.bh_spred: no such actuator"),
+        (lambda p: p.update(lwr_joint_1=0.1), r"posture\.lwr_joint_1: moves no finger"),
+        (lambda p: p.update(bh_spread=9.0), r"posture\.bh_spread: found 9\.0, expected a number"),
+    ],
+)
+def test_bad_postures(change: Any, says: str) -> None:
+    robot = ik.load_robot(KUKA)
+    posture = dict.fromkeys(hand_motors(robot.description), 0.5)
+    change(posture)
+    with pytest.raises(ik.CasadiIKError, match=says):
+        ik.Solver(robot).solve(ik.Grasp(palm=np.eye(4), posture=posture))
+
+
+def _table(tmp_path: Path, **changes: Any) -> Path:
+    """A table of one grasp; a change of None leaves a column out."""
+    robot = ik.load_robot(KUKA)
+    columns: dict[str, Any] = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.1)
+    columns |= dict.fromkeys(hand_motors(robot.description), 0.5)
+    columns |= changes
+    kept = {name: value for name, value in columns.items() if value is not None}
+    path = tmp_path / "grasps.csv"
+    path.write_text(",".join(kept) + "\n" + ",".join(map(str, kept.values())) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"bh_spread": None, "spread": 0.5}, "spread: no such joint, expected"),
+        ({"bh_spread": None}, "bh_spread: missing, expected a position"),
+        ({"x": 310}, r"position: found 310 m from the object.*numbers in mm\?"),
+        ({"bh_spread": 45}, r"joints: found angles beyond two turns.*in degrees\?"),
+        ({"bh_spread": 4}, "bh_spread: found 4, expected"),
+        ({"y": "nan"}, "row 0: position: holds NaN"),
+        ({"y": "abc"}, "row 0: y: found 'abc', expected a number"),
+        ({"yaw": None}, "yaw: missing, expected columns x y z"),
+    ],
+)
+def test_bad_tables(changes: dict[str, Any], says: str, tmp_path: Path) -> None:
+    with pytest.raises(DescriptionError, match=says) as caught:
+        ik.load_candidates(_table(tmp_path, **changes), KUKA)
+    assert "\n" not in str(caught.value)
+    assert "grasps.csv" in str(caught.value)
+
+
+def test_an_empty_set(tmp_path: Path) -> None:
+    path = tmp_path / "grasps.csv"
+    path.write_text("x,y,z,roll,pitch,yaw\n")
+    with pytest.raises(DescriptionError, match="found no grasps, expected at least one"):
+        ik.load_candidates(path, KUKA)
+
+
+def _getagrip(**changes: Any) -> dict[str, Any]:
+    arrays = {
+        "trans": np.zeros((2, 3)),
+        "rot": np.tile(np.eye(3), (2, 1, 1)),
+        "joint_angles": np.full((2, 16), 0.4),
+        "grasp_orientations": np.tile(np.eye(3), (2, 4, 1, 1)),
+    }
+    return arrays | changes
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (_getagrip(rot=2 * np.tile(np.eye(3), (2, 1, 1))), "row 0: rotation: .* no rotation"),
+        (_getagrip(rot=np.tile(np.diag([1.0, 1, -1]), (2, 1, 1))), "no rotation"),
+        (_getagrip(trans=np.zeros((3, 3))), "rotation: found shape"),
+        (_getagrip(joint_angles=np.zeros((2, 12))), "joints: found 12, expected 16"),
+        (_getagrip(trans="none"), "trans: expected an array of numbers"),
+        (_getagrip(trans=np.zeros((0, 3)), rot=np.zeros((0, 3, 3))), "found no grasps"),
+        ({"a": 1}, "its layout is none of getagrip"),
+        ([{"qpos": {"WRJTx": 0.0}}], r"row 0: qpos\.WRJTy: missing"),
+        ({"robot_pose": np.zeros((2, 3))}, r"robot_pose: found shape \(2, 3\)"),
+        ({"grasp_qpos": np.zeros(29)}, "row 0: rotation: holds NaN"),
+    ],
+)
+def test_bad_data_sets(content: Any, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "set.npy"
+    np.save(path, np.array(content, dtype=object))
+    with pytest.raises(DescriptionError, match=says) as caught:
+        ik.load_candidates(path, "panda+allegro_right")
+    assert "\n" not in str(caught.value)
+
+
+def test_another_hand(tmp_path: Path) -> None:
+    path = tmp_path / "set.npy"
+    np.save(path, np.array(_getagrip(), dtype=object))
+    with pytest.raises(UnsupportedError, match="layout getagrip: no hand of it is that of robot"):
+        ik.load_candidates(path, KUKA)
+    with pytest.raises(UnknownNameError, match="layout: found 'mine'"):
+        ik.load_candidates(path, KUKA, layout="mine")
+
+
+def test_a_coupled_joint_that_is_elsewhere(tmp_path: Path) -> None:
+    """Distal joints of the Shadow hand follow the middle ones; fingertips can still be asked."""
+    written = made("dexgraspnet_shadow", tmp_path)
+    entries = np.load(written.path, allow_pickle=True)
+    entries[0]["qpos"]["robot0:FFJ0"] += 0.2
+    np.save(written.path, entries)
+    with pytest.raises(DescriptionError, match=r"row 0: shadow_ffj1: .*take='contacts'"):
+        ik.load_candidates(written.path, written.robot)
+    assert len(ik.load_candidates(written.path, written.robot, take="contacts")) == len(entries)
+
+
+class _Runs:
+    """What it holds would be called by a plain reader of pickles."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.held = function, arguments
+
+    def __reduce__(self) -> Any:
+        return self.held
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda flag: _Runs(os.system, f"touch {flag}"),
+        lambda flag: _Runs(open, str(flag), "w"),
+        lambda flag: _Runs(eval, f"open({str(flag)!r}, 'w')"),
+        lambda flag: _Runs(np.save, str(flag), np.zeros(1)),
+        lambda flag: _Runs(np.memmap, str(flag), "u1", "w+", 0, (8,)),
+        lambda flag: _Runs(np.ndarray, (2**40,)),
+        lambda flag: _Runs(getattr, "a", "upper"),
+    ],
+)
+def test_nothing_in_a_pickle_is_run(build: Any, tmp_path: Path) -> None:
+    path, flag = tmp_path / "set.npy", tmp_path / "flag"
+    np.save(path, np.array(_getagrip(trans=build(flag)), dtype=object), allow_pickle=True)
+    with pytest.raises(DescriptionError, match=r"set\.npy: its pickle holds .* only$"):
+        ik.load_candidates(path, "panda+allegro_right")
+    assert not flag.exists()
+
+
+def test_damaged_pickles(tmp_path: Path) -> None:
+    """Every cut and many changes of a file end in one line, or in grasps."""
+    whole = made("getagrip_allegro", tmp_path).path.read_bytes()
+    robot, path, rng = (
+        ik.load_robot("panda+allegro_right"),
+        tmp_path / "cut.npy",
+        np.random.default_rng(0),
+    )
+    begun = whole.index(pickle.PROTO, 10)
+    for trial in range(300):
+        data = bytearray(whole)
+        if trial % 3 == 0:
+            del data[int(rng.integers(len(data))) :]
+        else:
+            for place in rng.integers(begun, begun + 700, 3):
+                data[place] = int(rng.integers(256))
+        path.write_bytes(bytes(data))
+        said = ""
+        try:
+            ik.load_candidates(path, robot)
+        except ik.CasadiIKError as error:
+            said = str(error)
+        assert "\n" not in said
