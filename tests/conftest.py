@@ -17,6 +17,10 @@ from toy_robots import copy_shipped_robot, write_coupled_robot
 
 import casadi_ik as ik
 
+# Half the time of the tests was the compiler's. Without optimisation it takes 0.4 of that, and not
+# a bit of a result is another (`test_compiler_flags`; tests of kernels take the usual flags).
+os.environ.setdefault("CASADI_IK_CFLAGS", "-O0")
+
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")

@@ -117,3 +117,50 @@ def test_where_limits_are_ignored_hands_beyond_them_are_found(robot, rng):
     q[:, 7:] += rng.uniform(-1, 1, (2000, 7))
     batch = ik.Solver(robot, limits="ignore").solve_batch(*robot.contacts(q))
     assert np.mean(~batch.success) <= 0.004
+
+
+FALLING = [
+    2.96705972839036,
+    2.094395102393195,
+    2.957666599978023,
+    2.092660133925822,
+    2.916178503456599,
+    2.015553214338501,
+    -0.6231548652933716,
+    3.141592653589793,
+    0,
+    0.5564127005107,
+    0.0002649701736958878,
+    0.8377580409572782,
+    0,
+    0.8018415500469888,
+]
+"""The floor of this hand's valley falls by 3e-5 over 24 degrees: one refinement is too few."""
+
+
+def test_a_refinement_that_gave_up_in_a_valley_goes_on(robot):
+    solver = ik.Solver(robot, tolerance=ik.Tolerance(1e-6, 1e-6))
+    q = np.array([FALLING])
+    assert solver.solve_batch(*robot.contacts(q)).success.all()
+
+
+AT_THE_TOLERANCE = [
+    -2.940961824074429,
+    0.9047366301093562,
+    -2.54675589188411,
+    -2.094395102393195,
+    -2.96705972839036,
+    -2.094395102393195,
+    -2.96705972839036,
+    3.141592653589793,
+    2.443460952792061,
+    2.443460952792061,
+    2.443379429526629,
+]
+"""A hand that is fitted to 1e-6 rad and not a bit better; its arm adds 6.5e-13."""
+
+
+def test_what_the_arm_adds_does_not_cost_the_verdict():
+    robot = ik.load_robot("kuka_lwr_barrett_coupled")
+    solver = ik.Solver(robot, tolerance=ik.Tolerance(1e-6, 1e-6))
+    assert solver.solve_batch(*robot.contacts(np.array([AT_THE_TOLERANCE]))).success.all()

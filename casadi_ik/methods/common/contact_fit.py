@@ -79,12 +79,20 @@ class Judged:
 
 
 def judge_contacts(
-    s: dict[str, Expr], p: dict[str, Expr], tried: Tried, rows: ContactRows
+    s: dict[str, Expr], p: dict[str, Expr], tried: Tried, rows: ContactRows, part: float = 1.0
 ) -> Judged:
-    """Judge a step by the contacts, its residuals those of `rows`; see `judge`."""
+    """Judge a step by the contacts, its residuals those of `rows`; see `judge`.
+
+    Args:
+        s: State.
+        p: Parameters.
+        tried: The step.
+        rows: The contacts.
+        part: Of the tolerances; what is within that is within them.
+    """
     residual = ca.if_else(gains(tried), tried.there, tried.before)
     positions, chords = rows.errors(residual)
-    tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
+    tolerances = part * p["position_tolerance"], part * chord(p["angle_tolerance"])
     exact = within_tolerance(positions / FINE, chords / FINE, *tolerances)
     return judge(s, tried, within_tolerance(positions, chords, *tolerances), exact)
 

@@ -23,6 +23,7 @@ from casadi_ik.methods.hand_first.going_on import (
     SURE,
     TINY,
     VARIED,
+    goes_on,
     near_cost,
 )
 from casadi_ik.methods.hand_first.one_target import OneTarget
@@ -235,8 +236,12 @@ class HandFirstMethod(LoopedMethod):
         hands = anywhere[None][:, :, list(self.robot.hand_actuators)]
         states, parameters = self.rows(problems, q0, hands, True)
         # The first of them begins as a whole: what stands in the way may be arm and hand together.
+        whole = np.broadcast_to(anywhere[0], (len(states), anywhere.shape[1]))
+        if goes_on(later - VALLEYS):
+            best, cost = (last[:, layouts.state.slice(name)] for name in ("best_q", "best_cost"))
+            whole = np.where(cost < SURE, best, whole)
         lower, upper = (parameters[:, layouts.parameters.slice(end)] for end in ("lower", "upper"))
-        states[:, layouts.state.slice("q")] = np.clip(anywhere[0], lower, upper)
+        states[:, layouts.state.slice("q")] = np.clip(whole, lower, upper)
         states[:, layouts.state.slice("phase")] = float(Phase.REFINEMENT)
         for name, value in fresh_fit().items():
             states[:, layouts.state.slice(name)] = value

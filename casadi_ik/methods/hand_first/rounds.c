@@ -258,7 +258,11 @@ static int begin_round(rounds *job, int64_t number) {
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = 0.0;
   if (later >= VALLEYS) {
-    /* The first begins as a whole: what stands in the way may be arm and hand together. */
+    /* The first begins as a whole: what stands in the way may be arm and hand together. The best so
+     * far goes on from time to time, if it is in a long valley. */
+    if ((later - VALLEYS) % 2 == 0 && job->last[STATE_BEST_COST] < SURE) {
+      memcpy(first, job->last + STATE_BEST_Q, sizeof first);
+    }
     for (k = 0; k < N_MOTORS; ++k) {
       job->state[STATE_Q + k] = clipped(first[k], job->parameters[PARAMETERS_LOWER + k],
                                         job->parameters[PARAMETERS_UPPER + k]);

@@ -49,6 +49,10 @@ from casadi_ik.symbolic.subexpressions import shared
 OWN_HAND = 0.5
 """Cost, with the best palm, up to which the hand as it is is fitted before other hands."""
 
+BEFORE_THE_ARM = 0.999
+"""Part of the tolerances that a hand is fitted to: the arm that follows it adds its rounding, which
+at 1e-6 has made an answer of 1.0000006e-6."""
+
 
 class HandFirstStep:
     """Builds the step graph for one robot.
@@ -182,7 +186,7 @@ class HandFirstStep:
         x = PalmAndHand(s["palm_rotation"], s["palm_origin"], s["q"][columns])
         tried = fit_step(self.layouts, self.arm, x, s["damping"], p, s["q"])
         contacts = self.layouts.contacts
-        judged = judge_contacts(s, p, tried, contacts)
+        judged = judge_contacts(s, p, tried, contacts, BEFORE_THE_ARM)
         keep, reached = judged.accepted, tried.reached
         # The last candidate goes on to the arm even if it does not fit: its arm and hand are the
         # nearest there is, and refinement starts from them.
