@@ -25,6 +25,7 @@ extensions = [
     "sphinx_copybutton",
     "building.mathml",
     "building.pages",
+    "building.sources",
 ]
 include_patterns = [
     "docs/**.md",

@@ -14,6 +14,8 @@ from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
 from building.api import documented, index_of_names, readable
+from building.commands import command_line
+from building.files import file_reference, quantities
 from building.results import results_table
 
 HERE = re.compile(r"^<!-- here: ([a-z-]+) ?(.*?) ?-->$", re.MULTILINE)
@@ -33,6 +35,9 @@ def _other_pages(*known: str) -> str:
 
 PARTS: dict[str, Callable[..., str]] = {
     "api": documented,
+    "command-line": command_line,
+    "files": file_reference,
+    "quantities": quantities,
     "names": index_of_names,
     "other-pages": _other_pages,
     "results": results_table,
