@@ -11,11 +11,12 @@ from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
 from casadi_ik.methods.registry import METHODS, register_method
 from casadi_ik.methods.screw_control.objectives import ScrewTask
+from casadi_ik.motion.approaching import Approach, ReachStatus
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.following import FollowState, FollowStatus
 from casadi_ik.motion.motion import Motion
 from casadi_ik.motion.path import Jump
-from casadi_ik.motion.reaching import Reach, ReachStatus
+from casadi_ik.motion.reaching import Reach
 from casadi_ik.motion.retarget import Retargeter, load_retarget
 from casadi_ik.motion.tracking import Track
 from casadi_ik.problem.collision_report import CollisionReport
@@ -31,6 +32,7 @@ from casadi_ik.solving.alternatives.finder import Alternative
 __all__ = [
     "METHODS",
     "Alternative",
+    "Approach",
     "ArmBranch",
     "ArmHand",
     "BatchSolution",

@@ -13,6 +13,7 @@ from casadi_ik.cli.export_parser import add_export
 from casadi_ik.cli.follow_parser import add_follow
 from casadi_ik.cli.import_parser import add_import
 from casadi_ik.cli.log_parser import add_log
+from casadi_ik.cli.reach_parser import add_reach
 from casadi_ik.cli.say import PROGRAM
 from casadi_ik.cli.shared_options import add_tolerances
 from casadi_ik.cli.values import assignment, file_name, numbers, one_of, whole
@@ -115,6 +116,7 @@ def build_parser() -> Parser:
     _add_solve(commands)
     _add_batch(commands)
     add_follow(commands)
+    add_reach(commands)
     add_choose(commands)
     add_import(commands)
     add_export(commands)

@@ -15,6 +15,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.methods.hand_first.method import UNBOUNDED
+from casadi_ik.motion.approaching import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.plan import FollowPlan
 from casadi_ik.motion.rates import Rates, length, rates_of, seconds, unbounded
@@ -188,25 +189,66 @@ class MovingSolver:
             >>> found.status.name, bool(found.motion.times[-1] > 0)
             ('REACHED', True)
         """
-        problem, start = self._questions.of_grasps([grasp], None), self._questions.start(q0)
+        start = self._questions.start(q0)
+        last, solutions = self._solutions(grasp, start, opening, distance, seed, limit)
+        rates = rates_of(self.robot, velocity, acceleration)
+        asked = ReachPlan(last, rates, seconds("period", period), seed)
+        return reach(asked, np.clip(start, *last.plan.bounds), solutions)
+
+    def approach(
+        self,
+        grasp: Grasp,
+        distance: float = 0.08,
+        opening: float = 0.02,
+        q0: ArrayLike | None = None,
+        seed: int = 0,
+        limit: int = 8,
+    ) -> Approach:
+        """The last part of the way to a grasp: a pre-grasp, straight on, closing.
+
+        The hand is open at the pre-grasp and comes straight along the line from the palm to the
+        contacts. Solutions of the grasp are tried, nearest to q0 first. With a scene all of it is
+        checked, between its points too; fingers touch the object only while they close.
+
+        Args:
+            grasp: As for `reach`.
+            distance: How far the hand comes straight [m].
+            opening: How far the fingertips are from their contacts before they close [m].
+            q0: (n,) where the robot is [rad or m]; None: at home.
+            seed: Of starts.
+            limit: Solutions that are tried at most.
+
+        Raises:
+            InputError: Bad numbers, or a grasp the robot cannot take.
+            UnsupportedError: The method is not hand-first.
+
+        Example:
+            >>> found = solver.approach(grasp)
+            >>> found.success, found.pregrasp.shape
+            (True, (14,))
+        """
+        start = self._questions.start(q0)
+        return approach(*self._solutions(grasp, start, opening, distance, seed, limit))
+
+    def _solutions(
+        self, grasp: Grasp, start: Array, opening: float, distance: float, seed: int, limit: int
+    ) -> tuple[ApproachPlan, list[Array]]:
+        """What the last part of the way to a grasp keeps to, and solutions (n,), nearest first."""
+        problem = self._questions.of_grasps([grasp], None)
+        bounds, free = self._bounds(None), unbounded(self.robot)
+        asked = ApproachPlan(
+            self._plan(start, bounds, 1.0, free, start, math.inf, PATH_PULL),
+            problem,
+            length("opening", opening),
+            length("distance", distance),
+        )
         engine = self._engine.kinds_of(problem)
         found = engine.finder.find(
             problem, start, seed, limit, "q0", apart=0.05, around=engine.around(problem)
         )
-        bounds, free = self._bounds(None), unbounded(self.robot)
-        asked = ReachPlan(
-            self._plan(start, bounds, 1.0, free, start, math.inf, PATH_PULL),
-            problem,
-            rates_of(self.robot, velocity, acceleration),
-            seconds("period", period),
-            length("opening", opening),
-            length("distance", distance),
-            seed,
-        )
         # A solve looks further for an answer that is free than a list of all does.
         best = engine.solve(replace(problem, prefer="q0"), Run(start, seed))
-        solutions = [*best.q[best.success], *(one.q for one in found)]
-        return reach(asked, np.clip(start, *bounds), solutions[:limit])
+        return asked, [*best.q[best.success], *(one.q for one in found)][:limit]
 
     def _plan(
         self,

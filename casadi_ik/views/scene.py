@@ -237,7 +237,7 @@ def _fill(
     for group, members in solids.items():
         stage.add(group, members)
     stage.add_floor(float(robot.links(q)[robot.description.root][2, 3]), arm + hand)
-    solids["object"] = _object(grasp) if grasp else []
+    solids["object"] = object_solids(grasp) if grasp else []
     solids["marks"] = contact_marks(robot, q, grasp, colors) if grasp else []
     stage.add("object", solids["object"], OBJECT)
     stage.add("marks", solids["marks"])
@@ -256,7 +256,7 @@ def _around(stage: Stage, robot: ArmHand, solution: Solution, grasp: Grasp, scen
         stage.add("touching", [] if solution.success else shapes, TOUCHING)
 
 
-def _object(grasp: Grasp) -> list[Solid]:
+def object_solids(grasp: Grasp) -> list[Solid]:
     """The object, if there is a description of it and its place is given."""
     pose = grasp.object_pose
     if not grasp.object or pose is None:
@@ -274,7 +274,7 @@ def _middle(robot: ArmHand, q: ArrayLike, grasp: Grasp) -> Array:
     grasp.arrays(robot.fingers)
     tips = dict(zip(robot.fingers, robot.contacts(q)[0], strict=True))
     places = [target_place(contact, tips[name]) for name, contact in grasp.contacts.items()]
-    return np.mean(places, axis=0)
+    return np.mean(places or list(tips.values()), axis=0)
 
 
 def _points(*groups: list[Solid]) -> Array:

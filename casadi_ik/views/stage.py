@@ -76,6 +76,12 @@ class Stage:
             actor.prop.interpolation = "Phong"
         self._groups[group] = actors
 
+    def replace(self, group: str, solids: Sequence[Solid], opacity: float = 1.0) -> None:
+        """Put other solids in the place of a group."""
+        for actor in self._groups.pop(group, []):
+            self.plotter.remove_actor(actor, render=False)
+        self.add(group, solids, opacity)
+
     def add_floor(self, height: float, solids: Sequence[Solid]) -> None:
         """A floor that fades out, with a grid and the soft shadow of solids."""
         points = np.concatenate([mesh.points for mesh, _ in solids])

@@ -111,3 +111,35 @@ def test_it_is_written_as_a_follower_is(robot, grasp, tmp_path):
     with pytest.raises(InputError, match=r"found suffix '\.txt', expected one of \.npz, \.csv"):
         motion.write(tmp_path / "way.txt")
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_the_last_part_alone(robot, grasp):
+    """A pre-grasp with open fingers, straight on; in a scene all of it is free, or it is said."""
+    found = ik.Solver(robot).approach(grasp, distance=0.06, opening=0.015)
+    assert (found.success, found.reason, found.clearance) == (True, "", None)
+    np.testing.assert_array_equal(found.pregrasp, found.coming[0])
+    np.testing.assert_array_equal(found.coming[-1], found.closing[0])
+    np.testing.assert_allclose(found.closing[-1], found.q, atol=1e-9)
+    palms = robot.palm(found.coming)[:, :3, 3]
+    assert np.linalg.norm(palms[-1] - palms[0]) == pytest.approx(0.06, abs=2e-3)
+    assert not robot.errors(found.pregrasp, *grasp.arrays(robot.fingers))[0].min() < 0.03
+    middle = robot.palm(found.coming[len(found.coming) // 2])[:3, 3] - 0.1 * np.array([0, 0, 1])
+    wall = {"wall": {"kind": "sphere", "radius": 0.09, "xyz": middle.tolist()}}
+    blocked = ik.Solver(robot, scene=ik.Scene(wall)).approach(grasp, distance=0.3, limit=1)
+    assert blocked.status in (ik.ReachStatus.NO_APPROACH, ik.ReachStatus.NOT_SOLVED)
+    assert blocked.pregrasp is None
+    assert blocked.reason
+
+
+def test_a_palm_that_is_given_is_reached(robot, grasp):
+    """Fingers open and close about the posture that is held."""
+    solution = ik.Solver(robot).solve(grasp)
+    motors = robot.actuators[7:]
+    posture = dict(zip(motors, solution.q[7:].tolist(), strict=True))
+    found = ik.Solver(robot).reach(ik.Grasp(palm=robot.palm(solution.q), posture=posture))
+    assert found.success
+    np.testing.assert_allclose(robot.palm(found.motion.q[-1]), robot.palm(solution.q), atol=1e-3)
+    assert (
+        np.abs(found.motion.q[found.motion.notes["part"] == "coming"] - solution.q)[:, 7:].max()
+        > 0.02
+    )

@@ -1,0 +1,102 @@
+"""What can be said to `casadi-ik reach`."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from casadi_ik.cli.shared_options import add_tolerances
+from casadi_ik.cli.values import file_name, numbers, positive, whole
+
+if TYPE_CHECKING:
+    from casadi_ik.cli.answer import Answer
+
+_EXAMPLES = """\
+examples:
+  casadi-ik reach cup --scene table --out motion.mcap --animation way.gif
+  casadi-ik reach GRASP --robot panda+allegro_right --object-pose 0.5 0 0.1 0 0 1.57 --out way.csv
+
+The robot goes from --q0 to a pre-grasp with open fingers, comes straight on, and closes: from rest
+to rest, within the motors' velocities and accelerations; with --scene all of it is free.
+MOTION.mcap holds it as trajectory_msgs/JointTrajectory, and as joint states for viewers; a name
+that ends in .npz or .csv gives arrays or a table.
+
+exit codes: 0 there is a way, 1 there is none (the report says why), 2 bad input
+"""
+
+
+def add_reach(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "reach",
+        help="the timed motion from where the robot is to a grasp",
+        description="Go from where the robot is to a grasp.",
+        epilog=_EXAMPLES,
+    )
+    parser.add_argument("grasp", metavar="GRASP", help="a shipped name or a YAML file")
+    parser.add_argument("--robot", metavar="R", help="a shipped name or a YAML file")
+    parser.add_argument(
+        "--out",
+        metavar="MOTION",
+        type=file_name(".mcap", ".npz", ".csv"),
+        required=True,
+        help="write the motion",
+    )
+    parser.add_argument(
+        "--animation",
+        metavar="FILE.gif",
+        type=file_name(".gif"),
+        help="draw the motion in real time",
+    )
+    parser.add_argument(
+        "--object-pose",
+        metavar="X",
+        type=numbers,
+        nargs="+",
+        help="where the object is: x y z [m] roll pitch yaw [rad] in the base frame",
+    )
+    parser.add_argument(
+        "--scene",
+        metavar="FILE",
+        help="what must not be touched: a shipped name or a YAML file (default: nothing is "
+        "checked)",
+    )
+    parser.add_argument(
+        "--opening",
+        metavar="M",
+        type=positive,
+        default=0.02,
+        help="how far fingertips are from their contacts before they close (default: 0.02)",
+    )
+    parser.add_argument(
+        "--distance",
+        metavar="M",
+        type=positive,
+        default=0.08,
+        help="how far the hand comes straight (default: 0.08)",
+    )
+    parser.add_argument(
+        "--period",
+        metavar="S",
+        type=positive,
+        default=0.01,
+        help="between two samples (default: 0.01)",
+    )
+    parser.add_argument(
+        "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"
+    )
+    add_tolerances(parser)
+    parser.add_argument(
+        "--q0",
+        metavar="V",
+        type=numbers,
+        nargs="+",
+        help="where the robot is: a number per actuator [rad or m] (default: home)",
+    )
+    parser.set_defaults(run=_reach)
+
+
+def _reach(arguments: argparse.Namespace) -> Answer:
+    from casadi_ik.cli.reach import reach
+
+    return reach(arguments)
