@@ -21,18 +21,15 @@ ROBOT = "kuka_lwr_barrett"
 ANSWERED = "globalThis.casadiIk?.now.answer && casadiIk.now.shown === casadiIk.now.answer.q"
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def build(out: Path, kept: Path) -> None:
     """The page of one robot, and its exported module."""
     if shutil.which("npm") is None or importlib.util.find_spec("ziglang") is None:
         pytest.skip("the page needs npm and ziglang")
-    out, kept = tmp_path_factory.mktemp("page"), tmp_path_factory.mktemp("module")
     words = ["--robots", ROBOT, "--out", str(out), "--keep", str(kept)]
     done = subprocess.run([sys.executable, BUILD, *words], capture_output=True, text=True)
     if done.returncode and "npm ci" in done.stderr:
         pytest.skip("npm cannot fetch what the page is built from")
     assert done.returncode == 0, done.stderr
-    return out, kept / ROBOT
 
 
 def now(page: Page, name: str) -> object:
@@ -133,8 +130,7 @@ def an_obstacle_is_kept_clear_of(page: Page, robot: ik.ArmHand) -> None:
     assert ik.Status.SOLVED in ends
 
 
-def test_by_mouse(built, browser: Browser, robot):
-    page = browser.open((built[0] / "index.html").as_uri(), 900, 600)
+def used_by_mouse(page: Page, robot: ik.ArmHand) -> None:
     settled(page)
     assert now(page, "answer.status") == ik.Status.SOLVED
     the_page_follows(page, robot)
@@ -146,8 +142,7 @@ def test_by_mouse(built, browser: Browser, robot):
     assert page.complaints == []
 
 
-def test_on_a_phone(built, browser: Browser):
-    page = browser.open((built[0] / "index.html").as_uri(), 360, 740, phone=True)
+def used_on_a_phone(page: Page) -> None:
     settled(page)
     assert page.evaluate("document.documentElement.scrollWidth") == 360
     before = asked(page)
@@ -159,8 +154,20 @@ def test_on_a_phone(built, browser: Browser):
     assert page.complaints == []
 
 
-def test_module_in_node(built):
-    done = subprocess.run(["node", "test.mjs"], cwd=built[1], capture_output=True, text=True)
+def as_in_python(module: Path) -> None:
+    """The exported module gives the stored answers bit for bit, in a scene too."""
+    done = subprocess.run(["node", "test.mjs"], cwd=module, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     said = json.loads(done.stdout)
     assert (said["targets"], said["wrong"], said["refused"]) == (1000, 0, True)
+
+
+# One test, since building takes as long as all that is done with what was built.
+def test_page(tmp_path: Path, request: pytest.FixtureRequest, robot: ik.ArmHand):
+    out, kept = tmp_path / "page", tmp_path / "module"
+    build(out, kept)
+    as_in_python(kept / ROBOT)
+    browser: Browser = request.getfixturevalue("browser")
+    url = (out / "index.html").as_uri()
+    used_by_mouse(browser.open(url, 900, 600), robot)
+    used_on_a_phone(browser.open(url, 360, 740, phone=True))
