@@ -8,13 +8,14 @@ SOLVE := $(BIN)/casadi-ik solve cup --scene table --log $(OUT)/cup.mcap --out $(
 PAPER := $(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup_paper.mcap
 SPHINX := $(BIN)/sphinx-build -E -q -W --keep-going -b html -c docs . out/docs
 
-.PHONY: help demo test lint docs bench notebooks clean
+.PHONY: help demo test lint docs page bench notebooks clean
 
 help:
 	@echo "make demo       set up and solve the grasp of a real object, by our method and the paper's"
 	@echo "make test       set up and run the tests"
 	@echo "make lint       style, types, layers, documentation"
 	@echo "make docs       build the documentation site: out/docs/index.html"
+	@echo "make page       build the page that solves in the browser: out/page/index.html"
 	@echo "make bench      timings on this machine"
 	@echo "make notebooks  execute the notebooks in place"
 	@echo "make clean      remove .venv and outputs"
@@ -59,6 +60,10 @@ lint: $(VENV)/dev.stamp
 docs: $(VENV)/docs.stamp
 	$(SPHINX)
 	@echo "out/docs/index.html"
+
+# Needs node and npm, for three.js.
+page: $(VENV)/dev.stamp
+	$(BIN)/python page/build.py --out out/page
 
 # Where the other solvers are installed (pip install -e ".[peers]") they are measured too.
 bench: $(VENV)/dev.stamp

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Generator, Iterable, Mapping
-from copy import copy
 from os import PathLike
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
-from casadi_ik.grasps.pose import one_pose
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.write.opening import recorder_of
 from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
 from casadi_ik.motion.moving import MovingSolver
-from casadi_ik.problem.clearance import Clearances, SceneCheck
+from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
@@ -31,9 +28,10 @@ from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.stream import SolvedBlock, Stream
+from casadi_ik.solving.surrounded_solver import SurroundedSolver
 
 
-class Solver(MovingSolver, ChoosingSolver):
+class Solver(MovingSolver, ChoosingSolver, SurroundedSolver):
     """A method on a robot, with a tolerance; build it once and use it for every grasp.
 
     Attributes:
@@ -109,44 +107,6 @@ class Solver(MovingSolver, ChoosingSolver):
 
     def __repr__(self) -> str:
         return f"<Solver {self.method} on {self.robot.name}, limits {self.limits}>"
-
-    def moved(self, name: str, pose: ArrayLike) -> Solver:
-        """The same solver with something in its scene elsewhere, in less than a millisecond.
-
-        Args:
-            name: Of an item of the scene.
-            pose: (4, 4) of it in the base frame.
-
-        Raises:
-            InputError: The solver has no scene, or this is no pose.
-            UnknownNameError: The scene has no such item.
-            DescriptionError: It would stand in the robot's base.
-        """
-        check = self._engine.check
-        if check is None:
-            raise InputError(f"{name!r} cannot be moved: the solver has no scene")
-        other = copy(self)
-        moved = check.moved(name, one_pose(pose))
-        other.scene, other._engine = moved.scene, self._engine.about(moved)
-        other._asked = (*self._asked[:-1], moved.scene)
-        return other
-
-    def check(self, q: ArrayLike, grasp: Grasp) -> Clearances | None:
-        """How far configurations are from touching anything they must not touch.
-
-        Args:
-            q: (n,) or (k, n) actuator positions [rad or m].
-            grasp: Its fingers may touch what is grasped.
-
-        Returns:
-            Clearances of the k configurations (one for a single q); None without a scene.
-
-        Raises:
-            InputError: Bad q, or a grasp that the robot cannot take.
-        """
-        problems = self._questions.of_grasps([grasp], None)
-        around = self._engine.around(problems)
-        return around and around.check(np.atleast_2d(self.robot.configuration(q)))
 
     @property
     def parameters(self) -> dict[str, Any]:

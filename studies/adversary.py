@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from hard_targets import contact_slopes, corners
+from miss_causes import CAUSE_HEADS, CAUSES, causes
 from missed import ROBOTS, TOLERANCES, load
 from rich.console import Console
 from runner import markdown_table, provenance, write_metrics, write_page
@@ -149,6 +150,7 @@ def take_turn(name: str, options: argparse.Namespace, seconds: float) -> Search:
 def write_report(options: argparse.Namespace) -> None:
     """Write the report on what all searches have come to."""
     rows, misses, metrics, codes = [], [], [], set[str]()
+    why: list[list[str]] = []
     for name in ROBOTS:
         path = options.out / name / "state.json"
         if not path.exists():
@@ -164,6 +166,10 @@ def write_report(options: argparse.Namespace) -> None:
             rows.append([name.replace("_", " "), tolerance, f"{search['seconds'] / 60:.1f}", *text])
             metrics.append(rate_metric(f"adversary/{name}/{tolerance}", count - len(lost), count))
             misses += [(name, miss) for miss in lost]
+            if lost:
+                robot = load(name, options.out / "robots")
+                found = causes(robot, TOLERANCES[tolerance], np.array([miss["q"] for miss in lost]))
+                why.append([name.replace("_", " "), tolerance, *found])
     heads = [
         "robot",
         "tolerance",
@@ -178,7 +184,10 @@ def write_report(options: argparse.Namespace) -> None:
         for name, miss in misses[:SHOWN]
     ]
     listed = markdown_table(["robot", "tolerance", "q"], shown) if shown else "None."
-    body = [INTRODUCTION, markdown_table(heads, rows), "## Misses", listed]
+    body = [INTRODUCTION, markdown_table(heads, rows)]
+    if why:
+        body += ["## Why", CAUSES, markdown_table(["robot", "tolerance", *CAUSE_HEADS], why)]
+    body += ["## Misses", listed]
     body += [
         "## Where this comes from",
         provenance({"adversary": ", ".join(sorted(codes)) or None}),

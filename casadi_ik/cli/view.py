@@ -58,6 +58,10 @@ def opened(arguments: argparse.Namespace) -> Viewer:
         raise InputError(f"view: found {len(what)} names, expected one (or two logs)")
     arguments.grasp = name = what[0]
     path, kind = Path(name), _kind(name)
+    if arguments.pads:
+        if kind != "robot" or not path.is_file():
+            raise InputError(f"{name}: --pads: expected the YAML file of a robot")
+        return viewing.view_pads(path, **served)
     settings, scene = _settings(arguments), the_scene(arguments)
     if kind == "robot":
         robot = load_robot(path if path.is_file() else name)
@@ -69,9 +73,10 @@ def opened(arguments: argparse.Namespace) -> Viewer:
         robot = the_robot(arguments.robot, path, grasp)
         meshes = _meshes(robot, Path(arguments.robot or grasp.robot), arguments)
         with located(str(path)):
-            return viewing.view_grasp(
-                robot, grasp, scene=scene, settings=settings, meshes=meshes, **served
-            )
+            grasp.arrays(robot.fingers)
+        return viewing.view_grasp(
+            robot, grasp, scene=scene, settings=settings, meshes=meshes, **served
+        )
     ranked = path.suffix == ".json"
     robot, choices = (ranked_of if ranked else candidates_of)(path, arguments, scene, settings)
     first, q = next(iter(choices.values()))()

@@ -18,6 +18,7 @@ examples:
   casadi-ik view ranked.json                answers of `casadi-ik choose`, to be gone through
   casadi-ik view candidates.yaml --robot R  candidates, each solved when it is chosen
   casadi-ik view cup.mcap                   play a solve; a second log plays beside it
+  casadi-ik view my_robot.yaml --pads       correct guessed pads by hand (see casadi-ik import)
 
 The page stays until Ctrl-C. Only this machine can open it unless --host says otherwise; whoever
 can open it can move what is on it, and all browsers see the same.
@@ -73,6 +74,7 @@ def add_view(commands: Any) -> None:
         nargs="+",
         help="which solve of each log (default: the only one)",
     )
+    parser.add_argument("--pads", action="store_true", help="correct the pads of a robot's file")
     parser.add_argument(
         "--meshes", action="store_true", help="draw the meshes of the robot's files"
     )

@@ -84,7 +84,8 @@ class Written:
         lines = [
             f"# Made by: {self.command}",
             "# What no file of a robot says was guessed: look at the lines marked GUESS, correct",
-            "# them here. To see them: casadi-ik import THIS.yaml --picture FILE.png",
+            "# them here. To see them: casadi-ik import THIS.yaml --picture FILE.png; to drag pads",
+            "# to where they belong: casadi-ik view THIS.yaml --pads",
             *(f"# {one_line(note)}" for note in self.notes),
             f"name: {scalar(self.name)}",
         ]

@@ -11,6 +11,6 @@ except ImportError as error:
     ) from error
 
 from casadi_ik.viewing.server import HOST, PORT, Viewer
-from casadi_ik.viewing.start import view_grasp, view_log
+from casadi_ik.viewing.start import view_grasp, view_log, view_pads
 
-__all__ = ["HOST", "PORT", "Viewer", "view_grasp", "view_log"]
+__all__ = ["HOST", "PORT", "Viewer", "view_grasp", "view_log", "view_pads"]

@@ -12,6 +12,9 @@ from casadi_ik.viewing.frames import facing
 PLATE = 0.75
 """Half the edge of what is drawn of a half-space, about the robot [m]."""
 
+MOST_SEEN = 3000
+"""Triangles of a mesh that are drawn: finer ones would be slow to send and to turn."""
+
 SHARP = np.cos(np.deg2rad(35.0))
 """Faces that meet at a larger angle meet at an edge."""
 
@@ -112,3 +115,17 @@ def _upright(middle: Array, axis: Array) -> Array:
     """A pose whose z axis is an axis."""
     turned = facing(middle, axis)
     return turned @ np.array([[0, 0, 1.0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+def coarser(body: Surface, most: int = MOST_SEEN) -> Surface:
+    """A surface with no more than about so many triangles: points of a cell become one."""
+    size = float(np.ptp(body.points, axis=0).max()) / 256 if len(body.points) else 0.0
+    while len(body.triangles) > most:
+        cells = np.round(body.points / size).astype(np.int64)
+        _, first, of = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        triangles = of.reshape(-1)[body.triangles]
+        a, b, c = triangles.T
+        triangles = triangles[(a != b) & (b != c) & (a != c)]
+        body = Surface(body.points[first], np.unique(triangles, axis=0))
+        size *= 1.4
+    return body

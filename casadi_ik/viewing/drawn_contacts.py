@@ -42,7 +42,13 @@ class DrawnContacts:
     """The contacts of all fingers."""
 
     def __init__(
-        self, server: viser.ViserServer, asked: Asked, drags: Drags, name: str = ""
+        self,
+        server: viser.ViserServer,
+        asked: Asked,
+        drags: Drags,
+        name: str = "",
+        tips: bool = True,
+        size: float = 1.0,
     ) -> None:
         """Draw them.
 
@@ -51,12 +57,14 @@ class DrawnContacts:
             asked: What is asked first.
             drags: Who is told.
             name: Of the node that they hang on; "": the base frame.
+            tips: Whether what is reached is drawn too.
+            size: Of the marks, as a part of the usual.
         """
         self._targets = {
-            finger: _Target(server, finger, held, drags, name)
+            finger: _Target(server, finger, held, drags, name, size)
             for finger, held in asked.held.items()
         }
-        self._tips = {finger: _Tip(server, finger, name) for finger in asked.held}
+        self._tips = {finger: _Tip(server, finger, name) for finger in asked.held if tips}
         self.place(asked)
 
     def place(self, asked: Asked, dragged: str = "") -> None:
@@ -82,11 +90,17 @@ class _Target:
     """What is asked of a finger."""
 
     def __init__(
-        self, server: viser.ViserServer, finger: str, held: Held, drags: Drags, above: str
+        self,
+        server: viser.ViserServer,
+        finger: str,
+        held: Held,
+        drags: Drags,
+        above: str,
+        size: float,
     ) -> None:
         contact, name = held.contact, f"{above}/contacts/{finger}"
         self.control = server.scene.add_transform_controls(
-            name, scale=SIZE, line_width=3.0, depth_test=False
+            name, scale=size * SIZE, line_width=3.0, depth_test=False
         )
         color = palette.rgb(palette.TARGET)
 
@@ -100,8 +114,8 @@ class _Target:
                 cast_shadow=False,
             )
 
-        self._parts = [mesh("point", ball(0.0065))]
-        self._arrow = mesh("normal", arrow(0.045, 0.0052))
+        self._parts = [mesh("point", ball(size * 0.0065))]
+        self._arrow = mesh("normal", arrow(size * 0.045, size * 0.0052))
         if contact.line is not None:
             ends = contact.point - BEYOND * contact.line, contact.point + BEYOND * contact.line
             self._parts.append(mesh("line", tube(*ends, 0.002)))

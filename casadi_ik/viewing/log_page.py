@@ -103,7 +103,7 @@ class LogPage:
         contacts = DrawnContacts(self.server, track.asked, NOBODY, name)
         if len(self.tracks) > 1:
             self.server.scene.add_label(
-                f"{name}/label", track.label, position=(0.0, 0.0, -0.06), anchor="top-center"
+                f"{name}/label", track.label, position=(0.0, 0.0, 0.02), anchor="top-center"
             )
         return drawn, contacts
 

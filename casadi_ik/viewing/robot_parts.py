@@ -17,7 +17,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.importing.surfaces import Surface, box_shape, round_shape, together
 from casadi_ik.robots.collision import LinkSolid
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.viewing.bodies import sharp, tube
+from casadi_ik.viewing.bodies import coarser, sharp, tube
 
 ARM_RADIUS, FINGER_RADIUS = 0.045, 0.009
 """Of the tubes of links without shapes [m]."""
@@ -56,7 +56,9 @@ def robot_parts(
     for link, surface in _tubes(robot, sides).items():
         if sides[link] not in described:
             found[link] = surface
-    found |= {link: one for link, one in (meshes or {}).items() if len(one.triangles)}
+    found |= {
+        link: sharp(coarser(one)) for link, one in (meshes or {}).items() if len(one.triangles)
+    }
     return tuple(
         LinkPart(link, found[link], _color(description, link, sides[link]))
         for link in description.links

@@ -38,7 +38,7 @@ def set_stage(server: viser.ViserServer, title: str, floor: float = 0.0) -> None
         "/light/lamp",
         color=(255, 250, 242),
         intensity=2.2,
-        position=(1.6, -1.2, 3.0),
+        position=(0.9, -0.7, 3.2),
         cast_shadow=True,
     )
     scene.add_light_directional("/light/fill", intensity=0.6, position=(-2.0, 2.0, 1.0))
@@ -106,9 +106,23 @@ def look_at_robot(server: viser.ViserServer, robot: ArmHand, q: Array, wide: int
     for turn in np.deg2rad([-75, -60, -45, -30, 30, 45, 60, 75]):
         way = np.array([np.cos(side + turn), np.sin(side + turn), TILT])
         views.append(way / np.linalg.norm(way))
-    share = 0.5 if wide == 1 else 0.0
+    share = 0.62 if wide == 1 else 0.0
     target = (1 - share) * (low + high) / 2 + share * hand
-    look_at(server, target, size, max(views, key=apart))
+    look_at(server, target, (0.72 if wide == 1 else 1.0) * size, max(views, key=apart))
+
+
+def look_at_hand(server: viser.ViserServer, robot: ArmHand, q: Array) -> None:
+    """The hand alone at q, from the side that its thumb's pad is seen from."""
+    links, palm = robot.links(q), robot.palm(q)
+    hand = {joint.child for joint in robot.description.joints if joint.part == "hand"}
+    tips, _ = robot.contacts(q)
+    points = [links[link][:3, 3] for link in links if link in hand]
+    every = np.concatenate([np.array([*points, palm[:3, 3]]), tips])
+    low, high = every.min(axis=0), every.max(axis=0)
+    size = max(float(np.linalg.norm(high - low)), 0.1)
+    # Across the way from palm to thumb, along which the pads are seen from the side.
+    view = palm[:3, 0] + 0.35 * palm[:3, 2] + 0.25 * palm[:3, 1]
+    look_at(server, (low + high) / 2, 1.25 * size, view + np.array([0.0, 0.0, 0.3]))
 
 
 def legend(entries: Iterable[tuple[str, str]]) -> str:

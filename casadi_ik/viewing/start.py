@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from os import PathLike
+from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
-from casadi_ik.errors import InputError
+from casadi_ik.errors import DescriptionError, InputError
+from casadi_ik.files.reading import read_yaml
 from casadi_ik.grasps import Grasp
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.logs.read.one_solve import OneSolve
@@ -17,7 +20,12 @@ from casadi_ik.viewing.asked import Asked, Settings, asked_of
 from casadi_ik.viewing.grasp_page import GraspPage
 from casadi_ik.viewing.log_page import LogPage
 from casadi_ik.viewing.log_track import track_of
+from casadi_ik.viewing.meshes import robot_meshes
+from casadi_ik.viewing.pad_page import PadPage
 from casadi_ik.viewing.server import HOST, Viewer, serve
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+"""Where nobody else sees a page."""
 
 
 def view_grasp(
@@ -80,4 +88,26 @@ def view_log(
     tracks = [track_of(*one) for one in solves]
     server = serve(host, port)
     page = LogPage(server, tracks)
+    return Viewer(server, page, page.stop)
+
+
+def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None = None) -> Viewer:
+    """A page on which the pads of an imported robot are corrected.
+
+    Args:
+        path: Its description, as `casadi-ik import` has written it.
+        host: As for `view_grasp`; what others may see they may not have written.
+        port: As for `view_grasp`.
+
+    Raises:
+        DescriptionError: The description is malformed, or does not state its pads.
+        InputError: A port that cannot be had.
+    """
+    file = Path(path)
+    robot = load_robot(file)
+    if not isinstance(read_yaml(file).get("fingers"), dict):
+        raise DescriptionError(f"{file}: fingers: expected the pads of the fingers, by name")
+    surfaces = robot_meshes(robot, file)
+    server = serve(host, port)
+    page = PadPage(server, robot, file, surfaces, writable=host in LOOPBACK)
     return Viewer(server, page, page.stop)

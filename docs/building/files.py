@@ -101,5 +101,5 @@ def _title(name: str) -> str:
         return NAMES[title]
     words = re.sub(r"(Entry|File)$", "", title)
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", words).capitalize()
-    of = OF[module]
+    of = OF.get(module, "")
     return words if not of or of == words.lower() else f"{words} ({of})"

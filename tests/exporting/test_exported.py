@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
 import shutil
 import subprocess
 from pathlib import Path
@@ -116,18 +114,6 @@ def test_wrapper_in_cpp(project, tmp_path):
         ["g++", *flags, f"-I{project / 'include'}", str(text)], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
-@pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="no ziglang")
-def test_module_in_node(tmp_path, capsys):
-    out = tmp_path / "page"
-    # A hand alone: a small module compiles in a third of the time.
-    assert main(["export", "ar10", "--out", str(out), "--target", "wasm"]) == 0
-    done = subprocess.run(["node", "test.mjs"], cwd=out, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    said = json.loads(done.stdout)
-    assert (said["targets"], said["wrong"], said["refused"]) == (1000, 0, True)
 
 
 @pytest.mark.parametrize(

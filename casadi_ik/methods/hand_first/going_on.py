@@ -31,10 +31,11 @@ TINY = 1e-9
 
 
 def goes_on(number: int) -> bool:
-    """Whether in a round from anywhere, from 0, the best so far goes on if it is in a valley.
+    """Whether a round from anywhere, from 0, begins at the best so far if that lies in a valley.
 
     The floor of some valleys falls so little that a refinement gives up: ten of them have reached
-    the end. Every other round, since what lies at a valley's lowest place has to be left.
+    the end. And the best so far may be another than when hands along its valley were tried. Every
+    other round, since what has come to a valley's lowest place has to leave it.
     """
     return number % 2 == 0
 

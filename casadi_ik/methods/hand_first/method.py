@@ -232,14 +232,18 @@ class HandFirstMethod(LoopedMethod):
         if later < VALLEYS:
             best = last[:, layouts.state.slice("best_q")]
             return self.rows(problems, q0, self.hands.along_valley(problems, best, later), True)
-        anywhere = self.hands.anywhere(problems, later - VALLEYS)
-        hands = anywhere[None][:, :, list(self.robot.hand_actuators)]
-        states, parameters = self.rows(problems, q0, hands, True)
         # The first of them begins as a whole: what stands in the way may be arm and hand together.
-        whole = np.broadcast_to(anywhere[0], (len(states), anywhere.shape[1]))
+        anywhere = self.hands.anywhere(problems, later - VALLEYS)
+        whole = np.repeat(anywhere[:1], len(last), axis=0)
+        hands = np.repeat(anywhere[None][:, :, list(self.robot.hand_actuators)], len(last), axis=0)
         if goes_on(later - VALLEYS):
             best, cost = (last[:, layouts.state.slice(name)] for name in ("best_q", "best_cost"))
-            whole = np.where(cost < SURE, best, whole)
+            flat = np.flatnonzero(cost < SURE)
+            which = VALLEYS + (later - VALLEYS) // 2
+            if len(flat):
+                whole[flat] = best[flat]
+                hands[flat] = self.hands.along_valley(problems.rows(flat), best[flat], which)
+        states, parameters = self.rows(problems, q0, hands, True)
         lower, upper = (parameters[:, layouts.parameters.slice(end)] for end in ("lower", "upper"))
         states[:, layouts.state.slice("q")] = np.clip(whole, lower, upper)
         states[:, layouts.state.slice("phase")] = float(Phase.REFINEMENT)

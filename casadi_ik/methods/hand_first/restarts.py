@@ -53,6 +53,22 @@ STRIDES = (
     -0.3,
     0.8,
     -0.8,
+    0.5,
+    -0.5,
+    0.6,
+    -0.6,
+    0.7,
+    -0.7,
+    0.25,
+    -0.25,
+    1.0,
+    -1.0,
+    1.2,
+    -1.2,
+    1.5,
+    -1.5,
+    2.0,
+    -2.0,
 )
 """How far along a valley a hand begins anew [rad of the motor that moves most], round by round."""
 
@@ -171,7 +187,7 @@ class Restarts:
         Args:
             problems: k targets.
             q: (k, n) where it did.
-            which: The round. Even ones keep motors at a limit there; odd ones do not.
+            which: The round, from 0. Even ones keep motors at a limit there; odd ones do not.
         """
         columns = self._hand
         rigid, slopes = self._slopes(q, problems)

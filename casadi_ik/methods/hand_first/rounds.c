@@ -239,10 +239,12 @@ static int begin_round(rounds *job, int64_t number) {
   double *outputs[2], first[N_MOTORS];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   const int64_t later = number - TABLE_ROUNDS;
-  int code = DONE, i, k;
+  int code = DONE, goes_on, i, k;
   memcpy(job->last, job->state, sizeof job->last);
+  goes_on = later >= VALLEYS && (later - VALLEYS) % 2 == 0 && job->last[STATE_BEST_COST] < SURE;
   if (later < 0 || !number) code = from_table(job, number);
   else if (later < VALLEYS) code = along_valley(job, later);
+  else if (goes_on) code = along_valley(job, VALLEYS + (later - VALLEYS) / 2);
   else from_anywhere(job, later - VALLEYS, first);
   if (code != DONE) return code;
   inputs[0] = job->points;
@@ -258,11 +260,8 @@ static int begin_round(rounds *job, int64_t number) {
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = 0.0;
   if (later >= VALLEYS) {
-    /* The first begins as a whole: what stands in the way may be arm and hand together. The best so
-     * far goes on from time to time, if it is in a long valley. */
-    if ((later - VALLEYS) % 2 == 0 && job->last[STATE_BEST_COST] < SURE) {
-      memcpy(first, job->last + STATE_BEST_Q, sizeof first);
-    }
+    /* The first begins as a whole: what stands in the way may be arm and hand together. */
+    if (goes_on) memcpy(first, job->last + STATE_BEST_Q, sizeof first);
     for (k = 0; k < N_MOTORS; ++k) {
       job->state[STATE_Q + k] = clipped(first[k], job->parameters[PARAMETERS_LOWER + k],
                                         job->parameters[PARAMETERS_UPPER + k]);

@@ -156,7 +156,7 @@ class RoundsPlan:
             "UPPER": robot.upper,
             "SIZE": hands.size,
             "ORDER_RANGES": np.maximum((robot.upper - robot.lower)[hand], going_on.TINY),
-            "STRIDES": np.concatenate([hands.strides(i) for i in range(restarts.VALLEYS)]),
+            "STRIDES": np.concatenate([hands.strides(i) for i in range(self.rounds)]),
             "HAND_STEPS": even_steps(len(hand)),
             "ALL_STEPS": even_steps(len(robot.actuators)),
             "ANYWHERE_LOWER": lower,

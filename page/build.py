@@ -1,0 +1,206 @@
+"""Build the page that solves in the browser: drag a contact, and arm and hand follow.
+
+Every robot's solver is exported as WebAssembly and written into a script of its own, which the page
+loads when the robot is chosen; three.js comes from the npm registry (`npm ci`, versions in
+package-lock.json) and is bundled. What comes out are plain files: they work from any file host, and
+from disk::
+
+    python page/build.py --out out/page
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import casadi_ik as ik
+from casadi_ik.collision.solids import Kind, of_object
+from casadi_ik.exporting.project import checked_prefix, write_folder
+from casadi_ik.exporting.wasm import wasm_project
+from casadi_ik.grasps.load import shipped_grasps
+from casadi_ik.grasps.objects import load_object
+
+HERE = Path(__file__).parent
+
+ROBOTS = {
+    "kuka_lwr_barrett": "LWR 4+ · Barrett",
+    "panda+allegro_right": "Panda · Allegro",
+    "baxter_ar10": "Baxter · AR10",
+    "panda+shadow": "Panda · Shadow",
+}
+"""What can be chosen, and what it is called there."""
+
+CAPACITY = 8
+"""Solids of a scene: an object of several parts, and the obstacle."""
+
+LARGEST = 4e6
+"""A robot's script is at most as large [bytes]."""
+
+SPANS = 20_000
+"""Random configurations, from which it is known how far fingertips reach, and apart."""
+
+
+def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
+    """The robot's shipped grasps whose objects an export can have in its scene."""
+    found = []
+    for file in shipped_grasps(name):
+        grasp = ik.load_grasp(file)
+        points, normals = grasp.arrays(robot.fingers)
+        if grasp.object is None or grasp.object_pose is None or grasp.more(robot.fingers):
+            continue
+        parts = of_object(load_object(grasp.object).shape)
+        if len(parts) >= CAPACITY or any(solid.kind is Kind.CONVEX for solid, _ in parts):
+            continue
+        solids = []
+        for solid, place in parts:
+            pose = grasp.object_pose @ place
+            factor = [2, 2, 2] if solid.kind is Kind.BOX else [1, 2, 1]
+            solids.append(
+                {
+                    "kind": int(solid.kind),
+                    "size": (solid.size * factor).tolist(),
+                    "pose": [*pose[:3, :3].ravel().tolist(), *pose[:3, 3].tolist()],
+                }
+            )
+        found.append(
+            {
+                "name": file,
+                "object": grasp.object.replace("_", " "),
+                "points": [None if np.isnan(p).any() else p.tolist() for p in points],
+                "normals": [None if np.isnan(n).any() else n.tolist() for n in normals],
+                "solids": solids,
+            }
+        )
+    if not found:
+        raise SystemExit(f"{name}: no shipped grasp for the page")
+    return found
+
+
+def reached(robot: ik.ArmHand) -> dict[str, Any]:
+    """How far apart two fingertips, and each from the base, were in random configurations [m]."""
+    points, _ = robot.contacts(robot.random(np.random.default_rng(0), SPANS))
+    pairs = itertools.combinations(range(len(robot.fingers)), 2)
+    away = {pair: np.linalg.norm(points[:, pair[0]] - points[:, pair[1]], axis=1) for pair in pairs}
+    return {
+        "spans": [
+            {"fingers": pair, "least": float(d.min()), "most": float(d.max())}
+            for pair, d in away.items()
+        ],
+        "reach": np.linalg.norm(points, axis=2).max(axis=0).tolist(),
+    }
+
+
+def about(robot: ik.ArmHand, name: str) -> dict[str, Any]:
+    """What the page has to know of a robot beside its solver."""
+    return {
+        "name": robot.name,
+        "title": ROBOTS.get(name, name),
+        "arm": arm_links(robot),
+        "prismatic": [bool(kind == "m") for kind in units(robot)],
+        "grasps": of_grasps(robot, name),
+        **reached(robot),
+    }
+
+
+def arm_links(robot: ik.ArmHand) -> list[str]:
+    """Links up to what the arm's last motor moves; what is fixed to that is the hand's."""
+    joints = [joint for joint in robot.description.joints if joint.part == "arm"]
+    last = max((i for i, joint in enumerate(joints) if joint.type != "fixed"), default=-1)
+    return [robot.description.root, *(joint.child for joint in joints[: last + 1])]
+
+
+def units(robot: ik.ArmHand) -> list[str]:
+    """Per actuator "m" where it slides."""
+    driven = {joint.name: joint.type for joint in robot.description.movable}
+    return [
+        "m" if driven.get(name) == "prismatic" or "slider" in name else "rad"
+        for name in robot.actuators
+    ]
+
+
+def run(*command: str) -> None:
+    """Run a command in this folder."""
+    done = subprocess.run(command, cwd=HERE, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)}:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+
+
+def bundle(entry: Path, out: Path, *more: str) -> None:
+    """A script that needs nothing and is no module: from disk, browsers load no others."""
+    run(
+        *("npx", "--no-install", "esbuild", str(entry), "--bundle", "--minify", "--format=iife"),
+        *("--target=es2022", "--charset=utf8", "--log-level=error", f"--outfile={out}", *more),
+    )
+
+
+def build_robot(name: str, out: Path, keep: Path | None) -> dict[str, Any]:
+    """A robot's script; what the page says of it before it is loaded.
+
+    Args:
+        name: Of the robot.
+        out: Folder of the page.
+        keep: Where the exported module stays, if it shall.
+    """
+    robot = ik.load_robot(name)
+    prefix = checked_prefix(None, name)
+    data = about(robot, name)
+    with tempfile.TemporaryDirectory() as folder:
+        place = (keep or Path(folder)) / prefix
+        write_folder(place, wasm_project(robot, prefix, CAPACITY))
+        (place / "about.json").write_text(json.dumps(data), encoding="utf-8")
+        entry = place / "entry.js"
+        entry.write_text(
+            f'import * as solver from "./{prefix}.js";\n'
+            f'import wasm from "./{prefix}.wasm";\n'
+            'import about from "./about.json";\n'
+            f"globalThis.casadiIkRobots ??= {{}};\n"
+            f"globalThis.casadiIkRobots[{json.dumps(name)}] = {{ solver, wasm, about }};\n",
+            encoding="utf-8",
+        )
+        script = out / "robots" / f"{prefix}.js"
+        loaders = ("--loader:.wasm=binary", "--external:node:fs/promises")
+        bundle(entry, script, *loaders, "--define:import.meta.url=''")
+    size = script.stat().st_size
+    if size > LARGEST:
+        raise SystemExit(f"{name}: {size / 1e6:.1f} MB, expected at most {LARGEST / 1e6:.0f} MB")
+    print(f"{name}: {size / 1e6:.2f} MB", flush=True)
+    motors, fingers = len(robot.actuators), len(robot.fingers)
+    return {
+        "name": name,
+        "title": data["title"],
+        "what": f"{motors} motors, {fingers} fingers",
+        "script": f"robots/{prefix}.js",
+        "size": size,
+    }
+
+
+def main() -> None:
+    """Build it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--robots", nargs="+", default=list(ROBOTS), metavar="ROBOT")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the exported modules here")
+    arguments = parser.parse_args()
+    if shutil.which("npm") is None:
+        raise SystemExit("the page needs node and npm, to bundle three.js")
+    out = arguments.out.resolve()
+    (out / "robots").mkdir(parents=True, exist_ok=True)
+    run("npm", "ci", "--no-audit", "--no-fund", "--silent")
+    robots = [build_robot(name, out, arguments.keep) for name in arguments.robots]
+    bundle(HERE / "src" / "main.js", out / "page.js", f"--define:ROBOTS={json.dumps(robots)}")
+    for name in ("index.html", "page.css"):
+        shutil.copy(HERE / "src" / name, out / name)
+    print(f"open {out / 'index.html'}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""The page: built, its module compared with Python in node, used by hand in Chromium."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Browser, Page
+
+import casadi_ik as ik
+from casadi_ik.kernels.clearance_kernel import ClearanceKernel
+
+BUILD = Path(__file__).parents[2] / "page" / "build.py"
+ROBOT = "kuka_lwr_barrett"
+ANSWERED = "globalThis.casadiIk?.now.answer && casadiIk.now.shown === casadiIk.now.answer.q"
+
+
+def build(out: Path, kept: Path) -> None:
+    """The page of one robot, and its exported module."""
+    if shutil.which("npm") is None or importlib.util.find_spec("ziglang") is None:
+        pytest.skip("the page needs npm and ziglang")
+    words = ["--robots", ROBOT, "--out", str(out), "--keep", str(kept)]
+    done = subprocess.run([sys.executable, BUILD, *words], capture_output=True, text=True)
+    if done.returncode and "npm ci" in done.stderr:
+        pytest.skip("npm cannot fetch what the page is built from")
+    assert done.returncode == 0, done.stderr
+
+
+def now(page: Page, name: str) -> object:
+    return page.evaluate(f"casadiIk.now.{name}")
+
+
+def asked(page: Page) -> np.ndarray:
+    return np.array(page.evaluate("casadiIk.now.points.map((p) => p.toArray())"))
+
+
+def settled(page: Page) -> None:
+    """Everything is done that was asked for, and the robot stands."""
+    page.wait(f"{ANSWERED} && !casadiIk.stage.asked")
+
+
+def the_page_follows(page: Page, robot: ik.ArmHand) -> None:
+    """A contact is dragged: the fingertip that is drawn is there, by Python's kinematics."""
+    before = asked(page)
+    x, y = page.evaluate("casadiIk.pixel('point 0')")
+    page.drag((x, y), (x + 9, y - 9), steps=4)
+    settled(page)
+    after = asked(page)
+    assert 2e-3 < np.linalg.norm(after[0] - before[0]) < 0.1
+    assert now(page, "answer.status") == ik.Status.SOLVED
+    q = np.array(page.evaluate("[...casadiIk.now.shown]"))
+    points, _ = robot.contacts(q)
+    assert np.linalg.norm(points - after, axis=1).max() <= 5.001e-3
+    drawn = page.evaluate("[...casadiIk.now.solving.solver.shapes(casadiIk.now.shown)]")
+    (placed,) = ClearanceKernel(robot.description).placed(q[None])
+    assert np.abs(np.array(drawn) - placed.ravel()).max() < 1e-12
+    mesh = page.evaluate("casadiIk.now.body.parts.find((p) => !p.isSolid).mesh.position.toArray()")
+    first = page.evaluate("casadiIk.now.body.parts.find((p) => !p.isSolid).at")
+    assert np.allclose(mesh, placed.ravel()[first : first + 3])
+
+
+def a_normal_turns(page: Page) -> None:
+    turned = "casadiIk.now.normals[1].toArray()"
+    before = page.evaluate(turned)
+    x, y = page.evaluate("casadiIk.pixel('normal 1')")
+    page.drag((x, y), (x + 6, y + 4), steps=3)
+    settled(page)
+    after = page.evaluate(turned)
+    assert np.linalg.norm(after) == pytest.approx(1.0)
+    assert 0.02 < np.linalg.norm(np.subtract(after, before)) < 0.6
+
+
+def the_object_takes_its_contacts_along(page: Page) -> None:
+    before = asked(page)
+    x, y = page.evaluate("casadiIk.pixel('object')")
+    around = [(x + 3 * i, y + 3 * k) for i in range(-12, 13) for k in range(-12, 13)]
+    script = f"{json.dumps(around)}.find(([x, y]) => casadiIk.under(x, y) === 'object')"
+    x, y = page.evaluate(script)
+    page.drag((x, y), (x + 25, y), steps=4)
+    settled(page)
+    moved = asked(page) - before
+    assert np.linalg.norm(moved[0]) > 5e-3
+    assert np.ptp(moved, axis=0).max() < 1e-9
+
+
+def out_of_reach_is_explained(page: Page) -> None:
+    x, y = page.evaluate("casadiIk.pixel('point 0')")
+    page.drag((x, y), (x - 200, y + 90), steps=3)
+    settled(page)
+    assert page.evaluate("document.getElementById('status').textContent") == "not reached"
+    said = page.evaluate("document.getElementById('reason').textContent")
+    assert said.startswith("Out of reach: ")
+    assert "apart" in said
+    page.evaluate("document.getElementById('reset').click()")
+    settled(page)
+    assert page.evaluate("document.getElementById('reason').hidden") is True
+
+
+def an_obstacle_is_kept_clear_of(page: Page, robot: ik.ArmHand) -> None:
+    """Dragged into the arm: how far every answer is from touching, by Python's distances."""
+    page.evaluate("document.getElementById('obstacle').click()")
+    settled(page)
+    goal = page.evaluate("casadiIk.pixel('point 0')")
+    ends = set()
+    for part in (0.3, 0.7):
+        x, y = page.evaluate("casadiIk.pixel('obstacle')")
+        page.drag((x, y), (x + part * (goal[0] - x), y + part * (goal[1] - y)), steps=3)
+        settled(page)
+        apple, post = (now(page, f"{name}.solids[0]") for name in ("object", "obstacle"))
+        assert isinstance(apple, dict)
+        assert isinstance(post, dict)
+        ball = {"kind": "sphere", "radius": apple["size"][0], "xyz": apple["pose"][9:]}
+        box = {"kind": "box", "size": post["size"], "xyz": post["pose"][9:]}
+        scene = ik.Scene({"apple": ball, "post": box}, grasped="apple")
+        solver, points = ik.Solver(robot, scene=scene), asked(page)[None]
+        problems = solver._questions.of_arrays(points, np.full_like(points, np.nan), None)
+        around = solver._engine.around(problems)
+        assert around is not None
+        q = np.array(page.evaluate("[...casadiIk.now.answer.q]"))
+        clear = around.check(q[None])
+        assert now(page, "answer.clearance") == pytest.approx(float(clear.distance[0]), abs=1e-9)
+        ends.add(now(page, "answer.status"))
+        assert (now(page, "answer.status") == ik.Status.SOLVED) == bool(clear.free[0])
+    assert ik.Status.SOLVED in ends
+
+
+def used_by_mouse(page: Page, robot: ik.ArmHand) -> None:
+    settled(page)
+    assert now(page, "answer.status") == ik.Status.SOLVED
+    the_page_follows(page, robot)
+    page.wait("/^[0-9.]+ (µs|ms)$/.test(document.getElementById('time').textContent)")
+    a_normal_turns(page)
+    the_object_takes_its_contacts_along(page)
+    out_of_reach_is_explained(page)
+    an_obstacle_is_kept_clear_of(page, robot)
+    assert page.complaints == []
+
+
+def used_on_a_phone(page: Page) -> None:
+    settled(page)
+    assert page.evaluate("document.documentElement.scrollWidth") == 360
+    before = asked(page)
+    x, y = page.evaluate("casadiIk.pixel('point 0')")
+    page.touch((x, y), (x + 6, y - 5), steps=3)
+    settled(page)
+    assert np.linalg.norm(asked(page)[0] - before[0]) > 2e-3
+    assert page.evaluate("document.getElementById('canvas').clientHeight") > 300
+    assert page.complaints == []
+
+
+def as_in_python(module: Path) -> None:
+    """The exported module gives the stored answers bit for bit, in a scene too."""
+    done = subprocess.run(["node", "test.mjs"], cwd=module, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    said = json.loads(done.stdout)
+    assert (said["targets"], said["wrong"], said["refused"]) == (1000, 0, True)
+
+
+# One test, since building takes as long as all that is done with what was built.
+def test_page(tmp_path: Path, request: pytest.FixtureRequest, robot: ik.ArmHand):
+    out, kept = tmp_path / "page", tmp_path / "module"
+    build(out, kept)
+    as_in_python(kept / ROBOT)
+    browser: Browser = request.getfixturevalue("browser")
+    url = (out / "index.html").as_uri()
+    used_by_mouse(browser.open(url, 900, 600), robot)
+    used_on_a_phone(browser.open(url, 360, 740, phone=True))

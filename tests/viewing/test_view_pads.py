@@ -1,0 +1,113 @@
+"""Guessed pads corrected by dragging, and what is written of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.errors import DescriptionError
+from casadi_ik.viewing import Viewer, view_pads
+from casadi_ik.viewing.pad_text import LinkPad, corrected, save_pads
+
+URDF = """<robot name="hand"><link name="palm"/>
+{links}</robot>"""
+
+FINGER = """<link name="{name}_1"/><link name="{name}_2"><collision><origin xyz="0 0 0.02"/>
+<geometry><box size="0.02 0.016 0.04"/></geometry></collision></link><link name="{name}_tip"/>
+<joint name="{name}_a" type="revolute"><origin xyz="0 {y} 0.05"/><parent link="palm"/>
+<child link="{name}_1"/><axis xyz="{x} 0 0"/><limit lower="0" upper="1.5" velocity="1" effort="1"/>
+</joint><joint name="{name}_b" type="revolute"><origin xyz="0 0 0.04"/><parent link="{name}_1"/>
+<child link="{name}_2"/><axis xyz="{x} 0 0"/><limit lower="0" upper="1.5" velocity="1" effort="1"/>
+</joint><joint name="{name}_c" type="fixed"><origin xyz="0 0 0.04" rpy="0.3 0 0"/>
+<parent link="{name}_2"/><child link="{name}_tip"/></joint>"""
+
+YAML = """# Made by somebody
+name: my_hand
+hand: {file: hand.urdf, palm: palm}  # a comment that stays
+fingers:  # xyz [m]
+  # GUESS: where a ray meets the shape
+  first: {link: first_tip, xyz: [0, 0.01, -0.01], normal: [0, 1, 0]}
+  second:
+    link: second_2
+    rpy: [0, 0, 90 deg]
+    normal: [1, 0, 0]
+"""
+
+
+@pytest.fixture
+def description(tmp_path: Path) -> Path:
+    fingers = (("first", -0.04, -1), ("second", 0.04, 1))
+    links = "".join(FINGER.format(name=name, y=y, x=x) for name, y, x in fingers)
+    (tmp_path / "hand.urdf").write_text(URDF.format(links=links))
+    path = tmp_path / "my_hand.yaml"
+    path.write_text(YAML)
+    return path
+
+
+@pytest.fixture
+def viewer(description: Path) -> Iterator[Viewer]:
+    viewer = view_pads(description)
+    yield viewer
+    viewer.stop()
+
+
+def test_dragged_pads_are_saved_and_read_back(viewer: Viewer, description: Path) -> None:
+    page = viewer.page
+    before = ik.load_robot(description)
+    points, normals = before.contacts(before.home)
+    pose = page.asked.held["first"].control.copy()
+    pose[:3, 3] += [0.001, 0.002, 0.003]
+    page.drag_control("first", pose)
+    page.drag_normal("second", np.array([0.1, -0.9, 0.3]))
+    page.save()
+    assert page.work.settle()
+    assert page.said == "saved to my_hand.yaml: first, second"
+    after = ik.load_robot(description)
+    moved, faced = after.contacts(after.home)
+    assert np.allclose(moved[0], points[0] + [0.001, 0.002, 0.003], atol=1e-6)
+    assert np.allclose(moved[1], points[1], atol=1e-6)
+    assert np.allclose(faced[0], normals[0], atol=1e-6)
+    assert np.allclose(faced[1], np.array([0.1, -0.9, 0.3]) / np.sqrt(0.91), atol=1e-6)
+    text = description.read_text()
+    assert "# corrected by hand; the guess was: where a ray meets the shape\n  first:" in text
+    assert "  # corrected by hand\n  second:" in text
+    for kept in ("# Made by somebody", "# a comment that stays", "fingers:  # xyz [m]"):
+        assert kept in text
+    assert page.changed == []
+
+
+def test_a_pad_goes_onto_the_skin(viewer: Viewer) -> None:
+    page = viewer.page
+    page.onto_skin("first")
+    assert page.work.settle()
+    assert page.said == ""
+    pad = page.pads(page.asked)["first"]
+    # The box of the last phalanx is 16 mm thick: its side is 8 mm from the middle.
+    assert abs(pad.point[1]) == pytest.approx(0.008, abs=1e-6)
+    assert np.allclose(np.abs(pad.normal), [0, 1, 0], atol=1e-6)
+    page.reset()
+    assert page.work.settle()
+    assert page.changed == []
+
+
+def test_nothing_is_written_where_pads_are_not_stated(tmp_path: Path, description: Path) -> None:
+    text = description.read_text()
+    with pytest.raises(DescriptionError, match=r"fingers\.third"):
+        save_pads(description, {"third": LinkPad(np.zeros(3), np.array([1.0, 0.0, 0.0]))})
+    assert description.read_text() == text
+    with pytest.raises(DescriptionError, match=r"fingers\.third: not in the description"):
+        corrected(text, "third", np.zeros(3), np.ones(3))
+    other = tmp_path / "other.yaml"
+    other.write_text("name: other\nhand: barrett_bh8_280\nfingers: [thumb]\n")
+    with pytest.raises(DescriptionError, match=r"other\.yaml: fingers: expected"):
+        view_pads(other)
+
+
+def test_others_may_look_but_not_write(description: Path) -> None:
+    viewer = view_pads(description, host="0.0.0.0")
+    assert viewer.page._save.disabled
+    viewer.stop()
