@@ -36,17 +36,17 @@ INTRODUCTION = f"""
 Paths of random smooth postures at up to {100 * SHARE:.0f} % of the velocity limits, frames of
 {1e3 * PERIOD:g} ms, seeds 0 on. The follower is given fingertip positions only (no normals) and
 keeps to limits of position, velocity and acceleration. *Error:* of fingertips, in frames after the
-first second. *Roughness:* largest change of a motor's velocity from frame to frame as a part of what
-its acceleration limit permits; *path:* the same of the postures that made the targets. *Time:* of a
-call from Python, median and 99th percentile; other work ran on the machine.
+first second. *Roughness:* largest change of a motor's velocity from frame to frame, as a part of
+what its acceleration limit permits; *path:* the same of the postures that made the targets. *Time:*
+of a call from Python, median and 99th percentile; other work ran on the machine.
 """
 
 PEER = """
-dex-retargeting 0.5 maps a hand's keypoints to a hand alone, without an arm, by NLopt: published and
-measured before on Allegro are 770 to 980 us a frame with a 95th percentile of 5 ms. It is not run
-here: its wheel (0.5.0) imports torch, which it does not name among what it needs. Its position and
-vector modes minimise a Huber loss of fingertip positions or vectors plus a pull to the last frame,
-with limits of position but not of velocity or acceleration.
+dex-retargeting 0.5 maps a hand's keypoints to a hand alone, without an arm, by NLopt. Figures
+known for Allegro, on another machine: 770 to 980 us a frame, 95th percentile 5 ms. It is not run
+here: its wheel imports torch, which it does not name among what it needs. Its position and vector
+modes minimise a Huber loss of fingertip positions or vectors plus a pull to the last frame, with
+limits of position but not of velocity or acceleration.
 """
 
 
