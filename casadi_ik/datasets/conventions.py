@@ -11,7 +11,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.datasets.hand_poses import HandPoses
 from casadi_ik.errors import DescriptionError, UnsupportedError
-from casadi_ik.files.reading import Angles, Point, Struct, frame_matrix, read
+from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
 from casadi_ik.files.shipped import resolve, shipped_names
 
 
@@ -113,7 +113,7 @@ def load_convention(name_or_path: str | Path) -> Convention:
         if joint in (other for other, _ in joints.values()):
             raise DescriptionError(f"{path}: joints.{name}: {joint} is named twice")
         joints[name] = joint, -1.0 if said.startswith("-") else 1.0
-    pose = frame_matrix(entry.frame)
+    pose = frame_matrix(Frame(entry.frame.xyz, entry.frame.rpy))
     if not np.isfinite(pose).all():
         raise DescriptionError(f"{path}: frame: expected finite numbers")
     return Convention(path.stem, entry.frame.link, pose, joints)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import DescriptionError
 
 FAR = 5.0
@@ -55,8 +55,10 @@ class HandPoses:
         if self.joints.ndim != 2 or len(self.joints) != count:
             self._fail(f"joints: found shape {self.joints.shape}, expected ({count}, joints)")
         for name in ("position", "rotation", "joints"):
-            bad = ~np.isfinite(getattr(self, name)).reshape(count, -1).all(axis=1)
-            self._refuse(bad, f"{name}: holds NaN or infinity, expected finite numbers")
+            finite = np.isfinite(getattr(self, name)).reshape(count, -1).all(axis=1)
+            self._refuse(
+                np.asarray(~finite), f"{name}: holds NaN or infinity, expected finite numbers"
+            )
         away = np.linalg.norm(self.position, axis=1)
         if (away > FAR).any():
             row = int(np.argmax(away))
@@ -65,7 +67,7 @@ class HandPoses:
                 f"{FAR:g} m (numbers in mm?)"
             )
         self._refuse(
-            (np.abs(self.joints) > LARGE).any(axis=1),
+            np.asarray((np.abs(self.joints) > LARGE).any(axis=1)),
             "joints: found angles beyond two turns, expected radians (numbers in degrees?)",
         )
         object.__setattr__(self, "rotation", self._exact())
@@ -79,7 +81,7 @@ class HandPoses:
         self._refuse(bad, "rotation: its columns are no rotation, expected a rigid pose")
         return exact
 
-    def _refuse(self, bad: np.ndarray, problem: str) -> None:
+    def _refuse(self, bad: Bools, problem: str) -> None:
         if bad.any():
             self._fail(f"row {int(np.argmax(bad))}: {problem}")
 

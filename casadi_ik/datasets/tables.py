@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,8 @@ def read_table(path: Path) -> HandPoses:
         DescriptionError: It is damaged, columns are missing, or not of numbers.
         UnsupportedError: Parquet, and polars is not installed.
     """
-    readers = dict(zip(SUFFIXES, (_of_csv, _of_npz, _of_parquet), strict=True))
+    readers: Mapping[str, Callable[[Path], Mapping[str, Array]]]
+    readers = dict(zip(map(str, SUFFIXES), (_of_csv, _of_npz, _of_parquet), strict=True))
     try:
         if path.suffix.lower() != ".parquet" and path.stat().st_size > MOST:
             raise DescriptionError(f"{path}: found more than {MOST} bytes")

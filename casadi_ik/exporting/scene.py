@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
 from casadi_ik.collision.model import CollisionModel, own_solids
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import UnsupportedError
@@ -215,7 +214,7 @@ class SceneSources:
         pairs, capsules = model.pairs, model.capsules
         moving = np.array([one.link in model.moving for one in capsules], dtype=int)
         crossing = [int(not model.moving.isdisjoint(model.names(i, j))) for i, j in pairs.tolist()]
-        arrays: dict[str, Array] = {
+        arrays: dict[str, np.ndarray] = {
             "RADII": model.radii,
             "HALVES": model.halves,
             "LINK": np.array([links[one.link] for one in capsules]),

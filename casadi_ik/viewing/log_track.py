@@ -106,7 +106,7 @@ def track_of(solve: OneSolve, robot: ArmHand) -> Track:
             f"solve {solve.solve_id} of {solve.method}: the log kept no iterations of it"
         )
     q = solve.columns("q")
-    finite = np.isfinite(q).all(axis=1)
+    finite = np.asarray(np.isfinite(q).all(axis=1))
     q = np.where(finite[:, None], q, robot.home)
     contacts: dict[str, Contact] = {}
     for i, finger in enumerate(solve.fingers):

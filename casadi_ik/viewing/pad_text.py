@@ -97,11 +97,12 @@ def corrected(text: str, finger: str, point: Array, normal: Array) -> str:
             node = there[name]
             edits.append((node.start_mark.index, node.end_mark.index, value))
         elif entry.flow_style:
-            edits.append((entry.end_mark.index - 1,) * 2 + (f", {name}: {value}",))
+            edits.append((entry.end_mark.index - 1, entry.end_mark.index - 1, f", {name}: {value}"))
         else:
             first, _ = entry.value[0]
             indent = " " * first.start_mark.column
-            edits.append((first.start_mark.index,) * 2 + (f"{name}: {value}\n{indent}",))
+            at = first.start_mark.index
+            edits.append((at, at, f"{name}: {value}\n{indent}"))
     for start, end, value in sorted(edits, reverse=True):
         text = text[:start] + value + text[end:]
     return _marked(text, key.start_mark.line)

@@ -79,7 +79,7 @@ class Stage:
     def replace(self, group: str, solids: Sequence[Solid], opacity: float = 1.0) -> None:
         """Put other solids in the place of a group."""
         for actor in self._groups.pop(group, []):
-            self.plotter.remove_actor(actor, render=False)
+            self.plotter.renderer.remove_actor(actor, render=False)
         self.add(group, solids, opacity)
 
     def add_floor(self, height: float, solids: Sequence[Solid]) -> None:
