@@ -38,6 +38,13 @@ class SurroundedSolver:
             InputError: The solver has no scene, or this is no pose.
             UnknownNameError: The scene has no such item.
             DescriptionError: It would stand in the robot's base.
+
+        Example:
+            >>> solver = ik.Solver(robot, scene=ik.load_scene("table"))
+            >>> lower = solver.scene.items["table"].pose.copy()
+            >>> lower[2, 3] -= 0.1
+            >>> solver.moved("table", lower).solve(grasp).success
+            True
         """
         check = self._engine.check
         if check is None:
@@ -60,6 +67,12 @@ class SurroundedSolver:
 
         Raises:
             InputError: Bad q, or a grasp that the robot cannot take.
+
+        Example:
+            >>> solver = ik.Solver(robot, scene=ik.load_scene("table"))
+            >>> clear = solver.check(robot.home, grasp)
+            >>> bool(clear.free[0]), bool(clear.distance[0] > 0)
+            (True, True)
         """
         problems = self._questions.of_grasps([grasp], None)
         around = self._engine.around(problems)
