@@ -40,11 +40,11 @@ class SurroundedSolver:
             DescriptionError: It would stand in the robot's base.
 
         Example:
-            >>> solver = ik.Solver(robot, scene=ik.load_scene("table"))
-            >>> lower = solver.scene.items["table"].pose.copy()
-            >>> lower[2, 3] -= 0.1
-            >>> solver.moved("table", lower).solve(grasp).success
-            True
+            >>> lower = np.eye(4)
+            >>> lower[2, 3] = -0.3
+            >>> among = ik.Solver(robot, scene=ik.load_scene("table"))
+            >>> among.moved("table", lower).solve(grasp).status.name
+            'SOLVED'
         """
         check = self._engine.check
         if check is None:
@@ -69,10 +69,9 @@ class SurroundedSolver:
             InputError: Bad q, or a grasp that the robot cannot take.
 
         Example:
-            >>> solver = ik.Solver(robot, scene=ik.load_scene("table"))
-            >>> clear = solver.check(robot.home, grasp)
-            >>> bool(clear.free[0]), bool(clear.distance[0] > 0)
-            (True, True)
+            >>> among = ik.Solver(robot, scene=ik.load_scene("table"))
+            >>> bool(among.check(solution.q, grasp).distance[0] > 0)
+            True
         """
         problems = self._questions.of_grasps([grasp], None)
         around = self._engine.around(problems)

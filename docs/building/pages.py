@@ -30,7 +30,7 @@ def _other_pages(*known: str) -> str:
     others = [name for name in pages if name not in {"index", *named, *known}]
     if not others:
         return ""
-    return "\n".join(["```{toctree}", ":hidden:", ":caption: More", *others, "```"])
+    return "\n".join(["```{toctree}", ":hidden:", ":caption: More", "", *others, "```"])
 
 
 PARTS: dict[str, Callable[..., str]] = {
