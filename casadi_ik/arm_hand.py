@@ -311,12 +311,6 @@ class ArmHand:
         Raises:
             MissingExtraError: viser is not installed.
             InputError: See `configuration`.
-
-        Example:
-            >>> viewer = robot.view()
-            >>> viewer.url.startswith("http://127.0.0.1:")
-            True
-            >>> viewer.stop()
         """
         return on_demand("casadi_ik.viewing").view_grasp(self, q=self.configuration(q), **options)
 
