@@ -136,10 +136,6 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
-
-        Example:
-            >>> robot.toggle_margins(robot.home)  # no lead screws here; the AR10 has some
-            {}
         """
         configuration = self.configuration(q)
         names, kernel = self._kernels.toggle_margins
@@ -233,12 +229,6 @@ class ArmHand:
         Returns:
             Distances [m] (f,) or (k, f), angles [rad] the same, and () or (k,) by how much the
             worst actuator or joint is beyond its limits [rad or m].
-
-        Example:
-            >>> points, normals = robot.contacts(robot.home)
-            >>> position, angle, beyond = robot.deviations(robot.home, points, normals)
-            >>> bool(position.max() < 1e-9 and beyond <= 0)
-            True
         """
         position, angle, beyond = self._kernels.deviations(q, points, normals)
         # A kernel's single number has no dimension of its own, even that of a single finger.
@@ -252,10 +242,6 @@ class ArmHand:
 
         Raises:
             InputError: See `configuration`.
-
-        Example:
-            >>> bool(robot.beyond_limits(robot.home) <= 0)
-            True
         """
         (beyond,) = self._kernels.beyond(self.configuration(q))
         return beyond

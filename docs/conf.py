@@ -17,6 +17,7 @@ author = "The casadi_ik developers"
 copyright = author  # noqa: A001  (Sphinx's own name)
 root_doc = "docs/index"
 language = "en"
+smartquotes = False
 
 extensions = [
     "sphinx.ext.autodoc",

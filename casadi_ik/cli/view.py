@@ -73,9 +73,10 @@ def opened(arguments: argparse.Namespace) -> Viewer:
         robot = the_robot(arguments.robot, path, grasp)
         meshes = _meshes(robot, Path(arguments.robot or grasp.robot), arguments)
         with located(str(path)):
-            return viewing.view_grasp(
-                robot, grasp, scene=scene, settings=settings, meshes=meshes, **served
-            )
+            grasp.arrays(robot.fingers)
+        return viewing.view_grasp(
+            robot, grasp, scene=scene, settings=settings, meshes=meshes, **served
+        )
     ranked = path.suffix == ".json"
     robot, choices = (ranked_of if ranked else candidates_of)(path, arguments, scene, settings)
     first, q = next(iter(choices.values()))()

@@ -12,9 +12,9 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.cli.choose import the_candidates
 from casadi_ik.cli.question import located, the_object_pose, the_robot
 from casadi_ik.collision.scene import Scene
+from casadi_ik.datasets import load_candidates
 from casadi_ik.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def candidates_of(
     robot = the_robot(arguments.robot, path)
     pose = the_object_pose(arguments)
     choices: Choices = {}
-    for number, grasp in enumerate(the_candidates(path, robot)):
+    for number, grasp in enumerate(load_candidates(path, robot)):
         placed = grasp if pose is None else grasp.in_object_frame().at(pose)
 
         def ask(placed: Any = placed) -> tuple[Asked, Array]:

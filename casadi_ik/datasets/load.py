@@ -108,7 +108,7 @@ def _loaded(
     if kind == ".npy" and layout != TABLE:
         given, found = read_layout(path, layout)
         return _of_hand(given, robot, convention_for(robot, found, hand), take, thing)
-    if kind in SUFFIXES and (layout == TABLE or not _has_targets(path)):
+    if kind in SUFFIXES and (layout == TABLE or (layout is None and not _has_targets(path))):
         given = read_table(path)
         known = (*robot.description.joint_names, *robot.actuators)
         names = tuple(name for name in given.names if name in known)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -46,6 +47,37 @@ def hand_posture(robot: ArmHand, posture: Mapping[str, float], name: str = "post
     if missing:
         raise InputError(f"{name}.{missing[0]}: missing, expected a number for every finger motor")
     return values
+
+
+def hand_postures(robot: ArmHand, postures: Mapping[str, ArrayLike], count: int) -> Array:
+    """(k, n) positions of all motors that move fingers; NaN for the others.
+
+    Args:
+        robot: The robot.
+        postures: Positions (k,), or one for all, by actuator [rad or m].
+        count: k.
+
+    Raises:
+        UnknownNameError: No such actuator.
+        InputError: As for `hand_posture`, or another number of positions; the message names the
+            row.
+    """
+    columns: dict[str, Array] = {}
+    for name, value in postures.items():
+        try:
+            columns[name] = np.broadcast_to(np.asarray(value, dtype=float), (count,))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"postures.{name}: expected {count} numbers, or one") from error
+    return np.array(
+        [
+            hand_posture(
+                robot,
+                {name: float(column[row]) for name, column in columns.items()},
+                f"postures: row {row}",
+            )
+            for row in range(count)
+        ]
+    )
 
 
 def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array]:

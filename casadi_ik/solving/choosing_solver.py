@@ -6,12 +6,17 @@ from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
 
+from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
+from casadi_ik.grasps.pose import checked_pose
+from casadi_ik.problem.palm_targets import hand_postures
 from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.ranking import Ranking
+from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.solving.alternatives.finder import APART, Alternative
 from casadi_ik.solving.choice import Judgement, choose
 from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
 
 
 class ChoosingSolver:
@@ -63,6 +68,53 @@ class ChoosingSolver:
         finder = self._engine.kinds_of(problems).finder
         start, around = self._questions.start(q0), self._engine.around(problems)
         return finder.find(problems, start, seed, limit, prefer, apart, around)
+
+    def solve_palms(
+        self,
+        palms: ArrayLike,
+        postures: Mapping[str, ArrayLike],
+        q0: ArrayLike | None = None,
+        seed: int = 0,
+        jobs: int = 1,
+        diagnose: bool = False,
+        fixed: Mapping[str, float] | None = None,
+        prefer: str | None = None,
+    ) -> BatchSolution:
+        """Solve k palms that are given, with hands as they are said: only arms are unknown.
+
+        Args:
+            palms: (k, 4, 4) poses of `robot.palm` in the base frame.
+            postures: Positions (k,), or one for all, of every motor that moves a finger, by name
+                [rad or m].
+            q0: (n,) or (k, n) start; None is `robot.home`.
+            seed: As for `solve`.
+            jobs: Threads, at least 1.
+            diagnose: As for `solve_batch`.
+            fixed: As for `solve`, for other actuators.
+            prefer: As for `solve`.
+
+        Returns:
+            As `solve_batch`, with `palm_position_error`, `palm_angle_error` and `palm_ok`.
+
+        Raises:
+            InputError: No rigid poses, or postures that are not all there or beyond limits.
+            UnknownNameError: No such actuator.
+            UnsupportedError: The method is not hand-first.
+
+        Example:
+            >>> q = robot.random(np.random.default_rng(4), 50)
+            >>> hands = dict(zip(robot.actuators[7:], q[:, 7:].T))
+            >>> batch = solver.solve_palms(robot.palm(q), hands)
+            >>> bool(batch.success.all()), bool(batch.palm_position_error.max() < 1e-3)
+            (True, True)
+        """
+        poses = checked_pose(palms, "palms")
+        if poses.ndim != 3:
+            raise InputError(f"palms: found shape {poses.shape}, expected (k, 4, 4)")
+        hands = hand_postures(self._questions.robot, postures, len(poses))
+        preferred = self._engine.preference(prefer, q0 is not None)
+        problems = self._questions.of_palms(poses, hands, fixed, preferred)
+        return self._engine.solve(problems, Run(q0, seed, jobs, None, diagnose))
 
     def choose(
         self,

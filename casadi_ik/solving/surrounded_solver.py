@@ -38,6 +38,13 @@ class SurroundedSolver:
             InputError: The solver has no scene, or this is no pose.
             UnknownNameError: The scene has no such item.
             DescriptionError: It would stand in the robot's base.
+
+        Example:
+            >>> lower = np.eye(4)
+            >>> lower[2, 3] = -0.3
+            >>> among = ik.Solver(robot, scene=ik.load_scene("table"))
+            >>> among.moved("table", lower).solve(grasp).status.name
+            'SOLVED'
         """
         check = self._engine.check
         if check is None:
@@ -60,6 +67,11 @@ class SurroundedSolver:
 
         Raises:
             InputError: Bad q, or a grasp that the robot cannot take.
+
+        Example:
+            >>> among = ik.Solver(robot, scene=ik.load_scene("table"))
+            >>> bool(among.check(solution.q, grasp).distance[0] > 0)
+            True
         """
         problems = self._questions.of_grasps([grasp], None)
         around = self._engine.around(problems)

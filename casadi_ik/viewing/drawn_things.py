@@ -109,7 +109,7 @@ class DrawnThings:
                 color=palette.rgb(color),
                 opacity=opacity,
                 cast_shadow=name == OBJECT,
-                receive_shadow=0.3,
+                receive_shadow=0.15,
             )
 
             @mesh.on_click

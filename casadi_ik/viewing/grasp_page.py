@@ -70,7 +70,9 @@ class GraspPage:
         self.server, self.robot, self.asked = server, robot, asked
         self._first = asked, q
         self._answerer = Answerer(robot)
-        self.answer = (self._answerer.solve if solved else self._answerer.judged)(asked, q)
+        answer = self._answerer.solve if solved else self._answerer.judged
+        answer(asked, q)  # what the first one takes is the loading of kernels
+        self.answer = answer(asked, q)
         self._answered_for: Asked | None = asked
         self._listed_for: Asked | None = None
         self.solutions: tuple[Alternative, ...] = ()

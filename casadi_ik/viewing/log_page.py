@@ -112,8 +112,8 @@ class LogPage:
         if len(self.tracks) == 1:
             return np.zeros(3)
         track = self.tracks[0]
-        tips = np.concatenate([one.robot.contacts(one.q)[0].reshape(-1, 3) for one in self.tracks])
-        size = max(0.5, 1.3 * float(np.ptp(tips, axis=0).max()))
+        links = np.array([pose[:3, 3] for pose in track.robot.links(track.q[-1]).values()])
+        size = max(0.4, float(np.ptp(links, axis=0).max()))
         hand = track.robot.contacts(track.q[-1])[0].mean(axis=0)
         across = np.array([-hand[1], hand[0], 0.0])
         length = float(np.linalg.norm(across))

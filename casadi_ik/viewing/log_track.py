@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -52,10 +53,20 @@ class Track:
             found[finger] = ContactVerdict(p, a, not off, bound)
         return found
 
-    @property
+    @cached_property
     def errors(self) -> tuple[Array, Array]:
-        """(k, f) distances [m] and angles [rad]."""
-        return self.solve.columns("position_error"), self.solve.columns("angle_error")
+        """(k, f) distances [m] and angles [rad]; where a step has none of its own, those of q."""
+        solve = self.solve
+        targets = np.broadcast_arrays(
+            solve.target_points, solve.target_normals, np.zeros((len(self), 1, 1))
+        )[:2]
+        reached = self.robot.errors(self.q, *targets)
+        recorded = solve.columns("position_error"), solve.columns("angle_error")
+        position, angle = (
+            np.where(np.isfinite(ours), ours, theirs)
+            for ours, theirs in zip(recorded, reached, strict=True)
+        )
+        return position, angle
 
     @property
     def singular_values(self) -> dict[str, Array]:

@@ -70,7 +70,7 @@ class PadPage:
         look_at_hand(server, robot, robot.home)
         # Paler than elsewhere, so that edges and skin are seen.
         self._drawn = DrawnRobot(
-            server, robot, [replace(part, color=palette.SCENE) for part in parts]
+            server, robot, [replace(part, color=palette.FAINT) for part in parts]
         )
         self._contacts = DrawnContacts(
             server,

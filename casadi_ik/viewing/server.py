@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import socket
 from collections.abc import Callable
@@ -79,11 +80,9 @@ def _is_free(host: str, port: int) -> bool:
         with socket.create_server((host, port)):
             return True
     except OSError as error:
-        if isinstance(error, socket.gaierror):
-            raise InputError(
-                f"host: found {host!r}, expected an address of this machine"
-            ) from error
-        return False
+        if error.errno in (errno.EADDRINUSE, errno.EACCES):
+            return False
+        raise InputError(f"host: found {host!r}, expected an address of this machine") from error
 
 
 def _shown(host: str) -> str:

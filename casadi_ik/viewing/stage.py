@@ -103,7 +103,9 @@ def look_at_robot(server: viser.ViserServer, robot: ArmHand, q: Array, wide: int
         return float(gap + 0.03 * (1 - np.abs(normals @ view).max()))
 
     views = []
-    for turn in np.deg2rad([-75, -60, -45, -30, 30, 45, 60, 75]):
+    # Two stand beside each other as seen from where they reach to.
+    turns = [-75, -60, -45, -30, 30, 45, 60, 75] if wide == 1 else [-30, 30]
+    for turn in np.deg2rad(turns):
         way = np.array([np.cos(side + turn), np.sin(side + turn), TILT])
         views.append(way / np.linalg.norm(way))
     share = 0.62 if wide == 1 else 0.0

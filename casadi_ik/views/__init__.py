@@ -1,10 +1,16 @@
 """Pictures of grasps and of convergence; needs the extra `plots`: matplotlib and PyVista."""
 
+import warnings
+
 from casadi_ik.errors import MissingExtraError
 
 try:
     import matplotlib as _  # noqa: F401
-    import pyvista as _pyvista  # noqa: F401
+
+    with warnings.catch_warnings():
+        # What it downloads with has progress bars, which complain in notebooks without widgets.
+        warnings.filterwarnings("ignore", "IProgress not found")
+        import pyvista as _pyvista  # noqa: F401
 except ImportError as error:
     raise MissingExtraError(
         f"pictures need {error.name}, which is not installed: pip install casadi-ik[plots]"

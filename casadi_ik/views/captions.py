@@ -30,7 +30,8 @@ def label_fingers(axes: Axes, places: dict[str, Array], solution: Solution, gras
         grasp: The question.
     """
     height, width = axes.images[0].get_size()
-    seen = {finger: place for finger, place in places.items() if finger in grasp.contacts}
+    asked = grasp.contacts or places  # of a palm that is given all fingers follow
+    seen = {finger: place for finger, place in places.items() if finger in asked}
     middle = (min(x for x, _ in seen.values()) + max(x for x, _ in seen.values())) / 2
     lowest = {"left": -np.inf, "right": -np.inf}
     for finger, (x, y) in sorted(seen.items(), key=lambda item: item[1][1]):
@@ -92,6 +93,8 @@ def add_legend(
 
 def _asked(grasp: Grasp) -> str:
     """What the marks of a target are."""
+    if grasp.palm is not None:
+        return "asked for: palm and posture"
     contacts = grasp.contacts.values()
     placed = [contact for contact in contacts if not np.isnan(contact.point[0])]
     marks = {

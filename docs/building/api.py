@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import enum
 import inspect
+import re
+
+from sphinx.domains.python import PyObject
 
 import casadi_ik
 
@@ -62,3 +65,28 @@ def readable(
 ) -> None:
     """Types stand in the text as they are, where an underscore at an end would be a link."""
     lines[:] = [line.replace("np.bool_]", "np.bool]") for line in lines]
+
+
+def in_words(
+    _app: object,
+    _what: str,
+    _name: str,
+    _thing: object,
+    _: object,
+    said: str | None,
+    gives: str | None,
+) -> tuple[str, str | None] | None:
+    """A signature as it stands in the source: short names of arrays, defaults that are made."""
+
+    def plain(text: str) -> str:
+        text = re.sub(r"(?:~?\w+\.)*TypeAliasForwardRef\('(\w+)'\)", r"\1", text)
+        return text.replace("<factory>", "...")
+
+    return None if said is None else (plain(said), gives and plain(gives))
+
+
+def call_them_attributes() -> None:
+    """Docstrings say "Attributes", so the pages do."""
+    for field in PyObject.doc_field_types:
+        if field.name == "variable":
+            field.label = "Attributes"

@@ -13,7 +13,7 @@ from pathlib import Path
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-from building.api import documented, index_of_names, readable
+from building.api import call_them_attributes, documented, in_words, index_of_names, readable
 from building.commands import command_line
 from building.files import file_reference, quantities
 from building.results import results_table
@@ -30,7 +30,7 @@ def _other_pages(*known: str) -> str:
     others = [name for name in pages if name not in {"index", *named, *known}]
     if not others:
         return ""
-    return "\n".join(["```{toctree}", ":hidden:", ":caption: More", *others, "```"])
+    return "\n".join(["```{toctree}", ":hidden:", ":caption: More", "", *others, "```"])
 
 
 PARTS: dict[str, Callable[..., str]] = {
@@ -61,4 +61,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Tell Sphinx of it."""
     app.connect("source-read", _expand)
     app.connect("autodoc-process-docstring", readable, priority=900)
+    app.connect("autodoc-process-signature", in_words)
+    call_them_attributes()
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -35,4 +35,5 @@ def _last_change(path: Path) -> tuple[str, str]:
     except (OSError, subprocess.CalledProcessError):
         return "-", "-"
     day, _, commit = done.stdout.strip().partition(" ")
-    return day or "-", f"`{commit}`" if commit else "-"
+    # Hyphens at which no line is broken.
+    return day.replace("-", "\u2011") or "-", f"`{commit}`" if commit else "-"

@@ -12,6 +12,7 @@ import yaml
 from command_line import Command
 
 import casadi_ik as ik
+from casadi_ik.files.reading import roll_pitch_yaw
 
 ROBOT = "kuka_lwr_barrett"
 PLACE = ("--object-pose", "-0.82", "0.127", "0.41", "0", "0", "0.3")
@@ -135,3 +136,30 @@ def test_bad_input_is_one_line_and_writes_nothing(run: Command, tmp_path: Path) 
     ):
         assert expected in run("choose", bad, *words, *more, "--out", out).error
     assert not out.exists()
+
+
+def test_palms_of_a_table(run: Command, tmp_path: Path) -> None:
+    """A table's hands stay as they are; where their palms came to is in what is written."""
+    robot, out = ik.load_robot(ROBOT), tmp_path / "ranked.json"
+    q = robot.random(np.random.default_rng(5), 8)
+    palms, motors = robot.palm(q), robot.actuators[7:]
+    rows = ["x,y,z,roll,pitch,yaw," + ",".join(motors)]
+    for palm, row in zip(palms, q, strict=True):
+        turned = roll_pitch_yaw(palm[:3, :3])
+        rows.append(",".join(repr(float(v)) for v in (*palm[:3, 3], *turned, *row[7:])))
+    path = tmp_path / "grasps.csv"
+    path.write_text("\n".join(rows))
+    words = ("choose", path, "--robot", ROBOT, "--out", out)
+    done = run(*words, "--limit", "3")
+    assert (done.exit, done.err) == (0, "")
+    found = json.loads(out.read_text())
+    assert (found["candidates"], found["answered"]) == (8, 8)
+    for one in found["ranked"]:
+        assert one["solution"]["palm"]["ok"]
+        assert one["solution"]["q"][7:] == pytest.approx(q[one["candidate"]][7:].tolist())
+    assert "layout" in run(*words, "--layout", "mine").error
+    assert "expected one of bodex" in run(*words, "--layout", "bodex").error
+    path.write_text(rows[0].replace("bh_spread", "spread") + "\n" + rows[1])
+    refused = run(*words)
+    assert refused.exit == 2
+    assert "grasps.csv: spread: no such joint" in refused.error.replace("\n", " ")

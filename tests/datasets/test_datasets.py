@@ -105,6 +105,27 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     assert not missed.palm.ok
 
 
+def test_many_palms() -> None:
+    """Hands that differ from row to row stay as they are, in one thread or two."""
+    robot = ik.load_robot(KUKA)
+    solver = ik.Solver(robot)
+    q = robot.random(np.random.default_rng(4), 60)
+    motors = hand_motors(robot.description)
+    columns = [robot.actuators.index(motor) for motor in motors]
+    hands = dict(zip(motors, q[:, columns].T, strict=True))
+    batch = solver.solve_palms(robot.palm(q), hands)
+    assert batch.success.all()
+    assert batch.palm_ok is not None
+    assert batch.palm_ok.all()
+    assert batch.q[:, columns] == pytest.approx(q[:, columns], abs=1e-9)
+    again = solver.solve_palms(robot.palm(q), hands, jobs=2)
+    np.testing.assert_array_equal(again.q, batch.q)
+    with pytest.raises(ik.CasadiIKError, match=r"postures: row 3\.bh_spread: found 9\.0"):
+        solver.solve_palms(robot.palm(q), hands | {"bh_spread": [0.1] * 3 + [9.0] + [0.1] * 56})
+    with pytest.raises(ik.CasadiIKError, match=r"postures\.bh_spread: expected 60 numbers"):
+        solver.solve_palms(robot.palm(q), hands | {"bh_spread": [0.1] * 3})
+
+
 @pytest.mark.parametrize(
     ("given", "says"),
     [

@@ -24,6 +24,10 @@ METHODS_TOO = ("ArmHand", "Solver", "Grasp", "Contact", "Scene", "ScrewControl",
 PLAIN = {
     "ArmHand.configuration",  # checks and copies
     "ArmHand.frames_at",  # contact_frames without checks
+    "ArmHand.beyond_limits",  # three numbers as errors has them
+    "ArmHand.deviations",
+    "ArmHand.toggle_margins",
+    "ArmHand.view",  # a server and a browser; tests/viewing has them
     "ScrewControl.stepper",  # as Solver.stepper
     "logs.Log.attachment",
     "logs.Log.sources",
@@ -106,5 +110,5 @@ def test_examples(names: dict[str, Any], folder: Path, monkeypatch: pytest.Monke
     for name in documented():
         example = parser.get_doctest(text_of(name), dict(names), name, None, 0)
         runner.run(example, out=report.append, clear_globs=False)
-    assert runner.tries > 150
+    assert runner.tries > 140
     assert runner.failures == 0, "".join(report)

@@ -13,6 +13,7 @@ import jsonschema
 import pytest
 import yaml
 
+import casadi_ik as ik
 from casadi_ik.cli.parser import build_parser
 from casadi_ik.cli.schemas import schema_of
 
@@ -92,3 +93,13 @@ def test_faults_are_seen() -> None:
     assert fault("casadi-ik solved cup") == "no command 'solved'"
     assert fault("casadi-ik log why cup.mcap --scene table") == "no option --scene"
     assert sum(1 for page in PAGES for _ in commands(page.read_text())) > 40
+
+
+def test_every_public_name_is_on_a_page_of_the_reference() -> None:
+    shown = []
+    for page in (ROOT / "docs" / "reference").glob("*.md"):
+        for names in re.findall(r"^<!-- here: api (.*) -->$", page.read_text(), re.MULTILINE):
+            shown += names.split()
+    public = {*ik.__all__, *(f"logs.{name}" for name in ik.logs.__all__)} - {"logs"}
+    public -= {"CasadiIKError"}  # with the other errors, by their module
+    assert sorted(name for name in shown if not name.startswith("errors.")) == sorted(public)

@@ -18,7 +18,7 @@ from casadi_ik.viewing.frames import pose_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (Debian: apt chromium)")
 
-WINDOW = (640, 400)
+WINDOW = (900, 560)
 
 KNOWN = ("THREE.Clock", "KHR_parallel_shader_compile", "GPU stall")
 """What viser's client says of itself and of a browser without a graphics card."""

@@ -1,0 +1,127 @@
+"""`casadi-ik view`: what it opens, and how it refuses what it cannot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.cli.main import main
+from casadi_ik.cli.parser import build_parser
+from casadi_ik.cli.solve import as_json
+from casadi_ik.cli.view import opened
+from casadi_ik.viewing import Viewer
+
+CANDIDATES = """robot: kuka_lwr_barrett
+candidates:
+  - contacts: {thumb: {point: [-0.83, 0.15, 0.41], normal: [0.48, -0.88, 0]}}
+  - contacts: {thumb: {point: [-0.80, 0.15, 0.41], normal: [0.48, -0.88, 0]}}
+"""
+
+
+@pytest.fixture
+def view() -> Iterator[object]:
+    """Opens what the command line says; ends it all."""
+    running: list[Viewer] = []
+
+    def open_page(*words: str) -> Viewer:
+        running.append(opened(build_parser().parse_args(["view", *words])))
+        return running[-1]
+
+    yield open_page
+    for one in running:
+        one.stop()
+
+
+def test_a_grasp_and_a_robot(view) -> None:
+    cup = view()
+    assert cup.page.asked.name == "cup"
+    assert cup.page.answer.success
+    robot = view("kuka_lwr_barrett", "--tolerance-position", "0.001")
+    assert robot.page.answer.success
+    assert robot.page.asked.settings.tolerance.position == 1e-3
+    assert np.allclose(robot.page.answer.q, robot.page.robot.home, atol=1e-6)
+    assert cup.url != robot.url
+
+
+def test_candidates_and_ranked_answers(view, robot: ik.ArmHand, tmp_path: Path) -> None:
+    path = tmp_path / "candidates.yaml"
+    path.write_text(CANDIDATES)
+    page = view(str(path), "--robot", "kuka_lwr_barrett").page
+    assert len(page.candidates) == 2
+    page.choose(list(page.candidates)[1])
+    assert page.work.settle()
+    assert page.answer.success
+    assert page.asked.grasp.contacts["thumb"].point[0] == pytest.approx(-0.80)
+    solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
+    entry = {"candidate": 3, "name": "", "score": 0.5, "solution": as_json(solution)}
+    ranked = tmp_path / "ranked.json"
+    ranked.write_text(json.dumps({"ranked": [entry]}))
+    shown = view(str(ranked)).page
+    assert shown.answer.success
+    assert np.allclose(shown.answer.q, solution.q)
+
+
+def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None:
+    paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+    for path, grasp in zip(paths, ("cup", "mug"), strict=True):
+        ik.Solver(robot).solve(ik.load_grasp(grasp), log=path)
+    page = view(*map(str, paths)).page
+    page.show(10_000)
+    assert page.work.settle()
+    assert page.now == page.count - 1 == max(map(len, page.tracks)) - 1
+    for track, (drawn, _) in zip(page.tracks, page._shown, strict=True):
+        assert np.array_equal(drawn.q, track.q[-1])
+        assert all(one.ok for one in track.verdicts(len(track) - 1).values())
+    assert "smallest singular values" in page._charts.content
+    page.jump(ahead=False)
+    assert page.work.settle()
+    assert page.now in {one for track in page.tracks for one in track.eventful}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["cupp"], "'cupp' is neither a shipped grasp"),
+        (["cup", "mug"], "found 2 names, expected one (or two logs)"),
+        (["cup", "--method", "x"], "--method: found 'x'"),
+        (["cup", "--pads"], "--pads: expected the YAML file of a robot"),
+        (["nothing.mcap"], "nothing.mcap"),
+        (["nothing.json"], "nothing.json: cannot be read"),
+        (["cup", "--host", "192.0.2.1"], "host: found '192.0.2.1'"),
+    ],
+)
+def test_bad_words_are_one_line(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", *words]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+
+
+def test_a_robot_and_a_solution_show_themselves(robot: ik.ArmHand) -> None:
+    shown = robot.view()
+    assert shown.page.answer.success
+    shown.stop()
+    solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
+    viewer = solution.view(grasp=ik.load_grasp("cup"))
+    assert np.array_equal(viewer.page.answer.q, solution.q)
+    assert viewer.page.answer.success
+    viewer.stop()
+
+
+def test_without_viser_the_extra_is_named(
+    robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sys
+
+    for name in [name for name in sys.modules if name.startswith("casadi_ik.viewing")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ik.CasadiIKError, match=r"pip install casadi-ik\[view\]"):
+        robot.view()
