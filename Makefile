@@ -6,7 +6,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 OUT := out/demo
 SOLVE := $(BIN)/casadi-ik solve cup --scene table --log $(OUT)/cup.mcap --out $(OUT)/cup.json
 PAPER := $(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup_paper.mcap
-SPHINX := $(BIN)/sphinx-build -E -q -W --keep-going -b html -c docs . out/docs
+SPHINX := $(BIN)/sphinx-build -E -q -W --keep-going -b html -c docs . out/docs \
+  && $(BIN)/python docs/building/links.py out/docs
 
 .PHONY: help demo test lint docs page bench notebooks clean
 

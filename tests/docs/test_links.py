@@ -1,0 +1,23 @@
+"""What is said of a built site whose links lead nowhere."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+
+from building.links import broken
+
+
+def test_broken_links_are_named(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "b.html").write_text('<h1 id="here"></h1><a href="../a.html">up</a>')
+    (tmp_path / "a.html").write_text(
+        '<a href="deep/b.html#here">x</a> <a href="https://elsewhere/x">x</a> <a href="#top">x</a>'
+        '<p id="top"></p> <img alt="" src="gone.png"> <a href="deep/b.html#nowhere">x</a>'
+    )
+    assert sorted(broken(tmp_path)) == [
+        "a.html: deep/b.html#nowhere: no such place",
+        "a.html: gone.png: no such file",
+    ]
