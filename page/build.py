@@ -45,6 +45,10 @@ CAPACITY = 8
 LARGEST = 4e6
 """A robot's script is at most as large [bytes]."""
 
+CLOSE = 0.015
+"""Of two contacts of a shipped grasp that are nearer to each other [m] one is left out: the shapes
+of two fingers would overlap."""
+
 SPANS = 20_000
 """Random configurations, from which it is known how far fingertips reach, and apart."""
 
@@ -57,6 +61,9 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
         points, normals = grasp.arrays(robot.fingers)
         if grasp.object is None or grasp.object_pose is None or grasp.more(robot.fingers):
             continue
+        for i, k in itertools.combinations(range(len(points)), 2):
+            if np.linalg.norm(points[i] - points[k]) < CLOSE:
+                points[k] = normals[k] = np.nan
         parts = of_object(load_object(grasp.object).shape)
         if len(parts) >= CAPACITY or any(solid.kind is Kind.CONVEX for solid, _ in parts):
             continue

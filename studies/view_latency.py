@@ -73,7 +73,7 @@ def main() -> None:
     if asked.plain:
         viewer._server.scene.add_light_directional("/light/lamp", position=(0.9, -0.7, 3.2))
     with Browser() as browser:
-        page = browser.open(viewer.url, 900, 560)
+        page = browser.open(viewer.url, 700, 420)
         page.wait("document.querySelector('.ik-status') !== null")
         time.sleep(4.0)
         (client,) = viewer._server.get_clients().values()

@@ -34,7 +34,7 @@ from casadi_ik.solving.alternatives.way_out import with_way_out
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
-from casadi_ik.solving.freeing import freed, freed_at_once
+from casadi_ik.solving.freeing import RANKED, freed, freed_at_once
 from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.solved_part import SolvedPart, judged
@@ -180,9 +180,7 @@ class Engine:
             if other is not self:
                 return other.quick(problems, run)
         method, robot = self._quick, self.robot
-        if method is None or problems.prefer in (MANIPULABILITY, CLEARANCE):
-            return None
-        if problems.palms is not None:
+        if method is None or problems.palms is not None or problems.prefer in RANKED:
             return None
         start = run.start(robot)
         if start.ndim != 1:
@@ -323,8 +321,7 @@ class Engine:
             return replace(batch, diagnoses=(None,) * len(batch))
         own = isinstance(self.method, HandFirstMethod)
         q, seconds = outcome.q.copy(), outcome.time.copy()
-        touching = batch.status == Status.COLLISION
-        rows = np.flatnonzero(~batch.success & ~touching)
+        rows = np.flatnonzero(~batch.success & (batch.status != Status.COLLISION))
         if not len(rows):
             return replace(batch, diagnoses=(None,) * len(batch))
         unbiased = replace(problems.rows(rows), prefer="limits")

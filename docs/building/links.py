@@ -34,5 +34,4 @@ def broken(folder: Path) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    lines = list(broken(Path(sys.argv[1]).resolve()))
-    sys.exit("\n".join(lines))
+    sys.exit("\n".join(broken(Path(sys.argv[1]).resolve())) or 0)

@@ -3,7 +3,7 @@ import * as THREE from "three";
 import { COLORS, ContactMark, RobotBody, Things, matrixOf, poseOf } from "./bodies.js";
 import { Grip } from "./grip.js";
 import { Panel } from "./panel.js";
-import { Solving } from "./solving.js";
+import { FREE, Solving } from "./solving.js";
 import { Stage } from "./stage.js";
 
 /* global ROBOTS */
@@ -49,13 +49,22 @@ async function choose(robot) {
     solving = await load(robot);
   } catch (error) {
     by("loading").textContent = error.message;
+    console.error(error);
     return;
   }
   if (wanted !== robot.name) return;
   by("loading").hidden = true;
   now.solving = solving;
   panel.robot(solving.robot);
-  take(0, true);
+  take(Math.max(solving.robot.about.grasps.findIndex(isFree), 0), true);
+}
+
+// Whether a grasp is solved with its object there, and nothing touching: the first such is shown.
+function isFree(grasp) {
+  const flat = [grasp.points, grasp.normals].map((all) => all.map((v) => v ?? FREE));
+  const object = grasp.solids.map((one) => ({ ...one, grasped: true }));
+  const { solving } = now;
+  return solving.ask(...flat, null, object).status === solving.robot.Status.SOLVED;
 }
 
 // A shipped grasp, as it was made.
@@ -110,7 +119,6 @@ function solids() {
   return [...object, ...obstacle.map((one) => ({ ...one, grasped: false }))];
 }
 
-const FREE = [NaN, NaN, NaN];
 const placed = () => now.points.filter(Boolean);
 const question = () => [now.points, now.normals].map((all) => all.map((v) => v?.toArray() ?? FREE));
 

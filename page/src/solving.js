@@ -4,6 +4,9 @@
 // solved for so long [ms].
 const LONG = 25;
 
+// What stands for a point or a normal that is free.
+export const FREE = [NaN, NaN, NaN];
+
 export class Solving {
   constructor(robot, solver) {
     Object.assign(this, { robot, solver });
@@ -13,10 +16,11 @@ export class Solving {
   // Browsers compile twice, the second time what has been used: used it is here, not in a drag.
   warm() {
     const { solver, robot } = this, end = performance.now() + 150;
-    const { points, normals } = robot.about.grasps[0];
+    const grasp = robot.about.grasps[0];
+    const [points, normals] = [grasp.points, grasp.normals].map((all) => all.flatMap((v) => v ?? FREE));
     while (performance.now() < end) {
-      solver.solve(points.flat(), normals.flat());
-      solver.solve(points.flat(), normals.flat(), robot.home);
+      solver.solve(points, normals);
+      solver.solve(points, normals, robot.home);
     }
   }
 
@@ -35,20 +39,30 @@ export class Solving {
       else solver.setSolid(i, robot.Kind.NOTHING);
     }
     const begun = performance.now();
-    const answer = solver.solve(points.flat(), normals.flat(), near ?? undefined);
+    const answer = this.tried(points.flat(), normals.flat(), near);
     return { ...answer, time: 1e3 * (performance.now() - begun), counted: 1 };
+  }
+
+  // Where the nearest answer touches something, the one that is far from limits may not; and the
+  // other way round, from home.
+  tried(points, normals, near) {
+    const { solver, robot } = this, { COLLISION } = robot.Status;
+    const first = solver.solve(points, normals, near ?? undefined);
+    if (first.status !== COLLISION) return first;
+    const second = solver.solve(points, normals, near ? undefined : robot.home);
+    return second.status === COLLISION ? first : second;
   }
 
   // Time [us] of solving the same target again and again: the median over lots.
   timed(points, normals, near) {
-    const flat = [points.flat(), normals.flat(), near ?? undefined];
+    const flat = [points.flat(), normals.flat(), near];
     const end = performance.now() + LONG, lots = [];
     let counted = 0;
     do {
       const begun = performance.now();
       let count = 0;
       do {
-        for (let i = 0; i < 4; ++i) this.solver.solve(...flat);
+        for (let i = 0; i < 4; ++i) this.tried(...flat);
         count += 4;
       } while (performance.now() - begun < 1);
       lots.push((1e3 * (performance.now() - begun)) / count);

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 
 from building.links import broken
+
+SCRIPT = Path(__file__).parents[2] / "docs" / "building" / "links.py"
 
 
 def test_broken_links_are_named(tmp_path: Path) -> None:
@@ -21,3 +24,13 @@ def test_broken_links_are_named(tmp_path: Path) -> None:
         "a.html: deep/b.html#nowhere: no such place",
         "a.html: gone.png: no such file",
     ]
+
+
+def test_the_script_ends_with_what_it_found(tmp_path: Path) -> None:
+    page = tmp_path / "a.html"
+    page.write_text('<p id="top"></p><a href="#top">x</a>')
+    assert subprocess.run([sys.executable, SCRIPT, tmp_path], check=False).returncode == 0
+    page.write_text('<a href="gone.html">x</a>')
+    done = subprocess.run([sys.executable, SCRIPT, tmp_path], check=False, capture_output=True)
+    assert done.returncode == 1
+    assert b"gone.html" in done.stderr

@@ -18,7 +18,7 @@ from casadi_ik.viewing.frames import pose_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (Debian: apt chromium)")
 
-WINDOW = (900, 560)
+WINDOW = (700, 420)
 
 KNOWN = ("THREE.Clock", "KHR_parallel_shader_compile", "GPU stall")
 """What viser's client says of itself and of a browser without a graphics card."""
@@ -32,6 +32,8 @@ def browser() -> Iterator[Browser]:
 
 def opened(browser: Browser, viewer: Viewer) -> tuple[Page, Any]:
     """The page, and the camera of its browser as the server knows it, once it has drawn."""
+    # Without a graphics card shadows take most of the time.
+    viewer._server.scene.add_light_directional("/light/lamp", position=(0.9, -0.7, 3.2))
     page = browser.open(viewer.url, *WINDOW)
     page.wait("document.querySelector('canvas') !== null")
     server, end = viewer._server, time.monotonic() + 30

@@ -137,8 +137,8 @@ class _Part:
             q: (k, n) first answers.
             rows: Candidates that have one.
         """
-        if not len(rows):
-            return q[rows], rows
+        if not len(rows) or self.problems.palms is not None:
+            return q[rows], rows  # a hand that is given has no other posture
         some = self.problems.rows(rows)
         postures = self.trials.method.postures(some, 0)
         count, n = postures.shape[1], q.shape[1]
