@@ -163,7 +163,7 @@ class Grasp:
             if not self.posture:
                 raise InputError("posture: missing, expected one for the hand of the palm")
         elif not self.contacts:
-            raise InputError("contacts: empty, expected at least one finger")
+            raise InputError("contacts: found none, expected at least one finger, or a palm")
         for finger, contact in self.contacts.items():
             if not isinstance(contact, Contact):
                 raise InputError(

@@ -25,8 +25,8 @@ FILES: dict[str, tuple[bytes, str]] = {
     "a number": (b"12", ": .*expected"),
     "code": (b"!!python/object/apply:os.system ['echo hi']", ":1:1: not valid YAML: could not"),
     "holds itself": (b"contacts: &a\n  thumb: *a\n", ": nested too deeply, or holds itself"),
-    "no contacts": (b"robot: kuka_lwr_barrett", ": .*missing required field `contacts`"),
-    "contacts empty": (b"robot: kuka_lwr_barrett\ncontacts: {}", ": contacts: empty"),
+    "no contacts": (b"robot: kuka_lwr_barrett", ": contacts: found none, expected"),
+    "contacts empty": (b"robot: kuka_lwr_barrett\ncontacts: {}", ": contacts: found none"),
     "contacts a list": (b"contacts: [1, 2]", ": contacts: expected"),
 }
 

@@ -125,7 +125,7 @@ def test_bad_input_is_one_line_and_writes_nothing(run: Command, tmp_path: Path) 
     for path, expected in (
         (empty, "empty: found no YAML file, expected grasp files"),
         (tmp_path / "none.yaml", "none.yaml: no such file or folder"),
-        (rows, "rows.npz: row 0: contacts: empty"),
+        (rows, "rows.npz: row 0: contacts: found none"),
     ):
         assert expected in run("choose", path, *words, "--out", out).error
     bad.write_text(yaml.safe_dump({"candidates": [entry(0.0)]}))

@@ -43,7 +43,7 @@ def test_contact_normalises_and_freezes() -> None:
         (lambda: Contact([0, 0, 0], [[0, 0, 1]]), r"normal: found shape \(1, 3\)"),
         (lambda: Contact(["a", "b", "c"]), "point: found .*three numbers"),
         (lambda: Contact([[1, 2], [3]]), "point: found .*three numbers"),
-        (lambda: Grasp({}), "contacts: empty"),
+        (lambda: Grasp({}), "contacts: found none"),
         (lambda: Grasp({"thumb": ([0, 0, 0], [0, 0, 1])}), "contacts.thumb: found tuple"),  # pyright: ignore[reportArgumentType]
     ],
 )
