@@ -18,7 +18,8 @@ from toy_robots import copy_shipped_robot, write_coupled_robot
 import casadi_ik as ik
 
 # Half the time of the tests was the compiler's. Without optimisation it takes 0.4 of that, and not
-# a bit of a result is another (`test_compiler_flags`; tests of kernels take the usual flags).
+# a bit of a result is another (`test_optimisation_changes_no_bit`, of kernels and of hand-first).
+# What solves much takes the usual flags: `usual_flags`.
 os.environ.setdefault("CASADI_IK_CFLAGS", "-O0")
 
 # How long an example takes says nothing on a busy machine.
@@ -57,6 +58,14 @@ def browser() -> Iterator[Browser]:
         pytest.skip("no Chromium (on Debian: apt-get install chromium)")
     with Browser() as started:
         yield started
+
+
+@pytest.fixture(scope="module")
+def usual_flags() -> Iterator[None]:
+    """Kernels as users have them, for tests that solve so much that it pays."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("CASADI_IK_CFLAGS", raising=False)
+        yield
 
 
 @pytest.fixture

@@ -128,7 +128,7 @@ def test_bad_file(tmp_path: Path, old: str, new: str, key: str, says: str) -> No
 @pytest.mark.parametrize(
     ("text", "key", "says"),
     [
-        ("robot: kuka_lwr_barrett\n", "contacts", "empty"),
+        ("robot: kuka_lwr_barrett\n", "contacts", "found none"),
         ("contacts: {}\n", "contacts", "at least one finger"),
         ("", "(top level)", "`null`"),
         ("- 1\n- 2\n", "(top level)", "`array`"),

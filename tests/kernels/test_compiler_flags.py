@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import casadi_ik as ik
 from casadi_ik.kernels import LoopKernel
 from casadi_ik.kernels.compiler import find_compiler
 
@@ -38,19 +37,3 @@ def test_optimisation_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CASADI_IK_CFLAGS", "-O1")
     assert find_compiler() != flags
     assert iterates() == usual
-
-
-def answers() -> bytes:
-    """Of a shipped robot's method, few enough to be solved one by one."""
-    solver = ik.Solver(ik.load_robot("ar10"))
-    q = solver.robot.random(np.random.default_rng(0), COUNT)
-    batch = solver.solve_batch(*solver.robot.contacts(q))
-    assert batch.success.all()
-    return batch.q.tobytes() + batch.iterations.tobytes()
-
-
-def test_nor_does_none_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most tests are compiled so."""
-    usual = answers()
-    monkeypatch.setenv("CASADI_IK_CFLAGS", "-O0")
-    assert answers() == usual

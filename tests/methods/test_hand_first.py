@@ -222,6 +222,20 @@ def test_an_arm_without_a_closed_form(tmp_path_factory, tolerance):
     assert np.mean(batch.phases["refinement"] == 0) > 0.9
 
 
+def test_optimisation_changes_no_bit(robot, rng, monkeypatch):
+    points, normals = robot.contacts(robot.random(rng, 100))
+
+    def answers() -> bytes:
+        batch = ik.Solver(robot).solve_batch(points, normals)
+        assert batch.success.all()
+        return batch.q.tobytes() + batch.iterations.tobytes()
+
+    monkeypatch.setenv("CASADI_IK_CFLAGS", "-O0")
+    plain = answers()
+    monkeypatch.delenv("CASADI_IK_CFLAGS")
+    assert answers() == plain
+
+
 def test_every_stage_goes_side_by_side(method):
     """The arm nearest to q0 was chosen for one solve after the other: three times the time."""
     assert "lanes_one_by_one(&alone" not in lanes_source(method.graph.function, "", 4)

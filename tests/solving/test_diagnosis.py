@@ -13,6 +13,8 @@ import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.problem.solution import BatchSolution
 
+pytestmark = pytest.mark.usefixtures("usual_flags")
+
 STARTS = 2
 
 

@@ -17,6 +17,8 @@ import casadi_ik as ik
 from casadi_ik.kernels.cancellation import CancelledError, stop_if_cancelled
 from casadi_ik.solving.workers import workers
 
+pytestmark = pytest.mark.usefixtures("usual_flags")
+
 SCRIPT = """
     import os, signal, sys, threading, time
     import numpy as np

@@ -24,6 +24,8 @@ from casadi_ik.solving.diagnosis.pair_rows import pair_rows
 from casadi_ik.solving.diagnosis.prover import MOST, Prover
 from casadi_ik.solving.diagnosis.wrist_bound import Seen
 
+pytestmark = pytest.mark.usefixtures("usual_flags")
+
 BLIND = [[0, 100, 48, 78, 48, 48, 48], [0, 90, 48, 78, 46, 60, 31], [4, 94, 48, 78, 48, 47, 48]]
 """Hands (spread, thumb, finger 2, finger 3) [deg] that a lookup of postures tells badly apart."""
 
