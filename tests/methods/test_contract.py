@@ -42,13 +42,17 @@ class Case:
         """A solver, built once per set of options."""
         key = repr(sorted(options.items()))
         if key not in self.solvers:
-            if self.method in PAPER:
-                options = {"finger_step": "closed-form"} | options
-            if self.method.startswith("original"):
-                # They swing for thousands of iterations; what is promised shows in fewer.
-                options = {"max_iterations": 500} | options
-            self.solvers[key] = ik.Solver(self.robot, self.method, **options)
+            self.solvers[key] = self.fresh_solver(**options)
         return self.solvers[key]
+
+    def fresh_solver(self, **options) -> ik.Solver:
+        """A solver of its own."""
+        if self.method in PAPER:
+            options = {"finger_step": "closed-form"} | options
+        if self.method.startswith("original"):
+            # They swing for thousands of iterations; what is promised shows in fewer.
+            options = {"options": {"max_iterations": 500}} | options
+        return ik.Solver(self.robot, self.method, **options)
 
     def grasp(self, row: int = 0) -> ik.Grasp:
         return ik.Grasp(
@@ -196,8 +200,7 @@ def test_a_batch_goes_side_by_side(case):
         case.solver().solve_batch(point[None], normal[None])
         for point, normal in zip(case.points, case.normals, strict=True)
     ]
-    options = {"finger_step": "closed-form"} if case.method in PAPER else {}
-    batch = ik.Solver(case.robot, case.method, **options).solve_batch(case.points, case.normals)
+    batch = case.fresh_solver().solve_batch(case.points, case.normals)
     for row, alone in enumerate(one_by_one):
         fields_equal(batch, alone, slice(row, row + 1))
 
