@@ -3,7 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+INSTALL := $(PIP) install --quiet --no-compile -c constraints.txt
 OUT := out/demo
+# Tests start hundreds of processes: what one has parsed of the package, the next need not again,
+# whatever the surroundings say.
+export PYTHONDONTWRITEBYTECODE :=
 SOLVE := $(BIN)/casadi-ik solve cup --scene table --log $(OUT)/cup.mcap --out $(OUT)/cup.json
 PAPER := $(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup_paper.mcap
 SPHINX := $(BIN)/sphinx-build -E -q -W --keep-going -b html -c docs . out/docs \
@@ -28,15 +32,15 @@ $(VENV)/python.stamp:
 	touch $@
 
 $(VENV)/demo.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
-	$(PIP) install --quiet -c constraints.txt -e ".[plots]"
+	$(INSTALL) -e ".[plots]"
 	touch $@
 
 $(VENV)/dev.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
-	$(PIP) install --quiet -c constraints.txt -e ".[test,lint,docs]"
+	$(INSTALL) -e ".[test,lint,docs]"
 	touch $@ $(VENV)/demo.stamp $(VENV)/docs.stamp
 
 $(VENV)/docs.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
-	$(PIP) install --quiet -c constraints.txt -e ".[docs]"
+	$(INSTALL) -e ".[docs]"
 	touch $@
 
 # The grasp of a real object by the default method, then by the paper's, and the two side by side.

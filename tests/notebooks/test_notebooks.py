@@ -7,7 +7,6 @@ Execute them anew, outputs included, with
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import nbformat
@@ -30,11 +29,9 @@ def test_there_are_notebooks_and_they_are_small() -> None:
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path: Path, tmp_path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
-    # Kernels are as a user has them.
-    environment = {key: value for key, value in os.environ.items() if key != "CASADI_IK_CFLAGS"}
     NotebookClient(
         notebook, timeout=120, kernel_name="python3", resources={"metadata": {"path": tmp_path}}
-    ).execute(env=environment)
+    ).execute()
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
             assert output.get("name") != "stderr", output
