@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from make_grasp_sets import TABLES, made
+from make_grasp_sets import ROBOTS, TABLES, made
 
 import casadi_ik as ik
 from casadi_ik.datasets.conventions import load_convention
@@ -50,8 +50,7 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
 def test_conventions_agree_with_the_published_hands(name: str) -> None:
     """Where the last joints of the fingers are by another library in the published model."""
     published, convention = PUBLISHED[name], load_convention(name)
-    hand = {"allegro": "panda+allegro_right", "leap": "panda+leap", "shadow": "ur5e+shadow"}
-    described = ik.load_robot(hand[name.split("_")[1]]).description
+    described = ik.load_robot(ROBOTS.get(name.split("_")[1], KUKA)).description
     joints = {
         convention.joints[key][0]: np.array([convention.joints[key][1] * value])
         for key, value in published["joints"].items()
@@ -285,16 +284,14 @@ def test_nothing_in_a_pickle_is_run(build: Any, tmp_path: Path) -> None:
     assert not flag.exists()
 
 
-def test_damaged_pickles(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["getagrip_allegro", "multidex_allegro"])
+def test_damaged_pickles(name: str, tmp_path: Path) -> None:
     """Every cut and many changes of a file end in one line, or in grasps."""
-    whole = made("getagrip_allegro", tmp_path).path.read_bytes()
-    robot, path, rng = (
-        ik.load_robot("panda+allegro_right"),
-        tmp_path / "cut.npy",
-        np.random.default_rng(0),
-    )
+    written = made(name, tmp_path).path
+    whole, path = written.read_bytes(), tmp_path / f"cut{written.suffix}"
+    robot, rng = ik.load_robot("panda+allegro_right"), np.random.default_rng(0)
     begun = whole.index(pickle.PROTO, 10)
-    for trial in range(300):
+    for trial in range(150):
         data = bytearray(whole)
         if trial % 3 == 0:
             del data[int(rng.integers(len(data))) :]
