@@ -1,4 +1,4 @@
-"""Files of torch are read without torch: what one of its own holds, and what is wrong with others."""
+"""Files of torch, read without torch: what one of its own holds, and what is wrong with others."""
 
 from __future__ import annotations
 
