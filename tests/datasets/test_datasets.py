@@ -13,6 +13,7 @@ import pytest
 from make_grasp_sets import ROBOTS, TABLES, made
 
 import casadi_ik as ik
+from casadi_ik.cli.report import reasons
 from casadi_ik.datasets.conventions import load_convention
 from casadi_ik.datasets.hands import link_poses
 from casadi_ik.errors import DescriptionError, UnknownNameError, UnsupportedError
@@ -102,6 +103,18 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     assert missed.status is ik.Status.UNREACHABLE
     assert missed.palm is not None
     assert not missed.palm.ok
+    assert missed.diagnosis is not None
+    assert missed.diagnosis.palm is not None
+    assert missed.diagnosis.palm.position_error > 1
+    said = reasons(solver, missed)
+    assert "the arm does not reach where the palm is asked" in said
+    assert "proved: the palm has the wrist where the arm does not reach" in said
+    assert any(line.startswith("the palm misses its place by ") for line in said)
+    assert not any(finger in line for line in said for finger in (*robot.fingers, "contact"))
+    assert far.palm is not None
+    (again,) = solver.solve_palms(far.palm[None], far.posture, diagnose=True).diagnoses
+    assert again is not None
+    assert again.palm is not None
 
 
 def test_many_palms() -> None:
