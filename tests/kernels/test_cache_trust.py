@@ -180,7 +180,7 @@ def test_a_sticky_folder_above_is_enough(directory: Path) -> None:
 def test_a_folder_is_looked_into_and_not_listed(
     directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To list tens of thousands of files before each library is loaded takes longer than a solve."""
+    """To list tens of thousands of files for each library takes longer than a solve."""
     directory.mkdir(mode=0o700)
 
     def listed(*_: object) -> list[str]:
