@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from torch_zip import write_torch
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
@@ -67,7 +68,7 @@ def made(name: str, folder: Path, seed: int = 0, robot: ik.ArmHand | None = None
     palms[:, :3, :3] = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
     palms[:, :3, 0] *= np.linalg.det(palms[:, :3, :3])[:, None]
     palms[:, :3, 3] = rng.uniform(-0.15, 0.15, (COUNT, 3))
-    path = folder / (f"{stem}.{kind}" if kind else f"{stem}.npy")
+    path = folder / f"{stem}.{kind or ('pt' if layout == 'multidex' else 'npy')}"
     if layout == "table":
         motors = hand_motors(held.description)
         values = q[:, [held.actuators.index(name) for name in motors]]
@@ -146,6 +147,17 @@ def _dexgraspbench(path: Path, frames: Array, convention: Convention, joints: Ar
     np.save(path, np.array(held, dtype=object))
 
 
+def _multidex(path: Path, frames: Array, convention: Convention, joints: Array) -> None:
+    """Columns of the rotation are neither units nor at a right angle, as optimisers leave them."""
+    hand = convention.name.partition("_")[2]
+    first, second = frames[:, :3, 0], frames[:, :3, 1]
+    turns = [1.1 * (first + 0.05 * second), 0.9 * (second + 0.05 * first)]
+    rows = np.hstack([frames[:, :3, 3], *turns, joints])
+    metadata = [(row, "contactdb+apple", hand) for row in rows]
+    info = {"num_total": len(rows), "num_per_object": {"contactdb+apple": len(rows)}}
+    write_torch(path, {"info": info, "metadata": [*metadata]})
+
+
 def _table(path: Path, palms: Array, names: tuple[str, ...], joints: Array) -> None:
     columns = dict(zip("xyz", palms[:, :3, 3].T, strict=True))
     if path.suffix == ".csv":
@@ -191,6 +203,7 @@ WRITERS: dict[str, Callable[[Path, Array, Convention, Array], None]] = {
     "dexgraspnet": _dexgraspnet,
     "bodex": _bodex,
     "dexgraspbench": _dexgraspbench,
+    "multidex": _multidex,
 }
 
 TABLES = ("table.csv", "table.npz", "table.parquet")

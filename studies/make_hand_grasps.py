@@ -8,7 +8,8 @@ Run it again whenever an object, a hand or the recipes change::
 The thumb presses against the two fingers after it. Where the object may be in the hand follows from
 the pads of the hand half closed: amid them, its y axis (that the thumb presses along) from the
 fingers to the thumb, its z axis along the row of fingers. The pinch is taken that needs least
-friction among those that keep the axes of phalanges clear of the object.
+friction among those that keep the axes of phalanges clear of the object and in which the robot's
+shapes touch nothing but what they hold, with the table there as well.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from grasp_synthesis.clearing import MARGIN, cleared, surroundings
 from grasp_synthesis.fingertip_pinch import TipPinch, TipPinchProblem
 from grasp_synthesis.holding import Scene, hold
 from grasp_synthesis.writing import grasp_text, made_by, placed_at
@@ -28,15 +30,17 @@ import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.files.shipped import models_folder
 from casadi_ik.grasps import Box, EllipticCylinder, GraspObject, load_object
+from casadi_ik.problem.clearance import SceneCheck
 
 ARM = "panda"
 HANDS = {
-    "allegro": ("allegro_right", ("thumb", "index", "middle")),
-    "leap": ("leap", ("thumb", "index", "middle")),
-    "shadow": ("shadow", ("thumb", "index", "middle")),
-    "robotiq_3f": ("robotiq_3f", ("thumb", "finger_1", "finger_2")),
+    "allegro": ("allegro_right", ("thumb", "index", "middle"), 0.030),
+    "leap": ("leap", ("thumb", "index", "middle"), 0.036),
+    "shadow": ("shadow", ("thumb", "index", "middle"), 0.022),
+    "robotiq_3f": ("robotiq_3f", ("thumb", "finger_1", "finger_2"), 0.030),
 }
-"""By the first word of a file: the hand, and the fingers that touch, the thumb first."""
+"""By the first word of a file: the hand, the fingers that touch, the thumb first, and how far two
+of them on the same side are apart at least [m]."""
 
 UP = (0.0, 0.0, 1.0)
 UPRIGHT = {
@@ -137,13 +141,20 @@ def make(
         EDGE,
         still,
         (middle - ROOM, middle + ROOM),
+        HANDS[recipe.hand][2],
     )
-    for pinch in problem.solve(rng, starts):
-        gap = clear(robot, item, recipe.sides, pinch)
-        if pinch.residual > 1e-9 or gap < PHALANX_GAP or pinch.friction > FRICTION:
+    alone = SceneCheck(robot, ik.Scene(margin=MARGIN))
+    table = SceneCheck(robot, ik.load_scene("table"))
+    for found in problem.solve(rng, starts):
+        if found.residual > 1e-9 or found.friction > FRICTION:
+            continue
+        pinch = cleared(alone, recipe.item, recipe.sides, found, rng)
+        if pinch is None or (gap := clear(robot, item, recipe.sides, pinch)) < PHALANX_GAP:
             continue
         q = hold(description, root, pinch, Scene(LOW, HIGH, UPRIGHT[recipe.item], ABOVE), rng)
-        if q is not None:
+        if q is None:
+            continue
+        if surroundings(table, recipe.item, recipe.sides, pinch, q).free(q[None])[0]:
             print(f"{recipe.name}: friction {pinch.friction:.3f}, phalanges {1e3 * gap:.1f} mm")
             return text_of(robot, recipe, pinch, q, gap, seed)
     return None

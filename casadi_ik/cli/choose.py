@@ -44,6 +44,7 @@ def choose(arguments: argparse.Namespace) -> Answer:
         arguments.hand,
         take=arguments.take,
         grasped=arguments.object,
+        of=arguments.of,
     )
     check_outputs([("--out", out)], inputs=[path])
     solver = Solver(robot, tolerance=the_tolerance(arguments), scene=the_scene(arguments))

@@ -12,7 +12,15 @@ from casadi_ik.problem.preference import PREFERENCES
 if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
 
-LAYOUT_NAMES = ("getagrip", "dexgraspnet", "bodex", "dexgraspbench", "dexonomy", "table")
+LAYOUT_NAMES = (
+    "getagrip",
+    "dexgraspnet",
+    "bodex",
+    "dexgraspbench",
+    "dexonomy",
+    "multidex",
+    "table",
+)
 """Said here again: the parser does not wait for the package that reads them."""
 
 _EXAMPLES = """\
@@ -29,6 +37,7 @@ CANDIDATES is one of
   an npz file with points and normals (k, f, 3), as for `casadi-ik batch`
   an npy file of getagrip, dexgraspnet, bodex, dexgraspbench or dexonomy: palms and hands are as
     they are there, only the arm is looked for (--take contacts: only the fingertips are)
+  a pt file of multidex, the same; --of says of which of its objects
   a table (.csv, .npz, .parquet) with columns x y z, qw qx qy qz or roll pitch yaw (where the
     robot's palm frame is to be) and the hand's joints by name
 Nothing in a file is run. docs/choosing.md says what is in them.
@@ -82,6 +91,11 @@ def add_choose(commands: Any) -> None:
         metavar="NAME",
         help="what a data set or table grasps: a shipped name or a YAML file; of --take contacts "
         "only the pads that touch it count",
+    )
+    parser.add_argument(
+        "--of",
+        metavar="NAME",
+        help="of which object's grasps, by the file's own name, where it has those of several",
     )
     parser.add_argument(
         "--scene",

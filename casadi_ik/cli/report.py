@@ -14,6 +14,7 @@ from rich.text import Text
 
 from casadi_ik.api import Solver
 from casadi_ik.cli.batch_totals import BatchTotals
+from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.contact_verdict import PalmVerdict
 from casadi_ik.problem.solution import Solution
 from casadi_ik.problem.status import Status
@@ -27,8 +28,8 @@ _MEANING = {
     Status.INVALID: "a number was no longer finite",
     Status.STALLED: "the method came to a standstill",
     Status.ITERATION_LIMIT: "the budget of iterations is used up",
-    Status.UNREACHABLE: "the contacts cannot be reached: there is a proof",
-    Status.COLLISION: "contacts and limits are met, but something touches",
+    Status.UNREACHABLE: "{} cannot be reached: there is a proof",
+    Status.COLLISION: "{} and limits are met, but something touches",
     Status.NOT_FOUND: "neither a solution nor a proof that there is none",
 }
 
@@ -95,9 +96,7 @@ def solution_report(
         parts.append(_indented(warning, "yellow"))
     if not solution.success:
         parts += [_indented(line, "yellow") for line in reasons(solver, solution)]
-    if solution.palm is not None:
-        parts.append(_palm(solution.palm))
-    parts += [_contacts(solution), _actuators(solver, solution)]
+    parts += [_asked(solution), _actuators(solver, solution)]
     if solver.limits == "ignore" and not solution.limits_ok:
         count = len(_beyond(solver, solution))
         parts.append(_indented(f"limits are ignored; positions beyond them: {count}", "yellow"))
@@ -115,9 +114,10 @@ def clearance(solution: Solution) -> str:
 
 def reasons(solver: Solver, solution: Solution) -> list[str]:
     """Why a grasp is not solved: what it missed, what is at a limit, and the diagnosis."""
-    lines = [_MEANING.get(solution.status, "the contacts are not met")]
+    asked = "the contacts" if solution.palm is None else "the palm"
+    lines = [_MEANING.get(solution.status, "not met").format(asked)]
     for finger, contact in solution.contacts.items():
-        if contact.ok:
+        if contact.ok or solution.palm is not None:
             continue
         missed = []
         if contact.position_error > contact.tolerance.position:
@@ -125,6 +125,12 @@ def reasons(solver: Solver, solution: Solution) -> list[str]:
         if contact.angle_error > contact.tolerance.angle:
             missed.append(f"its normal by {math.degrees(contact.angle_error):.2f} deg")
         lines.append(f"{finger} misses {' and '.join(missed)}")
+    if solution.palm is not None and not solution.palm.ok:
+        off = f"{solution.palm.position_error * 1e3:.2f} mm"
+        lines.append(
+            f"the palm misses its place by {off} and its direction by "
+            f"{math.degrees(solution.palm.angle_error):.2f} deg"
+        )
     if solver.limits == "enforce":
         beyond = _beyond(solver, solution)
         if beyond:
@@ -189,13 +195,10 @@ def duration(seconds: float) -> str:
     return f"{seconds * 1e6:.3g} us"
 
 
-def _palm(palm: PalmVerdict) -> Text:
-    """How far the palm is from where the grasp has it."""
-    off = f"  palm off by {palm.position_error * 1e3:.3g} mm, "
-    return Text(f"{off}{math.degrees(palm.angle_error):.3g} deg", "" if palm.ok else "red")
-
-
-def _contacts(solution: Solution) -> Table:
+def _asked(solution: Solution) -> Table:
+    """The palm against what was asked for, or the contacts."""
+    if solution.palm is not None:
+        return _palm(solution.palm, [one.tolerance for one in solution.contacts.values()])
     right = ("point off by", "tolerance", "normal off by", "tolerance")
     rows = table("contact", *right, "", right=right)
     for finger, contact in solution.contacts.items():
@@ -205,6 +208,18 @@ def _contacts(solution: Solution) -> Table:
             *_compared(contact.angle_error, contact.tolerance.angle, math.degrees(1), "deg"),
             Text("ok", "green") if contact.ok else Text("missed", "red"),
         )
+    return rows
+
+
+def _palm(palm: PalmVerdict, tolerances: Sequence[Tolerance]) -> Table:
+    right = ("place off by", "tolerance", "direction off by", "tolerance")
+    rows = table("", *right, "", right=right)
+    rows.add_row(
+        "palm",
+        *_compared(palm.position_error, max(one.position for one in tolerances), 1e3, "mm"),
+        *_compared(palm.angle_error, max(one.angle for one in tolerances), math.degrees(1), "deg"),
+        Text("ok", "green") if palm.ok else Text("missed", "red"),
+    )
     return rows
 
 

@@ -23,6 +23,9 @@ DIRECTIONS = 512
 """Planes that round a convex body off, besides those of its faces: between two of them a corner
 stands out by at most 2 % of the distance from it."""
 
+STRIDE = 197
+"""Places along their spiral from one of them to the next; has no factor in common with them."""
+
 LINKS = 5
 """Capsules that a bent one is made of."""
 
@@ -131,8 +134,12 @@ def _bent(shape: BentCapsule) -> list[tuple[Solid, Array]]:
 
 
 def _planes(normals: Array, support: Callable[[Array], Array]) -> Array:
-    """(m, 4) planes that touch a body, with these normals and evenly spread ones."""
-    ways = np.concatenate([_distinct(normals), spread(DIRECTIONS)])
+    """(m, 4) planes that touch a body, with evenly spread normals and with these.
+
+    Of the spread ones any that come first are spread, too: the driver looks at some before all.
+    """
+    order = (np.arange(DIRECTIONS) * STRIDE) % DIRECTIONS
+    ways = np.concatenate([spread(DIRECTIONS)[order], _distinct(normals)])
     return np.column_stack([ways, support(ways)])
 
 

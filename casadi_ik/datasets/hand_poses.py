@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 
@@ -29,6 +30,7 @@ class HandPoses:
         rotation: (k, 3, 3) its axes, exact rotations.
         joints: (k, m) joint positions [rad or m].
         names: Of the joints as the file calls them; none: the order of the hand's description.
+        objects: What each grasp is of, as the file calls it; none: all are of one thing.
     """
 
     where: str
@@ -36,6 +38,7 @@ class HandPoses:
     rotation: Array
     joints: Array
     names: tuple[str, ...] = ()
+    objects: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check what is given.
@@ -72,6 +75,32 @@ class HandPoses:
         )
         object.__setattr__(self, "rotation", self._exact())
 
+    def of(self, name: str | None) -> HandPoses:
+        """The grasps of one thing.
+
+        Args:
+            name: What the file calls it; None: there is only one.
+
+        Raises:
+            DescriptionError: There are several, or none of that name.
+        """
+        if name is None and len(set(self.objects)) <= 1:
+            return self
+        known = sorted(set(self.objects))
+        said = f"{len(known)} objects ({', '.join(known[:3])}{', ...' if known[3:] else ''})"
+        if name is None:
+            self._fail(f"found grasps of {said}, expected one; say which (of)")
+        if name not in known:
+            self._fail(f"of: found {name!r}, expected one of {said}")
+        rows = np.flatnonzero(np.array(self.objects) == name)
+        return HandPoses(
+            f"{self.where}: {name}",
+            self.position[rows],
+            self.rotation[rows],
+            self.joints[rows],
+            self.names,
+        )
+
     def _exact(self) -> Array:
         """The nearest rotations."""
         left, _, right = np.linalg.svd(self.rotation)
@@ -85,7 +114,7 @@ class HandPoses:
         if bad.any():
             self._fail(f"row {int(np.argmax(bad))}: {problem}")
 
-    def _fail(self, problem: str) -> None:
+    def _fail(self, problem: str) -> NoReturn:
         raise DescriptionError(f"{self.where}: {problem}")
 
     @property
@@ -120,9 +149,17 @@ def of_fixed_axes(angles: Array) -> Array:
 
 
 def of_two_columns(columns: Array) -> Array:
-    """(k, 3, 3) rotations whose first two columns are (k, 6), made orthogonal in order."""
+    """(k, 3, 3) rotations of (k, 6) two columns, from whose right angle both are as far as before.
+
+    Their sum and their difference are at a right angle whatever they are. Columns that are none, or
+    the same, become NaN. After `robust_compute_rotation_matrix_from_ortho6d` of GenDexGrasp.
+    """
+
+    def unit(vectors: Array) -> Array:
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
     with np.errstate(invalid="ignore", divide="ignore"):
-        first = columns[:, :3] / np.linalg.norm(columns[:, :3], axis=1, keepdims=True)
-        third = np.cross(first, columns[:, 3:])
-        third /= np.linalg.norm(third, axis=1, keepdims=True)
-    return np.stack([first, np.cross(third, first), third], axis=2)
+        first, second = unit(columns[:, :3]), unit(columns[:, 3:])
+        middle, across = unit(first + second), unit(first - second)
+        first, second = unit(middle + across), unit(middle - across)
+    return np.stack([first, second, np.cross(first, second)], axis=2)

@@ -95,11 +95,12 @@ def motor_positions(
             others move is where they do not put it.
     """
     motors = hand_motors(robot.description)
+    moved = _moved(robot.description, joints)
     for name in motors:
-        if name not in joints:
+        if name not in moved:
             raise DescriptionError(f"{where}: {name}: missing, expected a position")
     columns = [robot.actuators.index(name) for name in motors]
-    given = np.stack([joints[name] for name in motors], axis=1)
+    given = np.stack([moved[name] for name in motors], axis=1)
     lower, upper = robot.lower[columns], robot.upper[columns]
     found = np.clip(given, lower, upper)
     beyond = np.abs(given - found)
@@ -122,6 +123,18 @@ def motor_positions(
                 "(take='contacts')"
             )
     return motors, found
+
+
+def _moved(robot: RobotDescription, joints: Mapping[str, Array]) -> dict[str, Array]:
+    """The joints, and the motors whose joints are given alone: by the first that follows them."""
+    found = dict(joints)
+    for joint in robot.movable:
+        slope = joint.coupling.slope if joint.coupling is not None else None
+        if joint.coupling is None or slope is None or joint.name not in joints:
+            continue
+        if joint.coupling.of in robot.actuator_names:
+            found.setdefault(joint.coupling.of, (joints[joint.name] - slope[1]) / slope[0])
+    return found
 
 
 def joints_at(robot: ArmHand, motors: tuple[str, ...], positions: Array) -> dict[str, Array]:

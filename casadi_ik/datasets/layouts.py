@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.datasets.hand_poses import HandPoses, of_fixed_axes, of_quaternions
+from casadi_ik.datasets.hand_poses import (
+    HandPoses,
+    of_fixed_axes,
+    of_quaternions,
+    of_two_columns,
+)
+from casadi_ik.datasets.torch_files import read_torch
 from casadi_ik.datasets.unpickling import Packed, read_npy
 from casadi_ik.errors import DescriptionError
 from casadi_ik.grasps.pose import inverse
@@ -81,21 +87,60 @@ def dexgraspbench(path: Path, content: Any) -> HandPoses:
     return _of_rows(where, rows, _object_pose(where, found))
 
 
+def multidex(path: Path, content: Any) -> HandPoses:
+    """A dictionary of torch: metadata, a list of (q, object, hand), where the file has several.
+
+    q: translation (3), the first two columns of the rotation (6), joints in the order of the hand.
+    """
+    where, found = str(path), _mapping(path, content)
+    entries = found.get("metadata")
+    if not isinstance(entries, list) or not entries:
+        raise DescriptionError(f"{where}: metadata: expected a list of at least one grasp")
+    rows: list[Array] = []
+    objects: list[str] = []
+    for i, entry in enumerate(entries):
+        row = f"{where}: metadata: row {i}"
+        if not isinstance(entry, (tuple, list)) or len(entry) < 2 or type(entry[1]) is not str:
+            raise DescriptionError(f"{row}: expected q and the name of its object")
+        q = numbers(row, {"q": entry[0]}, "q")
+        if q.ndim != 1 or len(q) <= 9 or (rows and len(q) != len(rows[0])):
+            expected = f"({len(rows[0])},)" if rows else "(9 + joints,)"
+            raise DescriptionError(f"{row}: q: found shape {q.shape}, expected {expected}")
+        rows.append(q)
+        objects.append(entry[1])
+    values = np.stack(rows)
+    turns = of_two_columns(values[:, 3:9])
+    return HandPoses(where, values[:, :3], turns, values[:, 9:], objects=tuple(objects))
+
+
 LAYOUTS: Mapping[str, Callable[[Path, Any], HandPoses]] = {
     "getagrip": getagrip,
     "dexgraspnet": dexgraspnet,
     "bodex": bodex,
     "dexgraspbench": dexgraspbench,
     "dexonomy": dexgraspbench,
+    "multidex": multidex,
 }
-"""Of npy files, by name."""
+"""Of npy files and those of torch, by name."""
 
-MARKS = {"joint_angles": "getagrip", "robot_pose": "bodex", "grasp_qpos": "dexgraspbench"}
+READERS: Mapping[str, Callable[[Path], Any]] = {
+    ".npy": read_npy,
+    ".pt": read_torch,
+    ".pth": read_torch,
+}
+"""What reads a file, by its ending."""
+
+MARKS = {
+    "joint_angles": "getagrip",
+    "robot_pose": "bodex",
+    "grasp_qpos": "dexgraspbench",
+    "metadata": "multidex",
+}
 """Keys that tell layouts from one another."""
 
 
 def read_layout(path: Path, layout: str | None) -> tuple[HandPoses, str]:
-    """Grasps of an npy file, and their layout.
+    """Grasps of a file that ends as one of `READERS`, and their layout.
 
     Args:
         path: The file.
@@ -104,7 +149,7 @@ def read_layout(path: Path, layout: str | None) -> tuple[HandPoses, str]:
     Raises:
         DescriptionError: It is not of the layout, or of none.
     """
-    content = read_npy(path)
+    content = READERS[path.suffix.lower()](path)
     if layout is None:
         keys = content if isinstance(content, dict) else {}
         layout = next((found for mark, found in MARKS.items() if mark in keys), None)

@@ -14,7 +14,7 @@ from casadi_ik.batches.target_file import TargetFile
 from casadi_ik.datasets.conventions import Convention, convention_for, of_robot
 from casadi_ik.datasets.hand_poses import HandPoses
 from casadi_ik.datasets.hands import joints_at, motor_positions, palms_of
-from casadi_ik.datasets.layouts import LAYOUTS, read_layout
+from casadi_ik.datasets.layouts import LAYOUTS, READERS, read_layout
 from casadi_ik.datasets.tables import SUFFIXES, read_table
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.grasps import Contact, Grasp, GraspObject, load_object
@@ -46,14 +46,16 @@ def load_candidates(
     object_pose: ArrayLike | None = None,
     take: Take = "palm",
     grasped: str | GraspObject | None = None,
+    of: str | None = None,
 ) -> tuple[Grasp, ...]:
     """Grasps of a file or a folder, as `Solver.choose` takes them.
 
     Args:
         path: A YAML file with one grasp or a list (``candidates:``); a folder of such files; an npz
-            file with points and normals, as `Solver.solve_batch` takes them; an npy file of a data
-            set; a table (CSV, npz, Parquet) with columns x y z, qw qx qy qz or roll pitch yaw, and
-            the robot's joints by name, the pose that of its palm frame. Nothing in a file is run.
+            file with points and normals, as `Solver.solve_batch` takes them; an npy or pt file of a
+            data set; a table (CSV, npz, Parquet) with columns x y z, qw qx qy qz or roll pitch yaw,
+            and the robot's joints by name, the pose that of its palm frame. Nothing in a file is
+            run.
         robot: The robot, or its name; its hand must be that of the data.
         layout: One of `LAYOUTS`, or "table"; None: told from the file.
         hand: How the data name joints and where they have the hand's frame: one of
@@ -63,6 +65,7 @@ def load_candidates(
             only the arm is looked for. "contacts": the fingertips are asked for, where they are.
         grasped: The object, or its shipped name: of "contacts" only pads nearer to its surface
             than 10 mm count, and they are where the surface is; collisions know it by its name.
+        of: Whose grasps, by the file's own name, where a file has those of several objects.
 
     Returns:
         The grasps in the order of the file, at least one.
@@ -90,7 +93,7 @@ def load_candidates(
     if not file.exists():
         raise DescriptionError(f"{file}: no such file or folder, expected candidates")
     thing = load_object(grasped) if isinstance(grasped, str) else grasped
-    grasps = _loaded(file, held, layout, hand, take, thing)
+    grasps = _loaded(file, held, layout, hand, take, thing, of)
     if object_pose is None:
         return grasps
     return tuple(grasp.in_object_frame().at(object_pose) for grasp in grasps)
@@ -103,11 +106,14 @@ def _loaded(
     hand: str | Path | None,
     take: Take,
     thing: GraspObject | None,
+    of: str | None,
 ) -> tuple[Grasp, ...]:
     kind = path.suffix.lower()
-    if kind == ".npy" and layout != TABLE:
+    if kind in READERS and layout != TABLE:
         given, found = read_layout(path, layout)
-        return _of_hand(given, robot, convention_for(robot, found, hand), take, thing)
+        return _of_hand(given.of(of), robot, convention_for(robot, found, hand), take, thing)
+    if of is not None:
+        raise InputError(f"of: found {of!r}, but {path.name} has grasps of one object")
     if kind in SUFFIXES and (layout == TABLE or (layout is None and not _has_targets(path))):
         given = read_table(path)
         known = (*robot.description.joint_names, *robot.actuators)
@@ -115,7 +121,7 @@ def _loaded(
         own = _own(robot, names) if hand is None else convention_for(robot, TABLE, hand)
         return _of_hand(given, robot, own, take, thing)
     if layout is not None:
-        expected = ".npy" if layout != TABLE else ", ".join(SUFFIXES)
+        expected = ", ".join(READERS if layout != TABLE else SUFFIXES)
         raise DescriptionError(f"{path}: found no {expected} file, expected one of {layout}")
     if kind == ".npz":
         return tuple(_of_targets(path, robot.fingers))

@@ -1,4 +1,4 @@
-"""Numpy files with Python objects in them, read without running what they say.
+"""Files with pickled Python objects in them, read without running what they say.
 
 A pickle is a program. Here it may build plain containers, texts and numbers, and numpy arrays,
 types and scalars: whatever else it names is refused, and of numpy's own machinery nothing runs that
@@ -11,9 +11,12 @@ import io
 import math
 import pickle
 import re
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -51,7 +54,7 @@ class Packed:
                 raise pickle.UnpicklingError("an array of objects that are not there")
             self.items = data
             return
-        self.value = _numbers(data, kind.dtype, self.shape, bool(by_columns))
+        self.value = array_of(data, kind.dtype, self.shape, bool(by_columns))
 
 
 class _Kind:
@@ -81,7 +84,8 @@ def _kind(text: Any, *_: Any) -> _Kind:
     return _Kind(text)
 
 
-def _numbers(data: Any, dtype: np.dtype[Any], shape: tuple[int, ...], by_columns: bool) -> Any:
+def array_of(data: Any, dtype: np.dtype[Any], shape: tuple[int, ...], by_columns: bool) -> Any:
+    """An array of bytes, which have to be as many as it needs."""
     if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
         raise pickle.UnpicklingError("an array whose bytes are not as many as its shape says")
     flat = np.frombuffer(data, dtype) if data else np.zeros(0, dtype)
@@ -91,7 +95,7 @@ def _numbers(data: Any, dtype: np.dtype[Any], shape: tuple[int, ...], by_columns
 def _scalar(kind: Any, data: Any) -> Any:
     if not isinstance(kind, _Kind) or kind.holds_objects:
         raise pickle.UnpicklingError("a scalar without a type")
-    return _numbers(data, kind.dtype, (), False).item()
+    return array_of(data, kind.dtype, (), False).item()
 
 
 def _rebuilt(_: Any, shape: Any, __: Any) -> Packed:
@@ -113,7 +117,7 @@ def _encoded(text: Any, encoding: Any) -> bytes:
     return text.encode("latin1")
 
 
-class _Named:
+class Named:
     """What a pickle may name, and call if it is something to call; it cannot be changed."""
 
     __slots__ = ("_does",)
@@ -122,6 +126,7 @@ class _Named:
         self._does = does
 
     def __call__(self, *arguments: Any) -> Any:
+        """What it does, if anything."""
         if self._does is None:
             raise pickle.UnpicklingError("a call of an array's class")
         return self._does(*arguments)
@@ -130,22 +135,25 @@ class _Named:
         raise pickle.UnpicklingError("a change of what builds arrays")
 
 
-ALLOWED: dict[str, _Named] = {
-    "ndarray": _Named(),
-    "dtype": _Named(_kind),
-    "_reconstruct": _Named(_rebuilt),
-    "scalar": _Named(_scalar),
-    "_frombuffer": _Named(_from_buffer),
+ALLOWED: dict[str, Named] = {
+    "ndarray": Named(),
+    "dtype": Named(_kind),
+    "_reconstruct": Named(_rebuilt),
+    "scalar": Named(_scalar),
+    "_frombuffer": Named(_from_buffer),
 }
 """What of numpy a pickle may name, by its last name, and what it gets."""
 
 
-ENCODED = _Named(_encoded)
+ENCODED = Named(_encoded)
 """How pickles of Python 2 write bytes."""
 
 
-class _Reader(pickle.Unpickler):
+class Reader(pickle.Unpickler):
+    """Of pickles that hold arrays of numpy, containers, texts and numbers."""
+
     def find_class(self, module: str, name: str) -> Any:
+        """What a pickle names."""
         if module.split(".")[0] == "numpy" and name in ALLOWED:
             return ALLOWED[name]
         if (module, name) == ("_codecs", "encode"):
@@ -153,7 +161,49 @@ class _Reader(pickle.Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name}")
 
     def persistent_load(self, pid: Any) -> Any:
+        """What a pickle says is somewhere else."""
         raise pickle.UnpicklingError(f"things kept elsewhere: {pid}")
+
+
+@contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """What goes wrong with a file, in one line.
+
+    Args:
+        path: The file.
+        kind: What it should be.
+
+    Raises:
+        DescriptionError: It cannot be read, is too large, damaged, or names what it may not.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MOST:
+            raise DescriptionError(f"{path}: found {size} bytes, expected {MOST} at most")
+        yield
+    except OSError as error:
+        raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except pickle.UnpicklingError as error:
+        raise DescriptionError(
+            f"{path}: its pickle holds {_line(error)}, expected arrays, containers, texts and "
+            "numbers only"
+        ) from error
+    except (
+        ValueError,
+        TypeError,
+        AttributeError,
+        IndexError,
+        KeyError,
+        EOFError,
+        MemoryError,
+        OverflowError,
+        NotImplementedError,
+        RecursionError,
+        UnicodeError,
+        BadZipFile,
+        zlib.error,
+    ) as error:
+        raise DescriptionError(f"{path}: damaged, expected {kind}: {_line(error)}") from error
 
 
 def read_npy(path: Path) -> Any:
@@ -170,48 +220,23 @@ def read_npy(path: Path) -> Any:
         DescriptionError: It cannot be read, is damaged, or its pickle names anything else than
             arrays, containers, texts and numbers.
     """
-    try:
-        size = path.stat().st_size
-        if size > MOST:
-            raise DescriptionError(f"{path}: found {size} bytes, expected {MOST} at most")
-        with path.open("rb") as file:
-            return _content(path, file)
-    except OSError as error:
-        raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
+    with reading(path, "an npy file"), path.open("rb") as file:
+        return _content(path, file)
 
 
 def _content(path: Path, file: BinaryIO) -> Any:
-    try:
-        version = np.lib.format.read_magic(file)
-        read = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }.get(version)
-        if read is None:
-            raise DescriptionError(f"{path}: found npy version {version}, expected 1.0 or 2.0")
-        shape, by_columns, dtype = read(file)
-        rest = file.read()
-        if not dtype.hasobject:
-            return _numbers(rest, dtype, shape, by_columns)
-        found = _Reader(io.BytesIO(rest)).load()
-    except pickle.UnpicklingError as error:
-        raise DescriptionError(
-            f"{path}: its pickle holds {_line(error)}, expected arrays, containers, texts and "
-            "numbers only"
-        ) from error
-    except (
-        ValueError,
-        TypeError,
-        AttributeError,
-        IndexError,
-        KeyError,
-        EOFError,
-        MemoryError,
-        OverflowError,
-        RecursionError,
-        UnicodeError,
-    ) as error:
-        raise DescriptionError(f"{path}: damaged, expected an npy file: {_line(error)}") from error
+    version = np.lib.format.read_magic(file)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(version)
+    if read is None:
+        raise DescriptionError(f"{path}: found npy version {version}, expected 1.0 or 2.0")
+    shape, by_columns, dtype = read(file)
+    rest = file.read()
+    if not dtype.hasobject:
+        return array_of(rest, dtype, shape, by_columns)
+    found = Reader(io.BytesIO(rest)).load()
     if isinstance(found, Packed) and found.value is None:
         return found.items[0] if found.shape == () else found.items
     return found

@@ -25,7 +25,7 @@ from casadi_ik.kernels.swing_kernel import ArmPlaces
 from casadi_ik.methods.common.arm_branches import arms_graph
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import ROUNDING, SceneCheck
-from casadi_ik.solving.alternatives.swings import arm_places
+from casadi_ik.solving.alternatives.arm_places import arm_places
 
 MOST = 1000
 """The largest capacity: each solid costs kilobytes."""

@@ -72,7 +72,9 @@ def trusted_cache() -> Path | None:
         real = Path(os.path.realpath(directory, strict=True))
         problem = distrust(real)
         if not problem:
-            next(real.iterdir(), None)
+            # Looked into, not listed: what is kept may be tens of thousands of files.
+            with os.scandir(real) as entries:
+                next(entries, None)
             return real
     except (OSError, ValueError) as error:
         problem = f"cannot be used: {reason(error)}"

@@ -9,7 +9,7 @@ from enum import StrEnum
 from functools import cached_property
 
 from casadi_ik.arrays import Array
-from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.contact_verdict import ContactVerdict, PalmVerdict
 from casadi_ik.problem.problems import Tolerance
 from casadi_ik.problem.proof import Proof
 
@@ -29,6 +29,14 @@ class Reason(StrEnum):
     LIMITS = "limits of actuators block the grasp"
     NOT_FOUND = "no solution was found, and no reason why there should be none"
     REACHABLE = "the contacts can be reached; the method did not find the way"
+
+
+OF_PALMS = {
+    Reason.HAND: "the hand cannot be as it is asked",
+    Reason.REACH: "the arm does not reach where the palm is asked",
+    Reason.REACHABLE: "the palm can be reached; the method did not find the way",
+}
+"""What the reasons are where a palm was asked for, not contacts; the others are the same."""
 
 
 @dataclass(frozen=True)
@@ -163,6 +171,8 @@ class Diagnosis:
         q: (n,) that configuration; a solution if the reason is `REACHABLE`.
         time: Seconds the diagnosis took; in a batch its share. Without the search for remedies.
         lazy: Where the remedies come from.
+        palm: How far the palm is off in the nearest configuration; None where contacts were asked
+            for.
 
     Example:
         >>> far.status.name, far.diagnosis.reason.name, far.diagnosis.hand.fits
@@ -182,6 +192,7 @@ class Diagnosis:
     q: Array
     time: float
     lazy: Lazy = field(repr=False)
+    palm: PalmVerdict | None = None
 
     @property
     def established(self) -> bool:
@@ -201,16 +212,20 @@ class Diagnosis:
     @property
     def lines(self) -> tuple[str, ...]:
         """What, by how much, and what would help: short lines in mm and degrees."""
+        reason = self.reason if self.palm is None else OF_PALMS.get(self.reason, self.reason)
         if self.reason is Reason.REACHABLE:
-            return (str(self.reason), "reachable: hand-first solves it")
+            return (str(reason), "reachable: hand-first solves it")
         likely = "" if self.established or self.reason is Reason.NOT_FOUND else "likely: "
-        lines = [f"{likely}{self.reason}", *self._why(), *self._grounds()]
+        lines = [f"{likely}{reason}", *self._why(), *self._grounds()]
         for relief in self._shown:
             far = ", ".join(
                 f"{name} {_length(value, relief.units[name])} {_side(value)}"
                 for name, value in relief.beyond.items()
             )
             lines.append(f"solvable with limits lifted: {far}")
+        if self.palm is not None:
+            off = _missed(self.palm.position_error, self.palm.angle_error)
+            return (*lines, f"nearest: the palm is {off}")
         fingers = [item.finger for item in self.freed if item.part == "finger"]
         normals = [item.finger for item in self.freed if item.part == "normal"]
         every = normals == ["all"]
@@ -230,7 +245,7 @@ class Diagnosis:
     def _grounds(self) -> tuple[str, ...]:
         """On what the reason rests."""
         if self.proof is not None:
-            return self.proof.lines
+            return self.proof.lines if self.palm is None else self.proof.lines_of_palm
         return (f"not proved; no solution from {self.searches} starts",)
 
     @property

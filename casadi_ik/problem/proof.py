@@ -74,6 +74,13 @@ class Proof:
         parts = "at once" if self.boxes == 1 else f"in each of {self.boxes} parts of its postures"
         return (f"proved for {who} {parts}: {self.kind}",)
 
+    @property
+    def lines_of_palm(self) -> tuple[str, ...]:
+        """The same where a palm was asked for, with the hand as it is."""
+        if self.kind is ProofKind.REACH:
+            return ("proved: the palm has the wrist where the arm does not reach",)
+        return (f"proved: {self.kind}",)
+
     def check(self, robot: ArmHand, target: Problems | None = None) -> bool:
         """Prove it again by other means: whether the proof holds and says what it said.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.contact_verdict import ContactVerdict, PalmVerdict
 from casadi_ik.problem.problems import Problems
 
 LIMIT_SLACK = 1e-9
@@ -31,6 +31,11 @@ class PalmVerdicts:
     position_error: Array
     angle_error: Array
     ok: NDArray[np.bool_]
+
+    def of(self, row: int) -> PalmVerdict:
+        """One of them."""
+        errors = float(self.position_error[row]), float(self.angle_error[row])
+        return PalmVerdict(*errors, bool(self.ok[row]))
 
 
 @dataclass(frozen=True, eq=False)

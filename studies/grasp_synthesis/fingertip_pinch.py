@@ -66,6 +66,7 @@ class TipPinchProblem:
         edge_margin: float,
         idle: Array,
         room: tuple[Array, Array],
+        apart: float = 0.0,
     ) -> None:
         """Build it.
 
@@ -79,6 +80,7 @@ class TipPinchProblem:
             edge_margin: Distance of contacts from edges [m].
             idle: (n,) where all other motors stand.
             room: (3,) corners [m] of where the object may be in the hand's root frame.
+            apart: Least distance [m] of two contacts on the same side: fingers have a width.
         """
         self.idle = idle
         self.motors = sorted({i for name in sides for i in robot.finger_actuators(name)})
@@ -122,7 +124,13 @@ class TipPinchProblem:
             )
             press = ca.dot(force, normals[i])
             cones += [press - PRESS, (1 + friction**2) * press**2 - ca.sumsqr(force)]
-        inequalities = ca.vertcat(*cones, *facing)
+        on = list(sides.values())
+        beside = [
+            ca.sumsqr(points[i] - points[j]) - (apart / LENGTH) ** 2
+            for i, j in pairs
+            if apart and on[i] == on[j]
+        ]
+        inequalities = ca.vertcat(*cones, *facing, *beside)
         cost = friction**2 + 0.02 * ca.sumsqr(motors**2)
         x = ca.vertcat(motors, place, turn, ca.vec(surface), squeeze, friction)
         self.found = ca.Function("found", [x], [q, rotation, place * LENGTH])

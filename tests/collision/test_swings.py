@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
+from casadi_ik.methods.common.arm_branches import arms_graph
 from casadi_ik.problem.preference import PREFERENCES
+from casadi_ik.solving.alternatives.arm_places import arm_places
 from casadi_ik.solving.alternatives.swings import ArmSwings
+from casadi_ik.symbolic.closed_arms.held import held_arm
 
 
 @pytest.fixture(scope="module")
@@ -113,3 +116,29 @@ def test_the_first_hand_of_a_target_with_an_arm_is_enough(swings, robot, hands, 
     np.testing.assert_array_equal(plain.owner, firsts)
     np.testing.assert_array_equal(plain.tried, compiled.tried)
     np.testing.assert_allclose(plain.q, compiled.q, atol=1e-9)
+
+
+def test_an_arm_with_a_wrist_is_seen_with_the_wrist_anywhere():
+    """All arms at the wrist of a posture have its palm; one of them is the posture's own."""
+    robot = ik.load_robot("ur5e+shadow")
+    arm = held_arm(robot.description)
+    assert arm is not None
+    assert len(arm.held) == 2
+    at = arms_graph(arm, "arms_of_wrist", "").function
+    columns = list(robot.description.arm_actuators)
+    places = arm_places(robot, arm)
+    for q in robot.random(np.random.default_rng(1), 4):
+        palm = robot.palm(q)
+        wrist = q[columns][list(arm.held)]
+        found = np.array(at(np.concatenate([palm[:3, :3].ravel(), palm[:3, 3], wrist]))).ravel()
+        arms, slack = found[:-8].reshape(8, len(columns)), found[-8:]
+        whole = np.tile(q, (8, 1))
+        whole[:, columns] = arms
+        reached = robot.palm(whole[slack >= 0])
+        np.testing.assert_allclose(reached, np.tile(palm, (len(reached), 1, 1)), atol=1e-8)
+        off = np.abs(np.angle(np.exp(1j * (arms - q[columns])))).max(axis=1)
+        assert off[slack >= 0].min() < 1e-6
+    for level in places.levels:
+        assert level.shape[1] == 2
+        assert (level >= robot.lower[columns][list(arm.held)]).all()
+        assert (level <= robot.upper[columns][list(arm.held)]).all()

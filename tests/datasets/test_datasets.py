@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from make_grasp_sets import TABLES, made
+from make_grasp_sets import ROBOTS, TABLES, made
 
 import casadi_ik as ik
+from casadi_ik.cli.report import reasons
 from casadi_ik.datasets.conventions import load_convention
 from casadi_ik.datasets.hands import link_poses
 from casadi_ik.errors import DescriptionError, UnknownNameError, UnsupportedError
@@ -50,8 +51,7 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
 def test_conventions_agree_with_the_published_hands(name: str) -> None:
     """Where the last joints of the fingers are by another library in the published model."""
     published, convention = PUBLISHED[name], load_convention(name)
-    hand = {"allegro": "panda+allegro_right", "leap": "panda+leap", "shadow": "ur5e+shadow"}
-    described = ik.load_robot(hand[name.split("_")[1]]).description
+    described = ik.load_robot(ROBOTS.get(name.split("_")[1], KUKA)).description
     joints = {
         convention.joints[key][0]: np.array([convention.joints[key][1] * value])
         for key, value in published["joints"].items()
@@ -103,6 +103,18 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     assert missed.status is ik.Status.UNREACHABLE
     assert missed.palm is not None
     assert not missed.palm.ok
+    assert missed.diagnosis is not None
+    assert missed.diagnosis.palm is not None
+    assert missed.diagnosis.palm.position_error > 1
+    said = reasons(solver, missed)
+    assert "the arm does not reach where the palm is asked" in said
+    assert "proved: the palm has the wrist where the arm does not reach" in said
+    assert any(line.startswith("the palm misses its place by ") for line in said)
+    assert not any(finger in line for line in said for finger in (*robot.fingers, "contact"))
+    assert far.palm is not None
+    (again,) = solver.solve_palms(far.palm[None], far.posture, diagnose=True).diagnoses
+    assert again is not None
+    assert again.palm is not None
 
 
 def test_many_palms() -> None:
@@ -285,16 +297,14 @@ def test_nothing_in_a_pickle_is_run(build: Any, tmp_path: Path) -> None:
     assert not flag.exists()
 
 
-def test_damaged_pickles(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["getagrip_allegro", "multidex_allegro"])
+def test_damaged_pickles(name: str, tmp_path: Path) -> None:
     """Every cut and many changes of a file end in one line, or in grasps."""
-    whole = made("getagrip_allegro", tmp_path).path.read_bytes()
-    robot, path, rng = (
-        ik.load_robot("panda+allegro_right"),
-        tmp_path / "cut.npy",
-        np.random.default_rng(0),
-    )
+    written = made(name, tmp_path).path
+    whole, path = written.read_bytes(), tmp_path / f"cut{written.suffix}"
+    robot, rng = ik.load_robot("panda+allegro_right"), np.random.default_rng(0)
     begun = whole.index(pickle.PROTO, 10)
-    for trial in range(300):
+    for trial in range(150):
         data = bytearray(whole)
         if trial % 3 == 0:
             del data[int(rng.integers(len(data))) :]

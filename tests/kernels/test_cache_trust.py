@@ -177,6 +177,19 @@ def test_a_sticky_folder_above_is_enough(directory: Path) -> None:
         assert folders.trusted_cache() is None
 
 
+def test_a_folder_is_looked_into_and_not_listed(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To list tens of thousands of files for each library takes longer than a solve."""
+    directory.mkdir(mode=0o700)
+
+    def listed(*_: object) -> list[str]:
+        raise AssertionError("listed")
+
+    monkeypatch.setattr(os, "listdir", listed)
+    assert folders.trusted_cache() == Path(os.path.realpath(directory))
+
+
 def test_a_folder_is_made_for_the_user_alone(
     directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,9 @@
 enum { HALF_SPACE, CAPSULE, BOX, CYLINDER, CONVEX };
 enum { MOST_CUTS = 40 };
 
+/* So many planes of a convex solid, which are spread all around, tell whether it is far away. */
+enum { FEW = 64 };
+
 /* Where tangents and function agree to this [m], the least is found. */
 #define CLOSE 1e-7
 #define TINY 1e-30
@@ -71,32 +74,78 @@ LANES_INLINE along of_cylinder(const solid *one, vector p, vector h) {
   return (along) {lanes_select(outside, out, larger(a, b)), lanes_select(outside, outer, inner)};
 }
 
-LANES_INLINE along of_planes(const double *plane, int64_t count, vector p, vector h) {
-  along found = {SPREAD(-INFINITY), SPREAD(0.0)};
-  for (; count--; plane += 4) {
-    const lanes value = p.x * plane[0] + p.y * plane[1] + p.z * plane[2] - plane[3];
-    const lane_mask higher = value > found.value;
-    const lanes slope = h.x * plane[0] + h.y * plane[1] + h.z * plane[2];
-    found.value = lanes_select(higher, value, found.value);
-    found.slope = lanes_select(higher, slope, found.slope);
-  }
-  return found;
+/* A convex solid's planes along a segment: a straight line each, of which the highest counts. */
+typedef struct { lanes *line; int64_t count; } envelope;
+
+LANES_INLINE along higher_of(along a, along b) {
+  const lane_mask higher = b.value > a.value;
+  return (along) {lanes_select(higher, b.value, a.value), lanes_select(higher, b.slope, a.slope)};
 }
 
-static LANES_TARGET along from_solid(const clearance_job *job, const solid *one, vector c, vector h,
+LANES_INLINE along at_line(const lanes *line, lanes t) {
+  return (along) {line[0] + t * line[1], line[1]};
+}
+
+LANES_INLINE along highest(envelope planes, lanes t) {
+  const along none = {SPREAD(-INFINITY), SPREAD(0.0)};
+  const lanes *line = planes.line, *end = line + 2 * planes.count;
+  /* Four at a time: each comparison waits for the one before. */
+  along a = none, b = none, c = none, d = none;
+  for (; line + 8 <= end; line += 8) {
+    a = higher_of(a, at_line(line, t));
+    b = higher_of(b, at_line(line + 2, t));
+    c = higher_of(c, at_line(line + 4, t));
+    d = higher_of(d, at_line(line + 6, t));
+  }
+  for (; line < end; line += 2) a = higher_of(a, at_line(line, t));
+  return higher_of(higher_of(a, b), higher_of(c, d));
+}
+
+/* The lines of some planes; their highest in the middle is what is given. */
+static LANES_TARGET lanes of_planes(const double *plane, vector c, vector h, lanes *line,
+                                    int64_t first, int64_t last) {
+  lanes most[4];
+  int64_t i, k;
+  plane += 4 * first;
+  line += 2 * first;
+  for (k = 0; k < 4; ++k) most[k] = SPREAD(-INFINITY);
+  for (i = first; i < last; ++i, plane += 4, line += 2) {
+    line[0] = c.x * plane[0] + c.y * plane[1] + c.z * plane[2] - plane[3];
+    line[1] = h.x * plane[0] + h.y * plane[1] + h.z * plane[2];
+    most[i % 4] = larger(most[i % 4], line[0]);
+  }
+  return larger(larger(most[0], most[1]), larger(most[2], most[3]));
+}
+
+/* Without the lines that in no lane still looked at come up to a bound between two places. */
+static LANES_TARGET int64_t thinned(envelope planes, lanes low, lanes high, lanes bound,
+                                    lane_mask over) {
+  int64_t i, kept = 0;
+  for (i = 0; i < planes.count; ++i) {
+    const lanes value = planes.line[2 * i], slope = planes.line[2 * i + 1];
+    const lanes most = larger(value + low * slope, value + high * slope);
+    if (lanes_all((most < bound) | over)) continue;
+    planes.line[2 * kept] = value;
+    planes.line[2 * kept + 1] = slope;
+    ++kept;
+  }
+  return kept;
+}
+
+static LANES_TARGET along from_solid(const solid *one, vector c, vector h, envelope planes,
                                      lanes t) {
   const vector p = at(c, h, t);
   if (one->kind == BOX) return of_box(one, p, h);
   if (one->kind == CYLINDER) return of_cylinder(one, p, h);
-  return of_planes(job->planes + 4 * one->first, one->planes, p, h);
+  return highest(planes, t);
 }
 
 /* Lower bound of the least of the convex distance along a segment in the solid's frame. */
-static LANES_TARGET lanes lowest(const clearance_job *job, const solid *one, vector c, vector h) {
+static LANES_TARGET lanes lowest(const solid *one, vector c, vector h, envelope planes) {
   const lanes zero = SPREAD(0.0);
   lanes low = SPREAD(-1.0), high = SPREAD(1.0), best, bound, found = zero;
   lane_mask over = (lane_mask) zero;
-  along left = from_solid(job, one, c, h, low), right = from_solid(job, one, c, h, high);
+  along left = from_solid(one, c, h, planes, low), right = from_solid(one, c, h, planes, high);
   const lane_mask falls = left.slope < zero, rises = right.slope > zero;
   const lanes ends = lanes_select(falls, right.value, left.value);
   const lane_mask inner = falls & rises;
@@ -116,7 +165,7 @@ static LANES_TARGET lanes lowest(const clearance_job *job, const solid *one, vec
     if (cut == MOST_CUTS || lanes_all(over)) break;
     /* Where the tangents meet; every third time the middle, since flat ends creep. */
     t = cut % 3 == 2 ? (low + high) * 0.5 : smaller(larger(meet, low), high);
-    here = from_solid(job, one, c, h, t);
+    here = from_solid(one, c, h, planes, t);
     best = smaller(best, here.value);
     left_side = here.slope < zero;
     low = lanes_select(left_side, t, low);
@@ -125,6 +174,7 @@ static LANES_TARGET lanes lowest(const clearance_job *job, const solid *one, vec
     high = lanes_select(left_side, high, t);
     right.value = lanes_select(left_side, right.value, here.value);
     right.slope = lanes_select(left_side, right.slope, here.slope);
+    if (planes.count > 1) planes.count = thinned(planes, low, high, bound - CLOSE, over);
   }
   return lanes_select(inner, found, ends);
 }
@@ -132,7 +182,9 @@ static LANES_TARGET lanes lowest(const clearance_job *job, const solid *one, vec
 /* Distance of a capsule's segment from a solid, less `radius`; where the least distances are below
  * what this can be at all, anything above them. */
 static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, const lanes *pose,
-                                    vector c, vector h, double half, double radius, lanes least) {
+                                    vector c, vector h, double half, double radius, lanes least,
+                                    lanes *lines) {
+  const envelope planes = {lines, one->kind == CONVEX ? one->planes : 0};
   const vector x = load(pose), y = load(pose + 3), z = load(pose + 6);
   const vector r = minus(c, load(pose + 9));
   vector place, way;
@@ -155,21 +207,36 @@ static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, 
   way.x = x.x * h.x + y.x * h.y + z.x * h.z;
   way.y = x.y * h.x + y.y * h.y + z.y * h.z;
   way.z = x.z * h.x + y.z * h.y + z.z * h.z;
-  sure = from_solid(job, one, place, way, SPREAD(0.0)).value - (half + radius);
+  if (one->kind == CONVEX) {
+    const double *plane = job->planes + 4 * one->first;
+    const int64_t some = planes.count < FEW ? planes.count : FEW;
+    sure = of_planes(plane, place, way, lines, 0, some);
+    if (lanes_all(sure - (half + radius) >= least)) return sure - (half + radius);
+    sure = larger(sure, of_planes(plane, place, way, lines, some, planes.count));
+  } else {
+    sure = from_solid(one, place, way, planes, SPREAD(0.0)).value;
+  }
+  sure -= half + radius;
   if (lanes_all(sure >= least) || half == 0) return sure;
-  return lowest(job, one, place, way) - radius;
+  return lowest(one, place, way, planes) - radius;
 }
 
 EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
   workspace space;
-  lanes *q, *placed, *poses;
-  int64_t ticks = 0, k;
+  lanes *q, *placed, *poses, *lines;
+  const size_t places = 6 * N_CAPSULES + 12 * (N_OWN + (size_t) job->n_solids);
+  int64_t ticks = 0, most = 0, k;
   double limit;
-  int lane, outcome = set_up(&space, N_Q + 6 * N_CAPSULES + 12 * (N_OWN + (size_t) job->n_solids));
+  int lane, outcome;
+  for (k = 0; k < N_OWN + job->n_solids; ++k) {
+    if (job->solids[k].planes > most) most = job->solids[k].planes;
+  }
+  outcome = set_up(&space, N_Q + places + 2 * (size_t) most);
   if (outcome != DONE) return outcome;
   q = space.extra;
   placed = q + N_Q;
   poses = placed + 6 * N_CAPSULES + 12 * N_OWN;
+  lines = placed + places;
   limit = monotonic() + job->slice;
   for (k = 0; k < 12 * job->n_solids; ++k) poses[k] = SPREAD(job->poses[k]);
   for (; job->next < job->count; job->next += LANES) {
@@ -210,7 +277,7 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
       } else {
         const int64_t number = j - N_CAPSULES;
         distance = off_solid(job, job->solids + number, placed + 6 * N_CAPSULES + 12 * number, c, h,
-                             half, radius, enough);
+                             half, radius, enough, lines);
       }
       if (job->every) {
         for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {

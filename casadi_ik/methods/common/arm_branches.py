@@ -6,6 +6,7 @@ import casadi as ca
 
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.symbolic.closed_arms.form import SIGNS, ClosedForm
+from casadi_ik.symbolic.closed_arms.held import HeldArm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.srs_arm import SrsArm, at_angle, euler_angles, limit_roots, swivel
 from casadi_ik.symbolic.subexpressions import shared
@@ -64,7 +65,33 @@ def form_at(form: ClosedForm) -> ca.Function:
     return ca.Function("form_at", inputs, shared(arms, slack))
 
 
-def arms_graph(arm: SrsArm | ClosedForm, name: str, recipe: str) -> FunctionGraph:
+def held_at(arm: HeldArm) -> ca.Function:
+    """The eight arms with the held joints at given angles.
+
+    Returns:
+        (rotation (3, 3), origin (3, 1) [m], angles of the held joints and position of the swept
+        one, if there is one [rad]) -> configurations (8, n) [rad] of the whole arm and the slack
+        (8, 1) of each, as `form_at`.
+    """
+    rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
+    held = len(arm.held)
+    place = ca.SX.sym("place", places_of(arm))
+    angles, position = place[:held], place[held] if arm.form.swept else ca.SX(0)
+    seen = arm.seen(Pose(rotation, origin), angles)
+    found, slack = form_at(arm.form)(seen.rotation, seen.origin, position)
+    rows = [arm.joined(found[i, :].T, angles).T for i in range(len(SIGNS))]
+    outputs = shared(ca.vertcat(*rows), slack)
+    return ca.Function("held_at", [rotation, origin, place], outputs)
+
+
+def places_of(arm: SrsArm | ClosedForm | HeldArm) -> int:
+    """How many numbers say at which place of its freedom an arm is, see `arms_graph`."""
+    if isinstance(arm, HeldArm):
+        return len(arm.held) + bool(arm.form.swept)
+    return 2 if isinstance(arm, SrsArm) else 1
+
+
+def arms_graph(arm: SrsArm | ClosedForm | HeldArm, name: str, recipe: str) -> FunctionGraph:
     """All arms at a place of what the arm is free in, of one vector.
 
     Args:
@@ -74,18 +101,22 @@ def arms_graph(arm: SrsArm | ClosedForm, name: str, recipe: str) -> FunctionGrap
 
     Returns:
         Rotation (9, row by row), origin (3) [m], and of an S-R-S arm elbow sign and swivel [rad],
-        of another the position of its swept joint [rad] -> the joints of the arm of every side one
-        after the other [rad], then the slack of each: >= 0 within reach.
+        of another the angles of its held joints, if it has any, and the position of its swept
+        joint [rad] -> the joints of the arm of every side one after the other [rad], then the
+        slack of each: >= 0 within reach.
     """
     alone = isinstance(arm, SrsArm)
     sides, joints = (len(SIDES), 7) if isinstance(arm, SrsArm) else (len(SIGNS), len(arm.screws))
-    size = 12 + (2 if alone else 1)
+    size = 12 + places_of(arm)
 
     def build() -> ca.Function:
         x = ca.SX.sym("x", size)
         palm = [ca.reshape(x[:9], 3, 3).T, x[9:12]]
-        at = arm_at(arm) if isinstance(arm, SrsArm) else form_at(arm)
-        arms, slack = at(*palm, *ca.vertsplit(x[12:]))
+        if isinstance(arm, HeldArm):
+            arms, slack = held_at(arm)(*palm, x[12:])
+        else:
+            at = arm_at(arm) if isinstance(arm, SrsArm) else form_at(arm)
+            arms, slack = at(*palm, *ca.vertsplit(x[12:]))
         slacks = ca.repmat(slack, sides, 1) if alone else slack
         return ca.Function(name, [x], shared(ca.vertcat(ca.vec(arms.T), slacks)), ["x"], ["arms"])
 

@@ -15,7 +15,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
 from casadi_ik.problem.collision_report import CollisionReport
 from casadi_ik.problem.preference import CLEARANCE
@@ -212,13 +214,8 @@ class FreeSearch:
         robot = self.finder.robot
         count = STARTS if self.swings is None else HANDS
         owner = np.repeat(rows, count)
-        # Row by row, so that a target's starts do not depend on the others of a batch.
-        starts = np.concatenate(
-            [
-                robot.random(np.random.default_rng([self.seed, int(row)]), count)
-                for row in (self.problems.number(int(r)) for r in rows)
-            ]
-        )
+        numbers = np.array([self.problems.number(int(row)) for row in rows])
+        starts = np.concatenate(_shifted(robot, self.seed, numbers, count))
         last = self.hands[0][0]
         starts[::2, hand] = last[owner[::2]][:, hand]
         ends = self._descent.run(owner, self.limits.of(owner).clip(starts))
@@ -301,6 +298,18 @@ class FreeSearch:
         _, mine, _ = self._arms(q[kept], owner[kept], any_room, around, "limits")
         possible[mine] = True
         return possible
+
+
+def _shifted(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -> Array:
+    """(k, count, n) configurations, spread over the limits for each target in its own way.
+
+    A random cloud, for each target shifted around in the limits, by its number alone: whichever
+    others are looked at with it.
+    """
+    cloud = np.random.default_rng(seed).random((count, len(robot.lower)))
+    shift = numbers[:, None] * even_steps(len(robot.lower))
+    part = (cloud + shift[:, None]) % 1.0
+    return robot.lower + part * (robot.upper - robot.lower)
 
 
 def score_of(

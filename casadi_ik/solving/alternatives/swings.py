@@ -15,23 +15,13 @@ from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.measure_kernel import MeasureKernel
 from casadi_ik.kernels.recipe import recipe
-from casadi_ik.kernels.swing_kernel import ArmPlaces, Checked, Order, SwingKernel
-from casadi_ik.methods.common.arm_branches import SIDES, arms_graph
-from casadi_ik.methods.common.arm_placement import ALLOWED
+from casadi_ik.kernels.swing_kernel import Checked, Order, SwingKernel
+from casadi_ik.methods.common.arm_branches import arms_graph
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
 from casadi_ik.problem.preference import CLEARANCE
-from casadi_ik.symbolic.closed_arms.form import SIGNS
+from casadi_ik.solving.alternatives.arm_places import arm_places
+from casadi_ik.symbolic.closed_arms.held import HeldArm
 from casadi_ik.symbolic.closed_arms.recognise import ArmForm
-from casadi_ik.symbolic.srs_arm import SrsArm
-
-SWIVELS = 12
-"""Swivels looked at all around, for every branch."""
-
-BETWEEN = 1
-"""So many more between each two of them, where nothing is found."""
-
-CLOSER = 13
-"""Swivels looked at around the one that was taken."""
 
 TURN = 2 * np.pi
 
@@ -65,13 +55,13 @@ class ArmSwings:
     """The branches and swivels of one arm in closed form.
 
     A swivel is the angle of an S-R-S arm's elbow, or the position of another arm's swept joint; an
-    arm of six joints has none.
+    arm of six joints has none. An arm with a wrist beside these is free in that, too.
     """
 
     def __init__(
         self,
         robot: ArmHand,
-        arm: ArmForm,
+        arm: ArmForm | HeldArm,
         measure: Callable[[], FunctionKernel],
         compiled: bool = True,
     ) -> None:
@@ -179,40 +169,6 @@ def _first_hands(swung: Swung, of_one: NDArray[np.intp] | None) -> Swung:
     for one, hand in zip(whose[starts].tolist(), swung.owner[starts].tolist(), strict=True):
         tried[(of_one == one) & (np.arange(len(tried)) > hand)] = 0
     return Swung(swung.q[kept], swung.owner[kept], tried)
-
-
-def arm_places(robot: ArmHand, arm: ArmForm) -> ArmPlaces:
-    """Where the arms of a robot are looked at."""
-    columns = list(robot.description.arm_actuators)
-    sides, first, last = len(SIDES), 0.0, TURN
-    swept = True
-    if not isinstance(arm, SrsArm):
-        sides, swept = len(SIGNS), arm.swept_joint is not None
-        if arm.swept_joint is not None:
-            low, high = (ends[columns[arm.swept_joint]] for ends in (robot.lower, robot.upper))
-            middle, half = (low + high) / 2, min((high - low) / 2, np.pi)
-            first, last = middle - half, middle + half
-    step = (last - first) / SWIVELS
-    middles = first + step * (np.arange(SWIVELS) + 0.5)
-    between = np.arange(1, BETWEEN + 1) / (BETWEEN + 1)
-    levels = [middles, (middles[:, None] + step * between).ravel()]
-    if not swept:
-        levels = [np.zeros(1), np.zeros(0)]
-    placed = [level[:, None] for level in levels]
-    if isinstance(arm, SrsArm):
-        placed = [
-            np.vstack([np.insert(one, 0, sign, axis=1) for sign in (1, -1)]) for one in placed
-        ]
-    closer = step * np.linspace(-1, 1, CLOSER + 2)[1:-1] if swept else np.zeros(0)
-    return ArmPlaces(
-        np.array(columns, dtype=np.int64),
-        robot.lower[columns],
-        robot.upper[columns],
-        sides,
-        (placed[0], placed[1]),
-        closer,
-        ALLOWED,
-    )
 
 
 class _Slow:

@@ -24,7 +24,7 @@ from casadi_ik.problem.diagnosis import (
 )
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.proof import Proof, ProofKind
-from casadi_ik.problem.verdict import Verdict, deviations, judge
+from casadi_ik.problem.verdict import Verdict, deviations, judge, judge_palms
 from casadi_ik.solving.diagnosis.minimax import Closest, closest
 from casadi_ik.solving.diagnosis.palm_free import HandFits, PalmFree
 from casadi_ik.solving.diagnosis.prover import MOST, Prover
@@ -90,11 +90,12 @@ class Diagnostician:
         self.method.prepare()
         if problems.fixed is not None and problems.fixed.ndim > 1:
             # Hands that are held differently have nothing in common.
-            return [
+            found_alone = [
                 self.diagnose(_held_alone(problems, row), q0[row : row + 1], near)[0]
                 for row in range(len(problems))
                 for near in [None if nearest is None else nearest[row : row + 1]]
             ]
+            return _of_palms(self.robot, problems, found_alone)
         known = np.zeros(len(problems), dtype=bool)
         clock = _Clock(np.zeros(len(problems)))
         if nearest is None:
@@ -300,6 +301,20 @@ def _held_alone(problems: Problems, row: int) -> Problems:
     one = problems.rows(slice(row, row + 1))
     assert one.fixed is not None
     return replace(one, fixed=one.fixed[0], palms=None)
+
+
+def _of_palms(robot: ArmHand, problems: Problems, found: list[Diagnosis]) -> list[Diagnosis]:
+    """Diagnoses by the contacts that palms lead to, with what they say of the palms."""
+    palms = judge_palms(robot, problems, np.stack([one.q for one in found]))
+    if palms is None:
+        return found
+    told = []
+    for row, one in enumerate(found):
+        verdict = palms.of(row)
+        # Contacts can be met within their tolerances by a palm that is not.
+        short = one.reason is Reason.REACHABLE and not verdict.ok
+        told.append(replace(one, palm=verdict, reason=Reason.NOT_FOUND if short else one.reason))
+    return told
 
 
 def _reachable(

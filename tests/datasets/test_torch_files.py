@@ -1,0 +1,77 @@
+"""Files of torch, read without torch: what one of its own holds, and what is wrong with others."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+from torch_zip import write_torch
+
+import casadi_ik as ik
+from casadi_ik.datasets.torch_files import read_torch
+from casadi_ik.errors import DescriptionError
+
+
+def test_a_file_that_torch_wrote() -> None:
+    """By torch 2.13: strides, kinds of numbers, empty and single ones; grasps of two objects."""
+    path = Path(__file__).parent / "written_by_torch.pt"
+    found = read_torch(path)
+    assert found["view"].value.tolist() == np.arange(12.0).reshape(3, 4).T[1:].tolist()
+    assert [kind.value.tolist() for kind in found["kinds"]] == [[0, 1, 2]] * 7
+    assert found["flag"].value.tolist() == [True, False]
+    assert found["scalar"].value == 2.5
+    assert found["empty"].value.shape == (0, 3)
+    assert found["info"] == {"num": 3}
+    robot = "panda+allegro_right"
+    grasps = ik.load_candidates(path, robot, of="contactdb+apple")
+    assert [grasp.palm is not None and len(grasp.posture) for grasp in grasps] == [16, 16]
+    assert grasps[1].posture["allegro_thumb_3"] == pytest.approx(0.45)
+    says = r"found grasps of 2 objects \(contactdb\+apple, ycb\+pear\), expected one; say which"
+    with pytest.raises(DescriptionError, match=says):
+        ik.load_candidates(path, robot)
+    with pytest.raises(DescriptionError, match="of: found 'cup', expected one of 2 objects"):
+        ik.load_candidates(path, robot, of="cup")
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ({"metadata": []}, "metadata: expected a list of at least one grasp"),
+        ({"metadata": [(np.zeros(25),)]}, "metadata: row 0: expected q and the name"),
+        ({"metadata": [(np.zeros(25), "a")]}, "row 0: rotation: holds NaN"),
+        ({"metadata": [(np.zeros(9), "a")]}, r"row 0: q: found shape \(9,\), expected"),
+        ({"metadata": [(np.ones(25), "a"), (np.ones(24), "a")]}, r"row 1: q: .* expected \(25,\)"),
+        ({"grasps": 1}, "its layout is none of"),
+    ],
+)
+def test_bad_torch_files(content: Any, says: str, tmp_path: Path) -> None:
+    write_torch(tmp_path / "set.pt", content)
+    with pytest.raises(DescriptionError, match=says) as caught:
+        ik.load_candidates(tmp_path / "set.pt", "panda+allegro_right")
+    assert "\n" not in str(caught.value)
+
+
+def test_torch_files_of_other_kinds(tmp_path: Path) -> None:
+    """The format before torch 1.6, no torch file at all, and tensors beyond their numbers."""
+    path = tmp_path / "set.pt"
+    path.write_bytes(pickle.dumps(0x1950A86A20F9469CFC6C, 2))
+    with pytest.raises(DescriptionError, match=r"before torch 1\.6, .*: torch\.save\(torch\.load"):
+        read_torch(path)
+    path.write_bytes(b"x,y,z")
+    with pytest.raises(DescriptionError, match="found no zip, expected a file of torch"):
+        read_torch(path)
+    write_torch(path, {"a": np.arange(4.0)})
+    size, more = (pickle.BININT + n.to_bytes(4, "little") + pickle.TUPLE for n in (4, 9))
+    with ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    assert entries["set/data.pkl"].count(size) == 2  # of the raw file, then of the tensor
+    head, shape = entries["set/data.pkl"].rsplit(size, 1)
+    with ZipFile(path, "w") as archive:
+        for name, data in (entries | {"set/data.pkl": head + more + shape}).items():
+            archive.writestr(name, data)
+    with pytest.raises(DescriptionError, match="a tensor that is larger than its numbers"):
+        read_torch(path)
