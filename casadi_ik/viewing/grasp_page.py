@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
@@ -25,6 +26,9 @@ from casadi_ik.viewing.newest import Newest
 from casadi_ik.viewing.panel import Panel
 from casadi_ik.viewing.robot_parts import robot_parts
 from casadi_ik.viewing.stage import look_at_robot, set_stage
+
+PANELS = 0.1
+"""So far apart the motors are shown while something is dragged [s]."""
 
 LEGEND = (
     (palette.TARGET, "asked for: drag it"),
@@ -76,7 +80,8 @@ class GraspPage:
         self._answered_for: Asked | None = asked
         self._listed_for: Asked | None = None
         self.solutions: tuple[Alternative, ...] = ()
-        self._moving, self._dragged, self._forward = "", "", not solved
+        self._dragged, self._forward = "", not solved
+        self._motors_shown = 0.0
         set_stage(server, asked.name or robot.name, _lowest(asked))
         look_at_robot(server, robot, self.answer.q)
         self._drawn = DrawnRobot(server, robot, robot_parts(robot, meshes))
@@ -174,7 +179,6 @@ class GraspPage:
         """Give something its handles; "" takes them all away."""
 
         def work() -> None:
-            self._moving = name
             self._contacts.select(name)
             self._things.select(name)
             self._panel.selected(name)
@@ -192,6 +196,8 @@ class GraspPage:
             self._answered_for = self.asked
             self.solutions = ()
         self.draw(self.answer)
+        if time.monotonic() - self._motors_shown > PANELS:
+            self._show_motors()
 
     def draw(self, answer: Answered) -> None:
         """Show an answer."""
@@ -226,6 +232,7 @@ class GraspPage:
         self._panel.tell_solutions(found)
 
     def _show_motors(self) -> None:
+        self._motors_shown = time.monotonic()
         self._panel.tell_motors(self.answer.q, self.robot.joints(self.answer.q))
 
     def stop(self) -> None:

@@ -1,8 +1,8 @@
 """What a page is asked to do, done in a thread of its own: of each thing only the newest.
 
 Whoever drags sends twenty changes a second, whatever a solve takes. Each change has a key; one that
-was not begun when another of its key comes is dropped. The thread that talks to the browsers only
-ever puts a change down and goes on.
+was not begun when another of its key comes is dropped. What can wait is begun once the hand rests,
+and given up when it moves on. The thread that talks to the browsers only ever puts a change down.
 """
 
 from __future__ import annotations
@@ -11,9 +11,14 @@ import logging
 import threading
 from collections.abc import Callable
 
+from casadi_ik.kernels.cancellation import CancelledError, cancellable
+
 logger = logging.getLogger(__name__)
 
 Work = Callable[[], None]
+
+REST = 0.15
+"""So long nothing has come when what can wait is begun [s]; in a drag, changes are 0.05 s apart."""
 
 
 class Newest:
@@ -24,12 +29,15 @@ class Newest:
 
         Args:
             refresh: Called after changes, once for all that were waiting.
-            later: Called after that one by one, as long as nothing new comes.
+            later: Called one by one when nothing has come for a while; begun anew after the next
+                change if that comes in between.
         """
         self._refresh, self._later = refresh, later
         self._changes: dict[str, Work] = {}
         self._something = threading.Condition()
         self._busy = self._stopped = False
+        self._awaited = 0
+        self._moved_on = threading.Event()
         self.dropped = 0
         self._thread = threading.Thread(target=self._run, name="casadi-ik view", daemon=True)
         self._thread.start()
@@ -40,32 +48,51 @@ class Newest:
             if self._changes.pop(key, None) is not None:
                 self.dropped += 1
             self._changes[key] = change
+            self._moved_on.set()
             self._something.notify_all()
 
     def settle(self, seconds: float = 30.0) -> bool:
-        """Wait until everything is done; False if it takes longer."""
+        """Wait until everything is done, what can wait as well; False if it takes longer."""
         with self._something:
-            return self._something.wait_for(lambda: not (self._busy or self._changes), seconds)
+            self._awaited += 1
+            self._something.notify_all()
+            try:
+                return self._something.wait_for(lambda: not (self._busy or self._changes), seconds)
+            finally:
+                self._awaited -= 1
 
     def stop(self) -> None:
         """End the thread after what it is doing."""
         with self._something:
             self._stopped = True
+            self._moved_on.set()
             self._something.notify_all()
         if threading.current_thread() is not self._thread:
             self._thread.join(10.0)
 
     def _run(self) -> None:
         while self._wait():
-            changes = self._take()
-            for change in changes:
+            for change in self._take():
                 self._do(change)
             self._do(self._refresh)
-            for work in self._later:
-                with self._something:
-                    if self._changes or self._stopped:
-                        break
-                self._do(work)
+            if self._later and self._rests():
+                self._do_later()
+
+    def _do_later(self) -> None:
+        try:
+            with cancellable(self._moved_on):
+                for work in self._later:
+                    self._do(work)
+        except CancelledError:
+            logger.debug("given up for something newer")
+
+    def _rests(self) -> bool:
+        """Whether nothing comes for a while; at once if somebody waits for everything."""
+        with self._something:
+            self._something.wait_for(
+                lambda: self._changes or self._stopped or self._awaited, timeout=REST
+            )
+            return not (self._changes or self._stopped)
 
     def _wait(self) -> bool:
         with self._something:
@@ -79,6 +106,8 @@ class Newest:
         with self._something:
             changes = list(self._changes.values())
             self._changes.clear()
+            if not self._stopped:
+                self._moved_on.clear()
         return changes
 
     def _do(self, work: Work) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.files.reading import Frame, frame_matrix
+from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.viewing import newest
 from casadi_ik.viewing.asked import asked_of
 from casadi_ik.viewing.bodies import arrow, body_of, sharp
 from casadi_ik.viewing.frames import facing, pose_of, quaternions
@@ -118,6 +121,41 @@ def test_only_the_newest_change_of_a_key_is_done() -> None:
     # The first was under way; of the five that waited the last is done, and drawn once with "cup".
     assert done == ["first", "drawn", "thumb 4", "cup", "drawn", "later"]
     assert work.dropped == 4
+    work.stop()
+
+
+def test_what_can_wait_is_given_up_when_the_hand_moves_on() -> None:
+    begun, done = threading.Event(), []
+
+    def long() -> None:
+        begun.set()
+        while not done:
+            stop_if_cancelled()
+            time.sleep(0.001)
+        done.append("later")
+
+    work = Newest(lambda: None, (long,))
+    work.put("thumb", lambda: None)
+    assert begun.wait(10)
+    work.put("thumb", lambda: done.append("thumb"))
+    assert work.settle(10)
+    assert done == ["thumb", "later"]
+    work.stop()
+
+
+def test_nothing_that_can_wait_is_begun_before_the_hand_rests(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(newest, "REST", 60.0)
+    drawn, done = threading.Event(), []
+    work = Newest(drawn.set, (lambda: done.append("later"),))
+    work.put("thumb", lambda: None)
+    assert drawn.wait(10)
+    time.sleep(0.02)
+    assert done == []
+    # Whoever waits for everything does not wait for that.
+    assert work.settle(10)
+    assert done == ["later"]
     work.stop()
 
 

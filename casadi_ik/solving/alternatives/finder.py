@@ -14,6 +14,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
+from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.contact_verdict import ContactVerdict
@@ -225,6 +226,7 @@ class AlternativeFinder:
 
         found = []
         for branch in self._branches.find(palm, lower, upper):
+            stop_if_cancelled()
             arm, swivel = best_arm(
                 self._branches,
                 palm,
