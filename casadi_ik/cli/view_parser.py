@@ -48,8 +48,8 @@ def add_view(commands: Any) -> None:
     parser.add_argument(
         "--scene",
         metavar="FILE",
-        help="what answers must not touch: a shipped name or a YAML file (default: nothing is "
-        "checked)",
+        help="what answers must not touch, beside a log what stood there: a shipped name or a YAML "
+        "file (default: nothing)",
     )
     parser.add_argument("--method", metavar="M", help="to begin with; the page can change it")
     parser.add_argument(
