@@ -1,9 +1,10 @@
 """How well, how smoothly and how fast is a hand led by fingertip positions alone?
 
 A robot moves as random smooth postures do; a follower is given nothing but where the fingertips are
-in every frame, arm and hand together, and in a second run the palm's pose too, softly. Beside it
-stands what is published for retargeting of a hand alone::
+in every frame, arm and hand together, and in a second run the palm's pose too, softly. Beside it,
+if it is installed, dex-retargeting leads a hand alone, and so does the follower::
 
+    pip install dex-retargeting torch six trimesh  # the last three it imports and does not name
     python studies/teleoperation.py --report out/teleoperation
 """
 
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from moving_study.paths import smooth_path
+from peer_retargeting import beside
 from rich.console import Console
 from runner import markdown_table, write_page
 
@@ -39,14 +41,6 @@ keeps to limits of position, velocity and acceleration. *Error:* of fingertips, 
 first second. *Roughness:* largest change of a motor's velocity from frame to frame, as a part of
 what its acceleration limit permits; *path:* the same of the postures that made the targets. *Time:*
 of a call from Python, median and 99th percentile; other work ran on the machine.
-"""
-
-PEER = """
-dex-retargeting 0.5 maps a hand's keypoints to a hand alone, without an arm, by NLopt. Figures
-known for Allegro, on another machine: 770 to 980 us a frame, 95th percentile 5 ms. It is not run
-here: its wheel imports torch, which it does not name among what it needs. Its position and vector
-modes minimise a Huber loss of fingertip positions or vectors plus a pull to the last frame, with
-limits of position but not of velocity or acceleration.
 """
 
 
@@ -92,6 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Fingertip positions alone as targets.")
     parser.add_argument("--paths", type=int, default=10)
     parser.add_argument("--count", type=int, default=1000, help="frames of a path")
+    parser.add_argument("--peer-paths", type=int, default=2, help="those of dex-retargeting")
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS))
     parser.add_argument("--report", type=Path, default=Path("out/teleoperation"), help="folder")
     options = parser.parse_args(arguments)
@@ -111,7 +106,8 @@ def main(arguments: list[str] | None = None) -> None:
             Console().print(row)
     heads = ["robot", "palm too", "error, median [mm]", "99th percentile", "below 5 mm %"]
     heads += ["palm off, median [mm]", "roughness", "path's own", "time [us]", "p99 [us]"]
-    parts = [INTRODUCTION, markdown_table(heads, rows), "## Beside dex-retargeting", PEER]
+    peer = beside(options.peer_paths, options.count, PERIOD, SHARE)
+    parts = [INTRODUCTION, markdown_table(heads, rows), "## Beside dex-retargeting", *peer]
     write_page("Fingertip positions as targets", parts, options.report)
 
 

@@ -49,6 +49,24 @@ def hand_posture(robot: ArmHand, posture: Mapping[str, float], name: str = "post
     return values
 
 
+def postures_of(robot: ArmHand, postures: Sequence[Mapping[str, float]]) -> Array:
+    """(k, n) as `hand_posture` gives them, of many that name the same motors."""
+    motors = hand_motors(robot.description)
+    columns = [robot.actuators.index(name) for name in motors]
+    found = np.full((len(postures), len(robot.actuators)), np.nan)
+    try:
+        given = np.array([[posture[name] for name in motors] for posture in postures], dtype=float)
+    except (KeyError, TypeError, ValueError):
+        given = np.full((len(postures), len(motors)), np.nan)
+    low, high = robot.lower[columns], robot.upper[columns]
+    within = ((given >= low - ROUNDING) & (given <= high + ROUNDING)).all(axis=1)
+    found[:, columns] = np.clip(given, low, high)
+    for row, posture in enumerate(postures):
+        if not within[row] or len(posture) != len(motors):
+            found[row] = hand_posture(robot, posture)  # which says best what is wrong
+    return found
+
+
 def hand_postures(robot: ArmHand, postures: Mapping[str, ArrayLike], count: int) -> Array:
     """(k, n) positions of all motors that move fingers; NaN for the others.
 

@@ -15,7 +15,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp, Tolerance
 from casadi_ik.grasps.pose import checked_pose
 from casadi_ik.problem.contacts.arrays import more_arrays
-from casadi_ik.problem.palm_targets import hand_posture, held_too, touched
+from casadi_ik.problem.palm_targets import held_too, postures_of, touched
 from casadi_ik.problem.problems import DIRECTIONS, Problems, fixed_array, target_arrays
 
 
@@ -136,7 +136,7 @@ class Questions:
         palms = [grasp.palm for grasp in grasps if grasp.palm is not None]
         if len(palms) < len(grasps):
             raise InputError("grasps: found palms and contacts, expected the same in all")
-        postures = np.array([hand_posture(self.robot, grasp.posture) for grasp in grasps])
+        postures = postures_of(self.robot, [grasp.posture for grasp in grasps])
         problems = self.of_palms(np.stack(palms), postures, fixed, prefer)
         named, poses = grasps[0].object, _object_poses(grasps)
         return replace(problems, object=named, object_pose=poses)
