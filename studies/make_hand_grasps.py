@@ -35,7 +35,7 @@ from casadi_ik.problem.clearance import SceneCheck
 ARM = "panda"
 HANDS = {
     "allegro": ("allegro_right", ("thumb", "index", "middle"), 0.030),
-    "leap": ("leap", ("thumb", "index", "middle"), 0.036),
+    "leap": ("leap", ("thumb", "index", "middle"), 0.042),
     "shadow": ("shadow", ("thumb", "index", "middle"), 0.022),
     "robotiq_3f": ("robotiq_3f", ("thumb", "finger_1", "finger_2"), 0.030),
 }
@@ -44,8 +44,8 @@ of them on the same side are apart at least [m]."""
 
 UP = (0.0, 0.0, 1.0)
 UPRIGHT = {
-    **dict.fromkeys(("tomato_soup_can", "cup", "mug", "mustard_bottle"), UP),
-    "orange": None,
+    **dict.fromkeys(("tomato_soup_can", "cup", "mug", "mustard_bottle", "sugar_box"), UP),
+    **dict.fromkeys(("orange", "tennis_ball"), None),
 }
 """By object the axis that points up; None for balls."""
 

@@ -23,12 +23,12 @@ def add_tolerances(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_scene(parser: argparse.ArgumentParser) -> None:
-    """What must not be touched."""
+def add_scene(parser: argparse.ArgumentParser, more: str = "") -> None:
+    """What must not be touched, and what else it is for."""
     parser.add_argument(
         "--scene",
         metavar="FILE",
-        help="what must not be touched: a shipped name or a YAML file (default: nothing is "
+        help=f"what must not be touched{more}: a shipped name or a YAML file (default: nothing is "
         "checked)",
     )
 

@@ -45,7 +45,7 @@ def add_view(commands: Any) -> None:
     parser.add_argument(
         "--robot", metavar="R", help="a shipped name or a YAML file (default: the file's)"
     )
-    add_scene(parser)
+    add_scene(parser, ", or what stood there beside a log")
     parser.add_argument("--method", metavar="M", help="to begin with; the page can change it")
     parser.add_argument(
         "--limits",

@@ -9,8 +9,8 @@ from enum import Enum
 import numpy as np
 
 from casadi_ik.arrays import Array
+from casadi_ik.motion.clear_between import between
 from casadi_ik.motion.closing import Closer, LastPart
-from casadi_ik.motion.free_space import dense, motor_units
 from casadi_ik.motion.plan import FollowPlan
 from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.problems import Problems
@@ -115,7 +115,7 @@ def approaches(asked: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Trie
     holding, open_handed = _surroundings(asked)
     for number, q in enumerate(solutions, start=1):
         last = closer.find(asked.problem, q, asked.opening, asked.distance)
-        reason = _blocked(asked, last, holding, open_handed)
+        reason = _blocked(last, holding, open_handed)
         yield Tried(number, q, None if reason else last, reason, open_handed)
 
 
@@ -155,7 +155,6 @@ def _surroundings(asked: ApproachPlan) -> tuple[Surroundings | None, Surrounding
 
 
 def _blocked(
-    asked: ApproachPlan,
     last: LastPart | None,
     holding: Surroundings | None,
     open_handed: Surroundings | None,
@@ -163,17 +162,15 @@ def _blocked(
     """Why the last part cannot be gone; "": it can."""
     if last is None:
         return "the arm cannot follow the straight way back"
-    units = motor_units(asked.plan.robot)
     for name, postures, around in (
         ("the approach", last.coming, open_handed),
         ("the closing", last.closing, holding),
     ):
         if around is None or len(postures) < 2:
             continue
-        looked_at = dense(postures, units)
-        found = around.check(looked_at)
-        if not found.free.all():
-            pair = found.pair(int(np.argmin(found.room)))
+        ways = between(around, postures)
+        if not ways.free.all():
+            pair = around.check(ways.worst[[int(np.argmin(ways.room))]]).pair(0)
             assert pair is not None
             return f"{name} is not free: {pair[0]} and {pair[1]} touch"
     return ""

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, Bools
+from casadi_ik.motion.clear_between import between
 from casadi_ik.motion.path import Jump, Path
 from casadi_ik.motion.walker import Walker
 from casadi_ik.problem.clearance import Surroundings
@@ -34,6 +35,8 @@ class Track:
         angle_error: (k, f) [rad], NaN where free.
         jumps: Where the motion could not be continued.
         clearance: (k,) distance of the pair nearest to being too near [m]; None without a scene.
+        free_between: (k - 1,) whether nothing is too near all along the straight way from each
+            posture to the next; not where the motion jumps. None without a scene.
         time: Seconds spent on the whole motion.
 
     Example:
@@ -48,6 +51,7 @@ class Track:
     angle_error: Array
     jumps: tuple[Jump, ...]
     clearance: Array | None
+    free_between: Bools | None
     time: float
 
     def __len__(self) -> int:
@@ -89,6 +93,9 @@ def track(
     for start in _starts(engine, problems, q0, prefer, seed, around):
         q, jumps = path.follow(start)
         missed = int((~_solved(engine.robot, problems, q, around)).sum())
+        if around is not None and not missed:
+            # A way between two postures that touches something counts as one missed.
+            missed += int((~_free_between(around, q, jumps)).sum()) - len(jumps)
         if (missed, len(jumps)) < least:
             best, least = (q, jumps), (missed, len(jumps))
         if least[1] == 0 and (least[0] == 0 or least[0] <= path.unreachable):
@@ -105,8 +112,23 @@ def track(
         angle_error=verdict.angle_error,
         jumps=tuple(jumps),
         clearance=None if around is None else around.check(q).distance,
+        free_between=None if around is None else _free_between(around, q, jumps),
         time=time.perf_counter() - begin,
     )
+
+
+def _free_between(around: Surroundings, q: Array, jumps: Sequence[Jump]) -> Bools:
+    """(k - 1,) of postures (k, n) whether the ways between them are free; jumps are no ways."""
+    reached = np.array([jump.index for jump in jumps], dtype=np.intp)
+    free = np.ones(max(len(q) - 1, 0), dtype=bool)
+    free[reached - 1] = False
+    ends = np.flatnonzero(np.append(~free, True)) + 1
+    first = 0
+    for end in ends.tolist():
+        rows = np.arange(first, end)
+        free[first : end - 1] = between(around.rows(rows), q[rows]).free
+        first = end
+    return free
 
 
 def _starts(

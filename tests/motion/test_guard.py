@@ -7,6 +7,8 @@ import pytest
 from moving_study.paths import smooth_path
 
 import casadi_ik as ik
+from casadi_ik.motion.clear_between import RESOLUTION, between
+from casadi_ik.motion.free_space import dense, motor_units
 
 PERIOD = 0.004
 
@@ -62,6 +64,12 @@ def test_leaping_targets_never_make_it_touch_anything(robot, solver, seed):
     assert clearances(solver, np.array(q)).free.all()
 
 
+def clearances_around(solver):
+    grasp = ik.Grasp(dict.fromkeys(solver.robot.fingers[:1], ik.Contact([0, 0, 0], [0, 0, 1])))
+    around = solver._engine.around(solver._questions.of_grasps([grasp], None))
+    return around.rows(np.zeros(1, dtype=np.intp))
+
+
 def test_a_path_keeps_clear(robot, solver):
     """Down to the table and beyond: solved as far as that is free, never nearer than the margin."""
     points, normals = robot.contacts(robot.home)
@@ -81,6 +89,34 @@ def test_a_path_keeps_clear(robot, solver):
     assert track.clearance is not None
     assert clearances(solver, track.q).free.all()
     np.testing.assert_allclose(track.clearance, clearances(solver, track.q).distance)
+    # Between the postures, too, as far as that is looked into.
+    assert track.free_between is not None
+    assert track.free_between.all()
+    assert clearances(solver, dense(track.q, motor_units(robot))).room.min() >= -RESOLUTION
+
+
+def test_what_stands_between_two_free_postures_is_seen(robot):
+    """A thin pole that the arm sweeps through, and a ball that is carried through the robot."""
+    way = np.tile(robot.home, (3, 1))
+    way[:, 0] += [-0.7, 0.7, 0.72]
+    x, y, z = robot.palm(robot.home)[:3, 3]
+    pole = {"kind": "capsule", "radius": 0.002, "length": 0.1, "xyz": [x, y, z]}
+    solver = ik.Solver(robot, scene=ik.Scene({"pole": pole}))
+    around = clearances_around(solver)
+    assert around.free(way).all()
+    found = between(around, way)
+    assert found.free.tolist() == [False, True]
+    assert found.room[0] < 0
+    assert not around.free(found.worst[:1])[0]
+    held = ik.Scene({"ball": {"kind": "sphere", "radius": 0.02, "xyz": [x, y, z]}}, grasped="ball")
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = [[x, y - 0.5, z], [x, y + 0.5, z]]
+    carrying = ik.Solver(robot, scene=held)
+    problems = carrying._questions.of_arrays(*robot.contacts(way[:2]), None)
+    moving = carrying._engine.around(problems.holding("ball", poses))
+    standing = np.tile(robot.home, (2, 1))
+    assert moving.free(standing).all()
+    assert not between(moving, standing).free[0]
 
 
 def test_a_path_that_is_free_is_followed_as_without_a_scene(robot, solver):

@@ -43,6 +43,10 @@ class Different:
         rank = np.arange(len(order)) - np.searchsorted(mine, mine)
         whose, place = np.unique(mine, return_inverse=True)
         most, before = int(rank.max(initial=-1)) + 1, self._rows.shape[1]
+        if not before and most <= 1:
+            self._rows = np.full((len(self._rows), most, rows.shape[1]), np.nan)
+            self._rows[whose, :1] = rows[order][:, None]
+            return np.ones(len(rows), dtype=bool)
         new = np.full((len(whose), most, rows.shape[1]), np.nan)
         new[place, rank] = rows[order]
         every = np.concatenate([self._rows[whose], new], axis=1)
