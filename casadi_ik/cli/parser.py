@@ -157,6 +157,12 @@ def _add_solve(commands: Any) -> None:
         type=file_name(".png"),
         help="draw the grasp (needs casadi-ik[plots])",
     )
+    parser.add_argument(
+        "--picture-dark",
+        metavar="FILE.png",
+        type=file_name(".png"),
+        help="the same for a dark page",
+    )
     _add_diagnose(parser, default=True)
     parser.set_defaults(run=_solve)
 
