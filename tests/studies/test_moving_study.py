@@ -15,7 +15,7 @@ def test_two_paths_and_what_is_done_stays_done(tmp_path, monkeypatch: pytest.Mon
     monkeypatch.setattr("moving_study.one_path.STEPS", 200)
     monkeypatch.setattr("moving_study.one_path.WAIT", 50)
     monkeypatch.setattr("moving_study.lost.STEPS", 200)
-    monkeypatch.setattr("moving_study.choosing.CANDIDATES", 12)
+    monkeypatch.setattr("moving_study.choosing.CANDIDATES", 2)
     monkeypatch.setattr("moving_study.choosing.RUNS", 1)
     monkeypatch.setattr(moving, "STEPS", 200)
     moving.main(["--count", "1", *words])
