@@ -18,7 +18,7 @@ from matplotlib.image import imread
 import casadi_ik as ik
 from casadi_ik.errors import InputError, PictureError
 from casadi_ik.logs import EventKind, MethodRows, Table
-from casadi_ik.views import draw_alternatives, draw_convergence, draw_solution
+from casadi_ik.views import draw_alternatives, draw_convergence, draw_solution, stage
 from casadi_ik.views.captions import (
     MET_COLOR,
     MISSED_COLOR,
@@ -27,12 +27,18 @@ from casadi_ik.views.captions import (
     TARGET_COLOR,
 )
 from casadi_ik.views.marks import contact_marks, target_place
-from casadi_ik.views.picture import new_figure, save_picture
+from casadi_ik.views.picture import DARK, LIGHT, new_figure, save_picture
 from casadi_ik.views.strips import events_strip
 
 pytestmark = pytest.mark.opengl
 
 COARSE = 40  # dots per inch
+
+
+@pytest.fixture(autouse=True)
+def coarse_floor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The floor's shadow is a third of the time of a small picture, and nothing that is tested."""
+    monkeypatch.setattr(stage, "TEXELS", 128)
 
 
 def words(figure: Figure) -> str:
@@ -62,6 +68,16 @@ def test_the_picture_says_how_it_ended(robot, solution, grasp) -> None:
     for finger in robot.fingers:
         assert finger in text
     assert len(figure.axes) == 2
+
+
+def test_a_dark_page_has_a_picture_of_its_own(robot, solution, grasp) -> None:
+    figure = draw_solution(robot, solution, grasp, dpi=20, dark=True)
+    assert mcolors.to_hex(figure.get_facecolor()) == DARK.paper
+    # Where nothing stands the picture is as dark as what it is on.
+    assert mcolors.to_hex(figure.axes[1].images[0].get_array()[0, 0]) == DARK.paper
+    written = [text.get_color() for text in figure.texts]
+    assert {DARK.ink, DARK.faint} < set(written)
+    assert LIGHT.ink not in written
 
 
 def test_alternatives_are_drawn_side_by_side(robot, grasp) -> None:
