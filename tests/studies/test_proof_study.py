@@ -7,9 +7,6 @@ import json
 import impossible_targets
 import numpy as np
 import proofs
-import pytest
-
-pytestmark = pytest.mark.usefixtures("usual_flags")
 
 
 def test_counts_go_on_and_false_proofs_are_listed(tmp_path, monkeypatch):
