@@ -50,7 +50,7 @@ UPRIGHT = {
 """By object the axis that points up; None for balls."""
 
 ITEMS = {
-    "allegro": ("tomato_soup_can", "mug", "orange"),
+    "allegro": ("tomato_soup_can", "mug", "cup"),
     "leap": ("tomato_soup_can", "cup", "orange"),
     "shadow": ("tomato_soup_can", "cup", "orange"),
     "robotiq_3f": ("tomato_soup_can", "mug", "mustard_bottle"),
