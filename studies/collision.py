@@ -20,8 +20,10 @@ from typing import Any
 import joblib
 import numpy as np
 from collision_study.falsely_free import ROBOT, SIZE, Part, solve_part, the_check
+from collision_study.goals import HEADS
+from collision_study.goals import rows as goal_rows
 from collision_study.oracles import MuJoCoOracle
-from collision_study.search import MICROMETRE, POSTURES, SAFE, TURNS, Piece, solve_piece
+from collision_study.search import BATCH, MICROMETRE, POSTURES, SAFE, TURNS, Piece, solve_piece
 from runner import (
     Metric,
     command,
@@ -157,9 +159,11 @@ def solved(piece: Piece | Part) -> tuple[Piece | Part, dict[str, Any]]:
     return piece, {"code": code_version(), **found}
 
 
-def choices(options: argparse.Namespace) -> tuple[list[list[str]], list[Metric], str]:
-    """Rows on completeness and time by clutter, the figures, and what code they are of."""
-    rows, metrics, codes = [], list[Metric](), set[str]()
+def choices(
+    options: argparse.Namespace,
+) -> tuple[list[list[str]], list[list[str]], list[Metric], str]:
+    """Rows on completeness and time by clutter, on goals, figures, and what code they are of."""
+    rows, goals, metrics, codes = [], [], list[Metric](), set[str]()
     for robot in options.robot:
         for clutter in CLUTTER:
             paths = [_path(p, options.out) for p in pieces(options)]
@@ -169,7 +173,8 @@ def choices(options: argparse.Namespace) -> tuple[list[list[str]], list[Metric],
             targets = [target for one in done for target in one["targets"]]
             if targets:
                 rows.append(_row(robot, clutter, targets, metrics))
-    return rows, metrics, ", ".join(sorted(codes))
+                goals += goal_rows(robot, clutter, targets)
+    return rows, goals, metrics, ", ".join(sorted(codes))
 
 
 def _left(options: argparse.Namespace) -> str:
@@ -188,6 +193,9 @@ def _row(
     rate = rate_metric(f"{name}/found", found, found + missed)
     batch = mean_metric(f"{name}/batch", [1e6 * one["batch"] for one in targets], "us")
     single = [1e6 * one["single"] for one in targets]
+    answered = [1e6 * one["answered_time"] for one in targets if one["status"] == "SOLVED"]
+    if answered:
+        metrics.append(mean_metric(f"{name}/answered", answered, "us"))
     metrics += [rate, batch, mean_metric(f"{name}/single", single, "us")]
     return [
         robot,
@@ -199,6 +207,8 @@ def _row(
         ", ".join(f"{count} {status}" for status, count in statuses.most_common()),
         str(sum(one["false"] for one in targets)),
         f"{batch.value:.0f}",
+        f"{np.mean(answered):.0f}" if answered else "",
+        f"{1e6 * np.mean([one['blind_time'] for one in targets]):.0f}",
         f"{np.mean(single):.0f}",
         f"{np.median(single):.0f}",
     ]
@@ -220,7 +230,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     options = parser.parse_args(arguments)
     run(options)
-    found, metrics, codes = choices(options)
+    found, goals, metrics, codes = choices(options)
     agrees, more = agreement(options)
     times, by_mujoco = check(min(options.checked, 20_000), options.timed, options.seed)
     heads = ["configurations", "distance [us]", "free? [us]", "coal, any [us]"]
@@ -234,7 +244,8 @@ def main(arguments: list[str] | None = None) -> None:
         by_mujoco,
     ]
     heads = ["robot", "clutter", "targets", "free without a choice %", "found", "found %"]
-    heads += ["status", "false by coal", "batch, mean [us]", "single, mean [us]", "median [us]"]
+    heads += ["status", "false by coal", "batch, mean [us]", "with an answer [us]"]
+    heads += ["contacts alone [us]", "single, mean [us]", "median [us]"]
     parts += [
         "## Choice",
         f"Grasps at random places of a table, each turned {TURNS} times about the vertical, where "
@@ -244,9 +255,12 @@ def main(arguments: list[str] | None = None) -> None:
         f"answer: one was found, or a dense search of {options.searched:,} solutions, each nearest "
         f"to a random posture, finds one with {1e3 * SAFE:g} mm to spare. Processor time of a "
         "target with everything that is looked at until it is free or given up; *batch:* "
-        f"{TURNS} targets a call, *single:* one, without a diagnosis.",
+        f"{BATCH} targets a call, those of a grasp again and again; *with an answer:* the same of "
+        "these alone; *contacts alone:* without a scene; *single:* one, without a diagnosis.",
         markdown_table(heads, found),
         _left(options),
+        "## Goals",
+        markdown_table(HEADS, goals),
         "## Others",
         PEERS,
         "## Where this comes from",

@@ -31,8 +31,8 @@ DRAWN = 20_000
 BALL, SMALLEST = "ball", 0.012
 """What they hold, and its least radius [m]."""
 MICROMETRE = 1e-6
-WARM = 4
-"""Targets of a batch that is solved first, so that no time holds what is done once."""
+BATCH = 256
+"""Targets of a batch that is timed: those of a grasp, again and again."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +72,13 @@ def solve_piece(piece: Piece) -> dict[str, Any]:
         if len(kept):
             some = [grasps[i] for i in kept]
             rows += _solved(
-                robot, solids, held, some, points[kept], normals[kept], known.q[kept], piece
+                blind, solids, held, some, points[kept], normals[kept], known.q[kept], piece
             )
     return {"targets": rows}
 
 
 def _solved(
-    robot: ik.ArmHand,
+    without: ik.Solver,
     solids: dict[str, Any],
     held: dict[str, Any],
     grasps: list[ik.Grasp],
@@ -88,15 +88,20 @@ def _solved(
     piece: Piece,
 ) -> list[dict[str, Any]]:
     """What comes of the same grasp turned in several ways, a row for each."""
-    name = grasps[0].object
+    robot, name = without.robot, grasps[0].object
     poses = np.stack([grasp.object_pose for grasp in grasps if grasp.object_pose is not None])
     place = {"xyz": poses[0][:3, 3].tolist()}
     scene = ik.Scene({**solids, name: held | place}, grasped=name)
     solver = ik.Solver(robot, scene=scene)
-    solver.solve_batch(points[:WARM], normals[:WARM], object_pose=poses[:WARM])
-    begin = time.process_time()
     batch = solver.solve_batch(points, normals, object_pose=poses)
-    spent = (time.process_time() - begin) / len(points)
+    every = np.arange(BATCH) % len(points)
+    spent = _timed(solver, points[every], normals[every], poses[every])
+    alone = _timed(without, points[every], normals[every], None)
+    answered = np.flatnonzero(batch.success)
+    of_answered = 0.0
+    if len(answered):
+        some = answered[np.arange(BATCH) % len(answered)]
+        of_answered = _timed(solver, points[some], normals[some], poses[some])
     check = SceneCheck(robot, scene)
     rows = []
     for i, grasp in enumerate(grasps):
@@ -116,11 +121,22 @@ def _solved(
                 "blind": bool(around.free(blind[i][None])[0]),
                 "missed": missed,
                 "false": false,
+                "pair": "" if (why := batch.collisions[i]) is None else " and ".join(why.pair),
                 "batch": spent,
+                "answered_time": of_answered,
+                "blind_time": alone,
                 "single": time.process_time() - begin,
             }
         )
     return rows
+
+
+def _timed(solver: ik.Solver, points: Array, normals: Array, poses: Array | None) -> float:
+    """Processor time of a target [s], everything that is done once done before."""
+    solver.solve_batch(points, normals, object_pose=poses)
+    begin = time.process_time()
+    solver.solve_batch(points, normals, object_pose=poses)
+    return (time.process_time() - begin) / len(points)
 
 
 def surroundings(check: SceneCheck, robot: ik.ArmHand, grasp: ik.Grasp) -> Surroundings:
