@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -58,13 +59,8 @@ def solve_piece(piece: Piece) -> dict[str, Any]:
     """The targets of a piece, those that contacts alone can be solved at."""
     robot = ik.load_robot(piece.robot)
     blind = ik.Solver(robot)
-    rng = np.random.default_rng([piece.seed, piece.clutter, piece.number])
-    angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 0.85)
-    goal = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.1, 0.6)])
-    solids = {"table": TABLE, **_clutter(rng, piece.clutter, goal)}
     rows = []
-    for known_grasp, held in _grasps(robot):
-        grasps = [_moved(known_grasp, goal, rng) for _ in range(TURNS)]
+    for solids, held, grasps in _placed(piece, robot):
         arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
         points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
         known = blind.solve_batch(points, normals)
@@ -75,6 +71,32 @@ def solve_piece(piece: Piece) -> dict[str, Any]:
                 blind, solids, held, some, points[kept], normals[kept], known.q[kept], piece
             )
     return {"targets": rows}
+
+
+def grasps_at(piece: Piece) -> Iterator[tuple[ik.Scene, list[ik.Grasp]]]:
+    """The scene of every grasp of a piece, and the grasp's targets that contacts alone solve."""
+    robot = ik.load_robot(piece.robot)
+    blind = ik.Solver(robot)
+    for solids, held, grasps in _placed(piece, robot):
+        arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
+        points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
+        kept = np.flatnonzero(blind.solve_batch(points, normals).success)
+        pose, name = grasps[0].object_pose, grasps[0].object
+        assert pose is not None
+        scene = ik.Scene({**solids, name: held | {"xyz": pose[:3, 3].tolist()}}, grasped=name)
+        yield scene, [grasps[i] for i in kept]
+
+
+def _placed(
+    piece: Piece, robot: ik.ArmHand
+) -> Iterator[tuple[dict[str, Any], dict[str, Any], list[ik.Grasp]]]:
+    """What stands about, what is held, and how, of every grasp."""
+    rng = np.random.default_rng([piece.seed, piece.clutter, piece.number])
+    angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 0.85)
+    goal = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.1, 0.6)])
+    solids = {"table": TABLE, **_clutter(rng, piece.clutter, goal)}
+    for known_grasp, held in _grasps(robot):
+        yield solids, held, [_moved(known_grasp, goal, rng) for _ in range(TURNS)]
 
 
 def _solved(
