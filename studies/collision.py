@@ -279,8 +279,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--report", type=Path, default=Path("out/collision/report"), help="folder of the report"
     )
+    parser.add_argument("--so-far", action="store_true", help="report what is done, run nothing")
     options = parser.parse_args(arguments)
-    run(options)
+    if not options.so_far:
+        run(options)
     found, goals, metrics, codes = choices(options)
     agrees, more = agreement(options)
     times, by_mujoco = check(min(options.checked, 20_000), options.timed, options.seed)
