@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 ARM, ARM_JOINT = "#e8944a", "#5f6975"
 HAND, PALM, HAND_JOINT = "#65727f", "#414c58", "#333c46"
 
@@ -14,8 +16,21 @@ NEAREST = "#e00000"
 INK, FAINT = "#2b333b", "#7a848e"
 """Of text."""
 
+DARK_PAPER, DARK_INK, DARK_FAINT = "#161b22", "#e6edf3", "#9aa5b1"
+"""Of pictures for dark pages: the ground, and text on it."""
+
 LINES = ("#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6", "#c2334d", "#0f8b8d")
 """Of the lines of a diagram."""
+
+METHODS = {
+    "enhanced-dls": "#1f77b4",
+    "enhanced-sdls": "#ff7f0e",
+    "original-dls": "#2ca02c",
+    "original-sdls": "#d62728",
+    "thumb-first": "#9467bd",
+    "hand-first": "#8c564b",
+}
+"""Of the methods, wherever several are drawn beside each other; others have none of their own."""
 
 PHASES = ("#f3f1ec", "#fbecd9", "#deebf7", "#e3f2e1")
 """By the code of the phase."""
@@ -28,6 +43,12 @@ EVENTS = {
     "RESTART": "#2f6db3",
 }
 """Of the events that are marked; the others show as phases and limits."""
+
+
+def method_colors(methods: Iterable[str]) -> dict[str, str]:
+    """A colour for each of some methods: its own, or one that no other of them has."""
+    free = iter([color for color in LINES[::-1] if color not in METHODS.values()] * 9)
+    return {name: METHODS[name] if name in METHODS else next(free) for name in methods}
 
 
 def rgb(color: str) -> tuple[int, int, int]:

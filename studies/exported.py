@@ -3,9 +3,11 @@
 The shipped robot's solver is exported, built with the machine's compiler, and solves random
 targets one by one; the same from Python by `Solver.fast`, `Solver.solve` and in a batch, all by
 turns; and as WebAssembly in node and in Chromium where these are there. With `--scene` solids the
-same once more for a solver that checks collisions::
+same once more for a solver that checks collisions; with `--single` single precision beside double,
+and nothing else::
 
     python studies/exported.py --report out/exported
+    python studies/exported.py --single --report out/exported_single
 """
 
 from __future__ import annotations
@@ -47,9 +49,16 @@ STACK = """
 #include "targets.h"
 static arm_solver solver;
 static unsigned char stack[1 << 20] __attribute__((aligned(4096)));
+static REAL points[3 * ARM_FINGERS], normals[3 * ARM_FINGERS];
 static void *work(void *given) {
-  int i;
-  for (i = 0; i < TARGETS; ++i) arm_solve(&solver, targets[i].points, targets[i].normals, 0);
+  int i, k;
+  for (i = 0; i < TARGETS; ++i) {
+    for (k = 0; k < 3 * ARM_FINGERS; ++k) {
+      points[k] = (REAL) targets[i].points[k];
+      normals[k] = (REAL) targets[i].normals[k];
+    }
+    arm_solve(&solver, points, normals, 0);
+  }
   return given;
 }
 int main(void) {
@@ -105,10 +114,12 @@ def run(*command: str, folder: Path) -> str:
     return done.stdout
 
 
-def built(robot: ik.ArmHand, folder: Path, capacity: int | None = None) -> Path:
+def built(
+    robot: ik.ArmHand, folder: Path, capacity: int | None = None, single: bool = False
+) -> Path:
     """The exported project, built; with a scene if that is to hold so many solids."""
     project = folder / ("c" if capacity is None else "c_scene")
-    write_folder(project, c_project(robot, "arm", capacity))
+    write_folder(project, c_project(robot, "arm", capacity, single))
     run("make", folder=project)
     return project
 
@@ -119,14 +130,23 @@ def tail_of(name: str, said: dict[str, float]) -> list[str]:
     return [name, f"{said['targets']:,}", *(f"{said[key]:.1f}" for key in keys)]
 
 
-def sizes(project: Path) -> dict[str, int]:
+def sizes(project: Path, real: str = "double") -> dict[str, int]:
     """Bytes of code, tables, solver and stack."""
     table = run("size", "-t", "build/libarm.a", folder=project).splitlines()[1:]
     texts = {line.split()[5]: int(line.split()[0]) for line in table}
     tables = sum(size for name, size in texts.items() if "tables" in name)
     whole = next(size for name, size in texts.items() if name.startswith("(TOTALS)"))
     (project / "stack.c").write_text(STACK)
-    flags = ["-O2", "-Iinclude", "-Itest", "stack.c", "build/libarm.a", "-lm", "-pthread"]
+    flags = [
+        f"-DREAL={real}",
+        "-O2",
+        "-Iinclude",
+        "-Itest",
+        "stack.c",
+        "build/libarm.a",
+        "-lm",
+        "-pthread",
+    ]
     run("cc", *flags, "-o", "build/stack", folder=project)
     stack, solver = map(int, run("build/stack", folder=project).split())
     return {
@@ -240,6 +260,17 @@ def in_chromium(module: Path) -> list[float]:
             server.shutdown()
 
 
+def compare_precisions(options: argparse.Namespace) -> None:
+    """The report of `exported_single`."""
+    single = importlib.import_module("exported_single")
+    with tempfile.TemporaryDirectory() as place:
+        parts = single.compared(Path(place), options.targets, options.seconds, options.turns)
+    load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
+    parts.append(f"Load of the machine at the end: {load}.")
+    parts.append(provenance({"casadi_ik": version("casadi-ik")}))
+    write_page("A solver in single precision", parts, options.report)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Measure and write the report."""
     parser = argparse.ArgumentParser(description="Time, stack, memory, code of an exported solver.")
@@ -250,7 +281,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--scene", type=int, metavar="CAPACITY", help="measure that, too")
     parser.add_argument("--turns", type=int, default=TURNS)
     parser.add_argument("--report", type=Path, default=Path("out/exported"), help="folder")
+    parser.add_argument("--single", action="store_true", help="single beside double precision")
+    parser.add_argument("--targets", type=int, default=10_000, help="of a row of that comparison")
     options = parser.parse_args(arguments)
+    if options.single:
+        compare_precisions(options)
+        return
     robot = ik.load_robot("kuka_lwr_barrett")
     with tempfile.TemporaryDirectory() as place:
         project = built(robot, Path(place))

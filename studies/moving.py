@@ -16,7 +16,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from moving_study.one_path import EVERY, LEAPS, PERIOD, SHARE, STEPS, WAIT, calls, measure
+from moving_study.choosing import TEXT as CHOOSING
+from moving_study.choosing import choice_table, chosen
+from moving_study.goals import goal_table
+from moving_study.lost import TEXT as LOST
+from moving_study.lost import again, lost_table
+from moving_study.one_path import (
+    EVERY,
+    LEAPS,
+    PERIOD,
+    SHARE,
+    STEPS,
+    TIMES,
+    WAIT,
+    calls,
+    measure,
+)
 from moving_study.paths import smooth_path
 from rich.console import Console
 from runner import markdown_table, write_page
@@ -57,10 +72,30 @@ def ready(robot: str) -> ik.Solver:
 
 def spent(robot: str, count: int, folder: Path) -> list[float]:
     """CPU seconds of each call on some paths."""
-    file = folder / robot / f"calls_{count}.json"
+    file = folder / robot / f"least_calls_{count}.json"
     if not file.exists():
         solver = ik.Solver(ik.load_robot(robot))
         file.write_text(json.dumps([one for i in range(count) for one in calls(solver, i)]))
+    return json.loads(file.read_text())
+
+
+def lost(robot: str, rows: list[dict[str, Any]], folder: Path) -> list[dict[str, Any]]:
+    """The paths that are not wholly within tolerance, with other limits."""
+    found, solver = [], None
+    for number in [row["number"] for row in rows if row["met"] < 1]:
+        file = folder / robot / f"lost_{number:04d}.json"
+        if not file.exists():
+            solver = solver or ik.Solver(ik.load_robot(robot))
+            file.write_text(json.dumps(again(solver, number)))
+        found.append(json.loads(file.read_text()))
+    return found
+
+
+def choices(robot: str, folder: Path) -> list[dict[str, Any]]:
+    """Figures of choosing."""
+    file = folder / robot / "choices.json"
+    if not file.exists():
+        file.write_text(json.dumps(chosen(ik.load_robot(robot))))
     return json.loads(file.read_text())
 
 
@@ -157,7 +192,8 @@ def tables(
         f"{100 * SHARE:g} % of the velocity limits, seeds 0 on. Default tolerances (5 mm, 3 deg) "
         "and accelerations (full speed in a quarter of a second). Times are from Python; the "
         "machine was busy with other work, so beside the median of what a cycle takes there is the "
-        "processor's time of single calls on some of the paths.",
+        "processor's time of single calls on some of the paths, the least of "
+        f"{TIMES} runs of each call.",
         "## Followed cycle by cycle",
         markdown_table(
             [
@@ -176,7 +212,7 @@ def tables(
         "*Lost near a singular arm*: of the paths that are not wholly within tolerance, those "
         "whose own postures had a smallest singular value of the arm below 0.05 within the 300 "
         "cycles before; the postures there are the path's own, which the follower does not know, "
-        "and from others the motors would have to be faster.",
+        "and from others the motors would have to be faster. See also below.",
         "## Limits",
         f"Largest values as parts of the limits, on the smooth paths and on {LEAPS} targets a path "
         f"that leap and then wait {WAIT} cycles.",
@@ -223,13 +259,27 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--folder", type=Path, default=Path("out/moving"), help="of what is done")
     parser.add_argument("--report", type=Path, default=Path("out/moving/report"), help="folder")
     options = parser.parse_args(arguments)
-    found, tracks, times = {}, {}, {}
+    found, tracks, times, missed, taken = {}, {}, {}, {}, {}
     for robot in options.robots:
         found[robot] = rows_of(robot, options.count, options.folder, options.done)
         tracks[robot] = tracked(robot, options.tracks, options.folder)
         times[robot] = spent(robot, options.tracks, options.folder)
+        missed[robot] = lost(robot, found[robot], options.folder)
+        taken[robot] = choices(robot, options.folder)
         Console().print(robot, "done")
-    write_page("Moving targets", tables(found, tracks, times), options.report)
+    parts = [
+        *tables(found, tracks, times),
+        "## Paths that are lost",
+        LOST,
+        lost_table(missed, found),
+        "## Choosing",
+        CHOOSING,
+        choice_table(taken),
+        "## Goals",
+        "From the figures above; times are the processor's, of one thread.",
+        goal_table(found, times, tracks, taken, missed),
+    ]
+    write_page("Moving targets", parts, options.report)
     metrics = [one for robot, rows in found.items() for one in figures(robot, rows)]
     write_metrics(metrics, options.report / "metrics.json")
 

@@ -187,7 +187,7 @@ def main(arguments: list[str] | None = None) -> None:
     loads, parts = [os.getloadavg()[0]], []
     kinds = {"as it is": True, "not painted": False}
     # Painting in software may take seconds a step.
-    counts = {True: max(options.steps // 5, 3), False: options.steps}
+    counts = {True: max(options.steps // 8, 3), False: options.steps}
     viewer = view_grasp(ik.load_robot(ROBOT), ik.load_grasp("cup"), scene=ik.load_scene("table"))
     with browser_tools().Browser() as browser:
         found = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from casadi_ik.cli.shared_options import add_tolerances
+from casadi_ik.cli.shared_options import add_object_pose, add_scene, add_tolerances
 from casadi_ik.cli.values import file_name, numbers, one_of, whole
 from casadi_ik.problem.preference import PREFERENCES
 
@@ -59,14 +59,7 @@ def add_choose(commands: Any) -> None:
     )
     parser.add_argument("candidates", metavar="CANDIDATES", help="the grasps, see below")
     parser.add_argument("--robot", metavar="R", required=True, help="a shipped name or a YAML file")
-    parser.add_argument(
-        "--object-pose",
-        metavar="X",
-        type=numbers,
-        nargs="+",
-        help="where the object is: x y z [m] roll pitch yaw [rad] in the base frame; candidates "
-        "that do not say where theirs is are in its frame",
-    )
+    add_object_pose(parser, "; candidates that do not say where theirs is are in its frame")
     parser.add_argument(
         "--layout",
         metavar="L",
@@ -97,12 +90,7 @@ def add_choose(commands: Any) -> None:
         metavar="NAME",
         help="of which object's grasps, by the file's own name, where it has those of several",
     )
-    parser.add_argument(
-        "--scene",
-        metavar="FILE",
-        help="what answers must not touch: a shipped name or a YAML file (default: nothing is "
-        "checked)",
-    )
+    add_scene(parser)
     parser.add_argument(
         "--prefer",
         metavar="|".join(PREFERENCES),

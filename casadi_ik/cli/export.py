@@ -34,10 +34,16 @@ def export(arguments: argparse.Namespace) -> Answer:
     """
     check_method(arguments.method)
     check_folder(arguments.out)
+    if arguments.single and arguments.target == "wasm":
+        raise UnsupportedError(
+            "--single: WebAssembly computes as fast in double precision; expected --target c"
+        )
     robot = load_robot(arguments.robot)
     prefix = checked_prefix(arguments.prefix, robot.name)
-    made = wasm_project if arguments.target == "wasm" else c_project
-    files = made(robot, prefix, arguments.scene)
+    if arguments.target == "wasm":
+        files = wasm_project(robot, prefix, arguments.scene)
+    else:
+        files = c_project(robot, prefix, arguments.scene, arguments.single)
     write_folder(arguments.out, files)
     size = sum(len(content) for content in files.values())
     pairs = {

@@ -14,11 +14,14 @@ if TYPE_CHECKING:
 _EXPORT = """\
 examples:
   casadi-ik export kuka_lwr_barrett --out solver && make -C solver test
+  casadi-ik export kuka_lwr_barrett --out solver --single && make -C solver test
   casadi-ik export my_robot.yaml --out page --target wasm
 
 DIR becomes a project that needs nothing but a C compiler (--target wasm: a browser or node):
 library, header, example, a test of 1,000 stored targets, a benchmark, README. It solves one target
-at a time, in doubles; its answers are bit for bit those of this package. An earlier export in DIR
+at a time, in doubles; its answers are bit for bit those of this package. With --single, for
+controllers without a unit for doubles, all of it is in single precision: an answer is one in double
+precision, too, if another than here. An earlier export in DIR
 is replaced; any other folder that is not empty is refused. With --scene, being solved includes
 that nothing touches; where the answer does, the other ways are looked at in which the arm can hold
 the hand (other hands are not).
@@ -76,6 +79,11 @@ def add_export(commands: Any) -> None:
         metavar="CAPACITY",
         type=whole(1),
         help="collisions are checked: the robot with itself, and with so many solids at most",
+    )
+    parser.add_argument(
+        "--single",
+        action="store_true",
+        help="in single precision, for controllers that have no other (--target c)",
     )
     parser.set_defaults(run=_export)
     parser = commands.add_parser(

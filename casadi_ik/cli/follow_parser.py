@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from casadi_ik.cli.shared_options import add_tolerances
-from casadi_ik.cli.values import file_name, numbers, positive
+from casadi_ik.cli.shared_options import add_motion, add_scene, add_tolerances
+from casadi_ik.cli.values import numbers, positive
 
 if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
@@ -43,25 +43,14 @@ def add_follow(commands: Any) -> None:
     )
     parser.add_argument("frames", metavar="KEYPOINTS.npz", help="the frames, see below")
     parser.add_argument("--robot", metavar="R", help="a shipped name or a YAML file")
-    parser.add_argument(
-        "--out",
-        metavar="MOTION.mcap",
-        type=file_name(".mcap", ".npz", ".csv"),
-        required=True,
-        help="write the motion",
-    )
+    add_motion(parser)
     parser.add_argument(
         "--retarget", metavar="FILE.yaml", help="how a hand moves the robot's (default: see below)"
     )
     parser.add_argument(
         "--period", metavar="S", type=positive, default=0.005, help="of a cycle (default: 0.005)"
     )
-    parser.add_argument(
-        "--scene",
-        metavar="FILE",
-        help="what must not be touched: a shipped name or a YAML file (default: nothing is "
-        "checked)",
-    )
+    add_scene(parser)
     add_tolerances(parser)
     parser.add_argument(
         "--q0",

@@ -16,6 +16,9 @@ from casadi_ik.motion.retarget import KEYPOINTS
 RATE = 30.0
 """Frames in a second where the file has no times."""
 
+FAR = 5.0
+"""Contacts farther from the base than this [m], or keypoints from each other, are in mm."""
+
 MOST = 2**28
 """Numbers of an array, at most."""
 
@@ -48,15 +51,10 @@ class Frames:
             return np.repeat(values, len(times), axis=0)
         start, end = self.times[after - 1], self.times[after]
         share = np.clip((times - start) / (end - start), 0.0, 1.0)[:, None, None]
-        return np.where(
-            share <= 0,
-            values[after - 1],
-            np.where(
-                share >= 1,
-                values[after],
-                values[after - 1] + share * (values[after] - values[after - 1]),
-            ),
-        )
+        before, behind = values[after - 1], values[after]
+        with np.errstate(invalid="ignore"):  # a frame that is none gives none
+            between = before + share * (behind - before)
+        return np.where(share <= 0, before, np.where(share >= 1, behind, between))
 
 
 def read_frames(path: Path, fingers: int) -> Frames:
@@ -88,6 +86,7 @@ def read_frames(path: Path, fingers: int) -> Frames:
         raise InputError(
             f"{path}: {key}: found shape {frames.shape}, expected (k, {shape[0]}, 3), k >= 1"
         )
+    _refuse_other_units(f"{path}: {key}", frames, key)
     normals = arrays.get("normals")
     if normals is not None and (key == "keypoints" or normals.shape != frames.shape):
         expected = "points beside them" if key == "keypoints" else f"{frames.shape}"
@@ -103,6 +102,20 @@ def read_frames(path: Path, fingers: int) -> Frames:
         return Frames(times - times[0], frames, nothing, nothing)
     free = np.full(frames.shape, np.nan) if normals is None else normals
     return Frames(times - times[0], None, frames, free)
+
+
+def _refuse_other_units(where: str, frames: Array, key: str) -> None:
+    """One bad frame is no error of a stream; most of them too large are in other units."""
+    middle = frames.mean(axis=1, keepdims=True) if key == "keypoints" else 0.0
+    with np.errstate(invalid="ignore"):
+        away = np.linalg.norm(frames - middle, axis=2)
+    away = away[np.isfinite(away)]
+    if len(away) and np.median(away) > FAR:
+        raise InputError(
+            f"{where}: found {np.median(away):.4g} m from the "
+            f"{'middle of the hand' if key == 'keypoints' else 'base'}, expected at most {FAR:g} m "
+            "(numbers in mm?)"
+        )
 
 
 def _arrays(path: Path) -> dict[str, Array]:

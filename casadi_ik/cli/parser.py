@@ -15,7 +15,7 @@ from casadi_ik.cli.import_parser import add_import
 from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.reach_parser import add_reach
 from casadi_ik.cli.say import PROGRAM
-from casadi_ik.cli.shared_options import add_tolerances
+from casadi_ik.cli.shared_options import add_object_pose, add_scene, add_tolerances
 from casadi_ik.cli.values import assignment, file_name, numbers, one_of, whole
 from casadi_ik.cli.view_parser import add_view
 from casadi_ik.errors import InputError
@@ -157,6 +157,12 @@ def _add_solve(commands: Any) -> None:
         type=file_name(".png"),
         help="draw the grasp (needs casadi-ik[plots])",
     )
+    parser.add_argument(
+        "--picture-dark",
+        metavar="FILE.png",
+        type=file_name(".png"),
+        help="the same for a dark page",
+    )
     _add_diagnose(parser, default=True)
     parser.set_defaults(run=_solve)
 
@@ -226,19 +232,11 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
         help="which of several solutions: far from its limits, with a manipulable arm, near the "
         "start, or with --scene far from what may be hit (default: q0 if it is given, else limits)",
     )
-    parser.add_argument(
-        "--scene",
-        metavar="FILE",
-        help="what answers must not touch: a shipped name or a YAML file (default: nothing is "
-        "checked)",
-    )
-    parser.add_argument(
-        "--object-pose",
-        metavar="X",
-        type=numbers,
-        nargs="+",
-        help="where the object is: x y z [m] roll pitch yaw [rad] in the base frame; contacts move "
-        "with it, and those of a file that does not say where its object is are in its frame",
+    add_scene(parser)
+    add_object_pose(
+        parser,
+        "; contacts move with it, and those of a file that does not say where its object is are in "
+        "its frame",
     )
     parser.add_argument(
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from casadi_ik.cli.shared_options import add_tolerances
+from casadi_ik.cli.shared_options import add_motion, add_object_pose, add_scene, add_tolerances
 from casadi_ik.cli.values import file_name, numbers, positive, whole
 
 if TYPE_CHECKING:
@@ -35,32 +35,15 @@ def add_reach(commands: Any) -> None:
     )
     parser.add_argument("grasp", metavar="GRASP", help="a shipped name or a YAML file")
     parser.add_argument("--robot", metavar="R", help="a shipped name or a YAML file")
-    parser.add_argument(
-        "--out",
-        metavar="MOTION",
-        type=file_name(".mcap", ".npz", ".csv"),
-        required=True,
-        help="write the motion",
-    )
+    add_motion(parser)
     parser.add_argument(
         "--animation",
         metavar="FILE.gif",
         type=file_name(".gif"),
         help="draw the motion in real time",
     )
-    parser.add_argument(
-        "--object-pose",
-        metavar="X",
-        type=numbers,
-        nargs="+",
-        help="where the object is: x y z [m] roll pitch yaw [rad] in the base frame",
-    )
-    parser.add_argument(
-        "--scene",
-        metavar="FILE",
-        help="what must not be touched: a shipped name or a YAML file (default: nothing is "
-        "checked)",
-    )
+    add_object_pose(parser)
+    add_scene(parser)
     parser.add_argument(
         "--opening",
         metavar="M",

@@ -55,7 +55,7 @@ def table(*columns: str, right: Sequence[str] = ()) -> Table:
 
 def files(written: Iterable[tuple[str, object]]) -> list[RenderableType]:
     """Where files went, a line each that is never wrapped, so that it can be copied."""
-    return [Text(f"  {kind:<9}{path}", no_wrap=True, overflow="ignore") for kind, path in written]
+    return [Text(f"  {kind:<8} {path}", no_wrap=True, overflow="ignore") for kind, path in written]
 
 
 def headline(success: bool, status: str, rest: str) -> Text:

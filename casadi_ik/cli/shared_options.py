@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from casadi_ik.cli.values import positive
+from casadi_ik.cli.values import file_name, numbers, positive
 
 
 def add_tolerances(parser: argparse.ArgumentParser) -> None:
@@ -20,4 +20,36 @@ def add_tolerances(parser: argparse.ArgumentParser) -> None:
         metavar="RADIANS",
         type=positive,
         help="when a contact normal counts as reached (default: 0.0524, 3 deg)",
+    )
+
+
+def add_scene(parser: argparse.ArgumentParser, more: str = "") -> None:
+    """What must not be touched, and what else it is for."""
+    parser.add_argument(
+        "--scene",
+        metavar="FILE",
+        help=f"what must not be touched{more}: a shipped name or a YAML file (default: nothing is "
+        "checked)",
+    )
+
+
+def add_object_pose(parser: argparse.ArgumentParser, moves: str = "") -> None:
+    """Where the object is, and what that moves."""
+    parser.add_argument(
+        "--object-pose",
+        metavar="X",
+        type=numbers,
+        nargs="+",
+        help=f"where the object is: x y z [m] roll pitch yaw [rad] in the base frame{moves}",
+    )
+
+
+def add_motion(parser: argparse.ArgumentParser) -> None:
+    """Where a motion goes."""
+    parser.add_argument(
+        "--out",
+        metavar="MOTION.mcap",
+        type=file_name(".mcap", ".npz", ".csv"),
+        required=True,
+        help="write the motion",
     )

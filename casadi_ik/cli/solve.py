@@ -43,9 +43,11 @@ def solve(arguments: argparse.Namespace) -> Answer:
         grasp.arrays(robot.fingers)
     out: Path | None = arguments.out
     picture: Path | None = arguments.picture
-    outputs = {"--log": arguments.log, "--out": out, "--picture": picture}
+    dark: Path | None = arguments.picture_dark
+    pictures = [(file, kind) for file, kind in ((picture, False), (dark, True)) if file is not None]
+    outputs = {"--log": arguments.log, "--out": out, "--picture": picture, "--picture-dark": dark}
     check_outputs(outputs.items(), inputs=[path])
-    draw = _drawing(path, grasp) if picture is not None else None
+    draw = _drawing(path, grasp) if pictures else None
     solver = the_solver(arguments, robot)
     with located(str(path)):
         solution = solver.solve(
@@ -60,8 +62,8 @@ def solve(arguments: argparse.Namespace) -> Answer:
     if out is not None:
         text = json.dumps(as_json(solution), indent=2, allow_nan=False) + "\n"
         write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
-    if picture is not None and draw is not None:
-        draw(robot, solution, grasp, picture, scene=solver.scene)
+    for file, is_dark in pictures if draw is not None else ():
+        draw(robot, solution, grasp, file, scene=solver.scene, dark=is_dark)
     written = [(option.lstrip("-"), file) for option, file in outputs.items() if file is not None]
     warning = "" if arguments.scene else penetration(robot, grasp, solution)
     report = solution_report(grasp.name or str(path), solver, solution, written, warning)

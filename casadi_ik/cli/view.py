@@ -53,7 +53,9 @@ def opened(arguments: argparse.Namespace) -> Viewer:
     served = {"host": arguments.host, "port": arguments.port}
     if all(_is_log(Path(one)) for one in what):
         with located("view"):
-            return viewing.view_log(*the_logs(what, arguments), **served)
+            return viewing.view_log(
+                *the_logs(what, arguments), scene=the_scene(arguments), **served
+            )
     if len(what) > 1:
         raise InputError(f"view: found {len(what)} names, expected one (or two logs)")
     arguments.grasp = name = what[0]

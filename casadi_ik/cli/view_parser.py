@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from casadi_ik.cli.shared_options import add_tolerances
-from casadi_ik.cli.values import numbers, one_of, whole
+from casadi_ik.cli.shared_options import add_object_pose, add_scene, add_tolerances
+from casadi_ik.cli.values import one_of, whole
 
 if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
@@ -45,12 +45,7 @@ def add_view(commands: Any) -> None:
     parser.add_argument(
         "--robot", metavar="R", help="a shipped name or a YAML file (default: the file's)"
     )
-    parser.add_argument(
-        "--scene",
-        metavar="FILE",
-        help="what answers must not touch: a shipped name or a YAML file (default: nothing is "
-        "checked)",
-    )
+    add_scene(parser, ", or what stood there beside a log")
     parser.add_argument("--method", metavar="M", help="to begin with; the page can change it")
     parser.add_argument(
         "--limits",
@@ -60,13 +55,7 @@ def add_view(commands: Any) -> None:
         help="whether being solved includes the limits (default: enforce)",
     )
     add_tolerances(parser)
-    parser.add_argument(
-        "--object-pose",
-        metavar="X",
-        type=numbers,
-        nargs="+",
-        help="where the object of candidates is: x y z [m] roll pitch yaw [rad]",
-    )
+    add_object_pose(parser, ", of candidates")
     parser.add_argument(
         "--solve",
         metavar="N",

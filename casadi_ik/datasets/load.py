@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +13,7 @@ from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.batches.target_file import TargetFile
 from casadi_ik.datasets.conventions import Convention, convention_for, of_robot
-from casadi_ik.datasets.hand_poses import HandPoses
+from casadi_ik.datasets.hand_poses import FAR, HandPoses
 from casadi_ik.datasets.hands import joints_at, motor_positions, palms_of
 from casadi_ik.datasets.layouts import LAYOUTS, READERS, read_layout
 from casadi_ik.datasets.tables import SUFFIXES, read_table
@@ -94,6 +95,7 @@ def load_candidates(
         raise DescriptionError(f"{file}: no such file or folder, expected candidates")
     thing = load_object(grasped) if isinstance(grasped, str) else grasped
     grasps = _loaded(file, held, layout, hand, take, thing, of)
+    _refuse_other_units(file, grasps)
     if object_pose is None:
         return grasps
     return tuple(grasp.in_object_frame().at(object_pose) for grasp in grasps)
@@ -132,6 +134,17 @@ def _loaded(
         except InputError as error:
             raise DescriptionError(f"{path}: {grasp.name}: {error}") from error
     return grasps
+
+
+def _refuse_other_units(path: Path, grasps: Sequence[Grasp]) -> None:
+    for grasp in grasps:
+        for finger, contact in grasp.contacts.items():
+            away = 0.0 if contact.point is None else float(np.linalg.norm(contact.point))
+            if away > FAR:
+                raise DescriptionError(
+                    f"{path}: {grasp.name}: {finger}: point: found {away:.4g} m away, expected at "
+                    f"most {FAR:g} m (numbers in mm?)"
+                )
 
 
 def _own(robot: ArmHand, names: tuple[str, ...]) -> Convention:

@@ -32,14 +32,18 @@ TYPES = """\
 WHOLE = "casadi_whole"
 """Name of the outermost function."""
 
+DOUBLE, SINGLE = ("elementary_alone", "elementary"), ("elementary_single",)
+"""Where sines and arcs are from."""
+
 UNUSED = "  (void) arg, (void) res, (void) iw, (void) w, (void) mem;\n"
 
 
-def standing_alone(function: Any) -> str:
+def standing_alone(function: Any, single: bool = False) -> str:
     """The C code of a CasADi function, all of it static.
 
     Args:
         function: Dense and row-major.
+        single: Whether it will be rewritten for single precision: then its sines are of that.
 
     Raises:
         UnsupportedError: It needs memory of its own.
@@ -58,8 +62,7 @@ def standing_alone(function: Any) -> str:
     return "".join(
         (
             TYPES,
-            driver_text("elementary_alone"),
-            driver_text("elementary"),
+            *map(driver_text, SINGLE if single else DOUBLE),
             driver_text("extremes"),
             *(f"#define {own} own_{own}\n" for own in (*OWN, "fmax", "fmin")),
             *lines,

@@ -13,9 +13,17 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.exporting.scene import SceneSources
-from casadi_ik.exporting.scene_targets import IN_TEST_C, SceneTargets
+from casadi_ik.exporting.scene_targets import IN_TEST_C, IN_TEST_SINGLE, SceneTargets
+from casadi_ik.exporting.single import SinglePrecision, in_single_precision
 from casadi_ik.exporting.solver import SolverSources, hand_first
-from casadi_ik.exporting.targets import COUNT, Example, example, targets_header, written
+from casadi_ik.exporting.targets import (
+    COUNT,
+    Example,
+    example,
+    single_targets_header,
+    targets_header,
+    written,
+)
 from casadi_ik.exporting.template import filled
 
 MARK = ".casadi_ik_export"
@@ -78,6 +86,7 @@ class Exported:
         marks: What stands for the marks of the templates.
         sources: Headers and C files by path.
         scene: What its targets are solved in; None: the export knows no scene.
+        judge: Files of the kinematics that judge answers in single precision.
     """
 
     solver: Solver
@@ -85,10 +94,19 @@ class Exported:
     marks: dict[str, str]
     sources: dict[str, str]
     scene: SceneTargets | None
+    judge: dict[str, str]
 
 
-def exported(robot: ArmHand, prefix: str, capacity: int | None = None) -> Exported:
+def exported(
+    robot: ArmHand, prefix: str, capacity: int | None = None, single: bool = False
+) -> Exported:
     """The solver of a robot as source code.
+
+    Args:
+        robot: The robot.
+        prefix: What every name begins with.
+        capacity: How many solids may stand about; None: collisions are not looked at.
+        single: Whether it is in single precision.
 
     Raises:
         UnsupportedError: It cannot be exported.
@@ -99,9 +117,12 @@ def exported(robot: ArmHand, prefix: str, capacity: int | None = None) -> Export
             "export: its test needs answers from compiled code, and there is no C compiler here; "
             "pip install 'casadi-ik[compiler]' brings one"
         )
-    scene = None if capacity is None else SceneSources.of(robot, method, prefix, capacity)
+    allowing = SinglePrecision(robot) if single else None
+    scene = None
+    if capacity is not None:
+        scene = SceneSources.of(robot, method, prefix, capacity, allowing)
     tolerance = next(iter(solver.tolerances.values()))
-    sources = SolverSources(robot, method, prefix, tolerance, scene)
+    sources = SolverSources(robot, method, prefix, tolerance, scene, allowing)
     shown = example(robot)
     marks = sources.substitutes | {
         "EXAMPLE_WHAT": shown.what,
@@ -120,7 +141,8 @@ def exported(robot: ArmHand, prefix: str, capacity: int | None = None) -> Export
     if scene is not None:
         files[f"src/{prefix}_scene.c"] = scene.source()
     about = None if capacity is None else SceneTargets(solver, capacity)
-    return Exported(solver, shown, marks, files, about)
+    judge = sources.judge() if single else {}
+    return Exported(solver, shown, marks, sources.final(files), about, judge)
 
 
 def tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
@@ -130,27 +152,38 @@ def tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
     return {name: piece.replace("@P", project.marks["PREFIX"]) for name, piece in pieces.items()}
 
 
-def c_project(robot: ArmHand, prefix: str, capacity: int | None = None) -> dict[str, str | bytes]:
+def c_project(
+    robot: ArmHand, prefix: str, capacity: int | None = None, single: bool = False
+) -> dict[str, str | bytes]:
     """The files of a project in C, by path.
+
+    Args:
+        robot: The robot.
+        prefix: What every name begins with.
+        capacity: How many solids may stand about; None: collisions are not looked at.
+        single: Whether it is in single precision.
 
     Raises:
         UnsupportedError: The robot's solver cannot be exported.
     """
-    project = exported(robot, prefix, capacity)
+    project = exported(robot, prefix, capacity, single)
     files = {
-        f"include/{prefix}.hpp": "solver.hpp",
         "example/main.c": "main.c",
-        "test/test.c": "test.c",
+        "test/test.c": "test_single.c" if single else "test.c",
         "bench/bench.c": "bench.c",
         "CMakeLists.txt": "CMakeLists.txt",
         "Makefile": "Makefile",
         "README.md": "README.md",
     }
-    marks = project.marks | tested(project, IN_TEST_C)
+    marks = project.marks | tested(project, IN_TEST_SINGLE if single else IN_TEST_C)
+    wrapper = filled("solver.hpp", marks)
+    header = single_targets_header if single else targets_header
     return {
         **project.sources,
+        f"include/{prefix}.hpp": in_single_precision(wrapper) if single else wrapper,
         **{path: filled(name, marks) for path, name in files.items()},
-        "test/targets.h": targets_header(project.solver, project.scene),
+        **project.judge,
+        "test/targets.h": header(project.solver, project.scene),
     }
 
 

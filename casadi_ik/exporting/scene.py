@@ -14,6 +14,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.model import CollisionModel, own_solids
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import UnsupportedError
+from casadi_ik.exporting.single import ARM_ROUNDING, SinglePrecision
 from casadi_ik.exporting.template import filled
 from casadi_ik.kernels.codegen import define, driver_text
 from casadi_ik.kernels.constants import define_arrays, number
@@ -42,6 +43,7 @@ class SceneSources:
         prefix: What every name begins with.
         capacity: How many solids may stand about.
         check: The robot's shapes with itself alone.
+        single: What it allows for in single precision; None: it is in double.
     """
 
     robot: ArmHand
@@ -49,10 +51,16 @@ class SceneSources:
     prefix: str
     capacity: int
     check: SceneCheck
+    single: SinglePrecision | None = None
 
     @classmethod
     def of(
-        cls, robot: ArmHand, method: HandFirstMethod, prefix: str, capacity: int
+        cls,
+        robot: ArmHand,
+        method: HandFirstMethod,
+        prefix: str,
+        capacity: int,
+        single: SinglePrecision | None = None,
     ) -> SceneSources:
         """Find the pairs.
 
@@ -61,7 +69,7 @@ class SceneSources:
         """
         if capacity > MOST:
             raise UnsupportedError(f"--scene: found {capacity}, expected at most {MOST} solids")
-        return cls(robot, method, prefix, capacity, SceneCheck(robot, Scene()))
+        return cls(robot, method, prefix, capacity, SceneCheck(robot, Scene()), single)
 
     @property
     def model(self) -> CollisionModel:
@@ -103,13 +111,39 @@ class SceneSources:
 
     @property
     def room(self) -> int:
-        """Numbers that the choice among arms works with (`room` of drivers/swings.c)."""
+        """Eights of bytes that the choice among arms works with (`room` of drivers/swings.c)."""
         if self.places is None:
             return 1
         p, n = self.places, len(self.robot.actuators)
         most = max(*map(len, p.levels), len(p.closer)) * p.sides + 1
         free, arm = p.levels[0].shape[1], len(p.columns)
-        return 2 * most * (arm + 5) + most * (12 + free) + (most + 1) * n + 3 + (most + 3) // 4
+        whole = 6 * most + 2
+        numbers = 2 * most * (arm + 2) + most * (12 + free) + (most + 1) * n + 1
+        size = 8 if self.single is None else 4
+        return whole + (size * numbers + 2 * most + 7) // 8
+
+    @property
+    def rounding(self) -> float:
+        """What an answer may be short of the distance to keep [m]."""
+        return ROUNDING if self.single is None else 0.0
+
+    @property
+    def allowed(self) -> float:
+        """How far within its bounds an arm has to be, [rad] negative: rounding at a limit."""
+        places = self.places
+        assert places is not None
+        return places.allowed if self.single is None else -ARM_ROUNDING
+
+    @property
+    def margin(self) -> dict[str, str]:
+        """What stands for the marks of the distance to keep: in single precision rounding more."""
+        if self.single is None:
+            return {"MORE_MARGIN": "", "FIRST_MARGIN": ""}
+        more = number(self.single.tolerance.position)
+        return {
+            "MORE_MARGIN": f" + {more}",
+            "FIRST_MARGIN": f"  {self.prefix}_set_margin(solver, 0.0);\n",
+        }
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -127,13 +161,14 @@ class SceneSources:
             "CAPSULES": str(len(self.model.capsules)),
             "OWN_SOLIDS": str(self._own),
             "LINKS": str(len(self.links)),
-            "ROUNDING": number(ROUNDING),
+            "ROUNDING": number(self.rounding),
             "MOST_PAIRS": str(max(self._most_pairs, 1)),
             "SCENE_CONSTANTS": self._constants(),
             "SWINGS": "" if self.places is None else driver_text("swings"),
             "LINK_NAMES": ", ".join(json.dumps(link, ensure_ascii=False) for link in self.links),
             "SHAPES_JSON": json.dumps(self.shapes()),
         }
+        room = "double" if self.single is None else "int64_t"
         wasm, js, types = (
             filled(name, marks) for name in ("scene_wasm.c", "scene.js", "scene.d.ts")
         )
@@ -145,7 +180,7 @@ class SceneSources:
                 "  int64_t nearest[2]; /* places in the list of links; -1 - number: a solid */\n"
                 f"  {self.prefix}_scene scene;\n"
             ),
-            "SCENE_ROOM": f"  double room[{self.room}];\n",
+            "SCENE_ROOM": f"  {room} room[{self.room}];\n",
             "SCENE_LOOK": filled("scene_look.c", marks),
             "SCENE_INIT": f"  {self.prefix}_scene_init(solver);\n",
             "SCENE_WASM": wasm,
@@ -170,7 +205,7 @@ class SceneSources:
 
     def source(self) -> str:
         """The file of the scene."""
-        marks = {
+        marks = self.margin | {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
             "SCENE_CONSTANTS": self._constants(),
@@ -237,7 +272,7 @@ class SceneSources:
             "N_PAIRS": len(pairs),
             "HAS_CLOSED_ARM": int(self.places is not None),
         }
-        text = f"#define ROUNDING {number(ROUNDING)}\n"
+        text = f"#define ROUNDING {number(self.rounding)}\n"
         if self.places is not None:
             p = self.places
             whole |= {
@@ -248,7 +283,7 @@ class SceneSources:
                 "N_MORE_PLACES": len(p.levels[1]),
                 "N_CLOSER": len(p.closer),
             }
-            text += f"#define ALLOWED {number(p.allowed)}\n"
+            text += f"#define ALLOWED {number(self.allowed)}\n"
             text += f"#define ARM_COLUMNS {{{', '.join(map(str, p.columns.tolist()))}}}\n"
             arrays |= {
                 "PLACES": p.levels[0].ravel(),

@@ -154,6 +154,9 @@ IN_TEST_C = {
         "  }\n"
     ),
 }
+IN_TEST_SINGLE = IN_TEST_C | {
+    "SCENE_TEST_SAME": "  met &= solver->clearance >= MARGIN;\n",
+}
 IN_TEST_MJS = {
     "SCENE_TEST_SAME": (
         "    (target.clearance !== null && target.clearance !== answer.clearance) ||\n"

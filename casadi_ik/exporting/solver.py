@@ -11,18 +11,23 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
 from casadi_ik.exporting.generated import standing_alone
+from casadi_ik.exporting.precision import IN_DOUBLE, in_single
 from casadi_ik.exporting.scene import SceneSources, without_scene
+from casadi_ik.exporting.single import SinglePrecision, in_single_precision
 from casadi_ik.exporting.template import filled
 from casadi_ik.kernels import FunctionKernel, LoopKernel
 from casadi_ik.kernels.codegen import define, driver_text, row_major
 from casadi_ik.kernels.constants import define_arrays
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.lookup import TILE
+from casadi_ik.methods.hand_first.beginning import terms
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.rounds import RoundsPlan, source_text
 from casadi_ik.methods.registry import build_method
 from casadi_ik.problem.problems import Problems, Tolerance
+from casadi_ik.problem.verdict import LIMIT_SLACK
 
 SIGNATURE = re.compile(r"EXPORT (?:LANES_TARGET )?int casadi_ik_\w+\((\w+) \*job\)")
 
@@ -54,6 +59,7 @@ class SolverSources:
         prefix: What every name in it begins with.
         tolerance: When a contact counts as reached, unless set otherwise.
         scene: What it knows of collisions; None: nothing.
+        single: What it allows for in single precision; None: it is in double.
     """
 
     robot: ArmHand
@@ -61,6 +67,7 @@ class SolverSources:
     prefix: str
     tolerance: Tolerance
     scene: SceneSources | None = None
+    single: SinglePrecision | None = None
 
     @cached_property
     def plan(self) -> RoundsPlan:
@@ -72,12 +79,14 @@ class SolverSources:
         """The kernels."""
         plan = self.plan
         lookup, n_state = plan.hands.table.lookup, plan.layouts.state.size
-        rows = max(spread.count for spread in plan.hands.spreads[:2])
+        rows = max(spread.count for spread in plan.hands.spreads[:2]) + TILE
+        # Distances of all rows and of their tiles are 32 bits each.
+        room = rows if self.single is None else rows + rows // TILE
         # The record of an iteration is never asked for.
         loop = define(plan.solve.constants | {"N_RECORD": 0, "ROW_BYTES": 0})
         loop += "#define store_row(record, row) ((void) (record), (void) (row))\n"
         parts = (
-            self._part("look_up", "lookup", lookup.key, define(lookup.constants), rows + TILE),
+            self._part("look_up", "lookup", lookup.key, define(lookup.constants), room),
             self._part("begin", "map", plan.begin),
             self._part("solve", "loop", plan.solve, loop, 2 * n_state),
             self._part("contacts", "map", plan.contacts),
@@ -122,7 +131,7 @@ class SolverSources:
         body = "".join(
             (
                 f'#include "{self.prefix}_parts.h"\n\n',
-                standing_alone(function),
+                standing_alone(function, self.single is not None),
                 driver_text("freestanding"),
                 define({"N_W": function.sz_w()}),
                 filled("take.c", {"PREFIX": self.prefix}),
@@ -149,6 +158,10 @@ class SolverSources:
             for p in self.parts
         )
         about = without_scene() if self.scene is None else self.scene.substitutes()
+        about |= IN_DOUBLE if self.single is None else in_single(self.single)
+        lower, upper = self._bounds
+        single = self.single
+        changed = (None, None) if single is None else (single.reals, single.arrays)
         return about | {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
@@ -168,11 +181,11 @@ class SolverSources:
             "PARTS": parts,
             "CALLS": calls,
             "SIZES": define(sizes),
-            "CONSTANTS": self.plan.constants(),
+            "CONSTANTS": self.plan.constants(*changed),
             "ROUNDS": source_text("rounds"),
             "TERMS": define_arrays({"TERMS": self._terms(), "HOME": robot.home}),
             "LIMITS": define_arrays(
-                {f"{self.prefix}_lower": robot.lower, f"{self.prefix}_upper": robot.upper}, "const"
+                {f"{self.prefix}_lower": lower, f"{self.prefix}_upper": upper}, "const"
             ),
             "POSITION_TOLERANCE": repr(self.tolerance.position),
             "ANGLE_TOLERANCE": repr(self.tolerance.angle),
@@ -197,10 +210,41 @@ class SolverSources:
             body = re.sub(rf"\b{name}\b", str(size), body)
         return body.strip("\n").rstrip()
 
-    def _terms(self) -> Any:
+    @property
+    def _bounds(self) -> tuple[Array, Array]:
+        return (self.robot.lower, self.robot.upper) if self.single is None else self.single.bounds
+
+    def _terms(self) -> Array:
         f = len(self.robot.fingers)
-        none = np.zeros((1, f, 3))
-        return self.method.terms(Problems(none, none, self.tolerance, True))
+        none, allowed = np.zeros((1, f, 3)), self.tolerance
+        layout = terms(self.robot.description)
+        if self.single is not None:
+            less = self.single.tolerance
+            allowed = Tolerance(allowed.position - less.position, allowed.angle - less.angle)
+        found = self.method.terms(Problems(none, none, allowed, True)).copy()
+        found[layout.slice("lower")], found[layout.slice("upper")] = self._bounds
+        return found
+
+    def judge(self) -> dict[str, str]:
+        """Files of the kinematics in double precision that answers are judged by."""
+        function = self.plan.judge.function
+        marks = {
+            "KINEMATICS": standing_alone(function),
+            "JUDGE_W": str(max(function.sz_w(), 1)),
+            "JUDGE_IW": str(max(function.sz_iw(), 1)),
+            "JUDGE_ARG": str(function.sz_arg()),
+            "JUDGE_RES": str(function.sz_res()),
+            "POSITION_TOLERANCE": repr(self.tolerance.position),
+            "ANGLE_TOLERANCE": repr(self.tolerance.angle),
+            "LIMIT_SLACK": repr(LIMIT_SLACK),
+        }
+        return {f"test/{name}": filled(name, marks) for name in ("judge.c", "judge.h")}
+
+    def final(self, files: dict[str, str]) -> dict[str, str]:
+        """Files in C, in the precision that is wanted."""
+        if self.single is None:
+            return files
+        return {path: in_single_precision(text) for path, text in files.items()}
 
 
 def hand_first(robot: ArmHand) -> HandFirstMethod:

@@ -11,6 +11,7 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.exporting.scene_targets import SceneTargets
+from casadi_ik.exporting.single import in_single_precision
 from casadi_ik.grasps.load import load_grasp, shipped_grasps
 from casadi_ik.kernels.constants import number, numbers
 
@@ -98,6 +99,25 @@ def targets_header(solver: Solver, scene: SceneTargets | None = None) -> str:
         f"{'' if scene is None else '  double clearance;' + chr(10)}}} target;\n\n"
         "static const target targets[TARGETS] = {\n" + "".join(rows) + "};\n"
     ) + ("" if scene is None else "\n" + scene.header())
+
+
+def single_targets_header(solver: Solver, scene: SceneTargets | None = None) -> str:
+    """The same for a solver in single precision: no answers, and the scene as it takes it."""
+    robot = solver.robot
+    f, n = len(robot.fingers), len(robot.actuators)
+    rows = []
+    for target in stored(solver, scene):
+        q0 = target["q0"] or robot.home.tolist()
+        arrays = map(numbers, (target["points"], target["normals"], q0))
+        whole = int(target["q0"] is not None), int(target["status"])
+        rows.append("{" + ", ".join([*map(str, whole), *arrays]) + "},\n")
+    return (
+        "/* Targets, and how they end in double precision. */\n"
+        f"enum {{ TARGETS = {COUNT} }};\n\n"
+        "typedef struct {\n  int near, status;\n"
+        f"  double points[{3 * f}], normals[{3 * f}], q0[{n}];\n}} target;\n\n"
+        "static const target targets[TARGETS] = {\n" + "".join(rows) + "};\n"
+    ) + ("" if scene is None else "\n" + in_single_precision(scene.header()))
 
 
 def written(array: Array) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -79,8 +81,7 @@ class Asked:
     @property
     def sound(self) -> bool:
         """Whether what was asked in the last step were numbers and directions."""
-        told = self._told[-1]
-        return bool(told - told == 0.0)
+        return math.isfinite(self._told[-1])
 
     def ask_partly(self, points: Array, normals: Array) -> str:
         """Ask for points and normals of which some may be free.

@@ -10,7 +10,7 @@ import viser
 
 from casadi_ik import palette
 from casadi_ik.arrays import Array
-from casadi_ik.collision.scene import Item
+from casadi_ik.collision.scene import Item, Scene
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.grasps import load_object
 from casadi_ik.grasps.pose import inverse
@@ -24,6 +24,42 @@ OBJECT = "object"
 
 SIZE = 0.16
 """Of the control of a thing [m]."""
+
+
+def draw_scene(server: viser.ViserServer, scene: Scene, above: str) -> None:
+    """Draw what stands about a robot, to be looked at only.
+
+    Args:
+        server: The page.
+        scene: The scene.
+        above: The node that the robot's base is.
+    """
+    for name, item in scene.items.items():
+        for i, surface in enumerate(_item_surfaces(item)):
+            server.scene.add_mesh_simple(
+                f"{above}/things/{name}/{i}",
+                surface.points.astype(np.float32),
+                surface.triangles.astype(np.uint32),
+                color=palette.rgb(palette.SCENE),
+                opacity=0.8,
+                position=item.pose[:3, 3],
+                wxyz=quaternion(item.pose[:3, :3]),
+                cast_shadow=False,
+                receive_shadow=0.15,
+            )
+
+
+def lowest(scene: Scene | None) -> float:
+    """Height of the ground: that of the robot's base, or below all that stands there [m]."""
+    heights = [0.0]
+    for item in () if scene is None else scene.items.values():
+        for solid, place in item.parts:
+            if np.isfinite(solid.reach):
+                points = body_of(solid, np.zeros(3)).moved(item.pose @ place).points
+                heights.append(float(points[:, 2].min()) - 1e-3)
+            else:
+                heights.append(float((item.pose @ place)[2, 3]) - 4e-3)
+    return min(heights)
 
 
 class DrawnThings:

@@ -24,13 +24,14 @@ def save_grasp(client: Any, grasp: Grasp, solved: bool) -> None:
     """Send a grasp file."""
     comment = "From a page on which contacts are dragged; " + ("solved." if solved else "unsolved.")
     name = re.sub(r"\W+", "_", grasp.name) or "grasp"
-    client.send_file_download(f"{name}.yaml", grasp_text(grasp, comment).encode())
+    text = grasp_text(grasp, comment).encode()
+    client.send_file_download(f"{name}.yaml", text, save_immediately=True)
 
 
 def save_picture(client: Any, name: str) -> None:
     """Send what a browser sees, drawn by it anew in print size."""
     image = client.get_render(SIZE[1], SIZE[0], transport_format="png", timeout=PATIENCE)
-    client.send_file_download(name, png(np.asarray(image)))
+    client.send_file_download(name, png(np.asarray(image)), save_immediately=True)
 
 
 def picture_name(what: str) -> str:

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-import numpy as np
 import viser
 
 from casadi_ik import palette
@@ -17,11 +16,10 @@ from casadi_ik.importing.surfaces import Surface
 from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.viewing.answering import LOOKING, Answered, Answerer, failed
 from casadi_ik.viewing.asked import Asked
-from casadi_ik.viewing.bodies import body_of
 from casadi_ik.viewing.drawn_closest import DrawnClosest
 from casadi_ik.viewing.drawn_contacts import Drags, DrawnContacts
 from casadi_ik.viewing.drawn_robot import DrawnRobot
-from casadi_ik.viewing.drawn_things import OBJECT, DrawnThings
+from casadi_ik.viewing.drawn_things import OBJECT, DrawnThings, lowest
 from casadi_ik.viewing.newest import Newest
 from casadi_ik.viewing.panel import Panel
 from casadi_ik.viewing.robot_parts import robot_parts
@@ -82,7 +80,7 @@ class GraspPage:
         self.solutions: tuple[Alternative, ...] = ()
         self._dragged, self._forward = "", not solved
         self._motors_shown = 0.0
-        set_stage(server, asked.name or robot.name, _lowest(asked))
+        set_stage(server, asked.name or robot.name, lowest(asked.scene))
         look_at_robot(server, robot, self.answer.q)
         self._drawn = DrawnRobot(server, robot, robot_parts(robot, meshes))
         self._contacts = DrawnContacts(
@@ -238,16 +236,3 @@ class GraspPage:
     def stop(self) -> None:
         """End its thread."""
         self.work.stop()
-
-
-def _lowest(asked: Asked) -> float:
-    """Height of the ground: that of the robot's base, or below all that stands there [m]."""
-    lowest = [0.0]
-    for item in () if asked.scene is None else asked.scene.items.values():
-        for solid, place in item.parts:
-            if np.isfinite(solid.reach):
-                points = body_of(solid, np.zeros(3)).moved(item.pose @ place).points
-                lowest.append(float(points[:, 2].min()) - 1e-3)
-            else:
-                lowest.append(float((item.pose @ place)[2, 3]) - 4e-3)
-    return min(lowest)

@@ -12,10 +12,12 @@ import viser
 
 from casadi_ik import palette
 from casadi_ik.arrays import Array
+from casadi_ik.collision.scene import Scene
 from casadi_ik.logs.explain.phrases import plain_name
 from casadi_ik.viewing.charts import Course, chart
 from casadi_ik.viewing.drawn_contacts import Drags, DrawnContacts
 from casadi_ik.viewing.drawn_robot import DrawnRobot
+from casadi_ik.viewing.drawn_things import draw_scene, lowest
 from casadi_ik.viewing.log_track import Track
 from casadi_ik.viewing.newest import Newest
 from casadi_ik.viewing.robot_parts import robot_parts
@@ -44,16 +46,20 @@ class LogPage:
         work: What everything is done by.
     """
 
-    def __init__(self, server: viser.ViserServer, tracks: Sequence[Track]) -> None:
+    def __init__(
+        self, server: viser.ViserServer, tracks: Sequence[Track], scene: Scene | None = None
+    ) -> None:
         """Draw everything.
 
         Args:
             server: The page.
             tracks: One solve or two.
+            scene: What stood about each robot; None: nothing.
         """
         self.server, self.tracks, self.now = server, tuple(tracks), 0
+        self._scene = scene
         first = tracks[0]
-        set_stage(server, " / ".join(track.label for track in tracks))
+        set_stage(server, " / ".join(track.label for track in tracks), lowest(scene))
         middle = len(first.q) // 2
         look_at_robot(server, first.robot, first.q[middle], wide=len(tracks))
         self._shown = [self._add(i, track) for i, track in enumerate(tracks)]
@@ -101,6 +107,8 @@ class LogPage:
         frame.position = self._aside(number)
         drawn = DrawnRobot(self.server, track.robot, robot_parts(track.robot), name=f"{name}/robot")
         contacts = DrawnContacts(self.server, track.asked, NOBODY, name)
+        if self._scene is not None:
+            draw_scene(self.server, self._scene, name)
         if len(self.tracks) > 1:
             self.server.scene.add_label(
                 f"{name}/label", track.label, position=(0.0, 0.0, 0.02), anchor="top-center"

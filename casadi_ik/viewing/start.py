@@ -70,12 +70,16 @@ def view_grasp(
 
 
 def view_log(
-    *solves: tuple[OneSolve, ArmHand], host: str = HOST, port: int | None = None
+    *solves: tuple[OneSolve, ArmHand],
+    scene: Scene | None = None,
+    host: str = HOST,
+    port: int | None = None,
 ) -> Viewer:
     """A page on which one solve plays, or two side by side.
 
     Args:
         solves: Each with the robot that it was solved for.
+        scene: What stood about the robot, which a log does not tell; None: nothing is drawn.
         host: As for `view_grasp`.
         port: As for `view_grasp`.
 
@@ -87,7 +91,7 @@ def view_log(
         raise InputError(f"found {len(solves)} solves, expected one or two")
     tracks = [track_of(*one) for one in solves]
     server = serve(host, port)
-    page = LogPage(server, tracks)
+    page = LogPage(server, tracks, scene)
     return Viewer(server, page, page.stop)
 
 

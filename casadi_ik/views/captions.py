@@ -12,7 +12,7 @@ from casadi_ik import palette
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Grasp
 from casadi_ik.problem.solution import Solution
-from casadi_ik.views.picture import FAINT, INK
+from casadi_ik.views.picture import LIGHT, Ground
 
 OBJECT_COLOR = palette.OBJECT
 TARGET_COLOR = palette.TARGET
@@ -20,7 +20,13 @@ MET_COLOR, MISSED_COLOR = palette.MET, palette.MISSED
 NEAREST_COLOR = palette.NEAREST
 
 
-def label_fingers(axes: Axes, places: dict[str, Array], solution: Solution, grasp: Grasp) -> None:
+def label_fingers(
+    axes: Axes,
+    places: dict[str, Array],
+    solution: Solution,
+    grasp: Grasp,
+    ground: Ground = LIGHT,
+) -> None:
     """Name and errors of every finger, at the edge of the picture with a line to its contact.
 
     Args:
@@ -28,6 +34,7 @@ def label_fingers(axes: Axes, places: dict[str, Array], solution: Solution, gras
         places: Where the contact of each finger is in it [pixels].
         solution: The answer.
         grasp: The question.
+        ground: What is drawn on.
     """
     height, width = axes.images[0].get_size()
     asked = grasp.contacts or places  # of a palm that is given all fingers follow
@@ -39,14 +46,14 @@ def label_fingers(axes: Axes, places: dict[str, Array], solution: Solution, gras
         side = "right" if x > middle else "left"
         level = lowest[side] = max(y, lowest[side] + 0.12 * height, 0.08 * height)
         edge, shoulder = (0.985, 0.825) if side == "right" else (0.015, 0.175)
-        above = {"ha": side, "va": "bottom", "size": 11, "color": INK, "weight": "bold"}
+        above = {"ha": side, "va": "bottom", "size": 11, "color": ground.ink, "weight": "bold"}
         axes.text(edge * width, level - 0.006 * height, finger, **above)
         color = MET_COLOR if verdict.ok else MISSED_COLOR
         below = {"ha": side, "va": "top", "size": 9.5, "color": color}
         errors = _errors(verdict.position_error, verdict.angle_error)
         axes.text(edge * width, level + 0.006 * height, errors, **below)
         line = [edge * width, shoulder * width, x], [level, level, y]
-        axes.plot(*line, color=FAINT, lw=0.8, alpha=0.8)
+        axes.plot(*line, color=ground.faint, lw=0.8, alpha=0.8)
 
 
 def _errors(position: float, angle: float) -> str:
@@ -54,7 +61,7 @@ def _errors(position: float, angle: float) -> str:
     return "  ".join(parts if np.isnan(angle) else [*parts, f"{np.rad2deg(angle):.2f}°"])
 
 
-def add_title(figure: Figure, solution: Solution, grasp: Grasp) -> None:
+def add_title(figure: Figure, solution: Solution, grasp: Grasp, ground: Ground = LIGHT) -> None:
     """What was asked, how it ended, and the largest errors."""
     worst = [
         np.nanmax([getattr(verdict, name) for verdict in solution.contacts.values()] + [0.0])
@@ -62,17 +69,22 @@ def add_title(figure: Figure, solution: Solution, grasp: Grasp) -> None:
     ]
     what = f"{grasp.name} · {solution.robot}" if grasp.name else solution.robot
     large = {"size": 16, "weight": "bold", "va": "center"}
-    figure.text(0.02, 0.945, what, color=INK, **large)
+    figure.text(0.02, 0.945, what, color=ground.ink, **large)
     color = MET_COLOR if solution.success else MISSED_COLOR
     figure.text(0.98, 0.945, solution.status.name, color=color, ha="right", **large)
     limits = "" if solution.limits_ok else " · beyond a limit"
     how = f"{solution.method} · {solution.iterations} iterations"
     how += f" · largest errors {_errors(*worst)}{limits}"
-    figure.text(0.02, 0.90, how, size=11, color=FAINT, va="center")
+    figure.text(0.02, 0.90, how, size=11, color=ground.faint, va="center")
 
 
 def add_legend(
-    figure: Figure, solution: Solution, grasp: Grasp, has_object: bool, has_scene: bool = False
+    figure: Figure,
+    solution: Solution,
+    grasp: Grasp,
+    has_object: bool,
+    has_scene: bool = False,
+    ground: Ground = LIGHT,
 ) -> None:
     """What the arrows mean."""
     states = {verdict.ok for verdict in solution.contacts.values()}
@@ -87,7 +99,7 @@ def add_legend(
         pair = " and ".join(solution.closest)
         label = f"nearest: {pair}, {1e3 * solution.clearance:.1f} mm"
         handles.append(Line2D([], [], color=NEAREST_COLOR, lw=3.0, label=label))
-    style = {"frameon": False, "fontsize": 10, "labelcolor": INK}
+    style = {"frameon": False, "fontsize": 10, "labelcolor": ground.ink}
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), **style)
 
 

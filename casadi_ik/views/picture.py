@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -21,15 +22,35 @@ INK, FAINT = palette.INK, palette.FAINT
 """Colours of text."""
 
 
-def new_figure(width: float, height: float, dpi: float = DPI) -> Figure:
+@dataclass(frozen=True)
+class Ground:
+    """What a picture is drawn on.
+
+    Attributes:
+        paper: Its colour.
+        ink: Of text.
+        faint: Of text beside.
+    """
+
+    paper: str
+    ink: str
+    faint: str
+
+
+LIGHT = Ground("#ffffff", INK, FAINT)
+DARK = Ground(palette.DARK_PAPER, palette.DARK_INK, palette.DARK_FAINT)
+
+
+def new_figure(width: float, height: float, dpi: float = DPI, ground: Ground = LIGHT) -> Figure:
     """An empty figure.
 
     Args:
         width: [inch].
         height: [inch].
         dpi: Dots per inch.
+        ground: What it is drawn on.
     """
-    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor=ground.paper)
     FigureCanvasAgg(figure)
     return figure
 

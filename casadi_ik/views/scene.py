@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
@@ -30,7 +31,7 @@ from casadi_ik.views.captions import (
 )
 from casadi_ik.views.marks import contact_marks, target_place
 from casadi_ik.views.obstacles import in_scene, nearest_pair, scene_solids
-from casadi_ik.views.picture import DPI, INK, new_figure, save_picture
+from casadi_ik.views.picture import DARK, DPI, INK, LIGHT, new_figure, save_picture
 from casadi_ik.views.robot_body import robot_body
 from casadi_ik.views.shapes import Solid, with_edges
 from casadi_ik.views.stage import Image, Stage, over
@@ -74,6 +75,7 @@ def draw_solution(
     scene: Scene | None = None,
     view: View | None = None,
     dpi: float = DPI,
+    dark: bool = False,
 ) -> Figure:
     """Draw the answer to a grasp.
 
@@ -87,6 +89,7 @@ def draw_solution(
         view: Azimuth and elevation [rad] from which the close-up is seen; None: chosen so that
             the fingertips are well apart.
         dpi: Dots per inch.
+        dark: For a dark page.
 
     Returns:
         The figure, which belongs to no pyplot window.
@@ -96,7 +99,8 @@ def draw_solution(
         DescriptionError: The description of the object is malformed.
         InputError: The grasp has a finger that the robot has not.
     """
-    figure = new_figure(*SIZE, dpi)
+    ground = DARK if dark else LIGHT
+    figure, paper = new_figure(*SIZE, dpi, ground), np.float32(palette.rgb(ground.paper)) / 255
     colors = {
         finger: MET_COLOR if verdict.ok else MISSED_COLOR
         for finger, verdict in solution.contacts.items()
@@ -109,7 +113,7 @@ def draw_solution(
         target = _middle(robot, solution.q, grasp)
         pixels = _pixels(figure, WHOLE)
         stage.aim(whole_view(target, view), _points(*solids.values()), pixels, (0.03, 0.10))
-        image = over(1.0, stage.shoot("floor"), _inwards(pixels))
+        image = over(paper, stage.shoot("floor"), _inwards(pixels))
         image = over(image, stage.shoot("arm", "wrist", "hand", "object", "marks", *AROUND))
         _panel(figure, WHOLE, over(image, stage.shoot("marks", "nearest"), GHOST))
 
@@ -119,13 +123,13 @@ def draw_solution(
         pixels = _pixels(figure, CLOSE)
         stage.aim(view, _points(solids["hand"], near), pixels, (0.17, 0.02))
         # The arm is pale: it may stand in the way.
-        image = over(1.0, stage.shoot("wrist"), WRIST * _inwards(pixels))
+        image = over(paper, stage.shoot("wrist"), WRIST * _inwards(pixels))
         image = over(image, stage.shoot("hand", "object", "marks", "nearest", "touching"))
         axes = _panel(figure, CLOSE, over(image, stage.shoot("marks", "nearest"), GHOST))
         seen = stage.project(robot.contacts(solution.q)[0])
-    label_fingers(axes, dict(zip(robot.fingers, seen, strict=True)), solution, grasp)
-    add_title(figure, solution, grasp)
-    add_legend(figure, solution, grasp, bool(solids["object"]), scene is not None)
+    label_fingers(axes, dict(zip(robot.fingers, seen, strict=True)), solution, grasp, ground)
+    add_title(figure, solution, grasp, ground)
+    add_legend(figure, solution, grasp, bool(solids["object"]), scene is not None, ground)
     if path is not None:
         save_picture(figure, path)
     return figure

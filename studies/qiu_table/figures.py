@@ -15,12 +15,13 @@ from runner import Setting, Study, rate_metric
 from runner.study import robot_of
 
 import casadi_ik as ik
+from casadi_ik.palette import method_colors
 from qiu_table.paper import TABLE_I, printed_mean
 from qiu_table.settings import LIMITS, METHODS
 from qiu_table.tables import HEADS
 
 mpl.use("Agg")
-COLOURS = dict(zip(METHODS, mpl.colormaps["tab10"].colors, strict=False))  # type: ignore[attr-defined]
+COLOURS = method_colors(METHODS)
 DPI = 130
 CURVES = 8
 """Solved and failed runs drawn per method."""

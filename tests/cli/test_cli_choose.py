@@ -122,10 +122,13 @@ def test_bad_input_is_one_line_and_writes_nothing(run: Command, tmp_path: Path) 
     empty.mkdir()
     rows = tmp_path / "rows.npz"
     np.savez(rows, points=np.full((1, 3, 3), np.nan), normals=np.full((1, 3, 3), np.nan))
+    in_mm = tmp_path / "in_mm.npz"
+    np.savez(in_mm, points=np.full((1, 3, 3), 300.0), normals=np.full((1, 3, 3), np.nan))
     for path, expected in (
         (empty, "empty: found no YAML file, expected grasp files"),
         (tmp_path / "none.yaml", "none.yaml: no such file or folder"),
         (rows, "rows.npz: row 0: contacts: found none"),
+        (in_mm, "point: found 519.6 m away, expected at most 5 m (numbers in mm?)"),
     ):
         assert expected in run("choose", path, *words, "--out", out).error
     bad.write_text(yaml.safe_dump({"candidates": [entry(0.0)]}))

@@ -73,6 +73,7 @@ def test_keypoints_and_a_bad_frame(run: Command, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     keypoints = np.tile(rng.normal(size=(21, 3)), (40, 1, 1))
     keypoints[20] = np.nan
+    keypoints[24, 0] = np.inf
     frames = write(tmp_path, keypoints=keypoints)
     (tmp_path / "hand.yaml").write_text("robot: kuka_lwr_barrett\n" + RETARGET)
     out = tmp_path / "motion.npz"
@@ -91,6 +92,8 @@ def test_keypoints_and_a_bad_frame(run: Command, tmp_path: Path) -> None:
         ({"other": np.zeros(3)}, (), "expected keypoints (k, 21, 3) or points (k, 3, 3); found"),
         ({"points": np.zeros((0, 3, 3))}, (), "points: found shape (0, 3, 3), expected"),
         ({"points": np.full((2, 3, 3), "a")}, (), "points: found values of type"),
+        ({"points": np.full((2, 3, 3), 300.0)}, (), "expected at most 5 m (numbers in mm?)"),
+        ({"keypoints": 80.0 * np.eye(21)[None, :, :3]}, (), "m from the middle of the hand"),
         (
             {"points": np.zeros((2, 3, 3)), "times": [1.0, 0.0]},
             (),

@@ -16,6 +16,13 @@ pytestmark = pytest.mark.skipif(
 
 HERE = Path(__file__).parent
 
+OF_THE_COMPILER = (
+    "bit_for_bit or last_places or finite or equals_vm or row_major or comes_back or threads "
+    "or lookup or elementary"
+)
+"""Of the kernels' tests those whose outcome may be another with another compiler: arithmetic, the
+order of numbers, vectors, locks. What C says in any case is said once."""
+
 ITERATES = """
 import sys
 import numpy as np
@@ -34,19 +41,28 @@ for step in (random_step(0), branching_step()):
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """One without any compiler on its path, and caches of its own."""
+    """One without any compiler on its path, and a cache of its own.
+
+    Zig's own is the user's: from nothing zig makes its libraries anew, which takes longer than all
+    that is tested here.
+    """
     tmp_path = tmp_path_factory.mktemp("zig")
     (tmp_path / "empty").mkdir()
     changed = {"PATH": str(tmp_path / "empty"), "CASADI_IK_CACHE": str(tmp_path / "cache")}
-    home = {"ZIG_GLOBAL_CACHE_DIR": str(tmp_path / "zig"), "PYTHONPATH": str(HERE.parents[1])}
-    return {key: value for key, value in os.environ.items() if key != "CC"} | changed | home
+    here = {"PYTHONPATH": str(HERE.parents[1])}
+    return {key: value for key, value in os.environ.items() if key != "CC"} | changed | here
 
 
 def test_the_kernel_tests_pass(environment: dict[str, str]) -> None:
     files = ("test_loop.py", "test_function_kernel.py", "test_lookup.py", "test_elementary.py")
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0"]
     done = subprocess.run(
-        [*command, *(str(HERE / name) for name in files)],
+        [
+            *command,
+            *(str(HERE / name) for name in files),
+            "-k",
+            f"({OF_THE_COMPILER}) and not False",
+        ],
         env=environment,
         cwd=HERE.parents[1],
         capture_output=True,

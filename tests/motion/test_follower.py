@@ -49,10 +49,13 @@ def test_what_moves_smoothly_is_followed_within_tolerance(robot, solver, seed):
     np.testing.assert_allclose([state.angle_error for state in states], angle, atol=1e-7)
 
 
-kinds = st.sampled_from(["random", "near", "far", "NaN", "partly", "infinite", "zero", "free"])
+kinds = st.sampled_from(
+    ["random", "near", "far", "NaN", "partly", "infinite", "endless", "zero", "free"]
+)
 
 
 @settings(max_examples=40)
+@example(seed=1, events=["near", "endless", "near"])
 @example(seed=182075427, events=["near", "near", "random", "random", "random", "NaN", "near"])
 @given(seed=st.integers(0, 2**32), events=st.lists(kinds, min_size=1, max_size=12))
 def test_limits_are_kept_whatever_the_targets_do(robot, solver, seed, events):
@@ -72,6 +75,8 @@ def test_limits_are_kept_whatever_the_targets_do(robot, solver, seed, events):
             points[1, 2] = np.nan
         elif event == "infinite":
             normals[0, 0] = np.inf
+        elif event == "endless":
+            points[0, 1] = np.inf
         elif event == "zero":
             normals[2] = 0
         elif event == "free":
@@ -79,7 +84,7 @@ def test_limits_are_kept_whatever_the_targets_do(robot, solver, seed, events):
         for _ in range(rng.integers(1, 60)):
             q.append(follower(points, normals))
             state = follower.state
-            bad = event in ("NaN", "partly", "infinite", "zero")
+            bad = event in ("NaN", "partly", "infinite", "endless", "zero")
             assert (state.status is ik.FollowStatus.HOLDING) == bad
             assert bool(state.reason) == bad
     check_limits(robot, follower, np.array(q))

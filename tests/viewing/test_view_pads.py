@@ -11,7 +11,9 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.errors import DescriptionError
 from casadi_ik.viewing import Viewer, view_pads
+from casadi_ik.viewing.meshes import robot_meshes
 from casadi_ik.viewing.pad_text import LinkPad, corrected, save_pads
+from casadi_ik.viewing.robot_parts import robot_parts
 
 URDF = """<robot name="hand"><link name="palm"/>
 {links}</robot>"""
@@ -111,3 +113,13 @@ def test_others_may_look_but_not_write(description: Path) -> None:
     viewer = view_pads(description, host="0.0.0.0")
     assert viewer.page._save.disabled
     viewer.stop()
+
+
+def test_meshes_are_those_of_the_files(description: Path) -> None:
+    robot = ik.load_robot(description)
+    meshes = robot_meshes(robot, description)
+    assert set(meshes) == {"first_2", "second_2"}
+    drawn = {part.link: part.surface for part in robot_parts(robot, meshes)}
+    for link in meshes:
+        assert np.allclose(np.ptp(drawn[link].points, axis=0), [0.02, 0.016, 0.04])
+        assert np.allclose(drawn[link].points.mean(axis=0), [0, 0, 0.02])

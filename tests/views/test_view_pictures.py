@@ -27,7 +27,7 @@ from casadi_ik.views.captions import (
     TARGET_COLOR,
 )
 from casadi_ik.views.marks import contact_marks, target_place
-from casadi_ik.views.picture import new_figure, save_picture
+from casadi_ik.views.picture import DARK, LIGHT, new_figure, save_picture
 from casadi_ik.views.strips import events_strip
 
 pytestmark = pytest.mark.opengl
@@ -62,6 +62,18 @@ def test_the_picture_says_how_it_ended(robot, solution, grasp) -> None:
     for finger in robot.fingers:
         assert finger in text
     assert len(figure.axes) == 2
+
+
+def test_a_dark_page_has_a_picture_of_its_own(robot, solution, grasp) -> None:
+    light, dark = (draw_solution(robot, solution, grasp, dpi=20, dark=on) for on in (False, True))
+    assert words(light) == words(dark)
+    for figure, paper in ((light, LIGHT.paper), (dark, DARK.paper)):
+        assert mcolors.to_hex(figure.get_facecolor()) == paper
+        # Where nothing stands the picture is as dark as what it is on.
+        corner = figure.axes[1].images[0].get_array()[0, 0]
+        assert mcolors.to_hex(corner) == paper
+        brightness = sum(mcolors.to_rgb(figure.texts[0].get_color())) / 3
+        assert (brightness > 0.5) == (figure is dark)
 
 
 def test_alternatives_are_drawn_side_by_side(robot, grasp) -> None:

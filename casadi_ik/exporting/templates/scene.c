@@ -24,7 +24,7 @@ void @PREFIX@_scene_init(@PREFIX@_solver *solver) {
     own->reach = OWN_REACH[i];
   }
   for (i = 0; i < @GUARD@_SCENE; ++i) solver->scene.solids[N_OWN + i].kind = @GUARD@_NOTHING;
-}
+@FIRST_MARGIN@}
 
 int @PREFIX@_set_solid(@PREFIX@_solver *solver, int number, int kind, const double *size,
                        const double *pose, int grasped) {
@@ -50,7 +50,7 @@ int @PREFIX@_set_solid(@PREFIX@_solver *solver, int number, int kind, const doub
   return 0;
 }
 
-void @PREFIX@_set_margin(@PREFIX@_solver *solver, double margin) { solver->scene.margin = margin; }
+void @PREFIX@_set_margin(@PREFIX@_solver *solver, double margin) { solver->scene.margin = margin@MORE_MARGIN@; }
 
 void @PREFIX@_shapes(@PREFIX@_solver *solver, const double *q, double *places) {
   (void) @PREFIX@_place_kernel(q, places, &solver->memory);

@@ -27,8 +27,8 @@ void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, double position
   int i;
   for (i = 0; i < N_FINGERS; ++i) {
     if (finger >= 0 && i != finger) continue;
-    solver->terms[i] = position;
-    solver->terms[N_FINGERS + i] = angle;
+    solver->terms[i] = position@LESS_POSITION@;
+    solver->terms[N_FINGERS + i] = angle@LESS_ANGLE@;
   }
 }
 

@@ -11,7 +11,7 @@
  *
  * No heap, no locks, no input or output, no state outside the struct: solvers of several threads
  * do not know of each other. Lengths in metres, angles in radians, the robot's base frame.
- */
+@PRECISION_NOTE@ */
 #ifndef @GUARD@_H
 #define @GUARD@_H
 

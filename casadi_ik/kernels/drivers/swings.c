@@ -88,9 +88,10 @@ static int64_t more_arms(const swings_job *job) {
 
 static size_t room(const swings_job *job) {
   const int64_t wide = job->n_arm + 1, most = more_arms(job);
-  const int64_t numbers = 2 * most * (wide + 4) + most * (PALM + job->n_free)
-                        + (most + job->lanes) * job->n_q + 3 * job->lanes;
-  return (size_t) numbers * sizeof(double) + 2 * (size_t) most;
+  const int64_t whole = 6 * most + 2 * job->lanes;
+  const int64_t numbers = 2 * most * (wide + 1) + most * (PALM + job->n_free)
+                        + (most + job->lanes) * job->n_q + job->lanes;
+  return (size_t) whole * sizeof(int64_t) + (size_t) numbers * sizeof(double) + 2 * (size_t) most;
 }
 
 static void lay_out(const swings_job *job, scratch *space, char *next) {
@@ -100,18 +101,21 @@ static void lay_out(const swings_job *job, scratch *space, char *next) {
 #define TAKE(where, type, size) \
   (where) = (type *) next;      \
   next += (size_t) (size) * sizeof(type)
+  /* The widest first: each is aligned then. */
   for (i = 0; i < 2; ++i) {
-    TAKE(pools[i]->found, double, most * wide);
-    TAKE(pools[i]->score, double, most);
     TAKE(pools[i]->arm, int64_t, most);
     TAKE(pools[i]->place, int64_t, most);
     TAKE(pools[i]->group, int64_t, most);
   }
+  TAKE(space->closest, int64_t, job->lanes);
+  TAKE(space->picked, int64_t, job->lanes);
+  for (i = 0; i < 2; ++i) {
+    TAKE(pools[i]->found, double, most * wide);
+    TAKE(pools[i]->score, double, most);
+  }
   TAKE(space->samples, double, most * (PALM + job->n_free));
   TAKE(space->rows, double, (most + job->lanes) * job->n_q);
   TAKE(space->least, double, job->lanes);
-  TAKE(space->closest, int64_t, job->lanes);
-  TAKE(space->picked, int64_t, job->lanes);
   for (i = 0; i < 2; ++i) {
     TAKE(pools[i]->used, char, most);
   }

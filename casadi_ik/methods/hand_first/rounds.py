@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -82,11 +83,19 @@ class RoundsPlan:
         )
         return dict(zip(DIMENSIONS, values, strict=True))
 
-    def constants(self) -> str:
-        """All of them but the `sizes`, as C text."""
-        reals = {name: number(value) for name, value in self._real_numbers().items()}
-        lines = (f"#define {name} {value}\n" for name, value in reals.items())
-        return define(self._whole_numbers()) + "".join(lines) + define_arrays(self._arrays())
+    def constants(
+        self, reals: Mapping[str, float] | None = None, arrays: Mapping[str, Array] | None = None
+    ) -> str:
+        """All of them but the `sizes`, as C text.
+
+        Args:
+            reals: Those of them that are others than in Python.
+            arrays: Likewise.
+        """
+        numbers = self._real_numbers() | dict(reals or {})
+        lines = (f"#define {name} {number(value)}\n" for name, value in numbers.items())
+        tables = self._arrays() | dict(arrays or {})
+        return define(self._whole_numbers()) + "".join(lines) + define_arrays(tables)
 
     def _whole_numbers(self) -> dict[str, int]:
         layouts = self.layouts

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from casadi_ik.arrays import Array
-from casadi_ik.views.convergence import COLORS
+from casadi_ik.palette import method_colors
 from casadi_ik.views.picture import FAINT, INK, new_figure
 from casadi_ik.views.report.groups import Group
 
@@ -31,7 +31,7 @@ def effort(groups: Sequence[Group]) -> str:
     panels = (("iterations", "iterations"), ("time", "time of a solve [µs]"))
     for place, (name, label) in enumerate(panels, start=1):
         axes = figure.add_subplot(1, 2, place)
-        for method, color in zip(methods, _colors(len(methods)), strict=True):
+        for method, color in method_colors(methods).items():
             values = np.concatenate([getattr(g, name) for g in groups if g.method == method])
             values = np.sort(values * (1e6 if name == "time" else 1.0))
             share = 100 * np.arange(1, len(values) + 1) / len(values)
@@ -103,10 +103,6 @@ def curve(errors: Array) -> str:
         f'<line x1="0" x2="{width}" y1="{middle}" y2="{middle}" class="bound"/>'
         f'<polyline points="{dots}"/></svg>'
     )
-
-
-def _colors(count: int) -> list[str]:
-    return [COLORS[i % len(COLORS)] for i in range(count)]
 
 
 def _some(points: Array) -> Array:

@@ -1,0 +1,129 @@
+"""A solver in single precision: its C code rewritten, and what rounding has to be allowed for."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.problem.problems import Tolerance
+
+TOKEN = re.compile(
+    r"""
+    (?P<kept> /\*.*?\*/ | //[^\n]* | "(?:\\.|[^"\\])*" | '(?:\\.|[^'\\])*'
+            | ^[ ]*\#[ ]*include[^\n]* | 0[xX][0-9a-fA-F]+\w* )
+    | (?P<number> (?: \d+\.\d* | \.\d+ ) (?:[eE][-+]?\d+)? (?!\w) | \d+[eE][-+]?\d+ (?!\w) )
+    | \d[\w.]*
+    | (?P<word> [A-Za-z_]\w* )
+    """,
+    re.VERBOSE | re.MULTILINE | re.DOTALL,
+)
+
+_TURNS = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
+_OTHERS = ("exp", "log", "log10", "pow", "sqrt", "hypot", "fabs", "floor", "ceil", "fmod", "fmax")
+LIBM = frozenset((*_TURNS, *_OTHERS, "fmin", "rint", "round", "copysign"))
+"""Functions of the C library whose forms for single precision have an f behind their name."""
+
+FLOAT = np.finfo(np.float32)
+EPSILON = float(FLOAT.eps)
+
+ROUNDING = 8 * EPSILON
+"""What rounding makes of kinematics at most, as an angle [rad] and as a part of how far the robot
+reaches: two to three times what was found in 20,000 random solves of each of eleven robots."""
+
+ARM_ROUNDING = 16 * ROUNDING
+"""What rounding makes of the joints of an arm that is found again from where its palm is [rad]:
+one that stands at a limit is beyond it by as much, and put back."""
+
+NUDGE = EPSILON**0.5
+"""Difference [rad or m] from which slopes are taken: its own rounding and that of what it causes
+weigh the same."""
+
+SAMPLES = 1024
+"""Random configurations that say how far a robot reaches."""
+
+
+def in_single_precision(text: str) -> str:
+    """The same C code with single precision wherever it has double.
+
+    Types, numbers and calls of the C library are exchanged, so that no operation is left in double
+    precision. Numbers too large or too small for it become the largest and the smallest there are,
+    not infinite and nought: such bounds say "any" and "more than nothing", and a divisor kept above
+    nought that is nought after all makes fits go astray.
+    """
+    return TOKEN.sub(_exchanged, text)
+
+
+def _exchanged(match: re.Match[str]) -> str:
+    number, word = match["number"], match["word"]
+    if number is not None:
+        return _number(number)
+    if word == "double":
+        return "float"
+    return f"{word}f" if word in LIBM else match[0]
+
+
+def _number(text: str) -> str:
+    """A number as C writes it in single precision."""
+    value = float(text)
+    if value > float(FLOAT.max):
+        text = repr(float(FLOAT.max))
+    elif 0 < value < float(FLOAT.tiny):
+        text = repr(float(FLOAT.tiny))
+    return f"{text}f"
+
+
+@dataclass(frozen=True, eq=False)
+class SinglePrecision:
+    """What a solver in single precision allows for, so that double precision confirms its answers.
+
+    Attributes:
+        robot: The robot.
+    """
+
+    robot: ArmHand
+
+    @cached_property
+    def reach(self) -> float:
+        """How far contacts come from the origin of the base frame [m]."""
+        points, _ = self.robot.contacts(self.robot.random(np.random.default_rng(0), SAMPLES))
+        return float(np.linalg.norm(points, axis=-1).max())
+
+    @property
+    def tolerance(self) -> Tolerance:
+        """What rounding may make of an error: answers keep to tolerances less this."""
+        return Tolerance(ROUNDING * self.reach, ROUNDING)
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """The robot's limits (n,), moved inwards by rounding; exact in single precision.
+
+        Raises:
+            UnsupportedError: There is nothing between them then.
+        """
+        lower, upper = self.robot.lower, self.robot.upper
+        low = (lower + ROUNDING * np.maximum(1.0, np.abs(lower))).astype(np.float32)
+        high = (upper - ROUNDING * np.maximum(1.0, np.abs(upper))).astype(np.float32)
+        for name, one, other in zip(self.robot.actuators, low, high, strict=True):
+            if one >= other:
+                raise UnsupportedError(
+                    f"--single: motor {name!r}: between its limits there is too little room "
+                    "for single precision"
+                )
+        return low.astype(float), high.astype(float)
+
+    @property
+    def reals(self) -> dict[str, float]:
+        """Numbers of rounds.c that follow the precision."""
+        return {"NUDGE": NUDGE, "LIMIT_SLACK": 0.0, "TOLERANCE_SLACK": 0.0}
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """Arrays of rounds.c that follow the precision."""
+        lower, upper = self.bounds
+        return {"LOWER": lower, "UPPER": upper}

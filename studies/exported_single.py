@@ -1,0 +1,166 @@
+"""An exported solver in single precision beside the one in double: how often, how fast, how large.
+
+Both are built with the machine's compiler and solve the same random targets within reach, one by
+one; every answer is judged by Python's kinematics, in double precision. Run by
+`exported.py --single`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+from pathlib import Path
+
+import numpy as np
+from exported import built, by_turns, run, sizes, tail_of
+from runner import markdown_table
+
+import casadi_ik as ik
+from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
+
+ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right")
+TOLERANCES = ((5e-3, 3.0), (1e-3, 0.5), (1e-4, 0.05))
+"""Of positions [m] and angles [deg]."""
+
+AWAY = 0.3
+"""How far from the configuration that was drawn the robot is, each motor [rad, 1 sigma]."""
+
+MANY = """
+#include "arm.h"
+static arm_solver solver;
+void many(int count, REAL position, REAL angle, const REAL *points, const REAL *normals,
+          const REAL *q0, REAL *q, int *status) {
+  int i, k;
+  arm_init(&solver);
+  arm_set_tolerance(&solver, -1, position, angle);
+  for (i = 0; i < count; ++i) {
+    status[i] = arm_solve(&solver, points + i * 3 * ARM_FINGERS, normals + i * 3 * ARM_FINGERS,
+                          q0 ? q0 + i * ARM_MOTORS : 0);
+    for (k = 0; k < ARM_MOTORS; ++k) q[i * ARM_MOTORS + k] = solver.q[k];
+  }
+}
+"""
+
+HOW_OFTEN = """
+Random arms and hands within limits, {count:,} targets a row; from home a solution far from limits
+is wanted, from near (every motor some {away} rad off) one near that. Lost: solved in double
+precision only; gained: in single only. False: called solved by single precision, but not so for
+Python's kinematics in double precision.
+"""
+
+
+class Library:
+    """A built project as a library that solves many targets in a call."""
+
+    def __init__(self, project: Path, real: type[np.floating]) -> None:
+        """Build it."""
+        name = "float" if real is np.float32 else "double"
+        (project / "many.c").write_text(f"#define REAL {name}\n{MANY}")
+        texts = [str(path.relative_to(project)) for path in sorted(project.glob("src/*.c"))]
+        flags = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno")
+        command = ("cc", *flags, "-Iinclude", "-Isrc", "many.c", *texts, "-lm", "-o", "many.so")
+        run(*command, folder=project)
+        self._real = real
+        self._many = ctypes.CDLL(str(project / "many.so")).many
+        number = ctypes.c_float if real is np.float32 else ctypes.c_double
+        self._many.argtypes = [ctypes.c_int, number, number, *[ctypes.c_void_p] * 5]
+
+    def __call__(
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        q0: np.ndarray | None,
+        motors: int,
+        tolerance: tuple[float, float],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Answers (k, n) and whether they are called solved (k,), of k targets."""
+        given = [
+            None if array is None else np.ascontiguousarray(array, dtype=self._real)
+            for array in (points, normals, q0)
+        ]
+        q = np.empty((len(points), motors), dtype=self._real)
+        status = np.empty(len(points), dtype=np.int32)
+        places = [None if array is None else array.ctypes.data for array in (*given, q, status)]
+        self._many(len(points), *tolerance, *places)
+        return q.astype(float), status == ik.Status.SOLVED
+
+
+def how_often(name: str, libraries: tuple[Library, Library], count: int) -> list[list[str]]:
+    """Rows of the table: how many each solves, and how many of the second's are none."""
+    robot, rng, rows = ik.load_robot(name), np.random.default_rng(23), []
+    for metres, degrees in TOLERANCES:
+        tolerance = metres, float(np.deg2rad(degrees))
+        for start in ("home", "near"):
+            drawn = robot.random(rng, count)
+            points, normals = robot.contacts(drawn)
+            q0 = None
+            if start == "near":
+                moved = drawn + rng.normal(0, AWAY, drawn.shape)
+                q0 = np.clip(moved, robot.lower, robot.upper)
+            double, single = (
+                library(points, normals, q0, drawn.shape[1], tolerance) for library in libraries
+            )
+            position, angle, beyond = robot.deviations(single[0], points, normals)
+            slack = 1 + TOLERANCE_SLACK
+            met = (position <= tolerance[0] * slack) & (angle <= tolerance[1] * slack)
+            right = met.all(axis=1) & (beyond <= LIMIT_SLACK)
+            numbers = (
+                double[1].sum(),
+                single[1].sum(),
+                (double[1] & ~single[1]).sum(),
+                (single[1] & ~double[1]).sum(),
+                (single[1] & ~right).sum(),
+            )
+            rows.append(
+                [name, f"{1e3 * metres:g} mm, {degrees:g} deg", start, *(f"{n:,}" for n in numbers)]
+            )
+    return rows
+
+
+def compared(folder: Path, count: int, seconds: float, turns: int) -> list[str]:
+    """Parts of the page.
+
+    Args:
+        folder: Where projects are built.
+        count: Targets of a row.
+        seconds: Of a benchmark of 1e6 targets, at most.
+        turns: Of the comparison of CPU time.
+    """
+    rows, times, tails, bytes_of = [], [], [], {}
+    for name in ROBOTS:
+        robot = ik.load_robot(name)
+        places = {
+            what: built(robot, folder / name / what, single=what == "single")
+            for what in ("double", "single")
+        }
+        libraries = Library(places["double"], np.float64), Library(places["single"], np.float32)
+        rows += how_often(name, libraries, count)
+
+        def benched(place: Path) -> float:
+            return json.loads(run("build/bench", "2", "20000", folder=place))["cpu_mean"]
+
+        cpu = by_turns(
+            {what: lambda place=place: benched(place) for what, place in places.items()}, turns
+        )
+        ratio = cpu["single"] / cpu["double"]
+        times.append([name, f"{cpu['double']:.1f}", f"{cpu['single']:.1f}", f"{ratio:.2f}"])
+        for what, place in places.items():
+            said = json.loads(run("build/bench", f"{seconds}", folder=place))
+            tails.append(tail_of(f"{name}, {what}", said))
+            bytes_of[f"{name}, {what}"] = sizes(place, "float" if what == "single" else "double")
+    kinds = list(next(iter(bytes_of.values())))
+    return [
+        "## How often\n" + HOW_OFTEN.format(count=count, away=AWAY),
+        markdown_table(
+            ["robot", "tolerances", "start", "double", "single", "lost", "gained", "false"], rows
+        ),
+        f"## CPU time of a solve [us], the smallest mean of {turns} turns",
+        markdown_table(["robot", "double", "single", "ratio"], times),
+        "## The tail, by the clock on the wall [us]",
+        markdown_table(["", "targets", "mean", "median", "99.9th percentile", "largest"], tails),
+        "## Bytes",
+        markdown_table(
+            ["", *kinds],
+            [[name, *(f"{found[kind]:,}" for kind in kinds)] for name, found in bytes_of.items()],
+        ),
+    ]
