@@ -44,9 +44,16 @@ def rows(robot: str, clutter: int, targets: list[dict[str, Any]]) -> list[list[s
         own = [1e6 * one["answered_time"] for one in answered]
         mine = float(np.mean(own)) if own else np.nan
         blocked = 100 * (1 - len(answered) / len(targets))
-        why = (
-            f"contacts alone take {blind:.0f} us; {blocked:.0f} % have no answer, which takes all "
-            "that is looked at before a target is given up, and what is in the way"
+        touching = 100 * (1 - float(np.mean([one["blind"] for one in targets])))
+        first = (
+            f"contacts alone take {blind:.0f} us, and {touching:.0f} % of their answers touch "
+            "something and are exchanged"
+        )
+        why = first + (
+            f"; {blocked:.0f} % of the targets have no answer that is found: these take all that is "
+            "looked at before a target is given up, and the reasons"
+            if blocked
+            else ""
         )
         table.append(
             _row(
@@ -63,7 +70,7 @@ def rows(robot: str, clutter: int, targets: list[dict[str, Any]]) -> list[list[s
                 f"<= {MEANS[clutter]:.0f} us",
                 f"{mine:.0f} us",
                 mine <= MEANS[clutter],
-                f"contacts alone take {blind:.0f} us of it",
+                first,
             )
         )
     return table
