@@ -21,6 +21,7 @@ from torch_zip import write_torch
 import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.datasets.conventions import Convention, load_convention
+from casadi_ik.datasets.hand_poses import HandPoses
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.problem.hand_motors import finger_joints, hand_motors
@@ -81,7 +82,14 @@ def made(name: str, folder: Path, seed: int = 0, robot: ik.ArmHand | None = None
         links = held.links(q)[convention.link]
         frames = palms @ np.stack([inverse(pose) for pose in held.palm(q)]) @ links
         frames = frames @ convention.pose
-        WRITERS[layout](path, frames, convention, _theirs(convention, held, q))
+        joints = _theirs(convention, held, q)
+        if convention.wrist:
+            wrist = rng.uniform(-0.4, 0.4, (COUNT, len(convention.wrist)))
+            joints = np.hstack([wrist, joints])
+            bent = HandPoses("", np.zeros((COUNT, 3)), np.tile(np.eye(3), (COUNT, 1, 1)), joints)
+            there = convention.frames(bent) @ convention.pose
+            frames = frames @ np.stack([inverse(pose) for pose in there])
+        WRITERS[layout](path, frames, convention, joints)
     return Written(path, held, q, palms)
 
 

@@ -10,9 +10,11 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.datasets.hand_poses import HandPoses
+from casadi_ik.datasets.hands import motion
 from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
 from casadi_ik.files.shipped import resolve, shipped_names
+from casadi_ik.grasps.pose import inverse
 
 
 class HandFrame(Struct, frozen=True):
@@ -29,6 +31,20 @@ class HandFrame(Struct, frozen=True):
     rpy: Angles = (0.0, 0.0, 0.0)
 
 
+class WristJoint(Struct, frozen=True):
+    """A joint of the data set's hand before the robot's link.
+
+    Attributes:
+        name: The data set's.
+        axis: It turns about, in its own frame.
+        xyz: Its origin in the frame before: the data set's, or that of the joint before [m].
+    """
+
+    name: str
+    axis: Point
+    xyz: Point = (0.0, 0.0, 0.0)
+
+
 class ConventionFile(Struct, frozen=True):
     """How a data set has a hand: ``models/datasets/*.yaml``.
 
@@ -39,6 +55,8 @@ class ConventionFile(Struct, frozen=True):
         frame: Where the data set's frame of the hand is.
         joints: The data set's names, in the order of its arrays, and the robot's joints or motors;
             a minus sign before one: it turns the other way.
+        wrist: Joints between the data set's frame and `frame`, before the others in its arrays:
+            they place the hand, and are not asked for.
     """
 
     layouts: list[str]
@@ -46,6 +64,7 @@ class ConventionFile(Struct, frozen=True):
     source: str
     frame: HandFrame
     joints: dict[str, str]
+    wrist: tuple[WristJoint, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +76,14 @@ class Convention:
         link: The robot's link in whose frame the data set's frame is.
         pose: (4, 4) of that frame in the link's.
         joints: Names of the data set, in the order of its arrays: the robot's joint, and 1 or -1.
+        wrist: Joints of the data set before the link, before the others in its arrays.
     """
 
     name: str
     link: str
     pose: Array
     joints: dict[str, tuple[str, float]]
+    wrist: tuple[WristJoint, ...] = ()
 
     def fits(self, robot: ArmHand) -> bool:
         """Whether the robot has this hand."""
@@ -77,25 +98,37 @@ class Convention:
         Raises:
             DescriptionError: Names that the data set does not have, or another number of joints.
         """
-        names = given.names or tuple(self.joints)
+        wrist = tuple(one.name for one in self.wrist)
+        every = (*wrist, *self.joints)
+        names = given.names or every
         width = given.joints.shape[1]
         if len(names) != width:
             raise DescriptionError(
                 f"{given.where}: joints: found {width}, expected {len(names)}: {', '.join(names)}"
             )
         for name in names:
-            if name not in self.joints:
+            if name not in every:
                 raise DescriptionError(
-                    f"{given.where}: {name}: no such joint, expected {', '.join(self.joints)}"
+                    f"{given.where}: {name}: no such joint, expected {', '.join(every)}"
                 )
-        missing = [name for name in self.joints if name not in names]
+        missing = [name for name in every if name not in names]
         if missing:
             raise DescriptionError(f"{given.where}: {missing[0]}: missing, expected a position")
         found: dict[str, Array] = {}
         for i, name in enumerate(names):
-            joint, sign = self.joints[name]
-            found[joint] = sign * given.joints[:, i]
+            if name in self.joints:
+                joint, sign = self.joints[name]
+                found[joint] = sign * given.joints[:, i]
         return found
+
+    def frames(self, given: HandPoses) -> Array:
+        """(k, 4, 4) poses of the robot's link that the data's poses, and their wrists, give."""
+        poses, names = given.poses, given.names or tuple(one.name for one in self.wrist)
+        for one in self.wrist:
+            moved = motion("revolute", np.array(one.axis), given.joints[:, names.index(one.name)])
+            moved[:, :3, 3] = one.xyz
+            poses = poses @ moved
+        return poses @ inverse(self.pose)
 
 
 def load_convention(name_or_path: str | Path) -> Convention:
@@ -116,7 +149,7 @@ def load_convention(name_or_path: str | Path) -> Convention:
     pose = frame_matrix(Frame(entry.frame.xyz, entry.frame.rpy))
     if not np.isfinite(pose).all():
         raise DescriptionError(f"{path}: frame: expected finite numbers")
-    return Convention(path.stem, entry.frame.link, pose, joints)
+    return Convention(path.stem, entry.frame.link, pose, joints, entry.wrist)
 
 
 def convention_for(robot: ArmHand, layout: str, hand: str | Path | None) -> Convention:

@@ -34,12 +34,12 @@ def link_poses(
     for joint in robot.joints:
         pose = poses[joint.parent] @ joint.placement
         if joint.name in joints:
-            pose = pose @ _motion(joint.type, joint.axis, joints[joint.name])
+            pose = pose @ motion(joint.type, joint.axis, joints[joint.name])
         poses[joint.child] = pose
     return poses
 
 
-def _motion(kind: str, axis: Array, positions: Array) -> Array:
+def motion(kind: str, axis: Array, positions: Array) -> Array:
     """(k, 4, 4) what a joint does (Rodrigues)."""
     moved = np.tile(np.eye(4), (len(positions), 1, 1))
     if kind == "prismatic":

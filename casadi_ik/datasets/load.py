@@ -172,8 +172,7 @@ def _of_hand(
     if take == "palm" or not set(finger_joints(robot.description)) <= set(joints):
         motors, postures = motor_positions(robot, given.where, joints)
         joints = joints_at(robot, motors, postures) | joints
-    back = np.linalg.inv(convention.pose)
-    frames = given.poses @ back
+    frames = convention.frames(given)
     palms, points, normals = palms_of(robot, convention.link, frames, joints)
     stem, name = Path(given.where).stem, "" if thing is None else thing.name
     if take == "palm":

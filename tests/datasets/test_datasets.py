@@ -15,6 +15,7 @@ from make_grasp_sets import ROBOTS, TABLES, made
 import casadi_ik as ik
 from casadi_ik.cli.report import reasons
 from casadi_ik.datasets.conventions import load_convention
+from casadi_ik.datasets.hand_poses import HandPoses
 from casadi_ik.datasets.hands import link_poses
 from casadi_ik.errors import DescriptionError, UnknownNameError, UnsupportedError
 from casadi_ik.problem.hand_motors import hand_motors
@@ -52,12 +53,10 @@ def test_conventions_agree_with_the_published_hands(name: str) -> None:
     """Where the last joints of the fingers are by another library in the published model."""
     published, convention = PUBLISHED[name], load_convention(name)
     described = ik.load_robot(ROBOTS.get(name.split("_")[1], KUKA)).description
-    joints = {
-        convention.joints[key][0]: np.array([convention.joints[key][1] * value])
-        for key, value in published["joints"].items()
-    }
-    poses = link_poses(described, joints, 1)
-    back = np.linalg.inv(poses[convention.link][0] @ convention.pose)
+    values = np.array([list(published["joints"].values())])
+    given = HandPoses("", np.zeros((1, 3)), np.eye(3)[None], values, tuple(published["joints"]))
+    poses = link_poses(described, convention.positions(given), 1)
+    back = convention.frames(given)[0] @ np.linalg.inv(poses[convention.link][0])
     children = {joint.name: joint.child for joint in described.joints}
     # The little finger of DexGraspNet's model begins 1.7 mm beside the hand's.
     within = 2e-3 if name == "dexgraspnet_shadow" else 1.5e-4
