@@ -18,7 +18,7 @@ import argparse
 import json
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from typing import Any
 import joblib
 import numpy as np
 from hard_targets import SETS
+from miss_causes import CAUSE_HEADS, CAUSES, causes
 from other_robots import MADE, made_robot
 from rich.console import Console
 from rich.progress import Progress
@@ -164,10 +165,24 @@ def write_report(options: argparse.Namespace) -> None:
     total = f"{whole:,} solves, {len(listed)} missed."
     shown = markdown_table(["robot", "tolerance", "target", "q"], misses) if misses else "None."
     code = {"missed": ", ".join(sorted(codes)) or None}
-    body = [INTRODUCTION, total, table, "## Misses", shown, "## Where this comes from"]
+    body = [INTRODUCTION, total, table]
+    if listed:
+        places = [(robot, name, miss["q"]) for robot, name, _, miss in listed]
+        body += ["## Why", CAUSES, _why(places, options.out / "robots")]
+    body += ["## Misses", shown, "## Where this comes from"]
     body += [provenance(code), f"Seed {options.seed}."]
     write_page("Reachable targets that hand-first misses", body, options.report)
     write_metrics(metrics, options.report / "metrics.json")
+
+
+def _why(missed: Sequence[tuple[str, str, list[float]]], folder: Path) -> str:
+    """A table of the causes, of misses by robot, tolerance and configuration."""
+    rows = []
+    for robot, name in dict.fromkeys((robot, name) for robot, name, _ in missed):
+        q = np.array([one[2] for one in missed if one[:2] == (robot, name)])
+        found = causes(load(robot, folder), TOLERANCES[name], q)
+        rows.append([robot.replace("_", " "), name, *found])
+    return markdown_table(["robot", "tolerance", *CAUSE_HEADS], rows)
 
 
 def main(arguments: list[str] | None = None) -> None:

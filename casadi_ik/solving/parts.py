@@ -31,14 +31,21 @@ class BatchParts:
             trace: Whether all iterations are kept.
         """
         self._count = count
+        self._trace = trace
         self._largest = max(1, -(-count // jobs))
         self._size = min(FIRST_PART, self._largest) if trace else self._largest
 
     def __iter__(self) -> Iterator[slice]:
-        """The parts; a single empty one if there are no targets."""
+        """The parts; a single empty one if there are no targets.
+
+        A part is recorded while the next is solved. The last parts of a traced batch grow smaller,
+        so that little is left to record when all are solved.
+        """
         start = 0
         while True:
-            stop = min(start + self._size, self._count)
+            left = self._count - start
+            size = min(self._size, max(left // 2, ENOUGH)) if self._trace else self._size
+            stop = min(start + size, self._count)
             yield slice(start, stop)
             start = stop
             if start == self._count:

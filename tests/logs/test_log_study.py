@@ -196,7 +196,8 @@ def test_what_the_shell_says(
     info = said("info", study)
     assert info.startswith(str(study))
     assert f"shards 3: {', '.join(NAMES)}" in info
-    assert "empty.mcap: nothing in it is whole" in info
+    # A long path is folded in the middle of a word.
+    assert "empty.mcap:nothinginitiswhole" in info.replace(" ", "")
     assert "thumb position 0.005 | thumb position 0.001 (by shard)" in info
     solves = said("solves", study)
     assert "6 solves" in solves
@@ -204,7 +205,7 @@ def test_what_the_shell_says(
     assert f"solve 1 of {NAMES[1]}" in said("why", study, 3)
     merged = said("merge", study, "--out", tmp_path / "all.mcap")
     assert "6 of enhanced-dls" in merged
-    assert "empty.mcap: nothing in it is whole" in merged
+    assert "empty.mcap:nothinginitiswhole" in merged.replace(" ", "")
     assert f"solve 1 of {NAMES[1]}" in said("why", tmp_path / "all.mcap", 3)
 
 

@@ -155,7 +155,18 @@ def test_parts_are_as_large_as_their_iterations_allow(bytes_per_solve, size):
         if len(found) == 3:
             break
     assert found[0] == slice(0, FIRST_PART)
-    assert found[1].stop - found[1].start == min(size, 10**6 - FIRST_PART)
+    assert found[1].stop - found[1].start == min(size, (10**6 - FIRST_PART) // 2)
+
+
+def test_little_is_left_to_record_when_all_are_solved():
+    parts = BatchParts(10_000, 1, trace=True)
+    sizes = []
+    for part in parts:
+        sizes.append(part.stop - part.start)
+        parts.learn(10, 10 * CACHED_BYTES // 4000)
+    assert sum(sizes) == 10_000
+    assert sizes[1:4] == [4000, 2968, 1484]
+    assert sizes[-1] <= ENOUGH
 
 
 @pytest.mark.parametrize(("count", "jobs", "sizes"), [(0, 2, [0]), (5, 2, [3, 2]), (1, 4, [1])])

@@ -45,6 +45,7 @@ def test_a_count_goes_on_and_lists_what_is_lost(tmp_path):
     text = (report / "report.md").read_text()
     assert "160 solves, 1 missed." in text
     assert "row 3" in text
+    assert "| kuka lwr barrett | 5 mm, 3 deg | 1 | 1 |" in text, "it can be solved"
 
 
 def test_a_search_goes_on_and_climbs(tmp_path):

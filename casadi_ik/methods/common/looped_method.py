@@ -189,7 +189,7 @@ class LoopedMethod(ABC):
         self._check(problems)
         count = len(problems)
         iterations, seconds = np.zeros(count, dtype=np.int64), np.zeros(count)
-        records = _Records()
+        records = _Records(count)
         states = np.empty((count, self.graph.state.size))
         status = np.empty(count, dtype=np.int64)
         left, some, here, last = np.arange(count), problems, q0, None
@@ -256,19 +256,25 @@ class LoopedMethod(ABC):
 class _Records:
     """The records of a batch whose targets may take several rounds."""
 
-    def __init__(self) -> None:
-        self._rounds: list[NDArray[Any]] = []
-        self._targets: list[NDArray[np.intp]] = []
+    def __init__(self, count: int) -> None:
+        self._rounds: list[tuple[NDArray[np.intp], Counts, NDArray[Any]]] = []
+        self._counts = np.zeros(count, dtype=np.int64)
 
     def add(self, targets: NDArray[np.intp], iterations: Counts, rows: NDArray[Any]) -> None:
         """Add a round: the rows of some targets, (sum of their iterations,)."""
-        self._rounds.append(rows)
-        self._targets.append(np.repeat(targets, iterations))
+        self._rounds.append((targets, iterations, rows))
+        self._counts[targets] += iterations
 
     def by_target(self) -> NDArray[Any]:
         """The rows of all rounds, target by target."""
+        first = self._rounds[0][2]
         if len(self._rounds) == 1:
-            return self._rounds[0]
-        order = np.argsort(np.concatenate(self._targets), kind="stable")
-        rows = np.concatenate(list(map(opaque, self._rounds)))
-        return np.take(rows, order).view(self._rounds[0].dtype)
+            return first
+        ordered = np.empty(int(self._counts.sum()), first.dtype)
+        free = np.cumsum(self._counts) - self._counts
+        for targets, iterations, rows in self._rounds:
+            begins = np.cumsum(iterations) - iterations
+            places = np.arange(len(rows)) + np.repeat(free[targets] - begins, iterations)
+            opaque(ordered)[places] = opaque(rows)
+            free[targets] += iterations
+        return ordered
