@@ -50,7 +50,7 @@ def rows(robot: str, clutter: int, targets: list[dict[str, Any]]) -> list[list[s
             "something and are exchanged"
         )
         why = first + (
-            f"; {blocked:.0f} % of the targets have no answer that is found: these take all that is "
+            f"; {blocked:.0f} % of the targets have no answer that is found: they take all that is "
             "looked at before a target is given up, and the reasons"
             if blocked
             else ""
