@@ -3,7 +3,7 @@
 Run it again whenever an object, a hand or the recipes change::
 
     python studies/make_hand_grasps.py                                  # all into models/grasps
-    python studies/make_hand_grasps.py --only leap_cup
+    python studies/make_hand_grasps.py --only allegro_cup
 
 The thumb presses against the two fingers after it. Where the object may be in the hand follows from
 the pads of the hand half closed: amid them, its y axis (that the thumb presses along) from the
@@ -44,18 +44,20 @@ of them on the same side are apart at least [m]."""
 
 UP = (0.0, 0.0, 1.0)
 UPRIGHT = {
-    **dict.fromkeys(("tomato_soup_can", "cup", "mug", "mustard_bottle", "sugar_box"), UP),
-    **dict.fromkeys(("orange", "tennis_ball"), None),
+    **dict.fromkeys(("tomato_soup_can", "cup", "mug", "mustard_bottle", "potted_meat_can"), UP),
+    **dict.fromkeys(("orange",), None),
 }
 """By object the axis that points up; None for balls."""
 
 ITEMS = {
-    "allegro": ("tomato_soup_can", "mug", "orange"),
+    "allegro": ("tomato_soup_can", "mug", "cup"),
     "leap": ("tomato_soup_can", "cup", "orange"),
     "shadow": ("tomato_soup_can", "cup", "orange"),
-    "robotiq_3f": ("tomato_soup_can", "mug", "mustard_bottle"),
+    "robotiq_3f": ("mustard_bottle", "potted_meat_can"),
 }
-"""What each hand pinches. Four motors touch no ball with three exact pads."""
+"""What each hand pinches. Four motors touch no ball with three exact pads. The shipped pinches of
+leap and shadow are from before collisions were looked at: their fingers touch each other or the
+object, and no others were found yet for which a solver with a scene has an answer."""
 
 ROOM = 0.045  # [m] how far the object's middle may be from the middle of the pads
 PHALANX_GAP = 0.008  # [m] from a phalanx's axis to the object, but for the last, which touches
@@ -104,14 +106,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Compute the shipped grasps of catalogue hands.")
     parser.add_argument("--only", choices=[r.name for r in RECIPES], help="one file")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--starts", type=int, default=20, help="random starts per pinch")
+    parser.add_argument("--starts", type=int, default=60, help="random starts per pinch")
     parser.add_argument("--out", type=Path, default=models_folder() / "grasps")
     options = parser.parse_args(arguments)
     missing = 0
-    for index, recipe in enumerate(RECIPES):
+    for recipe in RECIPES:
         if options.only not in (None, recipe.name):
             continue
-        rng = np.random.default_rng([options.seed, index])
+        rng = np.random.default_rng([options.seed, *recipe.name.encode()])
         text = make(ik.load_robot(recipe.robot), recipe, rng, options.starts, options.seed)
         if text is None:
             print(f"{recipe.name}: no grasp found")

@@ -87,7 +87,7 @@ class Mink:
         self._mink, self._mujoco = mink, mujoco
         self._qp: Any = import_module("qpsolvers")
         joints = self._joints = Joints(robot)
-        self._model = model = self._built(robot)
+        self._model = model = self._spec(robot).compile()
         order = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, n) for n in joints.names]
         self._rows = np.array([model.jnt_qposadr[i] for i in order])
         self._bodies = [
@@ -114,7 +114,12 @@ class Mink:
         self._tasks = [Contacts(cost=np.ones(rows), lm_damping=damping)]
         self._coupled = [mink.EqualityConstraintTask(model, 1.0)] if joints.pairs else []
 
-    def _built(self, robot: ik.ArmHand) -> Any:
+    def limits(self) -> list[Any]:
+        """What the program keeps beside the bounds of motors."""
+        return []
+
+    def _spec(self, robot: ik.ArmHand) -> Any:
+        """The robot, before it is compiled."""
         compiler = (
             '<mujoco><compiler fusestatic="false" boundmass="0.01" boundinertia="0.001"/></mujoco>'
         )
@@ -129,7 +134,7 @@ class Mink:
                 name2=self._joints.names[a],
             )
             shared.data[:2] = 0.0, 1.0  # the polynomial b = 0 + 1 a
-        return spec.compile()
+        return spec
 
     def aim(self, points: Array, normals: Array) -> None:
         """See `Peer`."""
@@ -149,7 +154,12 @@ class Mink:
         """See `Peer`."""
         del q
         problem = self._mink.build_ik(
-            self._configuration, self._tasks, 1.0, 1e-8, limits=[], constraints=self._coupled
+            self._configuration,
+            self._tasks,
+            1.0,
+            1e-8,
+            limits=self.limits(),
+            constraints=self._coupled,
         )
         theta = self._configuration.q
         problem.lb, problem.ub = self._limits[0] - theta, self._limits[1] - theta

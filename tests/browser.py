@@ -104,9 +104,10 @@ class Page:
         self._numbers = itertools.count(1)
         self._complaints: list[str] = []
         self._console: list[str] = []
-        self._loaded = False
+        self._loaded: set[str] = set()
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
+        self.call("Page.setLifecycleEventsEnabled", enabled=True)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """A command of the DevTools protocol.
@@ -127,12 +128,12 @@ class Page:
 
     def go(self, url: str) -> None:
         """To another page, loaded when this returns."""
-        self._loaded = False
         went = self.call("Page.navigate", url=url)
         if went.get("errorText"):
             raise BrowserError(f"{url}: {went['errorText']}")
         end = time.monotonic() + PATIENCE
-        while not self._loaded:
+        # Of the page that was there before, the end of loading may be told yet.
+        while went.get("loaderId", "") not in {"", *self._loaded}:
             self._listen(max(end - time.monotonic(), 0.0))
             if time.monotonic() > end:
                 raise BrowserError(f"{url}: not loaded in {PATIENCE} s")
@@ -238,8 +239,9 @@ class Page:
 
     def _note(self, message: dict[str, Any]) -> None:
         kind, said = message.get("method"), message.get("params", {})
-        if kind == "Page.loadEventFired":
-            self._loaded = True
+        if kind == "Page.lifecycleEvent":
+            if said["name"] == "load":
+                self._loaded.add(said["loaderId"])
         elif kind == "Runtime.consoleAPICalled":
             words = (str(a.get("value", a.get("description", ""))) for a in said["args"])
             line = f"{said['type']}: {' '.join(words)}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -31,8 +32,8 @@ DRAWN = 20_000
 BALL, SMALLEST = "ball", 0.012
 """What they hold, and its least radius [m]."""
 MICROMETRE = 1e-6
-WARM = 4
-"""Targets of a batch that is solved first, so that no time holds what is done once."""
+BATCH = 256
+"""Targets of a batch that is timed: those of a grasp, again and again."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,8 @@ def solve_piece(piece: Piece) -> dict[str, Any]:
     """The targets of a piece, those that contacts alone can be solved at."""
     robot = ik.load_robot(piece.robot)
     blind = ik.Solver(robot)
-    rng = np.random.default_rng([piece.seed, piece.clutter, piece.number])
-    angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 0.85)
-    goal = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.1, 0.6)])
-    solids = {"table": TABLE, **_clutter(rng, piece.clutter, goal)}
     rows = []
-    for known_grasp, held in _grasps(robot):
-        grasps = [_moved(known_grasp, goal, rng) for _ in range(TURNS)]
+    for solids, held, grasps in _placed(piece, robot):
         arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
         points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
         known = blind.solve_batch(points, normals)
@@ -72,13 +68,39 @@ def solve_piece(piece: Piece) -> dict[str, Any]:
         if len(kept):
             some = [grasps[i] for i in kept]
             rows += _solved(
-                robot, solids, held, some, points[kept], normals[kept], known.q[kept], piece
+                blind, solids, held, some, points[kept], normals[kept], known.q[kept], piece
             )
     return {"targets": rows}
 
 
+def grasps_at(piece: Piece) -> Iterator[tuple[ik.Scene, list[ik.Grasp]]]:
+    """The scene of every grasp of a piece, and the grasp's targets that contacts alone solve."""
+    robot = ik.load_robot(piece.robot)
+    blind = ik.Solver(robot)
+    for solids, held, grasps in _placed(piece, robot):
+        arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
+        points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
+        kept = np.flatnonzero(blind.solve_batch(points, normals).success)
+        pose, name = grasps[0].object_pose, grasps[0].object
+        assert pose is not None
+        scene = ik.Scene({**solids, name: held | {"xyz": pose[:3, 3].tolist()}}, grasped=name)
+        yield scene, [grasps[i] for i in kept]
+
+
+def _placed(
+    piece: Piece, robot: ik.ArmHand
+) -> Iterator[tuple[dict[str, Any], dict[str, Any], list[ik.Grasp]]]:
+    """What stands about, what is held, and how, of every grasp."""
+    rng = np.random.default_rng([piece.seed, piece.clutter, piece.number])
+    angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 0.85)
+    goal = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.1, 0.6)])
+    solids = {"table": TABLE, **_clutter(rng, piece.clutter, goal)}
+    for known_grasp, held in _grasps(robot):
+        yield solids, held, [_moved(known_grasp, goal, rng) for _ in range(TURNS)]
+
+
 def _solved(
-    robot: ik.ArmHand,
+    without: ik.Solver,
     solids: dict[str, Any],
     held: dict[str, Any],
     grasps: list[ik.Grasp],
@@ -88,15 +110,20 @@ def _solved(
     piece: Piece,
 ) -> list[dict[str, Any]]:
     """What comes of the same grasp turned in several ways, a row for each."""
-    name = grasps[0].object
+    robot, name = without.robot, grasps[0].object
     poses = np.stack([grasp.object_pose for grasp in grasps if grasp.object_pose is not None])
     place = {"xyz": poses[0][:3, 3].tolist()}
     scene = ik.Scene({**solids, name: held | place}, grasped=name)
     solver = ik.Solver(robot, scene=scene)
-    solver.solve_batch(points[:WARM], normals[:WARM], object_pose=poses[:WARM])
-    begin = time.process_time()
     batch = solver.solve_batch(points, normals, object_pose=poses)
-    spent = (time.process_time() - begin) / len(points)
+    every = np.arange(BATCH) % len(points)
+    spent = _timed(solver, points[every], normals[every], poses[every])
+    alone = _timed(without, points[every], normals[every], None)
+    answered = np.flatnonzero(batch.success)
+    of_answered = 0.0
+    if len(answered):
+        some = answered[np.arange(BATCH) % len(answered)]
+        of_answered = _timed(solver, points[some], normals[some], poses[some])
     check = SceneCheck(robot, scene)
     rows = []
     for i, grasp in enumerate(grasps):
@@ -116,11 +143,22 @@ def _solved(
                 "blind": bool(around.free(blind[i][None])[0]),
                 "missed": missed,
                 "false": false,
+                "pair": "" if (why := batch.collisions[i]) is None else " and ".join(why.pair),
                 "batch": spent,
+                "answered_time": of_answered,
+                "blind_time": alone,
                 "single": time.process_time() - begin,
             }
         )
     return rows
+
+
+def _timed(solver: ik.Solver, points: Array, normals: Array, poses: Array | None) -> float:
+    """Processor time of a target [s], everything that is done once done before."""
+    solver.solve_batch(points, normals, object_pose=poses)
+    begin = time.process_time()
+    solver.solve_batch(points, normals, object_pose=poses)
+    return (time.process_time() - begin) / len(points)
 
 
 def surroundings(check: SceneCheck, robot: ik.ArmHand, grasp: ik.Grasp) -> Surroundings:

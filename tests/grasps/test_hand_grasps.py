@@ -14,6 +14,8 @@ import casadi_ik as ik
 from casadi_ik.grasps import Grasp, load_object
 
 HANDS = ("allegro_right", "leap", "shadow", "robotiq_3f")
+FREE = ("allegro", "robotiq_3f")
+"""Hands whose pinches are free of collision; those of the others are older."""
 NAMES = [name for hand in HANDS for name in ik.shipped_grasps(f"panda+{hand}")]
 
 
@@ -38,10 +40,10 @@ def placed(grasp: Grasp) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("hand", HANDS)
-def test_three_grasps_of_every_hand(hand: str) -> None:
+def test_every_hand_has_grasps(hand: str) -> None:
     names = ik.shipped_grasps(f"panda+{hand}")
-    assert len(names) == 3
-    assert len({ik.load_grasp(name).object for name in names}) == 3
+    assert len(names) >= 2
+    assert len({ik.load_grasp(name).object for name in names}) == len(names)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -75,13 +77,30 @@ def test_solved_exactly(name: str) -> None:
     assert solution.success, solution.status
 
 
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith(FREE)])
+def test_nothing_touches_but_the_pads(name: str) -> None:
+    """On a table there is an answer that is free: the hand holds the object and hits nothing."""
+    grasp = ik.load_grasp(name)
+    solver = ik.Solver(robot_of(grasp.robot), scene=ik.load_scene("table"), compiled=False)
+    solution = solver.solve(grasp, diagnose=False)
+    assert solution.success, solution.collision
+
+
 def test_the_script_makes_the_shipped_file(tmp_path: Path) -> None:
     """To six digits: the optimiser may differ in the last ones from machine to machine."""
     script = Path(__file__).resolve().parents[2] / "studies" / "make_hand_grasps.py"
-    command = [sys.executable, str(script), "--only", "robotiq_3f_mug", "--out", str(tmp_path)]
+    command = [
+        sys.executable,
+        str(script),
+        "--only",
+        "robotiq_3f_mustard_bottle",
+        "--out",
+        str(tmp_path),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     made, shipped = (
-        placed(ik.load_grasp(path)) for path in (tmp_path / "robotiq_3f_mug.yaml", "robotiq_3f_mug")
+        placed(ik.load_grasp(path))
+        for path in (tmp_path / "robotiq_3f_mustard_bottle.yaml", "robotiq_3f_mustard_bottle")
     )
     np.testing.assert_allclose(made[2], shipped[2], atol=1e-5)

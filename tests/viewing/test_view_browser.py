@@ -82,13 +82,17 @@ def said(page: Page, of: str) -> str:
 
 
 def press(page: Page, label: str, of: str = "button") -> None:
-    """Press what has a label, by mouse."""
-    x, y = page.wait(
+    """Press what has a label, by mouse, once it stays where it is."""
+    where = (
         f"(() => {{ const b = [...document.querySelectorAll({of!r})]"
         f".find(b => b.innerText.trim() === {label!r})?.getBoundingClientRect();"
         " return b && b.width && [b.x + b.width / 2, b.y + b.height / 2]; })()"
     )
-    page.click(x, y)
+    place, before = page.wait(where), None
+    while place != before:
+        time.sleep(0.3)
+        place, before = page.wait(where), place
+    page.click(*place)
 
 
 def arrived(file: Path) -> None:

@@ -125,6 +125,9 @@ def _moved(
                 middle = (low + high) / 2
                 good = helps(middle[:, None] * ways)
                 low, high = np.where(good, low, middle), np.where(good, middle, high)
+                # The shortest is wanted: what is longer than another way already is left out.
+                some = low < high.min()
+                low, high, ways = low[some], high[some], ways[some]
             x, y, z = (high[:, None] * ways)[int(high.argmin())].tolist()
             return x, y, z
         before = step
