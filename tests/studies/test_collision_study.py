@@ -24,6 +24,7 @@ def test_a_check_is_never_free_where_others_see_a_penetration():
 def test_the_choice_is_measured_and_taken_up_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(collision, "CLUTTER", (3,))
     monkeypatch.setattr(search, "TURNS", 2)
+    monkeypatch.setattr(search, "BATCH", 4)
     words = [
         "--robot",
         "kuka_lwr_barrett",
