@@ -62,8 +62,9 @@ def solve(arguments: argparse.Namespace) -> Answer:
     if out is not None:
         text = json.dumps(as_json(solution), indent=2, allow_nan=False) + "\n"
         write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
-    for file, is_dark in pictures if draw is not None else ():
-        draw(robot, solution, grasp, file, scene=solver.scene, dark=is_dark)
+    if draw is not None:
+        for file, is_dark in pictures:
+            draw(robot, solution, grasp, file, scene=solver.scene, dark=is_dark)
     written = [(option.lstrip("-"), file) for option, file in outputs.items() if file is not None]
     warning = "" if arguments.scene else penetration(robot, grasp, solution)
     report = solution_report(grasp.name or str(path), solver, solution, written, warning)

@@ -11,7 +11,7 @@ import io
 import math
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from zipfile import ZipFile, is_zipfile
 
 import numpy as np
@@ -76,7 +76,7 @@ class _TorchReader(Reader):
         self._archive, self._folder = archive, folder
         said = f"{folder}byteorder"
         big = said in archive.namelist() and archive.read(said) == b"big"
-        self._order = ">" if big else "<"
+        self._order: Literal[">", "<"] = ">" if big else "<"
         self._read: dict[str, np.ndarray] = {}
 
     def find_class(self, module: str, name: str) -> Any:

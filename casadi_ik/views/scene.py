@@ -100,7 +100,8 @@ def draw_solution(
         InputError: The grasp has a finger that the robot has not.
     """
     ground = DARK if dark else LIGHT
-    figure, paper = new_figure(*SIZE, dpi, ground), np.float32(palette.rgb(ground.paper)) / 255
+    figure = new_figure(*SIZE, dpi, ground)
+    paper = np.array(palette.rgb(ground.paper), np.float32) / 255
     colors = {
         finger: MET_COLOR if verdict.ok else MISSED_COLOR
         for finger, verdict in solution.contacts.items()

@@ -54,7 +54,7 @@ def browser_tools() -> ModuleType:
         tools = importlib.import_module("browser")
     finally:
         del sys.path[0]
-    tools.PATIENCE = 300.0  # a picture painted in software on a busy machine
+    vars(tools)["PATIENCE"] = 300.0  # a picture painted in software on a busy machine
     return tools
 
 
@@ -96,9 +96,9 @@ def drag(
         rest: Between what is drawn and the next step [s].
         drags: Where times go.
     """
-    start = places(0)
-    page.mouse("Moved", *map(float, start))
-    page.mouse("Pressed", *map(float, start), clickCount=1, **HELD)
+    x, y = places(0)
+    page.mouse("Moved", float(x), float(y))
+    page.mouse("Pressed", float(x), float(y), clickCount=1, **HELD)
     for i in range(1, steps + WARM + 1):
         if i == WARM + 1:
             page.evaluate("window.rows = []")
