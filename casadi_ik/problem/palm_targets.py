@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array, Bools
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.problem.hand_motors import hand_motors
 
@@ -59,7 +59,7 @@ def postures_of(robot: ArmHand, postures: Sequence[Mapping[str, float]]) -> Arra
     except (KeyError, TypeError, ValueError):
         given = np.full((len(postures), len(motors)), np.nan)
     low, high = robot.lower[columns], robot.upper[columns]
-    within: Bools = ((given >= low - ROUNDING) & (given <= high + ROUNDING)).all(axis=1)
+    within = np.asarray(((given >= low - ROUNDING) & (given <= high + ROUNDING)).all(axis=1))
     found[:, columns] = np.clip(given, low, high)
     for row, posture in enumerate(postures):
         if not within[row] or len(posture) != len(motors):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array, Bools
+from casadi_ik.arrays import Array
 
 
 def best_of_each(owner: NDArray[np.intp], value: Array, than: Array) -> NDArray[np.intp]:
@@ -55,7 +55,7 @@ class Different:
         near = np.ones((len(whose), most, before + most), dtype=bool)
         for one, known in zip(np.moveaxis(new, 2, 0), np.moveaxis(every, 2, 0), strict=True):
             near &= np.abs(one[:, :, None] - known[:, None]) < self._apart
-        fresh: Bools = ~near[:, :, :before].any(axis=2)
+        fresh = np.asarray(~near[:, :, :before].any(axis=2))
         for i in range(1, most):
             fresh[:, i] &= ~(near[:, i, before : before + i] & fresh[:, :i]).any(axis=1)
         added = np.full((len(self._rows), most, rows.shape[1]), np.nan)
