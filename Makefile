@@ -51,8 +51,9 @@ demo: $(VENV)/demo.stamp
 	$(PAPER)
 	$(BIN)/casadi-ik log compare $(OUT)/cup.mcap $(OUT)/cup_paper.mcap
 
+# One more at a time than there are cores: some wait, for a browser or for a process of their own.
 test: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n $$($(BIN)/python -c "import os; print(1 + os.cpu_count())")
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check

@@ -42,6 +42,7 @@ CALLS = 2000
 
 STACK = """
 #define _DEFAULT_SOURCE
+#include <math.h>
 #include <pthread.h>
 #include <stdio.h>
 #include <string.h>

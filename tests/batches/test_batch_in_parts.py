@@ -21,7 +21,7 @@ import casadi_ik as ik
 from casadi_ik.cli.main import main
 
 ROBOT = ("--robot", "kuka_lwr_barrett")
-COUNT, SIZE = 6000, 100
+COUNT, SIZE = 4000, 100
 PARTS = ("--part-size", str(SIZE))
 
 

@@ -14,8 +14,8 @@ import casadi_ik as ik
 from casadi_ik.grasps import Grasp, load_object
 
 HANDS = ("allegro_right", "leap", "shadow", "robotiq_3f")
-FREE = ("allegro", "robotiq_3f")
-"""Hands whose pinches are free of collision; those of the others are older."""
+FREE = ("allegro", "leap_orange", "robotiq_3f", "shadow")
+"""Pinches free of collision; the others are older."""
 NAMES = [name for hand in HANDS for name in ik.shipped_grasps(f"panda+{hand}")]
 
 

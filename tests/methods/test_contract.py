@@ -248,7 +248,10 @@ def test_an_empty_batch(case):
 
 
 def test_unreachable_contacts_are_a_status(case):
-    solution = case.solver().solve_batch(case.points[:1] + 10.0, case.normals[:1])
+    # It begins anew fifty times before it gives up; what it says then shows after three.
+    options = {"options": {"restarts": 3}} if case.method == "ipopt" else {}
+    solver = case.solver(**options)
+    solution = solver.solve_batch(case.points[:1] + 10.0, case.normals[:1])
     assert not solution.success[0]
     assert solution.status_names[0] in {"STALLED", "ITERATION_LIMIT", "UNREACHABLE"}
     assert np.all(np.isfinite(solution.q))

@@ -52,7 +52,7 @@ def bent(robot, rng, count):
 
 @pytest.mark.parametrize("hands", [shipped_hands, bent])
 def test_one_start_is_nearly_always_enough(robot, once, rng, hands):
-    batch = solve(robot, once, problems(robot, hands(robot, rng, 1200)))
+    batch = solve(robot, once, problems(robot, hands(robot, rng, 600)))
     assert batch.success.mean() >= 0.995
     assert batch.limits_ok.all()
     assert not batch.restarts.any()

@@ -3,7 +3,7 @@
 What is looked at, until one is free: all branches of the arm over the whole swivel with the hand as
 it is; the hand postures of every round, each with all its arms; descents from random arms; and
 steps away from what is nearest, each brought back to the contacts. A hand that touches something by
-itself is done with before any of its arms is looked at.
+itself, wherever its idle fingers are put, is done with before any of its arms is looked at.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from casadi_ik.problem.collision_report import CollisionReport
 from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.problem.problems import Problems
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
+from casadi_ik.solving.alternatives.idle_fingers import IdleFingers
 from casadi_ik.solving.alternatives.of_each import Different, best_of_each, first_of_each
 from casadi_ik.solving.alternatives.swings import ArmSwings, Preference
 from casadi_ik.solving.trials import Descent
@@ -102,6 +103,7 @@ class FreeSearch:
         self.tried = np.zeros(count, dtype=np.int64)
         self.hands: list[tuple[Array, NDArray[np.intp], Array]] = []
         robot, hand = finder.robot, finder.hand
+        self._idle = IdleFingers(robot, problems)
         self._ranges = np.maximum(robot.upper - robot.lower, 1e-9)
         self._known, self._swung = (Different(count, len(hand), ALIKE) for _ in range(2))
         self._fresh = np.ones(count, dtype=bool)
@@ -140,13 +142,13 @@ class FreeSearch:
         """The preferred free arms of hands (m, n) of targets."""
         if not len(q):
             return
-        around = self.around.rows(owner)
+        q = self._idle.aside(q, owner, self.around.held)
         if self.swings is None:
             self.take(q, owner)
             self.hands.append((q, owner, np.zeros(len(q))))
             np.add.at(self.tried, owner, 1)
             return
-        room = around.held.check(q).room
+        room = self.around.rows(owner).held.check(q).room
         parts = (q / self._ranges)[:, self.finder.hand]
         fresh = self._known.add(parts, owner)
         self._fresh[owner[fresh]] = True
