@@ -50,8 +50,13 @@ def test_the_choice_finds_what_contacts_alone_miss(solver, robot):
 def test_a_wall_in_the_way_is_named(robot):
     cup = ik.load_grasp("cup")
     wall = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3].tolist()}
-    solution = ik.Solver(robot, scene=ik.Scene({"balloon": wall})).solve(cup)
+    solver = ik.Solver(robot, scene=ik.Scene({"balloon": wall}))
+    solution = solver.solve(cup)
     assert solution.status is ik.Status.COLLISION
+    quick = solver.solve(cup, diagnose=False).collision
+    assert quick.pair == solution.collision.pair
+    assert quick.without_scene is None
+    assert quick.without_self is None
     assert not solution.success
     report = solution.collision
     assert "balloon" in report.pair

@@ -16,6 +16,15 @@ from casadi_ik.problem.problems import Problems
 PLACES = 48
 """Postures of the idle fingers that are looked at, evenly spread over their limits."""
 
+CLOSER = 24
+"""As many about the best of them, where they have too little room there, ever closer."""
+
+PARTS = (0.5, 0.25, 0.12)
+"""How far about [of the motors' ranges]."""
+
+NEAR = 0.02
+"""Room [m] that can be gained about a place."""
+
 
 class IdleFingers:
     """The motors of k targets' hands that move no finger with a contact."""
@@ -34,7 +43,11 @@ class IdleFingers:
         if problems.fixed is not None:
             self._motors &= np.isnan(problems.fixed)
         parts = (0.5 + np.arange(PLACES)[:, None] * even_steps(len(robot.lower))) % 1.0
-        self._places = robot.lower + parts * (robot.upper - robot.lower)
+        ranges = robot.upper - robot.lower
+        self._limits = robot.lower, robot.upper
+        self._places = robot.lower + parts * ranges
+        about = (parts[:CLOSER] - 0.5) * ranges
+        self._spread = (None, *(part * about for part in PARTS))
 
     def aside(self, q: Array, owner: NDArray[np.intp], around: Surroundings) -> Array:
         """Hands, those that touch something by themselves with their idle fingers elsewhere.
@@ -58,15 +71,25 @@ class IdleFingers:
         some, before = some[touching], before[touching]
         if not len(some):
             return q
-        motors = self._motors[owner[some]]
-        tried = np.where(motors[:, None], self._places, q[some][:, None])
-        rows = np.repeat(owner[some], PLACES)
-        room = of_idle.rows(rows).check(tried.reshape(-1, q.shape[1])).room.reshape(-1, PLACES)
-        best = room.argmax(axis=1)
-        each = np.arange(len(some))
-        better = room[each, best] > before
         moved = q.copy()
-        moved[some[better]] = tried[each, best][better]
+        for places in self._spread:
+            motors = self._motors[owner[some]]
+            about = moved[some][:, None]
+            there = self._places if places is None else about + places
+            tried = np.where(motors[:, None], np.clip(there, *self._limits), about)
+            count = tried.shape[1]
+            rows = np.repeat(owner[some], count)
+            room = of_idle.rows(rows).check(tried.reshape(-1, q.shape[1])).room.reshape(-1, count)
+            best = room.argmax(axis=1)
+            each = np.arange(len(some))
+            most = room[each, best]
+            better = most > before
+            moved[some[better]] = tried[each, best][better]
+            before = np.maximum(before, most)
+            near = (before < -ROUNDING) & (before > -NEAR)
+            some, before = some[near], before[near]
+            if not len(some):
+                break
         return moved
 
     @cached_property
