@@ -235,7 +235,11 @@ class HandFirstMethod(LoopedMethod):
         # The first of them begins as a whole: what stands in the way may be arm and hand together.
         anywhere = self.hands.anywhere(problems, later - VALLEYS)
         whole = np.repeat(anywhere[:1], len(last), axis=0)
-        hands = np.repeat(anywhere[None][:, :, list(self.robot.hand_actuators)], len(last), axis=0)
+        if self.hands.mends(problems):
+            hands = self.hands.mended(problems, number)
+        else:
+            hand = list(self.robot.hand_actuators)
+            hands = np.repeat(anywhere[None][:, :, hand], len(last), axis=0)
         if goes_on(later - VALLEYS):
             best, cost = (last[:, layouts.state.slice(name)] for name in ("best_q", "best_cost"))
             flat = np.flatnonzero(cost < SURE)
