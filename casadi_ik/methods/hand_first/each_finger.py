@@ -28,7 +28,7 @@ from casadi_ik.symbolic.subexpressions import shared
 ROWS = 128
 """Postures of a finger; with four times as many no more fits succeed."""
 
-AT_LIMITS = 0.3
+AT_LIMITS = 0.5
 """Part of the range that is moved to the limits."""
 
 TURNS = 2

@@ -336,7 +336,8 @@ static int begin_round(rounds *job, int64_t number) {
 
 static int is_hopeful(const rounds *job, int64_t number) {
   const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
-  if (number >= ROUNDS - RUGGED) return returns < RETURNS && cost < NEAR_COST;
+  const int64_t rugged = number - (ROUNDS - RUGGED);
+  if (rugged >= 0) return returns < RETURNS && cost < (rugged < EARLY ? NEAR_COST : NEAR_AT_LAST);
   return returns < RETURNS || cost < SURE || number < VARIED || number >= TABLE_ROUNDS;
 }
 

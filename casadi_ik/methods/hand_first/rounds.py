@@ -117,6 +117,7 @@ class RoundsPlan:
             "ROUNDS": self.rounds,
             "VALLEYS": restarts.VALLEYS,
             "RUGGED": restarts.RUGGED,
+            "EARLY": going_on.EARLY,
             "VARIED": going_on.VARIED,
             "RETURNS": going_on.RETURNS,
             "POOL": restarts.MENDED if self.mends else restarts.POOL,
@@ -139,7 +140,8 @@ class RoundsPlan:
         hand = len(self.layouts.robot.hand_actuators)
         return {
             "SURE": going_on.SURE,
-            "NEAR_COST": going_on.near_cost(hand),
+            "NEAR_COST": going_on.near_cost(hand, late=False),
+            "NEAR_AT_LAST": going_on.near_cost(hand, late=True),
             "AT_END": restarts.AT_END,
             "HELD": restarts.HELD,
             "NUDGE": restarts.NUDGE,
