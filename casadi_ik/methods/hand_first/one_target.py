@@ -31,6 +31,7 @@ KERNELS = {
     "solve": "loop_job",
     "contacts": "map_job",
     "valley": "map_job",
+    "each_finger": "map_job",
     "judge": "map_job",
 }
 """The compiled functions it calls, and what they work on."""
@@ -80,6 +81,8 @@ class OneTarget:
         if whole:
             self._link("contacts", plan.contacts)
             self._link("valley", hands.valley)
+            if plan.mends and hands.each_finger is not None:
+                self._link("each_finger", hands.each_finger)
         f = len(robot.fingers)
         self.points = self._view("points").reshape(f, 3)
         self.normals = self._view("normals").reshape(f, 3)
@@ -172,7 +175,9 @@ def _structure(sizes: dict[str, int]) -> type[ctypes.Structure]:
         ("beyond", ctypes.c_double),
         *_whole("iterations", "restarts", "status", "round", "under_way", "in_round", "rounds"),
         *_arrays(state=state, last=state, parameters=sizes["N_PARAMETERS"], mark=state),
-        *_arrays(postures=sizes["N_CANDIDATES"] * h, places=pool * h, closest=pool),
+        *_arrays(postures=sizes["N_CANDIDATES"] * h, near=pool * h),
+        *_arrays(mended=sizes["N_MENDED"] * h, left=sizes["N_MENDED"]),
+        *_arrays(places=pool * h, closest=pool),
         ("found", ctypes.c_int64 * pool),
         ("taken", ctypes.c_int64 * pool),
         *_arrays(moved=(h + 1) * n),
