@@ -52,7 +52,9 @@ DARK = 4.5
 """Ratio from which on a cell is so dark that its number is white."""
 
 PEERS = (
-    "Other packages are not run here: `studies/peers.py` compares with those that are installed."
+    "Not measured here: other packages (placo, Pink, mink) on the same pairs, of which `peers.py` "
+    "knows how to ask on the robots of its own. Arms that are still searched for numerically: those "
+    "that `casadi-ik robots` shows without a closed form."
 )
 
 INTRODUCTION = """
