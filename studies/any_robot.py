@@ -52,9 +52,8 @@ DARK = 4.5
 """Ratio from which on a cell is so dark that its number is white."""
 
 PEERS = (
-    "Not measured here: other packages (placo, Pink, mink) on the same pairs, of which `peers.py` "
-    "knows how to ask on the robots of its own. Arms that are still searched for numerically: those "
-    "that `casadi-ik robots` shows without a closed form."
+    "Not measured here: other packages (placo, Pink, mink) on the same pairs; `peers.py` asks them "
+    "on robots of its own."
 )
 
 INTRODUCTION = """
