@@ -16,6 +16,7 @@ import casadi as ca
 from casadi_ik.errors import KernelError
 from casadi_ik.kernels.arguments import looked_at_once
 from casadi_ik.kernels.some_at_once import some_at_once
+from casadi_ik.kernels.wanted_outputs import wanted_outputs
 
 
 @cache
@@ -81,7 +82,7 @@ def function_source(function: ca.Function) -> str:
     for line in text.splitlines():
         if line.lstrip().startswith("#error"):
             raise KernelError(f"kernel {name!r}: {line.strip().removeprefix('#error').strip()}")
-    return looked_at_once(text)
+    return wanted_outputs(looked_at_once(text))
 
 
 OWN = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")

@@ -17,6 +17,7 @@ WIDTHS = (1, 2, 4)
 """Of how many numbers there are calls."""
 
 LINE = re.compile(r"  (a\d+|out\d+\[\d+\])=(.*);")
+BLOCK, END = re.compile(r"  if \(res\[\d+\]\) \{"), "  }"
 DECLARED = re.compile(r"  casadi_real a\d+(?:, a\d+)*;")
 LOCAL = re.compile(r"\ba\d+\b")
 CALL = re.compile(r"(sin|cos|asin|acos|atan|atan2)\( ?(-?\w+) ?(?:, ?(-?\w+) ?)?\)")
@@ -35,6 +36,7 @@ class _Line:
         after: A bit for each call of an elementary function that it needs, by whatever way.
         kind: TURNS or ARCS for such a call, "" for anything else.
         given: What the call is of: an angle, or height and width.
+        block: The line that begins the block it stands in, "" for none.
         written: Whether it is among what is returned already.
     """
 
@@ -44,6 +46,7 @@ class _Line:
     after: int = 0
     kind: str = ""
     given: tuple[str, ...] = ()
+    block: str = ""
     written: bool = False
 
 
@@ -62,6 +65,7 @@ def _together(body: list[str]) -> list[str]:
     """The body of a function; as it is if it has no two calls, or lines that are no assignments."""
     first = next((i for i, line in enumerate(body) if LINE.fullmatch(line)), len(body))
     last = max((i + 1 for i, line in enumerate(body) if LINE.fullmatch(line)), default=first)
+    last += body[last : last + 1] == [END]
     lines = _parsed(body[first:last])
     if lines is None or sum(bool(line.kind) for line in lines) < 2:
         return body
@@ -75,9 +79,12 @@ def _parsed(texts: list[str]) -> list[_Line] | None:
     """The assignments, every one to a variable of its own; None if there is something else."""
     now: dict[str, int] = {}
     lines: list[_Line] = []
-    calls = 0
-    for number, text in enumerate(texts):
-        match = LINE.fullmatch(text)
+    calls, block = 0, ""
+    for text in texts:
+        if BLOCK.fullmatch(text) or text == END:
+            block = "" if text == END else text
+            continue
+        match, number = LINE.fullmatch(text), len(lines)
         if match is None:
             return None
         target, value = match.groups()
@@ -88,7 +95,8 @@ def _parsed(texts: list[str]) -> list[_Line] | None:
         after = 0
         for need in needs:
             after |= lines[need].after
-        line = _Line(target, LOCAL.sub(lambda name: f"t{now[name[0]]}", value), needs, after)
+        value = LOCAL.sub(lambda name: f"t{now[name[0]]}", value)
+        line = _Line(target, value, needs, after, block=block)
         lines.append(line)
         if target.startswith("a"):
             line.target, now[target] = f"t{number}", number
@@ -118,9 +126,13 @@ class _Writer:
 
     def text(self) -> list[str]:
         """All of them."""
-        for number in range(len(self._lines)):
+        block = ""
+        for number, line in enumerate(self._lines):
+            if line.block != block:
+                self._made += [*([END] if block else []), *([line.block] if line.block else [])]
+                block = line.block
             self._write(number)
-        return self._made
+        return [*self._made, *([END] if block else [])]
 
     def _write(self, number: int) -> None:
         """A line, after those it needs."""
@@ -172,7 +184,8 @@ class _Writer:
         for other in self._calls[:]:
             line = self._lines[other]
             own = 1 << line.after.bit_length() - 1
-            if line.kind != kind or line.after & ~self._done != own:
+            alike = line.kind == kind and line.block == group[0].block
+            if not alike or line.after & ~self._done != own:
                 continue
             if line.given not in places:
                 if len(places) == WIDTHS[-1]:

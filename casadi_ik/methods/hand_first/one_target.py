@@ -15,6 +15,7 @@ from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text
 from casadi_ik.kernels.driver_code import DriverCode, check
+from casadi_ik.made import made
 from casadi_ik.methods.hand_first.rounds import RoundsPlan, source_text
 from casadi_ik.methods.hand_first.state import STAGE_LABELS
 from casadi_ik.problem.method import Quick
@@ -127,13 +128,19 @@ class OneTarget:
         Args:
             judged: Whether there was a verdict.
         """
-        counts = map(int, self._counts.tolist())
         job = self._job
         errors = None
         if judged:
             errors = self.position_error.tolist(), self.angle_error.tolist(), job.beyond
-        phases = dict(zip(STAGE_LABELS, counts, strict=True))
-        return Quick(self.q.copy(), job.iterations, job.restarts, phases, errors)
+        phases = dict(zip(STAGE_LABELS, map(int, self._counts.tolist()), strict=True))
+        return made(
+            Quick,
+            q=self.q.copy(),
+            iterations=job.iterations,
+            restarts=job.restarts,
+            phases=phases,
+            errors=errors,
+        )
 
 
 def _driver(plan: RoundsPlan) -> str:
