@@ -7,7 +7,9 @@ Run it again whenever an object, the hand or the recipes change::
 
 A pad is a point with a normal, and the fingers do not spread: index and middle finger can only
 press on the same cylinder, and never exactly on the same ball. So cylinders are pinched by thumb,
-index and middle finger, balls by thumb and index.
+index and middle finger, balls by thumb and index. The pinch is taken that needs least friction
+among those that keep the axes of phalanges clear of the object and in which the robot's shapes
+touch nothing but what they hold, with the table there as well.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from grasp_synthesis.clearing import MARGIN, cleared, surroundings
 from grasp_synthesis.fingertip_pinch import TipPinch, TipPinchProblem
 from grasp_synthesis.holding import Scene, hold
 from grasp_synthesis.writing import grasp_text, made_by, placed_at
@@ -27,6 +30,7 @@ import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.files.shipped import models_folder
 from casadi_ik.grasps import GraspObject, load_object
+from casadi_ik.problem.clearance import SceneCheck
 
 ROBOT, ROOT = "baxter_ar10", "hand_base"
 ALL, TWO = {"thumb": 1, "index": -1, "middle": -1}, {"thumb": 1, "index": -1}
@@ -46,9 +50,11 @@ AXES = (
     (-1.0, 0.0, 0.0),
 )
 
-# Torso frame: x forward, y left, z up. Assumption: a table at z = -0.15 m.
-TABLE = -0.15
-LOW, HIGH = np.array([0.55, -0.55, 0.0]), np.array([0.85, -0.10, 0.25])
+# Torso frame: x forward, y left, z up. Assumption: a table at z = 0.
+LOW, HIGH = np.array([0.55, -0.55, 0.15]), np.array([0.85, -0.10, 0.40])
+ABOVE = 0.10
+PLACES = 4
+"""Places that a pinch is held at, until one is free."""
 
 
 @dataclass(frozen=True)
@@ -103,21 +109,29 @@ def make(
 ) -> str | None:
     """The text of one grasp file, or None if nothing was found."""
     item, description = load_object(recipe.name), robot.description
-    scene = Scene(LOW, HIGH, recipe.up, TABLE + 0.10)
+    scene = Scene(LOW, HIGH, recipe.up, ABOVE)
+    alone = SceneCheck(robot, ik.Scene(margin=MARGIN))
+    table = SceneCheck(robot, ik.load_scene("table"))
     problem = TipPinchProblem(
         description, ROOT, item, recipe.sides, AXES, 0, EDGE, idle(robot), ROOM
     )
-    for pinch in problem.solve(rng, starts):
-        palm, fingers = gaps(robot, item, recipe.sides, pinch)
-        if pinch.residual > 1e-9 or palm < PALM_GAP or fingers < PHALANX_GAP:
+    for found in problem.solve(rng, starts):
+        palm, fingers = gaps(robot, item, recipe.sides, found)
+        if found.residual > 1e-9 or palm < PALM_GAP or fingers < PHALANX_GAP:
             continue
-        q = hold(description, ROOT, pinch, scene, rng)
-        if q is not None:
-            print(
-                f"{recipe.name}: friction {pinch.friction:.3f}, gaps [mm] palm {1e3 * palm:.1f}, "
-                f"phalanges {1e3 * fingers:.1f}"
-            )
-            return text_of(robot, recipe, pinch, q, (palm, fingers), seed)
+        pinch = cleared(alone, recipe.name, recipe.sides, found, rng)
+        if pinch is None:
+            continue
+        for _ in range(PLACES):
+            q = hold(description, ROOT, pinch, scene, rng)
+            if q is None:
+                continue
+            if surroundings(table, recipe.name, recipe.sides, pinch, q).free(q[None])[0]:
+                print(
+                    f"{recipe.name}: friction {pinch.friction:.3f}, gaps [mm] palm "
+                    f"{1e3 * palm:.1f}, phalanges {1e3 * fingers:.1f}"
+                )
+                return text_of(robot, recipe, pinch, q, (palm, fingers), seed)
     return None
 
 
@@ -169,7 +183,7 @@ def text_of(
     header = [
         made_by("make_ar10_grasps.py", seed, recipe.name, ROBOT),
         f"Pinched: by {', '.join(recipe.sides)}, the other fingers are free.",
-        f"Scene: {scene}; base frame is the torso's. Assumption: a table at z = {TABLE} m.",
+        f"Scene: {scene}; base frame is the torso's. Assumption: a table at z = 0.",
         placed_at(q[list(robot.description.arm_actuators)]),
         f"Friction coefficient needed for the squeeze: {pinch.friction:.3f}. Gaps: object to the "
         f"plane of the knuckles {palm:.1f} mm, axes of the phalanges to the object "

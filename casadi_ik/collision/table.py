@@ -43,6 +43,9 @@ class Table:
     names: tuple[tuple[str, str], ...]
     moving: frozenset[str] = frozenset()
     margins: Array = field(default_factory=lambda: np.zeros(0))
+    _parted: dict[frozenset[str], tuple[Table, Table]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def poses(
         self, items: dict[str, Item], moved: str | None = None, to: Array | None = None
@@ -90,6 +93,13 @@ class Table:
     def of_scene(self) -> Table:
         """The pairs of the robot with what stands about it."""
         return self.only(~self._within)
+
+    def parted(self, links: frozenset[str]) -> tuple[Table, Table]:
+        """The pairs that one of some links is in, and all others; worked out once."""
+        if links not in self._parted:
+            within = np.array([not links.isdisjoint(pair) for pair in self.names], dtype=bool)
+            self._parted[links] = self.only(within), self.only(~within)
+        return self._parted[links]
 
     @property
     def _swinging(self) -> NDArray[np.bool_]:

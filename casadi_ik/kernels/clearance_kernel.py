@@ -33,6 +33,9 @@ logger = logging.getLogger(__name__)
 
 SYMBOL = "casadi_ik_clearance"
 
+RECENT = 8
+"""Pairs that the driver looks at first: those that were in the way last."""
+
 BLOCK = 1024
 """Configurations that numpy works on at a time where there is no compiled driver."""
 
@@ -52,7 +55,7 @@ class ClearanceJob(ctypes.Structure):
         ("pairs", ctypes.c_void_p),
         ("offsets", ctypes.c_void_p),
         ("n_pairs", ctypes.c_int64),
-        ("first", ctypes.c_int64),
+        ("recent", ctypes.c_int64 * RECENT),
         ("most", ctypes.c_double),
         ("enough", ctypes.c_double),
         ("least", ctypes.c_void_p),
@@ -184,7 +187,7 @@ class ClearanceKernel:
             pairs=table.pairs.ctypes.data,
             offsets=memory(offsets),
             n_pairs=len(table.pairs),
-            first=-1,
+            recent=(ctypes.c_int64 * RECENT)(*[-1] * RECENT),
             most=most,
             enough=enough,
             count=len(q),

@@ -87,6 +87,14 @@ class Surroundings:
         """With some of the pairs."""
         return Surroundings(self.kernel, self.table.only(pairs), self.poses, self.margin)
 
+    def parted(self, links: frozenset[str]) -> tuple[Surroundings, Surroundings]:
+        """With the pairs alone that one of some links is in, and with all others."""
+        within, others = self.table.parted(links)
+        return (
+            Surroundings(self.kernel, within, self.poses, self.margin),
+            Surroundings(self.kernel, others, self.poses, self.margin),
+        )
+
     @property
     def held(self) -> Surroundings:
         """With the pairs alone that the hand and its palm's pose decide."""

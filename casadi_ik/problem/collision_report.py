@@ -44,8 +44,9 @@ class CollisionReport:
         pair: The pair that is in the way in the best answer: two links, or a link and a solid.
         short: By how much they are nearer than they have to be [m].
         tried: Answers (hands, arms, elbows) that were looked at.
-        without_scene: Whether one of them is free of the robot itself, the scene left out.
-        without_self: Whether one of them is free of the scene, the robot itself left out.
+        without_scene: Whether one of them is free of the robot itself, the scene left out; None if
+            that was not looked at: it is where a diagnosis is asked for.
+        without_self: Whether one of them is free of the scene, the robot itself left out, or None.
         way_out: What else would do; None if that was not looked for: it is where one grasp is
             solved and a diagnosis asked for.
 
@@ -59,8 +60,8 @@ class CollisionReport:
     pair: Pair
     short: float
     tried: int
-    without_scene: bool
-    without_self: bool
+    without_scene: bool | None
+    without_self: bool | None
     way_out: WayOut | None = None
 
     @property

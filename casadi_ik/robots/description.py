@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -270,15 +270,28 @@ class RobotDescription:
         Raises:
             UnknownNameError: There is no such finger.
         """
+        return tuple(sorted(self._driving(self.finger(name).joints)))
+
+    def links_moved(self, actuators: Collection[int]) -> frozenset[str]:
+        """Links that one of some actuators (positions in q) moves."""
+        moved: set[str] = set()
+        for link in self.links:
+            joints = [joint.name for joint in self.chain(link) if joint.type != "fixed"]
+            if not self._driving(joints).isdisjoint(actuators):
+                moved.add(link)
+        return frozenset(moved)
+
+    def _driving(self, joints: Iterable[str]) -> set[int]:
+        """Positions in q of the actuators of some joints."""
         by_name = {joint.name: joint for joint in self.joints}
         found: set[int] = set()
-        for joint_name in self.finger(name).joints:
+        for joint_name in joints:
             joint = by_name[joint_name]
             while joint.coupling is not None and joint.coupling.of in by_name:
                 joint = by_name[joint.coupling.of]
             source = joint.name if joint.coupling is None else joint.coupling.of
             found.add(self.actuator_index(source))
-        return tuple(sorted(found))
+        return found
 
 
 def frozen(values: Sequence[float] | Array) -> Array:

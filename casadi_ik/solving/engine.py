@@ -268,7 +268,8 @@ class Engine:
                 outcome = self._most_manipulable(asked, starts[rows], run.seed, outcome)
             batch = judged(self.robot, self.method.name, asked, outcome, around)
             if around is not None and isinstance(self.method, HandFirstMethod):
-                batch = freed(self.kinds_of, asked, around, starts[rows], run.seed, outcome, batch)
+                q0, seed = starts[rows], run.seed
+                batch = freed(self.kinds_of, asked, around, q0, seed, outcome, batch, diagnose)
                 outcome = replace(outcome, q=batch.q, time=batch.time)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)

@@ -43,6 +43,7 @@ def freed(
     seed: int,
     outcome: Outcome,
     batch: BatchSolution,
+    reasons: bool = True,
 ) -> BatchSolution:
     """The verdicts on a batch after other answers were looked for where they touch something.
 
@@ -54,6 +55,7 @@ def freed(
         seed: Of all random numbers.
         outcome: What the method came to.
         batch: The verdicts on it.
+        reasons: Whether the reports say what else would do, see `FreeFinder.find`.
     """
     every = problems.prefer in RANKED
     touching = batch.status == Status.COLLISION
@@ -69,7 +71,7 @@ def freed(
     for _, of_kinds, some in by_kinds(asked):
         chosen = rows if of_kinds is None else rows[of_kinds]
         found = engine(some).freer.find(
-            some, around.rows(chosen), q[chosen], starts[chosen], seed, every
+            some, around.rows(chosen), q[chosen], starts[chosen], seed, every, reasons
         )
         q[chosen] = found.q
         for row, report in zip(chosen.tolist(), found.reports, strict=True):

@@ -85,6 +85,7 @@ static void add_pairs(@PREFIX@_solver *solver, int of_arm) {
 
 static clearance_job about(@PREFIX@_solver *solver) {
   clearance_job job = {0};
+  int i;
   solver->scene.n_pairs = 0;
   add_pairs(solver, 0);
   solver->scene.n_held = solver->scene.n_pairs;
@@ -97,7 +98,7 @@ static clearance_job about(@PREFIX@_solver *solver) {
   job.pairs = solver->scene.pairs;
   job.offsets = solver->scene.offsets;
   job.n_pairs = solver->scene.n_pairs;
-  job.first = -1;
+  for (i = 0; i < RECENT; ++i) job.recent[i] = -1;
   job.most = INFINITY;
   job.enough = -INFINITY;
   job.count = 1;

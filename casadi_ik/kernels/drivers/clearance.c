@@ -221,6 +221,14 @@ static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, 
   return lowest(one, place, way, planes) - radius;
 }
 
+/* Puts a pair to the end of the recent ones, which is looked at last of them; the first goes. */
+static void blocked_by(clearance_job *job, int64_t pair) {
+  int k = RECENT - 1, i;
+  while (k > 0 && job->recent[k] != pair) --k;
+  for (i = k; i < RECENT - 1; ++i) job->recent[i] = job->recent[i + 1];
+  job->recent[RECENT - 1] = pair;
+}
+
 EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
   workspace space;
   lanes *q, *placed, *poses, *lines;
@@ -260,8 +268,9 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
       break;
     }
     /* What was in the way last may be in the way again. */
-    for (k = job->first < 0 ? 0 : -1; k < job->n_pairs; ++k) {
-      const int64_t pair = k < 0 ? job->first : k;
+    for (k = -RECENT; k < job->n_pairs; ++k) {
+      const int64_t pair = k < 0 ? job->recent[RECENT + k] : k;
+      if (pair < 0) continue;
       const int i = job->pairs[2 * pair], j = job->pairs[2 * pair + 1];
       const vector c = load(placed + 6 * i), h = load(placed + 6 * i + 3);
       const double radius = job->radii[i] + job->offsets[pair], half = job->halves[i];
@@ -287,10 +296,10 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
       nearer = distance < least;
       least = lanes_select(nearer, distance, least);
       who = lanes_select(nearer, SPREAD((double) pair), who);
-      if (lanes_all(least < SPREAD(job->enough))) {
-        job->first = pair;
-        break;
-      }
+      if (lanes_all(least < SPREAD(job->enough))) break;
+    }
+    for (lane = 0; lane < LANES; ++lane) {
+      if (lanes_at(least, lane) < job->enough) blocked_by(job, (int64_t) lanes_at(who, lane));
     }
     for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
       job->least[job->next + lane] = lanes_at(least, lane);

@@ -7,6 +7,8 @@ typedef struct {
   int64_t first, planes;       /* rows of the table of planes */
 } solid;
 
+enum { RECENT = 8 };
+
 typedef struct {
   const double *q;             /* count rows of N_Q */
   const double *poses;         /* of the scene's solids: rotation row by row, then the origin */
@@ -18,7 +20,7 @@ typedef struct {
   const int32_t *pairs;        /* capsule; another, or N_CAPSULES + solid */
   const double *offsets;       /* taken off each pair's distance */
   int64_t n_pairs;
-  int64_t first;               /* pair that is looked at first, -1: none; then that which was enough */
+  int64_t recent[RECENT];      /* pairs that are looked at first, those that were enough; -1: none */
   double most;                 /* distances above this are not told apart */
   double enough;               /* nor those below this */
   double *least;

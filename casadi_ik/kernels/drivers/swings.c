@@ -239,25 +239,28 @@ static int pick(const swings_job *job, scratch *space, int64_t hand, pool *from,
                 double *better, int64_t *chosen) {
   const int clearest = job->order == CLEAREST;
   clearance_job *clear = job->clear;
+  const int64_t wanted = clear ? job->lanes : 1;
   *chosen = -1;
   for (;;) {
-    int64_t count = 0, i, n;
+    const double least = clearest ? -INFINITY : *better;
+    int64_t count = 0, i, n, *picked = space->picked;
     int code;
-    for (; count < (clear ? job->lanes : 1); ++count) {
-      double top = clearest ? -INFINITY : *better;
-      int64_t best = -1;
-      for (i = 0; i < from->count; ++i) {
-        if (from->used[i] || !(from->score[i] > top)) continue;
-        if (job->n_groups > 1 && from->group[i] != group) continue;
-        top = from->score[i];
-        best = i;
+    for (i = 0; i < from->count; ++i) {
+      const double value = from->score[i];
+      if (from->used[i] || !(value > least)) continue;
+      if (job->n_groups > 1 && from->group[i] != group) continue;
+      if (count == wanted && !(value > from->score[picked[count - 1]])) continue;
+      if (count < wanted) ++count;
+      for (n = count - 1; n > 0 && value > from->score[picked[n - 1]]; --n) {
+        picked[n] = picked[n - 1];
       }
-      if (best < 0) break;
-      from->used[best] = 1;
-      space->picked[count] = best;
-      configuration(job, hand, from->found + from->arm[best], space->rows + count * job->n_q);
+      picked[n] = i;
     }
     if (!count) return DONE;
+    for (n = 0; n < count; ++n) {
+      from->used[picked[n]] = 1;
+      configuration(job, hand, from->found + from->arm[picked[n]], space->rows + n * job->n_q);
+    }
     if (!clear) {
       *chosen = space->picked[0];
       *better = from->score[*chosen];
@@ -314,7 +317,7 @@ static int swing(const swings_job *job, scratch *space, int64_t hand, int level,
   const int64_t size = job->n_sides * (job->n_arm + 1);
   pool *all = &space->all;
   int64_t i, group, chosen;
-  int code;
+  int code, most;
   for (i = 0; i < count; ++i) {
     memcpy(space->samples + i * wide + PALM, job->places[level] + i * job->n_free,
            (size_t) job->n_free * sizeof(double));
@@ -335,9 +338,10 @@ static int swing(const swings_job *job, scratch *space, int64_t hand, int level,
     code = pick(job, space, hand, all, group, score, &chosen);
     if (code != DONE) return code;
     if (chosen < 0) continue;
-    if (job->order != CLEAREST || *score >= -job->rounding) *any = 1;
+    most = job->order == CLEAREST && *score >= job->caps[hand];
+    if (job->order != CLEAREST || most || *score >= -job->rounding) *any = 1;
     memcpy(arm, all->found + all->arm[chosen], (size_t) job->n_arm * sizeof(double));
-    if (all->place[chosen] < 0 || !job->n_closer) continue;
+    if (all->place[chosen] < 0 || !job->n_closer || most) continue;
     code = refine(job, space, hand, job->places[level] + all->place[chosen] * job->n_free,
                   all->group[chosen], score, arm);
     if (code != DONE) return code;

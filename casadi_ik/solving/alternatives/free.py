@@ -48,6 +48,7 @@ class FreeFinder:
         starts: Array,
         seed: int,
         every: bool = False,
+        reasons: bool = True,
     ) -> FreeAnswers:
         """Free answers of k targets.
 
@@ -59,6 +60,8 @@ class FreeFinder:
             seed: Of random arms.
             every: Whether an answer that is free already competes with the others for being
                 preferred, instead of being kept.
+            reasons: Whether to find out if those without one would have one without the scene, or
+                if the robot could pass through itself.
         """
         parts = []
         for first in range(0, len(q), TOGETHER):
@@ -74,7 +77,7 @@ class FreeFinder:
             if every:
                 search.take(q[rows], np.arange(len(rows)))
             search.run(q[rows], every)
-            parts.append(search.found())
+            parts.append(search.found(reasons))
         reports = tuple(report for part in parts for report in part.reports)
         return FreeAnswers(
             np.concatenate([part.q for part in parts]),

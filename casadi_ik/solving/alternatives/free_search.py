@@ -265,16 +265,16 @@ class FreeSearch:
             self.take(*self._solved(ends, owner))
             rows = rows[~self.free[rows] & (self.room[rows] > (1 - GAIN) * before)]
 
-    def found(self) -> FreeAnswers:
-        """What it came to."""
+    def found(self, reasons: bool) -> FreeAnswers:
+        """What it came to; whether it would work without the scene or the robot, if asked."""
         q = np.where(self.free[:, None], self.best, self.nearest)
         reports: list[CollisionReport | None] = [None] * len(q)
         blocked = np.flatnonzero(~self.free)
         if not len(blocked):
             return FreeAnswers(q, self.free, tuple(reports))
         clear = self.around.rows(blocked).check(q[blocked])
-        alone = self._possible(blocked, self.around.robot_alone)
-        passing = self._possible(blocked, self.around.scene_alone)
+        alone = self._possible(blocked, self.around.robot_alone) if reasons else None
+        passing = self._possible(blocked, self.around.scene_alone) if reasons else None
         for i, row in enumerate(blocked.tolist()):
             pair = clear.pair(i)
             assert pair is not None
@@ -282,8 +282,8 @@ class FreeSearch:
                 pair,
                 -float(clear.room[i]),
                 int(self.tried[row]),
-                bool(alone[row]),
-                bool(passing[row]),
+                None if alone is None else bool(alone[row]),
+                None if passing is None else bool(passing[row]),
             )
         return FreeAnswers(q, self.free, tuple(reports))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +21,7 @@ class IdleFingers:
     """The motors of k targets' hands that move no finger with a contact."""
 
     def __init__(self, robot: ArmHand, problems: Problems) -> None:
-        description = robot.description
+        self._description = description = robot.description
         free = np.isnan(problems.points[..., 0]) & np.isnan(problems.normals[..., 0])
         for more in problems.more.values():
             free &= np.isnan(more[..., 0])
@@ -43,12 +45,15 @@ class IdleFingers:
             around: What hands by themselves are checked against.
 
         Returns:
-            (m, n) each as it is, or with the idle fingers where it has most room.
+            (m, n) each as it is, or with the idle fingers where they have most room.
         """
         some = np.flatnonzero(self._motors[owner].any(axis=1))
         if not len(some):
             return q
-        before = around.rows(owner[some]).check(q[some]).room
+        of_idle, others = around.parted(self._links)
+        # What the idle fingers have no part in they do not help.
+        some = some[others.rows(owner[some]).free(q[some])]
+        before = of_idle.rows(owner[some]).check(q[some]).room
         touching = before < -ROUNDING
         some, before = some[touching], before[touching]
         if not len(some):
@@ -56,10 +61,16 @@ class IdleFingers:
         motors = self._motors[owner[some]]
         tried = np.where(motors[:, None], self._places, q[some][:, None])
         rows = np.repeat(owner[some], PLACES)
-        room = around.rows(rows).check(tried.reshape(-1, q.shape[1])).room.reshape(-1, PLACES)
+        room = of_idle.rows(rows).check(tried.reshape(-1, q.shape[1])).room.reshape(-1, PLACES)
         best = room.argmax(axis=1)
         each = np.arange(len(some))
         better = room[each, best] > before
         moved = q.copy()
         moved[some[better]] = tried[each, best][better]
         return moved
+
+    @cached_property
+    def _links(self) -> frozenset[str]:
+        """Links that a motor moves which is idle in one of the targets."""
+        idle = np.flatnonzero(self._motors.any(axis=0)).tolist()
+        return self._description.links_moved(idle)

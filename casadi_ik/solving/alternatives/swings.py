@@ -218,9 +218,10 @@ class _Slow:
             taken = self._take(best, score, *found)
             owner, _, places, branch = (each[taken] for each in found)
             self._refine(best, score, owner, places, branch)
-            enough = score.reshape(-1, self.groups).max(axis=1) >= (
-                -ROUNDING if self.prefer == CLEARANCE else -np.inf
-            )
+            wanted = np.full(len(self.q), -np.inf)
+            if self.prefer == CLEARANCE:
+                wanted = np.minimum(-ROUNDING, self.room)
+            enough = score.reshape(-1, self.groups).max(axis=1) >= wanted
             done = enough & np.isfinite(score.reshape(-1, self.groups)).any(axis=1)
             left = left[~done[left]]
         rows = np.flatnonzero(score > -np.inf)
