@@ -29,6 +29,7 @@ from importlib.metadata import version
 from pathlib import Path
 from threading import Thread
 
+import exported_goals as goals
 import numpy as np
 from runner import markdown_table, provenance, write_page
 
@@ -326,6 +327,10 @@ def main(arguments: list[str] | None = None) -> None:
         markdown_table(["", "targets", "mean", "median", "99.9th percentile", "largest"], rows),
         "## Bytes",
         markdown_table(["", "bytes"], [[name, f"{size:,}"] for name, size in bytes_of.items()]),
+        "## Goals",
+        markdown_table(
+            goals.HEADS, goals.rows(robot, cpu, measured, next(iter(bytes_of.values())))
+        ),
         provenance({"casadi_ik": version("casadi-ik")}),
     ]
     write_page("An exported solver", parts, options.report)

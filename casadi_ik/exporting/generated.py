@@ -6,7 +6,8 @@ import re
 from typing import Any
 
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.kernels.codegen import OWN, driver_text, function_source
+from casadi_ik.kernels.codegen import EXTREMES, OWN, driver_text, function_source, own_functions
+from casadi_ik.kernels.some_at_once import some_at_once
 
 DEFINITION = re.compile(
     r"^(?:CASADI_SYMBOL_EXPORT |static )*"
@@ -32,9 +33,6 @@ TYPES = """\
 WHOLE = "casadi_whole"
 """Name of the outermost function."""
 
-DOUBLE, SINGLE = ("elementary_alone", "elementary"), ("elementary_single",)
-"""Where sines and arcs are from."""
-
 UNUSED = "  (void) arg, (void) res, (void) iw, (void) w, (void) mem;\n"
 
 
@@ -51,6 +49,8 @@ def standing_alone(function: Any, single: bool = False) -> str:
     """
     name = function.name()
     text = function_source(function)
+    if not single:
+        text = some_at_once(text)
     if MEMORY.search(text):
         raise UnsupportedError(f"function {name!r} needs memory of its own: it cannot be exported")
     # Its own name could be one of the solver's.
@@ -59,14 +59,14 @@ def standing_alone(function: Any, single: bool = False) -> str:
     constants = [(match[1], match[0]) for match in CONSTANT.finditer(body)]
     kept = _reached(WHOLE, [*constants, *pieces])
     lines = [_static(source) for _, source in kept]
+    alone = driver_text("elementary_single"), driver_text("extremes")
     return "".join(
         (
             TYPES,
-            *map(driver_text, SINGLE if single else DOUBLE),
-            driver_text("extremes"),
-            *(f"#define {own} own_{own}\n" for own in (*OWN, "fmax", "fmin")),
+            *(alone if single else (own_functions(),)),
+            *(f"#define {own} own_{own}\n" for own in (*OWN, *EXTREMES)),
             *lines,
-            *(f"#undef {own}\n" for own in (*OWN, "fmax", "fmin")),
+            *(f"#undef {own}\n" for own in (*OWN, *EXTREMES)),
             f"#define STEP {WHOLE}\n",
         )
     )

@@ -93,6 +93,8 @@ class SolverSources:
             self._part("valley", "map", plan.hands.valley),
             self._part("judge", "map", plan.judge),
         )
+        if plan.mends and plan.hands.each_finger is not None:
+            parts += (self._part("each_finger", "map", plan.hands.each_finger),)
         return parts + self._scene_parts()
 
     def _scene_parts(self) -> tuple[Part, ...]:

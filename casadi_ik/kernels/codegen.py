@@ -15,6 +15,8 @@ import casadi as ca
 
 from casadi_ik.errors import KernelError
 from casadi_ik.kernels.arguments import looked_at_once
+from casadi_ik.kernels.some_at_once import some_at_once
+from casadi_ik.kernels.wanted_outputs import wanted_outputs
 
 
 @cache
@@ -80,22 +82,46 @@ def function_source(function: ca.Function) -> str:
     for line in text.splitlines():
         if line.lstrip().startswith("#error"):
             raise KernelError(f"kernel {name!r}: {line.strip().removeprefix('#error').strip()}")
-    return looked_at_once(text)
+    return wanted_outputs(looked_at_once(text))
 
 
 OWN = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")
 """Functions of the C library that generated code does not call (drivers/elementary.c)."""
+
+EXTREMES = ("fmax", "fmin")
+"""Likewise (drivers/extremes.c): a call takes as long as ten operations."""
+
+WIDE = """\
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#pragma GCC target("avx2")
+#endif
+"""
+"""Before all code: for machines with wide registers, whose instructions are fewer."""
+
+
+@cache
+def own_functions() -> str:
+    """Their forms for one number, and for some at once."""
+    forms = driver_text("elementary")
+    few = driver_text("elementary_few") + forms
+    return "".join(
+        (
+            driver_text("elementary_alone") + forms,
+            f"#define FEW 2\n{few}#undef FEW\n",
+            f"#ifdef __AVX2__\n#define FEW 4\n{few}#undef FEW\n#endif\n",
+            driver_text("elementary_calls") + driver_text("extremes"),
+        )
+    )
 
 
 def with_own_functions(text: str) -> str:
     """Generated code that calls the elementary functions of the drivers."""
     return "\n".join(
         (
-            driver_text("elementary_alone"),
-            driver_text("elementary"),
-            *(f"#define {name} own_{name}" for name in OWN),
+            own_functions(),
+            *(f"#define {name} own_{name}" for name in (*OWN, *EXTREMES)),
             text,
-            *(f"#undef {name}" for name in OWN),
+            *(f"#undef {name}" for name in (*OWN, *EXTREMES)),
         )
     )
 
@@ -106,14 +132,21 @@ def step_names(name: str) -> str:
     return "".join(f"#define STEP{suffix} {name}{suffix}\n" for suffix in suffixes)
 
 
-def library_source(function: ca.Function, driver: str) -> str:
-    """The text of a whole library: the function's code, its names, what drivers share, a driver."""
+def library_source(function: ca.Function, driver: str, wide: bool = False) -> str:
+    """The text of a whole library: the function's code, its names, what drivers share, a driver.
+
+    Args:
+        function: Dense and row-major.
+        driver: C text of the driver, with its constants.
+        wide: Whether the machine has wide registers.
+    """
     # More than one thread at once may hold memory of a function that needs some.
     header = "#define CASADI_MAX_NUM_THREADS 64\n"
     return "\n".join(
         (
+            WIDE if wide else "",
             header,
-            with_own_functions(function_source(function)),
+            with_own_functions(some_at_once(function_source(function))),
             step_names(function.name()),
             driver_text("common"),
             driver,

@@ -44,6 +44,7 @@ AS_THEY_ARE = tuple(
         r"(?:/\*.*\*/)?",
         r"(?:const )?casadi_(?:real|int)\b(?!.*=\d)[\w\s,*=+]*;",
         rf"(?:arg1|res1)\[\d+\]={POINTER};",
+        r"res1\[\d+\]=res\[\d+\] \? w\d+ : 0;",
         rf"wr\d+ = {POINTER};",
         r"casadi_real aside\d+\[\d+\];",
         r"const casadi_real \*in(\d+) = arg\[\1\] \? arg\[\1\] : casadi_nought;",
@@ -55,6 +56,8 @@ AS_THEY_ARE = tuple(
         r"for \(j=0; j<\d+; \+\+j\) rr\[i\+j\*\d+\] = \*cs\+\+;",
         r"for \(rr=[^;]*, cs=[^;]*; cs!=[^;]*; cs\+=\d+\) \*rr\+\+ = \*cs;",
         r"return 0;",
+        r"if \(res\[\d+\]\) \{",
+        r"\}",
     )
 )
 

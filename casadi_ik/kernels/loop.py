@@ -15,7 +15,7 @@ from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.buffered import doubles
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import stop_if_cancelled
-from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
 from casadi_ik.kernels.loop_job import FIRST_MARK, SLOTS, CompiledBatch
@@ -80,8 +80,14 @@ class LoopKernel:
         self._rows_each = 0.0
 
     def _load(self) -> ctypes.CDLL | None:
+        wide = machine_lanes() > 0
         return load_library(
-            self.step.name, lambda: self.function, self._driver("loop"), SYMBOL, self.step.recipe
+            self.step.name,
+            lambda: self.function,
+            self._driver("loop"),
+            SYMBOL,
+            f"{self.step.recipe} wide {wide}" if self.step.recipe else "",
+            partial(library_source, wide=wide),
         )
 
     @property

@@ -195,6 +195,9 @@ class Questions:
 
 def _object_poses(grasps: Sequence[Grasp]) -> Array | None:
     """(k, 4, 4) where grasps have their object; None unless all say it, of the same object."""
+    if len(grasps) == 1:
+        pose = grasps[0].object_pose
+        return None if pose is None else pose[None]
     if len({grasp.object for grasp in grasps}) > 1:
         return None
     poses = [grasp.object_pose for grasp in grasps if grasp.object_pose is not None]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.made import made
 from casadi_ik.problem.contact_verdict import ContactVerdict, PalmVerdict
 from casadi_ik.problem.problems import Problems
 
@@ -144,7 +145,15 @@ def judge_errors(
     for distance, turn, tolerance in errors:
         if not (distance <= tolerance.position * slack and turn <= tolerance.angle * slack):
             return None
-        contacts.append(ContactVerdict(distance, turn, True, tolerance))
+        contacts.append(
+            made(
+                ContactVerdict,
+                position_error=distance,
+                angle_error=turn,
+                ok=True,
+                tolerance=tolerance,
+            )
+        )
     return SolvedVerdict(contacts, limits_ok)
 
 

@@ -16,6 +16,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.in_background import InBackground
+from casadi_ik.made import made
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.clearance import SceneCheck, Surroundings
@@ -176,14 +177,12 @@ class Engine:
         """
         if problems.more:
             ((kinds, _, _),) = by_kinds(problems)
-            other = self.of_kinds(kinds)
-            if other is not self:
+            if (other := self.of_kinds(kinds)) is not self:
                 return other.quick(problems, run)
         method, robot = self._quick, self.robot
         if method is None or problems.palms is not None or problems.prefer in RANKED:
             return None
-        start = run.start(robot)
-        if start.ndim != 1:
+        if (start := run.start(robot)).ndim != 1:
             return None
         self.method.prepare()
         begin = time.perf_counter()
@@ -201,13 +200,13 @@ class Engine:
         if (around := self.around(problems)) is not None:
             clear = around.check(q[None])
             if not clear.free[0]:
-                other = freed_at_once(self, problems, around, q, start)
-                if other is None:
+                if (other := freed_at_once(self, problems, around, q, start)) is None:
                     return None
                 q, verdict, clear = other
                 seconds = time.perf_counter() - begin
             distance, closest = float(clear.distance[0]), clear.pair(0)
-        return Solution(
+        return made(
+            Solution,
             success=True,
             status=Status.SOLVED,
             q=q,

@@ -34,6 +34,8 @@ class Run:
     def __post_init__(self) -> None:
         for name, least in (("jobs", 1), ("seed", 0)):
             value = getattr(self, name)
+            if type(value) is int and value >= least:
+                continue
             if not isinstance(value, (int, np.integer)) or value < least:
                 raise InputError(f"{name}: found {value!r}, expected an integer >= {least}")
             object.__setattr__(self, name, int(value))

@@ -64,6 +64,8 @@ class Answerer:
         """Take the robot."""
         self.robot = robot
         self._solver = lru_cache(maxsize=16)(self._built)
+        # An object's file is read once, wherever it is dragged to.
+        self._alone = lru_cache(maxsize=16)(lambda name: Scene().holding(name, np.eye(4)))
         self._in_scene: tuple[Scene | None, Solver] | None = None
 
     def solver(self, asked: Asked) -> Solver:
@@ -160,9 +162,10 @@ class Answerer:
         if clear is None or pair is None:
             return None, None, True
         distance, free = float(clear.distance[0]), bool(clear.free[0])
-        scene = asked.scene
-        if asked.object and asked.object_pose is not None:
-            scene = scene.holding(asked.object, asked.object_pose)
+        scene, other = asked.scene, pair[1]
+        if other == asked.object and asked.object_pose is not None:
+            known = scene if other in scene.items else self._alone(other)
+            scene = known.moved(other, asked.object_pose)
         found = closest_points(self.robot, q, scene, pair)
         return distance, None if found is None else (pair, found), free
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -49,7 +50,7 @@ class Held:
     used: bool = True
     normal: bool = True
 
-    @property
+    @cached_property
     def placed(self) -> Contact:
         """The contact in the base frame, with what is asked of it."""
         found = self.contact.at(self.control)
@@ -80,7 +81,7 @@ class Asked:
     scene: Scene | None = None
     settings: Settings = Settings()
 
-    @property
+    @cached_property
     def grasp(self) -> Grasp:
         """The grasp; at least one finger is used."""
         contacts = {name: one.placed for name, one in self.held.items() if one.used}

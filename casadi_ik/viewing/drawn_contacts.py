@@ -99,6 +99,7 @@ class _Target:
         size: float,
     ) -> None:
         contact, name = held.contact, f"{above}/contacts/{finger}"
+        self._held: Held | None = None
         self.control = server.scene.add_transform_controls(
             name, scale=size * SIZE, line_width=3.0, depth_test=False
         )
@@ -155,6 +156,9 @@ class _Target:
             drags.selected(finger)
 
     def place(self, held: Held, moved: bool) -> None:
+        if held is self._held:
+            return
+        self._held = held
         if moved:
             self.control.position = held.control[:3, 3]
             self.control.wxyz = quaternion(held.control[:3, :3])

@@ -1,4 +1,8 @@
-"""A robot on a page: a mesh per link, moved by itself."""
+"""A robot on a page: a mesh per link that hangs on the link before it.
+
+What a joint moves is moved by the browser: a posture is sent as a turn per joint, not as a pose per
+link.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,8 @@ from casadi_ik.arrays import Array
 from casadi_ik.viewing.frames import quaternions
 from casadi_ik.viewing.robot_parts import LinkPart
 
-STILL = 1e-7
-"""Links that move by less [m, or in their axes] are left where they are."""
+STILL = 1e-9
+"""Links that move by less on the one before [m, or in their axes] are left where they are."""
 
 
 class DrawnRobot:
@@ -26,8 +30,6 @@ class DrawnRobot:
         robot: ArmHand,
         parts: Sequence[LinkPart],
         name: str = "/robot",
-        opacity: float | None = None,
-        tint: str | None = None,
     ) -> None:
         """Draw it at home.
 
@@ -36,26 +38,25 @@ class DrawnRobot:
             robot: The robot.
             parts: Its links as they are seen.
             name: Of its node.
-            opacity: 0 to 1; None: opaque.
-            tint: One colour for all of it; None: its own.
         """
         self._server, self._robot = server, robot
         server.scene.add_frame(name, show_axes=False)
+        self._before = _drawn_before(robot, parts)
+        names: list[str] = []
+        for part, before in zip(parts, self._before, strict=True):
+            names.append(f"{names[before] if before >= 0 else name}/{part.link}")
         self._meshes = [
             server.scene.add_mesh_simple(
-                f"{name}/{part.link}",
+                node,
                 part.surface.points.astype(np.float32),
                 part.surface.triangles.astype(np.uint32),
-                color=palette.rgb(tint or part.color),
-                opacity=opacity,
+                color=palette.rgb(part.color),
                 side="double",
-                cast_shadow=opacity is None,
-                receive_shadow=opacity is None,
+                receive_shadow=False,
             )
-            for part in parts
+            for node, part in zip(names, parts, strict=True)
         ]
-        names = robot.description.links
-        self._links = [names.index(part.link) for part in parts]
+        self._links = [robot.description.links.index(part.link) for part in parts]
         self._poses = np.full((len(parts), 4, 4), np.nan)
         self.q = robot.home
         self.place(robot.home)
@@ -63,17 +64,30 @@ class DrawnRobot:
     def place(self, q: Array) -> None:
         """Move it to q (n,) [rad or m]."""
         self.q = np.array(q)
-        every = list(self._robot.links(q).values())
-        poses = np.array([every[i] for i in self._links])
-        moved = ~(np.abs(poses - self._poses).max(axis=(1, 2)) < STILL)
-        turned = quaternions(poses[:, :3, :3])
+        every = np.array(list(self._robot.links(q).values()))[self._links]
+        # The last stands for the base frame, which the first links hang on.
+        on = np.concatenate([every, np.eye(4)[None]])[self._before]
+        poses = np.linalg.inv(on) @ every
+        gone = ~(np.abs(poses - self._poses) < STILL)
+        shifted, turned = gone[:, :3, 3].any(axis=1), gone[:, :3, :3].any(axis=(1, 2))
+        wxyz = quaternions(poses[:, :3, :3])
         with self._server.atomic():
-            for i in np.flatnonzero(moved):
+            for i in np.flatnonzero(shifted):
                 self._meshes[i].position = poses[i, :3, 3]
-                self._meshes[i].wxyz = turned[i]
-        self._poses[moved] = poses[moved]
+            for i in np.flatnonzero(turned):
+                self._meshes[i].wxyz = wxyz[i]
+        self._poses[shifted, :3, 3] = poses[shifted, :3, 3]
+        self._poses[turned, :3, :3] = poses[turned, :3, :3]
 
-    def show(self, visible: bool) -> None:
-        """Show or hide it."""
-        for mesh in self._meshes:
-            mesh.visible = visible
+
+def _drawn_before(robot: ArmHand, parts: Sequence[LinkPart]) -> list[int]:
+    """By part the number of the part that it hangs on; -1: none of them."""
+    drawn = {part.link: i for i, part in enumerate(parts)}
+    parents = {joint.child: joint.parent for joint in robot.description.joints}
+    found = []
+    for part in parts:
+        link = parents.get(part.link)
+        while link is not None and link not in drawn:
+            link = parents.get(link)
+        found.append(-1 if link is None else drawn[link])
+    return found

@@ -81,6 +81,7 @@ class DrawnThings:
             selected: Told of a thing that is clicked.
         """
         self._controls: dict[str, viser.TransformControlsHandle] = {}
+        self._poses: dict[str, Array] = {}
         surface = _object_surface(asked.object)
         if surface is not None and asked.object_pose is not None:
             self._add(server, OBJECT, [(surface, palette.OBJECT, 0.4)], moved, selected)
@@ -98,13 +99,16 @@ class DrawnThings:
     def place(self, asked: Asked, dragged: str = "") -> None:
         """Put everything where it is; what is being dragged is where the hand has it."""
         for name, control in self._controls.items():
-            if name == dragged:
-                continue
             if name == OBJECT and asked.object_pose is not None:
                 pose = asked.object_pose
             elif asked.scene is not None and name in asked.scene.items:
                 pose = asked.scene.items[name].pose
             else:
+                continue
+            if pose is self._poses.get(name):
+                continue
+            self._poses[name] = pose
+            if name == dragged:
                 continue
             control.position, control.wxyz = pose[:3, 3], quaternion(pose[:3, :3])
 

@@ -20,13 +20,13 @@ from casadi_ik.viewing.drawn_closest import DrawnClosest
 from casadi_ik.viewing.drawn_contacts import Drags, DrawnContacts
 from casadi_ik.viewing.drawn_robot import DrawnRobot
 from casadi_ik.viewing.drawn_things import OBJECT, DrawnThings, lowest
-from casadi_ik.viewing.newest import Newest
+from casadi_ik.viewing.newest import PAUSE, REST, Newest
 from casadi_ik.viewing.panel import Panel
 from casadi_ik.viewing.robot_parts import robot_parts
 from casadi_ik.viewing.stage import look_at_robot, set_stage
 
-PANELS = 0.1
-"""So far apart the motors are shown while something is dragged [s]."""
+LATEST = 0.5
+"""Motors are shown when there is time for it, but never so long after an answer [s]."""
 
 LEGEND = (
     (palette.TARGET, "asked for: drag it"),
@@ -79,7 +79,7 @@ class GraspPage:
         self._listed_for: Asked | None = None
         self.solutions: tuple[Alternative, ...] = ()
         self._dragged, self._forward = "", not solved
-        self._motors_shown = 0.0
+        self._untold_since: float | None = None
         set_stage(server, asked.name or robot.name, lowest(asked.scene))
         look_at_robot(server, robot, self.answer.q)
         self._drawn = DrawnRobot(server, robot, robot_parts(robot, meshes))
@@ -93,7 +93,8 @@ class GraspPage:
         self.candidates = dict(candidates or {})
         names = (*asked.held, *self._things.names)
         self._panel = Panel(self, names, LEGEND)
-        self.work = Newest(self._refresh, (self._show_motors, self._explain, self._list_solutions))
+        later = (PAUSE, self._show_motors), (REST, self._explain), (REST, self._list_solutions)
+        self.work = Newest(self._refresh, later)
         self.select(robot.fingers[0])
 
     # What a browser asks for: put down, and done when it is its turn.
@@ -194,7 +195,8 @@ class GraspPage:
             self._answered_for = self.asked
             self.solutions = ()
         self.draw(self.answer)
-        if time.monotonic() - self._motors_shown > PANELS:
+        self._untold_since = self._untold_since or time.monotonic()
+        if time.monotonic() - self._untold_since > LATEST:
             self._show_motors()
 
     def draw(self, answer: Answered) -> None:
@@ -230,8 +232,9 @@ class GraspPage:
         self._panel.tell_solutions(found)
 
     def _show_motors(self) -> None:
-        self._motors_shown = time.monotonic()
-        self._panel.tell_motors(self.answer.q, self.robot.joints(self.answer.q))
+        with self.server.atomic():
+            self._panel.tell_motors(self.answer.q, self.robot.joints(self.answer.q))
+        self._untold_since = None
 
     def stop(self) -> None:
         """End its thread."""

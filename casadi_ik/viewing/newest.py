@@ -1,14 +1,16 @@
 """What a page is asked to do, done in a thread of its own: of each thing only the newest.
 
 Whoever drags sends twenty changes a second, whatever a solve takes. Each change has a key; one that
-was not begun when another of its key comes is dropped. What can wait is begun once the hand rests,
-and given up when it moves on. The thread that talks to the browsers only ever puts a change down.
+was not begun when another of its key comes is dropped. What can wait is begun once nothing has come
+for a while, and given up when something comes. The thread that talks to the browsers only ever puts
+a change down.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 
 from casadi_ik.kernels.cancellation import CancelledError, cancellable
@@ -17,20 +19,23 @@ logger = logging.getLogger(__name__)
 
 Work = Callable[[], None]
 
+PAUSE = 0.02
+"""What follows a drag waits so long, and so never is in the way of an answer [s]."""
+
 REST = 0.15
-"""So long nothing has come when what can wait is begun [s]; in a drag, changes are 0.05 s apart."""
+"""After so long nothing moves any more [s]; in a drag, changes are 0.05 s apart."""
 
 
 class Newest:
     """A thread that does the newest change of every key, then draws, then what can wait."""
 
-    def __init__(self, refresh: Work, later: tuple[Work, ...] = ()) -> None:
+    def __init__(self, refresh: Work, later: tuple[tuple[float, Work], ...] = ()) -> None:
         """Start it.
 
         Args:
             refresh: Called after changes, once for all that were waiting.
-            later: Called one by one when nothing has come for a while; begun anew after the next
-                change if that comes in between.
+            later: Each called once nothing has come for so long [s], the shortest first; all begun
+                anew after the next change if that comes in between.
         """
         self._refresh, self._later = refresh, later
         self._changes: dict[str, Work] = {}
@@ -75,22 +80,24 @@ class Newest:
             for change in self._take():
                 self._do(change)
             self._do(self._refresh)
-            if self._later and self._rests():
-                self._do_later()
+            self._do_later(time.monotonic())
 
-    def _do_later(self) -> None:
+    def _do_later(self, since: float) -> None:
         try:
             with cancellable(self._moved_on):
-                for work in self._later:
+                for pause, work in self._later:
+                    if not self._rests(since + pause):
+                        return
                     self._do(work)
         except CancelledError:
             logger.debug("given up for something newer")
 
-    def _rests(self) -> bool:
-        """Whether nothing comes for a while; at once if somebody waits for everything."""
+    def _rests(self, until: float) -> bool:
+        """Whether nothing comes until then; at once if somebody waits for everything."""
         with self._something:
             self._something.wait_for(
-                lambda: self._changes or self._stopped or self._awaited, timeout=REST
+                lambda: self._changes or self._stopped or self._awaited,
+                timeout=max(until - time.monotonic(), 0.0),
             )
             return not (self._changes or self._stopped)
 

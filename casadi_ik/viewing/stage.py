@@ -14,12 +14,15 @@ from casadi_ik.arrays import Array
 AWAY = 1.3
 """How far the camera is, in sizes of what it looks at."""
 
+LAMP = np.array([0.55, -0.45, 1.9])
+"""From what is looked at to the lamp, in sizes of it."""
+
 TILT = 0.36
 """How far up it is, as a part of how far it is away along the ground."""
 
 
 def set_stage(server: viser.ViserServer, title: str, floor: float = 0.0) -> None:
-    """Light, a ground with a grid of 0.1 m and 0.5 m, and the look of the panel.
+    """Daylight, a ground with a grid of 0.1 m and 0.5 m, and the look of the panel.
 
     Args:
         server: The page.
@@ -33,13 +36,6 @@ def set_stage(server: viser.ViserServer, title: str, floor: float = 0.0) -> None
     scene.configure_environment_map(hdri=None)
     scene.add_light_hemisphere(
         "/light/sky", sky_color=(255, 255, 255), ground_color=(214, 210, 204), intensity=2.1
-    )
-    scene.add_light_directional(
-        "/light/lamp",
-        color=(255, 250, 242),
-        intensity=2.2,
-        position=(0.9, -0.7, 3.2),
-        cast_shadow=True,
     )
     scene.add_light_directional("/light/fill", intensity=0.6, position=(-2.0, 2.0, 1.0))
     scene.add_grid(
@@ -65,7 +61,7 @@ def set_stage(server: viser.ViserServer, title: str, floor: float = 0.0) -> None
 
 
 def look_at(server: viser.ViserServer, target: Array, size: float, view: Array) -> None:
-    """Where a browser that opens the page looks from.
+    """Where a browser that opens the page looks from, and what lights what it sees.
 
     Args:
         server: The page.
@@ -77,6 +73,18 @@ def look_at(server: viser.ViserServer, target: Array, size: float, view: Array) 
     server.initial_camera.fov = float(np.deg2rad(40.0))
     server.initial_camera.look_at = target
     server.initial_camera.position = target + AWAY * size * way
+    # For its shadows the scene is drawn once more, for those of a sun three times.
+    server.scene.add_light_spot(
+        "/light/lamp",
+        color=(255, 250, 242),
+        intensity=2.2,
+        decay=0.0,
+        angle=0.95,
+        penumbra=0.3,
+        position=target + size * LAMP,
+        direction=(-LAMP[0], -LAMP[1], -LAMP[2]),
+        cast_shadow=True,
+    )
 
 
 def look_at_robot(server: viser.ViserServer, robot: ArmHand, q: Array, wide: int = 1) -> None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.common.contact_shape import contact_shape
 from casadi_ik.methods.common.even_spread import evenly
-from casadi_ik.methods.common.posture_table import PostureTable
+from casadi_ik.methods.common.posture_table import PostureTable, differing
 
 HAND = tuple(range(7, 14))
 
@@ -142,12 +142,13 @@ def test_evenly(dimensions):
 def test_varied_postures_differ_and_begin_with_the_nearest(robot, table, rng):
     points, normals = robot.contacts(robot.random(rng, 300))
     nearest = table.nearest(points, normals, 1)
-    varied = table.varied(points, normals, 8, 48, 0.2)
+    pool = table.nearest(points, normals, 48)
+    varied = differing(pool, table.ranges, 8, 0.2)
     np.testing.assert_array_equal(varied[:, 0], nearest[:, 0])
     places = varied / (robot.upper - robot.lower)[list(HAND)]
     apart = np.sqrt(np.mean((places[:, :, None] - places[:, None]) ** 2, axis=3))
     assert np.median(apart[:, *np.triu_indices(8, 1)].min(axis=1)) >= 0.2
-    few = table.varied(points, normals, 8, 8, 0.9)
+    few = differing(pool[:, :8], table.ranges, 8, 0.9)
     np.testing.assert_array_equal(few[:, 0], nearest[:, 0])
     for row, alike in zip(few, table.nearest(points, normals, 8), strict=True):
         assert {tuple(posture) for posture in row} == {tuple(posture) for posture in alike}

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+import pickle
+
 import numpy as np
 import pytest
 
+import casadi_ik as ik
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Problems, Tolerance
@@ -173,3 +177,16 @@ def test_little_is_left_to_record_when_all_are_solved():
 def test_without_a_trace_there_is_a_part_for_each_thread(count, jobs, sizes):
     parts = list(BatchParts(count, jobs, trace=False))
     assert [part.stop - part.start for part in parts] == sizes
+
+
+def test_a_quick_answer_has_every_field(robot: ik.ArmHand) -> None:
+    points, normals = robot.contacts(robot.home)
+    contacts = map(ik.Contact, points, normals)
+    solution = ik.Solver(robot).solve(ik.Grasp(dict(zip(robot.fingers, contacts, strict=True))))
+    for one in (solution, *solution.contacts.values()):
+        needed = {f.name for f in dataclasses.fields(one) if f.default is dataclasses.MISSING}
+        names = {f.name for f in dataclasses.fields(one)}
+        assert needed <= vars(one).keys() <= names
+        again = dataclasses.replace(one)
+        assert repr(again) == repr(one)
+        assert repr(pickle.loads(pickle.dumps(one))) == repr(one)

@@ -12,12 +12,11 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.kernels.cancellation import stop_if_cancelled
-from casadi_ik.viewing import newest
 from casadi_ik.viewing.asked import asked_of
 from casadi_ik.viewing.bodies import arrow, body_of, sharp
 from casadi_ik.viewing.frames import facing, pose_of, quaternions
 from casadi_ik.viewing.grasp_text import grasp_text
-from casadi_ik.viewing.newest import Newest
+from casadi_ik.viewing.newest import REST, Newest
 
 
 def turned(x: float, y: float, z: float, *angles: float) -> np.ndarray:
@@ -110,7 +109,7 @@ def test_only_the_newest_change_of_a_key_is_done() -> None:
         go_on.wait(10)
         done.append("first")
 
-    work = Newest(lambda: done.append("drawn"), (lambda: done.append("later"),))
+    work = Newest(lambda: done.append("drawn"), ((REST, lambda: done.append("later")),))
     work.put("thumb", first)
     assert begun.wait(10)
     for i in range(5):
@@ -134,7 +133,7 @@ def test_what_can_wait_is_given_up_when_the_hand_moves_on() -> None:
             time.sleep(0.001)
         done.append("later")
 
-    work = Newest(lambda: None, (long,))
+    work = Newest(lambda: None, ((REST, long),))
     work.put("thumb", lambda: None)
     assert begun.wait(10)
     work.put("thumb", lambda: done.append("thumb"))
@@ -143,19 +142,16 @@ def test_what_can_wait_is_given_up_when_the_hand_moves_on() -> None:
     work.stop()
 
 
-def test_nothing_that_can_wait_is_begun_before_the_hand_rests(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(newest, "REST", 60.0)
-    drawn, done = threading.Event(), []
-    work = Newest(drawn.set, (lambda: done.append("later"),))
+def test_what_can_wait_is_begun_each_after_its_time() -> None:
+    soon, done = threading.Event(), []
+    later = (0.005, soon.set), (60.0, lambda: done.append("later"))
+    work = Newest(lambda: done.append("drawn"), later)
     work.put("thumb", lambda: None)
-    assert drawn.wait(10)
-    time.sleep(0.02)
-    assert done == []
+    assert soon.wait(10)
+    assert done == ["drawn"]
     # Whoever waits for everything does not wait for that.
     assert work.settle(10)
-    assert done == ["later"]
+    assert done == ["drawn", "later"]
     work.stop()
 
 

@@ -11,8 +11,10 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.errors import InputError
 from casadi_ik.viewing import Viewer, view_grasp
+from casadi_ik.viewing.answering import Answered
 from casadi_ik.viewing.asked import Settings
 from casadi_ik.viewing.drawn_things import OBJECT
+from casadi_ik.viewing.frames import pose_of
 
 
 def shifted(pose: np.ndarray, *by: float) -> np.ndarray:
@@ -46,6 +48,50 @@ def test_a_dragged_contact_is_reached(cup: Viewer) -> None:
     assert np.linalg.norm(tip - wanted) <= page.asked.settings.tolerance.position
     # The nearest answer: no motor goes far for a centimetre.
     assert np.abs(page.answer.q - before).max() < 0.5
+
+
+def test_links_stand_where_they_hang(cup: Viewer, rng: np.random.Generator) -> None:
+    """What a browser makes of poses that are sent link on link is the robot's kinematics."""
+    page, robot = cup.page, cup.page.robot
+    page.drag_motors(robot.random(rng, 1)[0])
+    assert page.work.settle()
+    drawn = {mesh.name: mesh for mesh in page._drawn._meshes}
+    places: dict[str, np.ndarray] = {"/robot": np.eye(4)}
+    for name, mesh in drawn.items():
+        on = places[name.rpartition("/")[0]]
+        places[name] = on @ pose_of(mesh.position, mesh.wxyz)
+    links = robot.links(page.answer.q)
+    assert len(drawn) == 17
+    for name, place in places.items():
+        if name != "/robot":
+            assert np.abs(place - links[name.rpartition("/")[2]]).max() < 1e-8
+
+
+def test_an_answer_is_a_turn_a_joint_and_nothing_that_can_wait(
+    cup: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, sent, drawn = cup.page, [], []
+    queue, draw = cup._server._websock_server.queue_message, page.draw
+    pose = shifted(page.asked.held["thumb"].control, 0.004, 0.008, 0.004)
+
+    def counted(answer: Answered) -> None:
+        sent.clear()
+        draw(answer)
+        drawn.append(list(sent))
+
+    monkeypatch.setattr(page, "draw", counted)
+    monkeypatch.setattr(
+        cup._server._websock_server, "queue_message", lambda m: (sent.append(m), queue(m))
+    )
+    page.drag_control("thumb", pose)
+    assert page.work.settle()
+    kinds = [[type(message).__name__ for message in messages] for messages in drawn]
+    robot = [m for m in drawn[0] if getattr(m, "name", "").startswith("/robot")]
+    assert len(drawn) == 1
+    assert 0 < len(robot) <= len(page.robot.description.movable)
+    # Of the panel the verdict; motors and solutions come once it is drawn.
+    assert kinds[0].count("GuiUpdateMessage") == 1
+    assert len(drawn[0]) < len(robot) + 14
 
 
 def test_a_dragged_normal_is_faced(cup: Viewer) -> None:

@@ -6,9 +6,10 @@
  * machine has. Within 2 units in the last place of normal numbers; angles beyond 5e8 rad go to the C library.
  * Reductions and coefficients are those of Moshier's Cephes library (sin.c, atan.c).
  *
- * Expects the macros NAME(f), QUALIFIERS, REAL and INTEGER, BITS(real) and REAL_OF(integer) for the
+ * Expects the macros NAME(f), QUALIFIERS, INNER (for what is part of others), REAL and INTEGER, BITS(real) and REAL_OF(integer) for the
  * same bits, MASK(comparison) with all bits of a true entry set, ROOT, SMALL(real) whether all
- * entries are such as can be reduced here, and LIBRARY(f, x) for the others.
+ * entries are such as can be reduced here, and LIBRARY(f, x) for the others; without LIBRARY only what
+ * needs neither is defined.
  */
 #define K(number) ((REAL) {0} + (number))
 #define PICK(mask, yes, no) REAL_OF(((mask) & BITS(yes)) | (~(mask) & BITS(no)))
@@ -17,32 +18,52 @@
 #define SHIFT 6755399441055744.0
 #define SIGN ((INTEGER) {0} + INT64_MIN)
 
-QUALIFIERS REAL NAME(reduced)(REAL x, REAL *turns) {
+/* Sine and cosine of the angle between x and the nearest whole quarter of a turn, whose number
+ * stands in the last bits of `quarters`. */
+INNER REAL NAME(rest)(REAL x, REAL *cosine, INTEGER *quarters) {
   const REAL k = x * 0.63661977236758134308 + SHIFT, whole = k - SHIFT;
-  *turns = k;
-  return ((x - whole * 1.57079625129699707031) - whole * 7.54978941586159635335e-8)
-       - whole * 5.39030285815811905290e-15;
+  const REAL r = ((x - whole * 1.57079625129699707031) - whole * 7.54978941586159635335e-8)
+               - whole * 5.39030285815811905290e-15;
+  const REAL z = r * r;
+  *cosine = (1.0 - 0.5 * z) + z * z * (4.16666666666665929218e-2
+      + z * (-1.38888888888730564116e-3 + z * (2.48015872888517045348e-5
+      + z * (-2.75573141792967388112e-7 + z * (2.08757008419747316778e-9
+      + z * -1.13585365213876817300e-11)))));
+  *quarters = BITS(k);
+  return r + r * z * (-1.66666666666666307295e-1
+      + z * (8.33333333332211858878e-3 + z * (-1.98412698295885395996e-4
+      + z * (2.75573136213857245213e-6 + z * (-2.50507477628578072866e-8
+      + z * 1.58962301576546568060e-10)))));
+}
+
+/* Sine of an angle so many quarters of a turn beyond one whose sine and cosine are known. */
+INNER REAL NAME(beyond)(REAL s, REAL c, INTEGER quarters) {
+  const INTEGER odd = -(quarters & 1), below = -((quarters >> 1) & 1);
+  return REAL_OF(BITS(PICK(odd, c, s)) ^ (below & SIGN));
 }
 
 /* Sine of x and `quarters` quarters of a turn. */
 QUALIFIERS REAL NAME(turned)(REAL x, int64_t quarters) {
-  REAL k;
-  const REAL r = NAME(reduced)(x, &k), z = r * r;
-  const REAL s = r + r * z * (-1.66666666666666307295e-1
-      + z * (8.33333333332211858878e-3 + z * (-1.98412698295885395996e-4
-      + z * (2.75573136213857245213e-6 + z * (-2.50507477628578072866e-8
-      + z * 1.58962301576546568060e-10)))));
-  const REAL c = (1.0 - 0.5 * z) + z * z * (4.16666666666665929218e-2
-      + z * (-1.38888888888730564116e-3 + z * (2.48015872888517045348e-5
-      + z * (-2.75573141792967388112e-7 + z * (2.08757008419747316778e-9
-      + z * -1.13585365213876817300e-11)))));
-  const INTEGER quarter = BITS(k) + quarters, odd = -(quarter & 1), below = -((quarter >> 1) & 1);
-  return REAL_OF(BITS(PICK(odd, c, s)) ^ (below & SIGN));
+  REAL c;
+  INTEGER k;
+  const REAL s = NAME(rest)(x, &c, &k);
+  return NAME(beyond)(s, c, k + quarters);
 }
 
+/* Sine and cosine of x, if it can be reduced here. */
+INNER void NAME(both)(REAL x, REAL *sine, REAL *cosine) {
+  REAL c;
+  INTEGER k;
+  const REAL s = NAME(rest)(x, &c, &k);
+  *sine = NAME(beyond)(s, c, k);
+  *cosine = NAME(beyond)(s, c, k + 1);
+}
+
+#ifdef LIBRARY
 QUALIFIERS REAL NAME(sin)(REAL x) { return SMALL(x) ? NAME(turned)(x, 0) : LIBRARY(sin, x); }
 QUALIFIERS REAL NAME(cos)(REAL x) { return SMALL(x) ? NAME(turned)(x, 1) : LIBRARY(cos, x); }
 QUALIFIERS REAL NAME(tan)(REAL x) { return NAME(sin)(x) / NAME(cos)(x); }
+#endif
 
 /* Angle of (x, y): that of the smaller coordinate over the larger, which is at most 1, or by
  * tan(a - pi / 4) = (t - 1) / (t + 1) beyond 0.66; then by symmetry. */
@@ -67,8 +88,10 @@ QUALIFIERS REAL NAME(atan2)(REAL y, REAL x) {
 }
 
 QUALIFIERS REAL NAME(atan)(REAL x) { return NAME(atan2)(x, K(1.0)); }
+#ifdef LIBRARY
 QUALIFIERS REAL NAME(asin)(REAL x) { return NAME(atan2)(x, ROOT((1.0 - x) * (1.0 + x))); }
 QUALIFIERS REAL NAME(acos)(REAL x) { return NAME(atan2)(ROOT((1.0 - x) * (1.0 + x)), x); }
+#endif
 
 #undef K
 #undef PICK
@@ -76,6 +99,7 @@ QUALIFIERS REAL NAME(acos)(REAL x) { return NAME(atan2)(ROOT((1.0 - x) * (1.0 + 
 #undef SIGN
 #undef NAME
 #undef QUALIFIERS
+#undef INNER
 #undef REAL
 #undef INTEGER
 #undef BITS

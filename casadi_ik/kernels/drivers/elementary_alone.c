@@ -17,6 +17,7 @@ static inline double own_double(int64_t bits) {
 
 #define NAME(f) own_##f
 #define QUALIFIERS static __attribute__((unused))
+#define INNER static inline __attribute__((always_inline, unused))
 #define REAL double
 #define INTEGER int64_t
 #define BITS(x) own_bits(x)

@@ -1,6 +1,7 @@
 /* The forms of elementary.c for vectors. */
 #define NAME(f) lanes_##f
 #define QUALIFIERS static __attribute__((unused, noinline)) LANES_TARGET
+#define INNER static inline __attribute__((always_inline, unused)) LANES_TARGET
 #define REAL lanes
 #define INTEGER lane_mask
 #define BITS(x) ((lane_mask) (x))

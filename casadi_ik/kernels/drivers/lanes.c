@@ -106,8 +106,7 @@ LANES_OF_TWO(fmod)
 LANES_OF_TWO(hypot)
 LANES_OF_TWO(pow)
 
-#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
-/* Of equal numbers the second, of a NaN the other: as that library does it. */
+/* As in extremes.c. */
 LANES_INLINE lanes lanes_fmax(lanes x, lanes y) {
   return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x > y), x, y));
 }
@@ -115,10 +114,6 @@ LANES_INLINE lanes lanes_fmax(lanes x, lanes y) {
 LANES_INLINE lanes lanes_fmin(lanes x, lanes y) {
   return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x < y), x, y));
 }
-#else
-LANES_OF_TWO(fmax)
-LANES_OF_TWO(fmin)
-#endif
 
 static inline void lanes_copy(const lanes *from, casadi_int count, lanes *to) {
   if (!to) return;

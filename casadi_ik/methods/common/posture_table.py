@@ -8,7 +8,6 @@ stage starts from postures that nearly fit, wherever the palm may be.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -16,15 +15,13 @@ from casadi_ik.kernels import LookupKernel
 from casadi_ik.methods.common.contact_shape import contact_shape
 from casadi_ik.methods.common.even_spread import evenly
 
-CHUNK = 256
-"""Targets whose postures are compared with each other at once."""
-
 
 class PostureTable:
     """Hand postures spread evenly over the limits.
 
     Attributes:
         postures: (t, k) positions of the hand's actuators.
+        ranges: (k,) between which they are spread.
         lookup: Finds rows of them.
     """
 
@@ -59,8 +56,8 @@ class PostureTable:
         q[:, columns] = lower + spread * (upper - lower)
         self.postures = q[:, columns]
         self._pulled = pull > 0
-        self._ranges = upper - lower
-        half_ranges = self._ranges / 2
+        self.ranges = upper - lower
+        half_ranges = self.ranges / 2
         scales = np.sqrt(pull / len(columns)) / half_ranges
         key = contact_shape(len(robot.fingers), scales if self._pulled else ())
         contacts = robot.contacts(q)
@@ -84,47 +81,36 @@ class PostureTable:
         asked = (points, normals, near) if self._pulled else (points, normals)
         return self.postures[self.lookup(count, *asked)]
 
-    def varied(self, points: Array, normals: Array, count: int, pool: int, similar: float) -> Array:
-        """The postures shaped most like the targets of those that differ from each other.
 
-        The nearest comes first; then always the nearest that is not like one taken before. What
-        is left over follows where there are no others.
+def differing(postures: Array, ranges: Array, count: int, similar: float) -> Array:
+    """Of postures in order of preference those that differ from each other.
 
-        Args:
-            points: (k, f, 3) [m], NaN where free.
-            normals: (k, f, 3), NaN where free.
-            count: How many, at most the pool.
-            pool: From how many of the nearest they are taken.
-            similar: Root mean square of the motors' differences, of their ranges, below which
-                postures are alike.
+    The first comes first; then always the first that is not like one taken before. What is left
+    over follows where there are no others.
 
-        Returns:
-            (k, count, hand) postures.
-        """
-        pool = min(max(pool, count), len(self.postures))
-        parts = [
-            self._chosen(
-                self.lookup(pool, points[i : i + CHUNK], normals[i : i + CHUNK]), count, similar
-            )
-            for i in range(0, len(points), CHUNK)
-        ]
-        return np.concatenate(parts) if parts else self.nearest(points, normals, count)
+    Args:
+        postures: (k, pool, hand).
+        ranges: (hand,) of the motors.
+        count: How many, at most the pool.
+        similar: Root mean square of the motors' differences, of their ranges, below which
+            postures are alike.
 
-    def _chosen(self, rows: NDArray[np.int64], count: int, similar: float) -> Array:
-        """Of rows (k, pool) in order of nearness those that differ, (k, count, hand)."""
-        places = self.postures[rows] / np.where(self._ranges > 0, self._ranges, 1.0)
-        alike = similar * similar * places.shape[2]
-        every = np.arange(len(rows))
-        closest = np.full(rows.shape, np.inf)
-        taken = np.zeros(rows.shape, dtype=bool)
-        chosen = np.empty((len(rows), count), dtype=np.intp)
-        for place in range(count):
-            # The first that differs; where none is left, the first that is not taken.
-            rank = taken * 2 + (closest < alike)
-            chosen[:, place] = pick = rank.argmin(axis=1)
-            taken[every, pick] = True
-            np.minimum(closest, squared_distance(places, places[every, pick][:, None]), out=closest)
-        return self.postures[rows[every[:, None], chosen]]
+    Returns:
+        (k, count, hand) postures.
+    """
+    places = postures / np.where(ranges > 0, ranges, 1.0)
+    alike = similar * similar * places.shape[2]
+    every = np.arange(len(places))
+    closest = np.full(places.shape[:2], np.inf)
+    taken = np.zeros(places.shape[:2], dtype=bool)
+    chosen = np.empty((len(places), count), dtype=np.intp)
+    for place in range(count):
+        # The first that differs; where none is left, the first that is not taken.
+        rank = taken * 2 + (closest < alike)
+        chosen[:, place] = pick = rank.argmin(axis=1)
+        taken[every, pick] = True
+        np.minimum(closest, squared_distance(places, places[every, pick][:, None]), out=closest)
+    return postures[every[:, None], chosen]
 
 
 def squared_distance(one: Array, other: Array) -> Array:

@@ -19,6 +19,7 @@ from casadi_ik.methods.common.posture_table import squared_distance
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.going_on import (
     CARRIED,
+    EARLY,
     RETURNS,
     SURE,
     TINY,
@@ -76,7 +77,8 @@ class HandFirstMethod(LoopedMethod):
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
         self.rounds = options.rounds + LATER
-        self._near = near_cost(len(robot.hand_actuators))
+        motors = len(robot.hand_actuators)
+        self._near = near_cost(motors, late=False), near_cost(motors, late=True)
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(
             robot, arm_form(robot) or held_arm(robot), options.candidates, self._kinds
@@ -125,8 +127,9 @@ class HandFirstMethod(LoopedMethod):
         """Whether a round may still help: see RETURNS and `restarts.RUGGED`."""
         layout = self.step.layouts.state
         returns, cost = (states[:, layout.slice(name).start] for name in ("returns", "best_cost"))
-        if number >= self.rounds - RUGGED:
-            return (returns < RETURNS) & (cost < self._near)
+        rugged = number - (self.rounds - RUGGED)
+        if rugged >= 0:
+            return (returns < RETURNS) & (cost < self._near[rugged >= EARLY])
         # No more hands of tables if their fits come back to a minimum that just misses.
         tables = VARIED <= number < self.options.rounds
         return (returns < RETURNS) | (cost < SURE) | (not tables)
@@ -235,7 +238,11 @@ class HandFirstMethod(LoopedMethod):
         # The first of them begins as a whole: what stands in the way may be arm and hand together.
         anywhere = self.hands.anywhere(problems, later - VALLEYS)
         whole = np.repeat(anywhere[:1], len(last), axis=0)
-        hands = np.repeat(anywhere[None][:, :, list(self.robot.hand_actuators)], len(last), axis=0)
+        if self.hands.mends(problems):
+            hands = self.hands.mended(problems, number)
+        else:
+            hand = list(self.robot.hand_actuators)
+            hands = np.repeat(anywhere[None][:, :, hand], len(last), axis=0)
         if goes_on(later - VALLEYS):
             best, cost = (last[:, layouts.state.slice(name)] for name in ("best_q", "best_cost"))
             flat = np.flatnonzero(cost < SURE)

@@ -15,6 +15,7 @@ from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.codegen import define, driver_text
 from casadi_ik.kernels.driver_code import DriverCode, check
+from casadi_ik.made import made
 from casadi_ik.methods.hand_first.rounds import RoundsPlan, source_text
 from casadi_ik.methods.hand_first.state import STAGE_LABELS
 from casadi_ik.problem.method import Quick
@@ -30,6 +31,7 @@ KERNELS = {
     "solve": "loop_job",
     "contacts": "map_job",
     "valley": "map_job",
+    "each_finger": "map_job",
     "judge": "map_job",
 }
 """The compiled functions it calls, and what they work on."""
@@ -79,6 +81,8 @@ class OneTarget:
         if whole:
             self._link("contacts", plan.contacts)
             self._link("valley", hands.valley)
+            if plan.mends and hands.each_finger is not None:
+                self._link("each_finger", hands.each_finger)
         f = len(robot.fingers)
         self.points = self._view("points").reshape(f, 3)
         self.normals = self._view("normals").reshape(f, 3)
@@ -124,13 +128,19 @@ class OneTarget:
         Args:
             judged: Whether there was a verdict.
         """
-        counts = map(int, self._counts.tolist())
         job = self._job
         errors = None
         if judged:
             errors = self.position_error.tolist(), self.angle_error.tolist(), job.beyond
-        phases = dict(zip(STAGE_LABELS, counts, strict=True))
-        return Quick(self.q.copy(), job.iterations, job.restarts, phases, errors)
+        phases = dict(zip(STAGE_LABELS, map(int, self._counts.tolist()), strict=True))
+        return made(
+            Quick,
+            q=self.q.copy(),
+            iterations=job.iterations,
+            restarts=job.restarts,
+            phases=phases,
+            errors=errors,
+        )
 
 
 def _driver(plan: RoundsPlan) -> str:
@@ -165,7 +175,9 @@ def _structure(sizes: dict[str, int]) -> type[ctypes.Structure]:
         ("beyond", ctypes.c_double),
         *_whole("iterations", "restarts", "status", "round", "under_way", "in_round", "rounds"),
         *_arrays(state=state, last=state, parameters=sizes["N_PARAMETERS"], mark=state),
-        *_arrays(postures=sizes["N_CANDIDATES"] * h, places=pool * h, closest=pool),
+        *_arrays(postures=sizes["N_CANDIDATES"] * h, near=pool * h),
+        *_arrays(mended=sizes["N_MENDED"] * h, left=sizes["N_MENDED"]),
+        *_arrays(places=pool * h, closest=pool),
         ("found", ctypes.c_int64 * pool),
         ("taken", ctypes.c_int64 * pool),
         *_arrays(moved=(h + 1) * n),

@@ -2,7 +2,8 @@
 
 The first round compares the target with a table of postures. The next ones compare it with a table
 many times as large, half of it at limits, and take only postures that differ from each other: the
-neighbours of one that failed fail as well. What all of them miss is one of two things. Its fit has
+neighbours of one that failed fail as well. Hands of many motors are mended before, see
+`each_finger`. What all of them miss is one of two things. Its fit has
 come to rest in a long valley, where the contacts hardly move while the hand does: so the next
 round begins along it, to either side of the best fit so far. Or no table holds its like: then
 postures drawn from anywhere follow, and a whole configuration of arm and hand; many of them where
@@ -11,6 +12,7 @@ the fits end somewhere else each time, as with many joints at their limits.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,7 +22,9 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.common.even_spread import evenly
-from casadi_ik.methods.common.posture_table import PostureTable
+from casadi_ik.methods.common.posture_table import PostureTable, differing
+from casadi_ik.methods.hand_first.each_finger import each_finger, mends
+from casadi_ik.methods.hand_first.going_on import VARIED
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.valley import valley
 from casadi_ik.problem.contacts.conditions import LENGTH
@@ -35,6 +39,16 @@ SIMILAR = 0.25
 
 POOL = 3
 """From so many times as many postures as are wanted those that differ are taken."""
+
+MENDED = 6
+"""The same where they are mended finger by finger before."""
+
+SPREAD = 96
+"""Postures that are mended for a round after the second: not those that look like the target any
+more, but as many others in every round. What one round misses the next finds as often as not."""
+
+CHUNK = 256
+"""Targets whose postures are compared with each other at once."""
 
 STRIDES = (
     0.05,
@@ -178,8 +192,59 @@ class Restarts:
         # Where limits are ignored a hand may stand on either side of them.
         free = not problems.enforce_limits and number % 2
         table = self.free_table if free else self.wide_table
+        mend = self.mends(problems)
+        if mend and number >= VARIED:
+            return self.mended(problems, number)
         wanted = number * count
-        return table.varied(points, normals, wanted, POOL * wanted, SIMILAR)[:, -count:]
+        pool = min((MENDED if mend else POOL) * wanted, len(table.postures))
+        parts = [np.empty((0, count, len(self._hand)))]
+        for asked in _chunks(points, normals):
+            near = table.nearest(*asked, pool)
+            near = self._mended(near, *asked) if mend else near
+            parts.append(differing(near, table.ranges, wanted, SIMILAR)[:, -count:])
+        return np.concatenate(parts)
+
+    def mends(self, problems: Problems) -> bool:
+        """Whether every finger by itself mends the postures that rounds begin from."""
+        return problems.enforce_limits and self.each_finger is not None
+
+    def mended(self, problems: Problems, number: int) -> Array:
+        """Mended postures (k, candidates, hand), other ones in every round.
+
+        Args:
+            problems: k targets.
+            number: The round, from 0.
+        """
+        table, count = self.wide_table, self._options.candidates
+        rows = np.arange(number * SPREAD, (number + 1) * SPREAD) % len(table.postures)
+        parts = [np.empty((0, count, len(self._hand)))]
+        for asked in _chunks(problems.points, problems.normals):
+            pool = np.broadcast_to(table.postures[rows], (len(asked[0]), SPREAD, len(self._hand)))
+            parts.append(differing(self._mended(pool, *asked), table.ranges, count, SIMILAR))
+        return np.concatenate(parts)
+
+    @cached_property
+    def each_finger(self) -> FunctionKernel | None:
+        """Mends postures of a hand with many motors, if its fingers have their own."""
+        if not mends(self._robot.description):
+            return None
+        return FunctionKernel(each_finger(self._robot.description), self._compiled)
+
+    @property
+    def pool(self) -> int:
+        """Postures of which a round's are taken, at most."""
+        wanted = self._options.candidates * max(self._options.rounds - 1, 1)
+        few = max(MENDED * self._options.candidates, SPREAD)
+        return max(POOL * wanted, few if mends(self._robot.description) else 0)
+
+    def _mended(self, near: Array, points: Array, normals: Array) -> Array:
+        """Postures (k, pool, hand), their fingers chosen one by one, in order of what is left."""
+        kernel, pool = self.each_finger, near.shape[1]
+        assert kernel is not None
+        asked = (np.repeat(part, pool, axis=0) for part in (points, normals))
+        better, left = kernel(*asked, np.ascontiguousarray(near).reshape(-1, near.shape[2]))
+        order = np.argsort(left.reshape(-1, pool), axis=1, kind="stable")
+        return np.take_along_axis(better.reshape(near.shape), order[:, :, None], axis=1)
 
     def along_valley(self, problems: Problems, q: Array, which: int) -> Array:
         """Postures (k, candidates, hand) to either side of a fit that came to rest.
@@ -272,3 +337,9 @@ class Restarts:
             compiled=self._compiled,
             bounds=bounds,
         )
+
+
+def _chunks(*arrays: Array) -> Iterator[tuple[Array, ...]]:
+    """So many targets after the others."""
+    for i in range(0, len(arrays[0]), CHUNK):
+        yield tuple(array[i : i + CHUNK] for array in arrays)

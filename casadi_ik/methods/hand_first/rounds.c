@@ -1,7 +1,7 @@
 /* All rounds of hand-first for one target, as method.py and restarts.py make them for a batch.
  *
- * Calls the compiled kernels by the macros LOOK_UP, BEGIN, SOLVE, CONTACTS, VALLEY and JUDGE, which
- * take a pointer to a job of the drivers. The constants come from rounds.py. Bit for bit the answers
+ * Calls the compiled kernels by the macros LOOK_UP, BEGIN, SOLVE, CONTACTS, VALLEY, EACH_FINGER (if
+ * MENDS) and JUDGE, which take a pointer to a job of the drivers. The constants come from rounds.py. Bit for bit the answers
  * of a batch: what is computed here is computed in the same order there.
  */
 
@@ -60,13 +60,43 @@ static double apart(const double *one, const double *other) {
   return sum;
 }
 
-/* Of the pool of nearest postures those that differ, best first; the last of them are the round's. */
+#if MENDS
+/* Every finger of the pool's postures chosen by itself; those of which least is left come first. */
+static int mend(rounds *job, int64_t pool) {
+  static const int64_t in[] = {0, 0, N_HAND}, out[] = {N_HAND, 1};
+  const double *inputs[3];
+  double *outputs[2];
+  map_job map = mapping(pool, inputs, in, outputs, out);
+  int64_t i, place;
+  int code;
+  inputs[0] = job->points;
+  inputs[1] = job->normals;
+  inputs[2] = job->near;
+  outputs[0] = job->mended;
+  outputs[1] = job->left;
+  do code = EACH_FINGER(&map);
+  while (code == SLICE_OVER);
+  if (code != DONE) return code;
+  for (i = 0; i < pool; ++i) {
+    for (place = i; place > 0 && job->left[i] < job->left[job->found[place - 1]]; --place) {
+      job->found[place] = job->found[place - 1];
+    }
+    job->found[place] = i;
+  }
+  for (i = 0; i < pool; ++i) {
+    memcpy(job->near + i * N_HAND, job->mended + job->found[i] * N_HAND, N_HAND * sizeof(double));
+  }
+  return DONE;
+}
+#endif
+
+/* Of the pool of postures those that differ, best first; the last of them are the round's. */
 static void vary(rounds *job, int table, int64_t pool, int64_t count) {
   int64_t i, k, place, pick;
   for (i = 0; i < pool; ++i) {
     for (k = 0; k < N_HAND; ++k) {
       const double range = TABLE_RANGE[table][k];
-      job->places[i * N_HAND + k] = posture(table, job->found[i], (int) k) / (range > 0 ? range : 1.0);
+      job->places[i * N_HAND + k] = job->near[i * N_HAND + k] / (range > 0 ? range : 1.0);
     }
     job->closest[i] = 1e300;
     job->taken[i] = 0;
@@ -89,10 +119,25 @@ static void vary(rounds *job, int table, int64_t pool, int64_t count) {
     if (place < count - N_CANDIDATES) continue;
     for (k = 0; k < N_HAND; ++k) {
       job->postures[(place - count + N_CANDIDATES) * N_HAND + k] =
-          posture(table, job->found[pick], (int) k);
+          job->near[pick * N_HAND + k];
     }
   }
 }
+
+#if MENDS
+/* Mended postures that do not look like the target in particular, other ones in every round. */
+static int from_spread(rounds *job, int64_t number) {
+  int64_t i;
+  int code, k;
+  for (i = 0; i < SPREAD; ++i) {
+    const int64_t row = (number * SPREAD + i) % TABLE_ROWS[1];
+    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, row, k);
+  }
+  code = mend(job, SPREAD);
+  if (code == DONE) vary(job, 1, SPREAD, N_CANDIDATES);
+  return code;
+}
+#endif
 
 /* Nearest to where the robot is first; its own posture before them, instead of the last. */
 static void order(rounds *job, int own) {
@@ -129,15 +174,27 @@ static int from_table(rounds *job, int64_t number) {
   const int64_t most = TABLE_ROWS[table];
   int64_t pool = number ? POOL * wanted : wanted;
   int code, i, k;
+#if MENDS
+  if (number >= VARIED) {
+    code = from_spread(job, number);
+    if (code == DONE && job->terms[TERMS_NEAREST] > 0) order(job, 0);
+    return code;
+  }
+#endif
   if (pool > most) pool = most;
   code = look_up(job, table, pool);
   if (code != DONE) return code;
+  for (i = 0; i < pool; ++i) {
+    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(table, job->found[i], k);
+  }
   if (number) {
+#if MENDS
+    code = mend(job, pool);
+    if (code != DONE) return code;
+#endif
     vary(job, table, pool, wanted);
   } else {
-    for (i = 0; i < N_CANDIDATES; ++i) {
-      for (k = 0; k < N_HAND; ++k) job->postures[i * N_HAND + k] = posture(0, job->found[i], k);
-    }
+    memcpy(job->postures, job->near, sizeof job->postures);
   }
   if (job->terms[TERMS_NEAREST] > 0) order(job, !number);
   return DONE;
@@ -246,6 +303,9 @@ static int begin_round(rounds *job, int64_t number) {
   else if (later < VALLEYS) code = along_valley(job, later);
   else if (goes_on) code = along_valley(job, VALLEYS + (later - VALLEYS) / 2);
   else from_anywhere(job, later - VALLEYS, first);
+#if MENDS
+  if (later >= VALLEYS && !goes_on) code = from_spread(job, number);
+#endif
   if (code != DONE) return code;
   inputs[0] = job->points;
   inputs[1] = job->normals;
@@ -276,7 +336,8 @@ static int begin_round(rounds *job, int64_t number) {
 
 static int is_hopeful(const rounds *job, int64_t number) {
   const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
-  if (number >= ROUNDS - RUGGED) return returns < RETURNS && cost < NEAR_COST;
+  const int64_t rugged = number - (ROUNDS - RUGGED);
+  if (rugged >= 0) return returns < RETURNS && cost < (rugged < EARLY ? NEAR_COST : NEAR_AT_LAST);
   return returns < RETURNS || cost < SURE || number < VARIED || number >= TABLE_ROUNDS;
 }
 

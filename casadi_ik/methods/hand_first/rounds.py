@@ -19,6 +19,7 @@ from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.methods.hand_first import going_on, restarts
 from casadi_ik.methods.hand_first.beginning import terms
+from casadi_ik.methods.hand_first.each_finger import mends
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.restarts import Restarts
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
@@ -28,7 +29,7 @@ from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
 DIMENSIONS = (
     *("N_FINGERS", "N_MOTORS", "N_HAND", "N_TERMS", "N_STATE", "N_PARAMETERS"),
-    *("N_CANDIDATES", "N_POOL", "N_MORE"),
+    *("N_CANDIDATES", "N_POOL", "N_MENDED", "N_MORE"),
 )
 """Of the arrays in `rounds`."""
 
@@ -75,13 +76,18 @@ class RoundsPlan:
     def sizes(self) -> dict[str, int]:
         """The `DIMENSIONS` by name."""
         robot, layouts, candidates = self.layouts.robot, self.layouts, self.options.candidates
-        pool = restarts.POOL * candidates * max(self.options.rounds - 1, 1)
+        pool = self.hands.pool
         values = (
             *(len(robot.fingers), len(robot.actuators), len(robot.hand_actuators)),
             *(terms(robot).size, layouts.state.size, layouts.parameters.size),
-            *(candidates, pool, len(layouts.contacts.data) - 2),
+            *(candidates, pool, pool if self.mends else 1, len(layouts.contacts.data) - 2),
         )
         return dict(zip(DIMENSIONS, values, strict=True))
+
+    @property
+    def mends(self) -> bool:
+        """Whether postures of the wide table are mended finger by finger."""
+        return self.enforce_limits and mends(self.layouts.robot)
 
     def constants(
         self, reals: Mapping[str, float] | None = None, arrays: Mapping[str, Array] | None = None
@@ -111,9 +117,12 @@ class RoundsPlan:
             "ROUNDS": self.rounds,
             "VALLEYS": restarts.VALLEYS,
             "RUGGED": restarts.RUGGED,
+            "EARLY": going_on.EARLY,
             "VARIED": going_on.VARIED,
             "RETURNS": going_on.RETURNS,
-            "POOL": restarts.POOL,
+            "POOL": restarts.MENDED if self.mends else restarts.POOL,
+            "MENDS": int(self.mends),
+            "SPREAD": restarts.SPREAD,
             "ENFORCE_LIMITS": int(self.enforce_limits),
             "HAS_ARM": int(bool(layouts.robot.arm_actuators)),
             "SOLVED_STATUS": int(Status.SOLVED),
@@ -131,7 +140,8 @@ class RoundsPlan:
         hand = len(self.layouts.robot.hand_actuators)
         return {
             "SURE": going_on.SURE,
-            "NEAR_COST": going_on.near_cost(hand),
+            "NEAR_COST": going_on.near_cost(hand, late=False),
+            "NEAR_AT_LAST": going_on.near_cost(hand, late=True),
             "AT_END": restarts.AT_END,
             "HELD": restarts.HELD,
             "NUDGE": restarts.NUDGE,

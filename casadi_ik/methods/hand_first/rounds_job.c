@@ -15,6 +15,7 @@ typedef struct {
   int64_t rounds;               /* how many may be made */
   double state[N_STATE], last[N_STATE], parameters[N_PARAMETERS], mark[N_STATE];
   double postures[N_CANDIDATES * N_HAND];
+  double near[N_POOL * N_HAND], mended[N_MENDED * N_HAND], left[N_MENDED];
   double places[N_POOL * N_HAND], closest[N_POOL];
   int64_t found[N_POOL];
   int64_t taken[N_POOL];
