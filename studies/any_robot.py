@@ -9,7 +9,7 @@ tolerances::
     python studies/any_robot.py --arm panda --hand allegro_right --count 10000
 
 A third of the pairs, another for every seed, is asked ten times as much. A run that is killed goes
-on where it stopped. Every miss is listed with its configuration.
+on where it stopped. Misses are counted by kind; a file beside the report has them all.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 
 import joblib
 import numpy as np
+from any_robot_goals import HEADS, goal_rows, missed_parts
 from catalogue_pair import KINDS, REFERENCE, TOLERANCES, Pair, try_pair
 from closed_chain.report import figure, title
 from rich.console import Console
@@ -50,8 +51,10 @@ TIMES = 10
 DARK = 4.5
 """Ratio from which on a cell is so dark that its number is white."""
 
-SHOWN = 40
-"""Misses listed in the report."""
+PEERS = (
+    "Not measured here: other packages (placo, Pink, mink) on the same pairs; `peers.py` asks them "
+    "on robots of its own."
+)
 
 INTRODUCTION = """
 All targets are contacts of configurations within limits, hence reachable. *Missed:* the verdict,
@@ -117,31 +120,20 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
     }
     parts, metrics = [INTRODUCTION.format(REFERENCE)], list[Metric]()
     total = sum(cell["count"] for entry in found.values() for cell in entry["cells"].values())
-    lost = [
-        (pair, name, miss)
-        for pair, entry in found.items()
-        for name, cell in entry["cells"].items()
-        for miss in cell["missed"]
-    ]
-    parts += [f"{len(found)} pairs, {total:,} solves, {len(lost)} missed."]
+    lost = sum(len(cell["missed"]) for entry in found.values() for cell in entry["cells"].values())
+    parts += [f"{len(found)} pairs, {total:,} solves, {lost} missed."]
+    left = [pair.robot for pair in paths if pair not in found]
+    if left:
+        parts += [f"Not run yet: {len(left)} of {len(paths)} pairs ({', '.join(left)})."]
     options.report.mkdir(parents=True, exist_ok=True)
     if found:
         _heat_map(found, options.report / "any_robot.png")
         parts += ["![time and misses of every pair](any_robot.png)"]
     for tolerance in TOLERANCES:
         parts += [f"## {tolerance}", _table(found, tolerance, metrics)]
-    rows = [
-        [
-            pair.robot,
-            name,
-            str(miss["row"]),
-            miss["status"],
-            " ".join(f"{x:.9g}" for x in miss["q"]),
-        ]
-        for pair, name, miss in lost[:SHOWN]
-    ]
-    heads = ["robot", "targets", "row", "status", "q"]
-    parts += ["## Misses", markdown_table(heads, rows) if rows else "None."]
+    if found:
+        parts += ["## Goals", markdown_table(HEADS, goal_rows(found)), PEERS]
+    parts += ["## Misses", *missed_parts(found, options.report / "misses.csv")]
     codes = ", ".join(sorted({entry["code"] for entry in found.values()}))
     parts += ["## Where this comes from", f"`{run_by}`", provenance({"any_robot": codes or None})]
     write_page("Every arm with every hand", [*parts, f"Seed {options.seed}."], options.report)

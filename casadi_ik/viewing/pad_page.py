@@ -121,7 +121,10 @@ class PadPage:
                 return asked
             pose = self._links[link]
             moved = asked.with_point(finger, (pose @ np.append(found[0], 1.0))[:3])
-            return moved.with_normal(finger, pose[:3, :3] @ found[1])
+            moved = moved.with_normal(finger, pose[:3, :3] @ found[1])
+            if np.allclose(moved.held[finger].control, asked.held[finger].control, atol=1e-7):
+                self.said = f"{finger}: it is on the skin, and faces as the skin does"
+            return moved
 
         self._change(f"skin {finger}", put)
 

@@ -13,19 +13,19 @@ from casadi_ik.solving.alternatives.idle_fingers import IdleFingers
 def test_only_motors_of_idle_fingers_move_and_only_for_more_room() -> None:
     robot = ik.load_robot("panda+shadow")
     rng, idle = np.random.default_rng(2), [robot.fingers.index(name) for name in ("ring", "little")]
-    q = robot.random(rng, 40)
+    q = robot.random(rng, 120)
     points, normals = robot.contacts(q)
-    points[:30, idle] = normals[:30, idle] = np.nan  # of the last ten no finger is idle
+    points[:90, idle] = normals[:90, idle] = np.nan  # of the last thirty no finger is idle
     problems = Problems(points, normals, ik.Tolerance(), True)
     around = SceneCheck(robot, ik.Scene({})).around(problems).held
-    owner = np.arange(40)
+    owner = np.arange(120)
     moved = IdleFingers(robot, problems).aside(q, owner, around)
     before, after = around.check(q).room, around.check(moved).room
     assert (after >= before).all()
     changed = (moved != q).any(axis=1)
-    assert changed[:30].sum() >= 3  # others touch something with their other fingers
+    assert changed[:90].sum() > 5
     assert (before[changed] < 0).all()
-    assert not changed[30:].any()
+    assert not changed[90:].any()
     assert (after[changed] > before[changed]).all()
     still, _ = robot.contacts(moved)
     np.testing.assert_array_equal(

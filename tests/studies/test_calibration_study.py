@@ -12,7 +12,7 @@ import pytest
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
 STUDIES = Path(__file__).parents[2] / "studies"
-MORE = ("--outliers", "0.2", "0.4")
+MORE = ("--outliers", "0.2", "0.4", "--poses", "15")
 
 
 def coverages(report: str) -> list[float]:

@@ -91,6 +91,10 @@ def test_a_pad_goes_onto_the_skin(viewer: Viewer) -> None:
     # The box of the last phalanx is 16 mm thick: its side is 8 mm from the middle.
     assert abs(pad.point[1]) == pytest.approx(0.008, abs=1e-6)
     assert np.allclose(np.abs(pad.normal), [0, 1, 0], atol=1e-6)
+    # Where nothing moves, it is said why.
+    page.onto_skin("first")
+    assert page.work.settle()
+    assert page.said.startswith("first: it is on the skin")
     page.reset()
     assert page.work.settle()
     assert page.changed == []
