@@ -50,7 +50,7 @@ def wanted_outputs(text: str) -> str:
 
 def _handed_on(body: list[str]) -> list[str]:
     """The body of a function whose calls fill only what is wanted of what is copied to outputs."""
-    copied = dict(match.groups() for line in body if (match := COPIED.fullmatch(line)))
+    copied = {match[1]: match[2] for line in body if (match := COPIED.fullmatch(line))}
     if not copied:
         return body
     # Its declaration, the call, the copy: nothing else may look at it.

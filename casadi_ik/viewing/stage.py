@@ -81,7 +81,7 @@ def look_at(server: viser.ViserServer, target: Array, size: float, view: Array) 
         decay=0.0,
         angle=0.95,
         penumbra=0.3,
-        position=target + size * LAMP,
+        position=tuple((target + size * LAMP).tolist()),
         direction=(-LAMP[0], -LAMP[1], -LAMP[2]),
         cast_shadow=True,
     )

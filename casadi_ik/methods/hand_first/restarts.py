@@ -198,9 +198,9 @@ class Restarts:
         wanted = number * count
         pool = min((MENDED if mend else POOL) * wanted, len(table.postures))
         parts = [np.empty((0, count, len(self._hand)))]
-        for asked in _chunks(points, normals):
-            near = table.nearest(*asked, pool)
-            near = self._mended(near, *asked) if mend else near
+        for some, facing in _chunks(points, normals):
+            near = table.nearest(some, facing, pool)
+            near = self._mended(near, some, facing) if mend else near
             parts.append(differing(near, table.ranges, wanted, SIMILAR)[:, -count:])
         return np.concatenate(parts)
 
