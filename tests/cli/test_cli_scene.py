@@ -27,7 +27,7 @@ def test_what_blocks_is_said(run: Command, tmp_path: Path) -> None:
     scene.write_text(
         "solids:\n  balloon: {kind: sphere, radius: 300 mm, xyz: [-820 mm, 127 mm, 410 mm]}\n"
     )
-    done = run("solve", "cup", "--scene", scene, "--no-diagnose")
+    done = run("solve", "cup", "--scene", scene)
     assert done.exit == 1
     assert done.out.startswith("COLLISION  cup")
     assert "contacts and limits are met, but something touches" in done.out
