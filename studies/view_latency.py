@@ -33,6 +33,16 @@ from casadi_ik.viewing.frames import pose_of
 ROBOT, FINGER = "kuka_lwr_barrett", "thumb"
 WINDOW = (1280, 800)
 
+REST, FLOW = 0.4, 0.03
+"""Between what is drawn and the next step: all that can wait is done; as a hand drags [s]."""
+
+KINDS = {
+    "as it is": (True, REST),
+    "not painted": (False, REST),
+    "not painted, in one go": (False, FLOW),
+}
+"""Whether it is painted, and the time between steps [s]."""
+
 BOX = (
     "(({x, y, width, height}) => [x, y, width, height])"
     "(document.querySelector('canvas').getBoundingClientRect())"
@@ -40,7 +50,8 @@ BOX = (
 
 INTRODUCTION = """
 A contact of the cup ({robot}) dragged in steps of a few millimetres, window {width} x {height},
-{steps} steps unpainted, {painted} painted, each begun when the one before was drawn. Load of its
+{steps} steps unpainted, {painted} painted, each begun {rest} s after the one before was drawn, when
+motors and solutions are told as well; "in one go": {flow} s, as a hand drags. Load of its
 {processors} processors while it ran: {load}. Medians, in brackets nine of ten.
 
 "As it is": Chromium paints in software here. "Not painted": the calls that paint are left out,
@@ -63,7 +74,7 @@ def swaying(start: np.ndarray, way: np.ndarray) -> Callable[[int], np.ndarray]:
     return lambda i: start + way * (np.sin(0.9 * i) + 0.1 * np.sin(0.37 * i)) * (i > 0)
 
 
-def on_view(viewer: Viewer, browser: Any, steps: int, painted: bool) -> Drags:
+def on_view(viewer: Viewer, browser: Any, steps: int, painted: bool, rest: float) -> Drags:
     """Drags on the page of `casadi-ik view`."""
     shown, served, solves, begun = viewer.page, [], [], [0.0]
     put, draw = shown.work.put, shown.draw
@@ -98,7 +109,7 @@ def on_view(viewer: Viewer, browser: Any, steps: int, painted: bool) -> Drags:
     messages = page.evaluate("window.messages")
     shown.work.put, shown.draw = asked, answered
     with cpu_of(browser, drags, server=True):
-        drag(page, swaying(here + 0.92 * way, 0.25 * way), steps, 0.4, drags)
+        drag(page, swaying(here + 0.92 * way, 0.25 * way), steps, rest, drags)
     shown.work.put, shown.draw = put, draw
     drags.notes["messages"] = (page.evaluate("window.messages") - messages) / len(served)
     drags.notes |= {"server": float(np.median(served)), "solve": float(np.median(solves))}
@@ -106,7 +117,7 @@ def on_view(viewer: Viewer, browser: Any, steps: int, painted: bool) -> Drags:
     return drags
 
 
-def on_page(path: Path, browser: Any, steps: int, painted: bool) -> Drags:
+def on_page(path: Path, browser: Any, steps: int, painted: bool, rest: float) -> Drags:
     """Drags on the page without a server."""
     page = opened(browser, path.resolve().as_uri(), *([] if painted else [NO_PAINTING]))
     page.wait("globalThis.casadiIk?.now.answer && !casadiIk.stage.asked", 60.0)
@@ -120,7 +131,7 @@ def on_page(path: Path, browser: Any, steps: int, painted: bool) -> Drags:
     drags = Drags(notes={"still": float(np.median(still))})
     start = np.array(page.evaluate("casadiIk.pixel('point 0')"))
     with cpu_of(browser, drags, server=False):
-        drag(page, swaying(start, np.array([9.0, -9.0])), steps, 0.4, drags)
+        drag(page, swaying(start, np.array([9.0, -9.0])), steps, rest, drags)
     page.wait("!casadiIk.stage.asked")
     time.sleep(0.5)
     drags.notes["settled"] = 1e-3 * page.evaluate("casadiIk.now.answer.time")
@@ -185,21 +196,20 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--report", type=Path, default=Path("out/view_latency"), help="folder")
     options = parser.parse_args(arguments)
     loads, parts = [os.getloadavg()[0]], []
-    kinds = {"as it is": True, "not painted": False}
     # Painting in software may take seconds a step.
     counts = {True: max(options.steps // 8, 3), False: options.steps}
     viewer = view_grasp(ik.load_robot(ROBOT), ik.load_grasp("cup"), scene=ik.load_scene("table"))
     with browser_tools().Browser() as browser:
         found = {}
-        for name, painted in kinds.items():
-            found[name] = on_view(viewer, browser, counts[painted], painted)
+        for name, (painted, rest) in KINDS.items():
+            found[name] = on_view(viewer, browser, counts[painted], painted, rest)
             loads.append(os.getloadavg()[0])
         parts += ["## `casadi-ik view cup --scene table`", table(found, VIEW_ROWS)]
         viewer.stop()
         if options.page is not None:
             found = {}
-            for name, painted in kinds.items():
-                found[name] = on_page(options.page, browser, counts[painted], painted)
+            for name, (painted, rest) in KINDS.items():
+                found[name] = on_page(options.page, browser, counts[painted], painted, rest)
                 loads.append(os.getloadavg()[0])
             parts += ["## The page without a server (WebAssembly)", table(found, PAGE_ROWS)]
     introduction = INTRODUCTION.format(
@@ -208,6 +218,8 @@ def main(arguments: list[str] | None = None) -> None:
         height=WINDOW[1],
         steps=options.steps,
         painted=counts[True],
+        rest=REST,
+        flow=FLOW,
         processors=os.cpu_count(),
         load=", ".join(f"{load:.1f}" for load in loads),
     )
