@@ -135,7 +135,7 @@ def test_the_answers_for_the_cup_are_different_ones(robot, solver, prefer):
 
 
 def test_how_different_they_are_is_a_parameter():
-    """On a robot whose arm has no closed form."""
+    """On a robot whose arm is only nearly of a closed form."""
     robot = ik.load_robot("baxter_ar10")
     asked = grasp(robot, robot.random(np.random.default_rng(1), 1)[0])
     solver = ik.Solver(robot)

@@ -26,6 +26,8 @@ KINDS = {
     "fr3": "spherical shoulder, joint 7 swept",
     "xarm7": "spherical shoulder, joint 7 swept",
     "kinova_gen3": "spherical wrist, joint 1 swept",
+    "baxter_left": "spherical wrist, joint 1 swept",
+    "baxter_right": "spherical wrist, joint 1 swept",
     "puma560": "spherical wrist",
     "viperx_300s": "spherical wrist",
     "jaco2": "spherical wrist",
@@ -37,9 +39,9 @@ KINDS = {
 FAMILIES = ("panda", "xarm7", "kinova_gen3", "puma560", "irb140", "ur5e")
 """One of each kind."""
 
-SEARCHED = ("sawyer", "baxter_right", "xarm6")
+SEARCHED = ("sawyer", "xarm6")
 
-NEARLY = {"kinova_gen3": 2e-3}
+NEARLY = {"kinova_gen3": 2e-3, "baxter_left": 3e-2, "baxter_right": 3e-2}
 """Poses [m] of arms that are solved as the ideal arm beside them."""
 
 
@@ -164,14 +166,14 @@ def _check_screws(form: ClosedForm, screws: Screws, angles: Array) -> None:
 
 def test_what_is_nearly_of_a_form_is_solved_as_that_and_what_is_not_is_not():
     screws = arm_screws(robot_of("puma560").description)
-    for size, known in ((5e-4, True), (4e-3, False)):
+    for size, known in ((5e-4, True), (1e-2, True), (4e-2, False)):
         points = screws.points.copy()
         points[4] += size * np.cross(screws.axes[3], screws.axes[4])
         form = recognised(replace(screws, points=points))
         assert (form is not None) == known
         if form is not None:
             assert not form.exact
-            assert form.off < 1e-3
+            assert form.off < 1e-2
 
 
 @pytest.mark.parametrize("name", FAMILIES)

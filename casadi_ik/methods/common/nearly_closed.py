@@ -2,21 +2,46 @@
 
 from __future__ import annotations
 
+import math
+
 import casadi as ca
 
 from casadi_ik.methods.common.contact_fit import DAMPING_FLOOR, EXACT
 from casadi_ik.methods.common.numeric_arm import pose_step
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.closed_arms.held import HeldArm
+from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
 
-STEPS = 2
-"""An arm that is off by a millimetre is right to a micrometre after one, to rounding after two."""
+RIGHT = 1e-12
+"""What is left [m and rad] when an arm is right to rounding."""
+
+CLOSE = 1e-3
+"""An arm that is off by more [m and rad] is searched for where its form has found none."""
+
+
+def is_searched_later(arm: ArmForm | HeldArm) -> bool:
+    """Whether rounds after the first search for the arm."""
+    if isinstance(arm, SrsArm):
+        return False
+    return isinstance(arm, HeldArm) or arm.off > CLOSE
+
+
+def steps(off: float) -> int:
+    """Newton's steps for an arm that is off by so much [m and rad]: each of them squares it.
+
+    One that is off by a millimetre is right to a micrometre after one, to rounding after two; one
+    that is off by a centimetre needs three.
+    """
+    squarings = math.log2(math.log(RIGHT) / math.log(max(off, RIGHT)))
+    return max(1, math.ceil(squarings))
 
 
 def brought_to(
-    robot: RobotDescription, arm: Expr, palm: Pose, lower: Expr, upper: Expr
+    robot: RobotDescription, arm: Expr, palm: Pose, lower: Expr, upper: Expr, off: float
 ) -> tuple[Expr, Expr]:
     """The arm, within its bounds, that brings the palm to a pose.
 
@@ -26,6 +51,7 @@ def brought_to(
         palm: Palm pose, base frame.
         lower: (n, 1) bounds of all motors.
         upper: (n, 1).
+        off: How far the ideal arm is from the real one [m and rad].
 
     Returns:
         The arm (a, 1), and whether it does.
@@ -43,6 +69,6 @@ def brought_to(
     inputs = [start, rotation, origin, p["lower"], p["upper"]]
     step = ca.Function("newton_step", inputs, shared(reached, hits))
     found: Expr = ca.MX(0)
-    for _ in range(STEPS):
+    for _ in range(steps(off)):
         arm, found = step(arm, palm.rotation, palm.origin, lower, upper)
     return arm, found

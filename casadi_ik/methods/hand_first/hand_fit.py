@@ -112,6 +112,9 @@ def _form_row(
     )
     bounds = p["lower"][list(columns)], p["upper"][list(columns)]
     beyond = form.beyond(moved, *bounds)
+    if not form.exact:
+        # What the ideal arm cannot reach by so little the real one may.
+        beyond -= ca.fmin(ca.fmax(beyond, -form.off), form.off)
     motion = ca.vertcat(shift, turn)
     slope = ca.jacobian(beyond, motion)
     here = ca.substitute([beyond, slope], [motion], [ca.SX.zeros(6, 1)])

@@ -47,7 +47,8 @@ def placement_stage(layouts: HandFirstLayouts, form: ArmForm | HeldArm) -> ca.Fu
         most = trials(form, PLACEMENT), trials(form, THOROUGH)
     exact = isinstance(form, SrsArm) or form.exact
     if not exact:
-        arm, hits = brought_to(layouts.robot, arm, palm, p["lower"], p["upper"])
+        off = form.off
+        arm, hits = brought_to(layouts.robot, arm, palm, p["lower"], p["upper"], off)
     place = _placed(layouts, most, exact)
     outputs = place(state, parameters, arm, margin, swivel, hits)
     return ca.Function("placement", [state, parameters], list(outputs))
@@ -71,9 +72,14 @@ def _placed(layouts: HandFirstLayouts, most: tuple[int, int], exact: bool) -> ca
     if most[0] < most[1]:
         begins = sum((s["spent"] == trial for trial in beginnings(THOROUGH)), ca.SX(0))
         former = ca.if_else(begins > 0, NO_MARGIN, former)
+    hits = ca.SX.sym("hits")
     better = margin > former
-    best, best_margin = ca.if_else(better, arm, s["arm"]), ca.fmax(margin, former)
+    best_margin = ca.fmax(margin, former)
     allowed = best_margin >= ALLOWED
+    if not exact:
+        # Newton's steps keep within limits, whether or not the ideal arm did.
+        better, allowed = ca.logic_or(better, hits), ca.logic_or(allowed, hits)
+    best = ca.if_else(better, arm, s["arm"])
     spent = s["spent"] + 1
     over = spent >= (
         most[0] if most[0] == most[1] else ca.if_else(s["earlier"] > 0, most[1], most[0])
@@ -81,7 +87,6 @@ def _placed(layouts: HandFirstLayouts, most: tuple[int, int], exact: bool) -> ca
     q = with_rows(s["q"], columns, best)
     q = ca.fmin(ca.fmax(q, p["lower"]), p["upper"])
     # The last candidate is placed even if its hand does not fit.
-    hits = ca.SX.sym("hits")
     solved = ca.logic_and(allowed, s["fits"] > 0)
     solved = solved if exact else ca.logic_and(solved, hits)
     leave = ca.logic_or(allowed, over)

@@ -29,6 +29,7 @@ from casadi_ik.methods.common.contact_fit import (
     fresh_fit,
     judge_contacts,
 )
+from casadi_ik.methods.common.nearly_closed import is_searched_later
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.common.whole_contacts import WholeStep
 from casadi_ik.methods.hand_first.balance_stage import balance_stage
@@ -126,9 +127,10 @@ class HandFirstStep:
         layouts, placed = self.layouts, self.placed
         if placed is None:
             return numeric_stage(layouts)
-        if not isinstance(placed, HeldArm):
+        if not is_searched_later(placed):
             return placement_stage(layouts, placed)
-        # What no place of the held joints brought within limits is searched in later rounds.
+        # What no place of the held joints brought within limits is searched in later rounds, and
+        # so is what Newton's steps did not lead to from the ideal arm.
         state = ca.MX.sym("state", layouts.state.size)
         parameters = ca.MX.sym("parameters", layouts.parameters.size)
         later = layouts.state.unpack(state)["earlier"] > 0

@@ -44,6 +44,11 @@ class HeldArm:
         """Whether the closed form is that of the real arm."""
         return self.form.exact
 
+    @property
+    def off(self) -> float:
+        """How far the ideal arm is from the real one [m and rad]."""
+        return self.form.off
+
     def seen(self, palm: Pose, angles: Expr) -> Pose:
         """The palm pose that the solved joints have to reach alone.
 

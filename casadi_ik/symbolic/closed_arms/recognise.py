@@ -23,8 +23,8 @@ from casadi_ik.symbolic.closed_arms.screws import (
 from casadi_ik.symbolic.closed_arms.spherical import MeetingAxes, ParallelPair
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
-NEAR = 1e-3
-"""How far an arm may be from the ideal one [m and rad]: what is left is for a step of Newton's."""
+NEAR = 1e-2
+"""How far an arm may be from the ideal one [m and rad]: what is left is for steps of Newton's."""
 
 APART = 1e-2
 """Links [m] and angles [rad] below which an arm is too degenerate to be solved like this."""
