@@ -26,6 +26,9 @@ from casadi_ik.viewing.asked import Asked, Settings
 MOST = 64
 """Solutions that are looked for."""
 
+NEARER = 1.02
+"""What is found at rest is shown where it misses by so much less than what is shown."""
+
 NOT_MET = "NOT MET"
 """Said of a configuration that has not all it is asked for."""
 
@@ -109,10 +112,26 @@ class Answerer:
     def explain(self, asked: Asked, q: Array) -> Answered:
         """The same with why a grasp is not solved and what would help.
 
+        What is shown stays if nothing nearer is found: of several that are equally near, the arm
+        does not go to another when the mouse rests.
+
         Raises:
             CasadiIKError: The question is malformed.
         """
-        return self._answered(asked, q, self.solver(asked), diagnose=True)
+        solver = self.solver(asked)
+        found = self._answered(asked, q, solver, diagnose=True)
+        if found.success:
+            return found
+        shown = self.judged(asked, q, solver)
+        if _missed(shown) > NEARER * _missed(found):
+            return found
+        return replace(
+            found,
+            q=q,
+            contacts=shown.contacts,
+            clearance=shown.clearance,
+            closest=shown.closest,
+        )
 
     def _answered(self, asked: Asked, q: Array, solver: Solver, diagnose: bool) -> Answered:
         solution = self._preferred(solver, asked.grasp, q, asked, diagnose)
@@ -122,9 +141,9 @@ class Answerer:
         if not np.isfinite(shown).all():
             shown = q
         found = self.judged(asked, shown, solver)
-        words = f"{solution.method} · {solution.iterations} iterations"
+        words = f"{solution.method} · {counted(solution.iterations, 'iteration')}"
         if solution.restarts:
-            words += f" · {solution.restarts} restarts"
+            words += f" · {counted(solution.restarts, 'restart')}"
         missed = not (diagnose or solution.success or solution.status is Status.COLLISION)
         return replace(
             found,
@@ -195,6 +214,22 @@ class Answerer:
 
     def _built(self, settings: Settings, scene: Scene | None) -> Solver:
         return Solver(self.robot, settings.method, settings.tolerance, settings.limits, scene=scene)
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things in words."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _missed(answer: Answered) -> float:
+    """By how much the worst contact is missed, in tolerances."""
+    parts = [0.0]
+    for one in answer.contacts.values():
+        parts += [
+            one.position_error / one.tolerance.position,
+            one.angle_error / one.tolerance.angle,
+        ]
+    return float(np.nanmax(parts))
 
 
 def why_not(solution: Solution) -> tuple[str, ...]:

@@ -207,7 +207,8 @@ class GraspPage:
             self._contacts.reach(self.asked, frames, answer.contacts)
             self._things.place(self.asked, self._dragged)
             closest = None if answer.closest is None else answer.closest[1]
-            self._closest.place(closest, answer.clearance)
+            met = all(one.ok for one in answer.contacts.values())
+            self._closest.place(closest, answer.clearance, told=met)
             self._panel.tell(answer)
         self.server.flush()
         self._dragged = ""

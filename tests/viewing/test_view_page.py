@@ -135,6 +135,8 @@ def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
     far, nearest = (max(one.position_error for one in answer.contacts.values()) for answer in drawn)
     assert nearest > 5e-3
     assert far <= 1.05 * nearest
+    # Where nothing nearer is found, the arm stays where it is when the reason comes.
+    assert np.array_equal(at_rest.q, at_once.q)
     assert at_rest is page.answer
     assert at_rest.headline == "UNREACHABLE"
     assert not at_rest.unexplained
