@@ -10,6 +10,7 @@ from casadi_ik.methods.common.contact_fit import DAMPING_FLOOR, EXACT
 from casadi_ik.methods.common.numeric_arm import pose_step
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.closed_arms.held import HeldArm
+from casadi_ik.symbolic.closed_arms.passing import PassingArm
 from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
@@ -27,7 +28,7 @@ def is_searched_later(arm: ArmForm | HeldArm) -> bool:
     """Whether rounds after the first search for the arm."""
     if isinstance(arm, SrsArm):
         return False
-    return isinstance(arm, HeldArm) or arm.off > CLOSE
+    return isinstance(arm, (HeldArm, PassingArm)) or arm.off > CLOSE
 
 
 def steps(off: float) -> int:
