@@ -41,6 +41,8 @@ exclude_patterns = [".*", "**/.*", "out", "build", "dist", "casadi_ik", "models"
 # Notebooks are executed by the tests; here they are shown as they were stored.
 nb_execution_mode = "off"
 nb_merge_streams = True
+# Tables and formulas that a cell prints look as those of the text around it.
+nb_render_markdown_format = "myst"
 myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 myst_dmath_double_inline = True

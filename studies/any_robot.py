@@ -9,7 +9,8 @@ tolerances::
     python studies/any_robot.py --arm panda --hand allegro_right --count 10000
 
 A third of the pairs, another for every seed, is asked ten times as much. A run that is killed goes
-on where it stopped. Misses are counted by kind; a file beside the report has them all.
+on where it stopped. Misses are counted by kind; a file beside the report has them all. What
+`any_robot_peers.py` found of other solvers, in that folder too, is shown as it is.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import any_robot_peers
 import joblib
 import numpy as np
 from any_robot_goals import HEADS, goal_rows, missed_parts
@@ -50,11 +52,6 @@ TIMES = 10
 
 DARK = 4.5
 """Ratio from which on a cell is so dark that its number is white."""
-
-PEERS = (
-    "Not measured here: other packages (placo, Pink, mink) on the same pairs; `peers.py` asks them "
-    "on robots of its own."
-)
 
 INTRODUCTION = """
 All targets are contacts of configurations within limits, hence reachable. *Missed:* the verdict,
@@ -126,13 +123,16 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
     if left:
         parts += [f"Not run yet: {len(left)} of {len(paths)} pairs ({', '.join(left)})."]
     options.report.mkdir(parents=True, exist_ok=True)
+    others = any_robot_peers.read(options.report)
     if found:
         _heat_map(found, options.report / "any_robot.png")
         parts += ["![time and misses of every pair](any_robot.png)"]
     for tolerance in TOLERANCES:
         parts += [f"## {tolerance}", _table(found, tolerance, metrics)]
     if found:
-        parts += ["## Goals", markdown_table(HEADS, goal_rows(found)), PEERS]
+        rows = [*goal_rows(found), any_robot_peers.goal_row(others)]
+        parts += ["## Goals", markdown_table(HEADS, rows)]
+    parts += any_robot_peers.parts(others)
     parts += ["## Misses", *missed_parts(found, options.report / "misses.csv")]
     codes = ", ".join(sorted({entry["code"] for entry in found.values()}))
     parts += ["## Where this comes from", f"`{run_by}`", provenance({"any_robot": codes or None})]

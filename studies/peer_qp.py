@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from peer_steps import LENGTH, Joints, PinContacts, cross, normal_axes, residual
+from peer_model import Joints, peer_urdf
+from peer_steps import LENGTH, PinContacts, cross, normal_axes, residual
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
+
+LEAST = 1e-9
+"""Smallest weight of placo's regularization: its program has to be strictly convex."""
 
 
 class Pink:
@@ -24,8 +28,7 @@ class Pink:
         tasks: Any = import_module("pink.tasks")
         self._pin = contacts = PinContacts(robot)
         model = contacts.model
-        names, place = contacts.joints.names, contacts.joints.order(model.names[1:].tolist())
-        self._place = place
+        names = contacts.joints.names
         start = contacts.theta(robot.home)
         self._configuration = self._pink.Configuration(model, model.createData(), start)
         self._lower, self._upper = model.lowerPositionLimit, model.upperPositionLimit
@@ -44,8 +47,8 @@ class Pink:
 
         self._tasks = [Contacts(lm_damping=damping)]
         self._coupled = [
-            tasks.JointCouplingTask([names[a], names[b]], [1.0, -1.0], 1.0, self._configuration)
-            for a, b in contacts.joints.pairs
+            tasks.JointCouplingTask([names[a], names[b]], [r, -1.0], 1.0, self._configuration)
+            for a, b, r in contacts.joints.pairs
         ]
 
     def aim(self, points: Array, normals: Array) -> None:
@@ -123,17 +126,15 @@ class Mink:
         compiler = (
             '<mujoco><compiler fusestatic="false" boundmass="0.01" boundinertia="0.001"/></mujoco>'
         )
-        urdf = robot.urdf().replace("<link", f"{compiler}<link", 1)
+        urdf = peer_urdf(robot, self._joints).replace("<link", f"{compiler}<link", 1)
         spec = self._mujoco.MjSpec.from_string(urdf)
-        for follower in list(spec.equalities):
-            spec.delete(follower)
-        for a, b in self._joints.pairs:
+        for a, b, ratio in self._joints.pairs:
             shared = spec.add_equality(
                 type=self._mujoco.mjtEq.mjEQ_JOINT,
                 name1=self._joints.names[b],
                 name2=self._joints.names[a],
             )
-            shared.data[:2] = 0.0, 1.0  # the polynomial b = 0 + 1 a
+            shared.data[:2] = 0.0, ratio  # the polynomial b = 0 + ratio a
         return spec
 
     def aim(self, points: Array, normals: Array) -> None:
@@ -182,21 +183,21 @@ class Placo:
     """placo: a position and an axis-align task per contact, limits and coupling hard."""
 
     def __init__(self, robot: ik.ArmHand, damping: float) -> None:
-        """Set it up; `damping` is the weight of the regularization task."""
+        """Set it up; `damping` times the squared error is the weight of the regularization task."""
         placo: Any = import_module("placo")
         self._joints = Joints(robot)
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "robot.urdf"
-            file.write_text(robot.urdf())
+            file.write_text(peer_urdf(robot, self._joints), encoding="utf-8")
             self._robot = placo.RobotWrapper(str(file), placo.Flags.ignore_collisions)
         self._solver = placo.KinematicsSolver(self._robot)
         self._solver.mask_fbase(True)
         self._solver.enable_joint_limits(True)
-        self._solver.add_regularization_task(damping)
+        self._damping, self._regular = damping, self._solver.add_regularization_task(damping)
         names = self._joints.names
-        for a, b in self._joints.pairs:
+        for a, b, ratio in self._joints.pairs:
             gear = self._solver.add_gear_task()
-            gear.set_gear(names[b], names[a], 1.0)
+            gear.set_gear(names[b], names[a], ratio)
             gear.configure("gear", "hard", 1.0)
         self._offsets = np.array([self._robot.get_joint_offset(name) for name in names])
         self._moves = np.array([self._robot.get_joint_v_offset(name) for name in names])
@@ -222,6 +223,7 @@ class Placo:
 
     def aim(self, points: Array, normals: Array) -> None:
         """See `Peer`."""
+        self._target = points, normals
         for i, (point, normal) in enumerate(zip(self._points, self._normals, strict=True)):
             point.target_world = points[i]
             normal.targetAxis_world = normals[i]
@@ -229,10 +231,14 @@ class Placo:
     def contacts(self, q: Array) -> tuple[Array, Array]:
         """See `Peer`."""
         placed = self._placed(q)
-        return placed[:, :3, 3], np.einsum("fij,fj->fi", placed[:, :3, :3], self._axes)
+        self._now = placed[:, :3, 3], np.einsum("fij,fj->fi", placed[:, :3, :3], self._axes)
+        return self._now
 
     def step(self, q: Array) -> Array:
         """See `Peer`."""
+        error = residual(*self._now, *self._target)
+        weight = max(self._damping * float(error @ error), LEAST)
+        self._regular.configure("regularization", "soft", weight)
         try:
             change = self._solver.solve(False)
         except RuntimeError:  # its quadratic program has no solution

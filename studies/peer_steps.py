@@ -1,8 +1,8 @@
 """Other solvers on our problem, each set up as its experts would: one iteration at a time.
 
-Every peer sees the robot through its URDF, contacts as points and normals, and the motors that the
-spread's two joints share. What is theirs is theirs: kinematics, tasks and quadratic program. All
-keep the limits in every step and move no motor by more than `CAP` at once.
+Every peer sees the robot through a URDF (`peer_model`), contacts as points and normals, and joints
+that follow others. What is theirs is theirs: kinematics, tasks and quadratic program. All keep the
+limits in every step.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from peer_model import Joints, peer_urdf
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
@@ -36,40 +36,14 @@ class Peer(Protocol):
         ...
 
 
-class Joints:
-    """Our motors and the peers' joints: theta = C q, without offsets."""
-
-    def __init__(self, robot: ik.ArmHand) -> None:
-        """Read the coupling off the robot."""
-        n = len(robot.actuators)
-        zero = np.array(list(robot.joints(np.zeros(n)).values()))
-        if zero.any():
-            raise SystemExit("peers: a coupling with an offset is not set up")
-        self.names = list(robot.joints(robot.home))
-        self.C = np.stack([list(robot.joints(row).values()) for row in np.eye(n)], axis=1)
-        self.leader = [int(np.flatnonzero(column)[0]) for column in self.C.T]
-        """A joint that moves as its motor does, for every motor."""
-        self.pairs = [
-            (int(rows[0]), int(row))
-            for rows in (np.flatnonzero(column) for column in self.C.T)
-            for row in rows[1:]
-        ]
-        """Joints that share a motor."""
-        self.lower, self.upper = self.C @ robot.lower, self.C @ robot.upper
-
-    def order(self, names: list[str]) -> NDArray[np.intp]:
-        """Where our joints are among a peer's."""
-        return np.array([names.index(name) for name in self.names])
-
-
 class PinContacts:
     """Contacts and their Jacobian by pinocchio, in our motors."""
 
     def __init__(self, robot: ik.ArmHand) -> None:
         """Load the robot and look the contact frames up."""
         self.pin: Any = import_module("pinocchio")
-        self.model = model = self.pin.buildModelFromXML(robot.urdf())
         self.joints = Joints(robot)
+        self.model = model = self.pin.buildModelFromXML(peer_urdf(robot, self.joints))
         self.frames = [model.getFrameId(f"{name}_contact") for name in robot.fingers]
         place = self.joints.order([n for n in model.names if n != "universe"])
         self.rows = np.array([model.joints[int(i) + 1].idx_q for i in place])

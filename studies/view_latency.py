@@ -33,7 +33,7 @@ from casadi_ik.viewing.frames import pose_of
 ROBOT, FINGER = "kuka_lwr_barrett", "thumb"
 WINDOW = (1280, 800)
 
-REST, FLOW = 0.4, 0.03
+REST, FLOW = 1.0, 0.03
 """Between what is drawn and the next step: all that can wait is done; as a hand drags [s]."""
 
 KINDS = {
@@ -51,11 +51,11 @@ BOX = (
 INTRODUCTION = """
 A contact of the cup ({robot}) dragged in steps of a few millimetres, window {width} x {height},
 {steps} steps unpainted, {painted} painted, each begun {rest} s after the one before was drawn, when
-motors and solutions are told as well; "in one go": {flow} s, as a hand drags. Load of its
+motors and most solutions are told as well; "in one go": {flow} s, as a hand drags. Load of its
 {processors} processors while it ran: {load}. Medians, in brackets nine of ten.
 
-"As it is": Chromium paints in software here. "Not painted": the calls that paint are left out,
-everything else remains; a graphics card is in between, and near to this. The server's share of
+"As it is": Chromium paints in software here. "Not painted": the calls that draw and clear are left
+out, everything else remains; a graphics card is in between, and near to this. The server's share of
 `casadi-ik view` is from the browser's message to the answer's hand-over; the solver's is in it.
 """
 

@@ -59,7 +59,10 @@ def ranked_of(
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))["ranked"]
         found = [(one, one["solution"]["q"], one["solution"]["robot"]) for one in entries]
-        labels = [f"candidate {one['candidate']}, score {one['score']:.4g}" for one in entries]
+        labels = [
+            f"{one.get('name') or 'candidate'} ({one['candidate']}), score {one['score']:.4g}"
+            for one in entries
+        ]
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:

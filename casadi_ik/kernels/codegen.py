@@ -91,6 +91,13 @@ OWN = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")
 EXTREMES = ("fmax", "fmin")
 """Likewise (drivers/extremes.c): a call takes as long as ten operations."""
 
+LOOPS = """\
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize ("O3")
+#endif
+"""
+"""Has gcc turn loops into vector operations, which it does not do at the level of long sources."""
+
 WIDE = """\
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #pragma GCC target("avx2")
@@ -132,19 +139,23 @@ def step_names(name: str) -> str:
     return "".join(f"#define STEP{suffix} {name}{suffix}\n" for suffix in suffixes)
 
 
-def library_source(function: ca.Function, driver: str, wide: bool = False) -> str:
+def library_source(
+    function: ca.Function, driver: str, wide: bool = False, loops: bool = False
+) -> str:
     """The text of a whole library: the function's code, its names, what drivers share, a driver.
 
     Args:
         function: Dense and row-major.
         driver: C text of the driver, with its constants.
         wide: Whether the machine has wide registers.
+        loops: Whether loops over tables are most of the work.
     """
     # More than one thread at once may hold memory of a function that needs some.
     header = "#define CASADI_MAX_NUM_THREADS 64\n"
     return "\n".join(
         (
             WIDE if wide else "",
+            LOOPS if loops else "",
             header,
             with_own_functions(some_at_once(function_source(function))),
             step_names(function.name()),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import casadi as ca
@@ -15,7 +15,7 @@ from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.buffered import BufferedFunction, doubles, memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import stop_if_cancelled
-from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
 from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
 from casadi_ik.kernels.function_graph import FunctionGraph
 
@@ -115,7 +115,9 @@ class FunctionKernel:
 
     def _load(self) -> ctypes.CDLL | None:
         driver = define(self.constants) + driver_text("map_job") + driver_text("map")
-        return load_library(self.name, lambda: self.function, driver, SYMBOL, self._graph.recipe)
+        write = partial(library_source, loops=self._graph.loops)
+        build = (self.name, lambda: self.function, driver, SYMBOL, self._graph.recipe)
+        return load_library(*build, write)
 
     @property
     def constants(self) -> dict[str, int]:

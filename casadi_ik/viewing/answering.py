@@ -26,8 +26,15 @@ from casadi_ik.viewing.asked import Asked, Settings
 MOST = 64
 """Solutions that are looked for."""
 
-LOOKING = "contacts and limits are met, but something touches; looking for a way out"
-"""Said until it is known why all answers touch something."""
+NEARER = 1.02
+"""What is found at rest is shown where it misses by so much less than what is shown."""
+
+NOT_MET = "NOT MET"
+"""Said of a configuration that has not all it is asked for."""
+
+TOUCHES = "contacts and limits are met, but something touches; looking for a way out"
+MISSES = "the nearest that was found; why follows when the mouse rests"
+"""Said until it is known why nothing answers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +51,7 @@ class Answered:
         closest: The nearest pair's names and points; None where there is none.
         seconds: The solve took.
         how: Method, iterations and such in a line.
+        unexplained: Whether why not has to be found out yet.
     """
 
     q: Array
@@ -55,6 +63,7 @@ class Answered:
     closest: tuple[tuple[str, str], Closest] | None = None
     seconds: float = 0.0
     how: str = ""
+    unexplained: bool = False
 
 
 class Answerer:
@@ -91,38 +100,60 @@ class Answerer:
         return solver
 
     def solve(self, asked: Asked, q: Array, solver: Solver | None = None) -> Answered:
-        """The answer nearest to q, or the preferred one, or why there is none.
+        """The answer nearest to q, or the preferred one, or the nearest to one that was found.
 
-        Why all answers touch something takes a second to find out: `explain` tells.
+        Why there is none takes up to a second to find out: `explain` tells.
 
         Raises:
             CasadiIKError: The question is malformed.
         """
-        solver, grasp = solver or self.solver(asked), asked.grasp
-        solution = self._preferred(solver, grasp, q, asked, diagnose=asked.scene is None)
-        if not (solution.success or solution.diagnosis or solution.status is Status.COLLISION):
-            solution = self._preferred(solver, grasp, q, asked, diagnose=True)
+        return self._answered(asked, q, solver or self.solver(asked), diagnose=False)
+
+    def explain(self, asked: Asked, q: Array) -> Answered:
+        """The same with why a grasp is not solved and what would help.
+
+        What is shown stays if nothing nearer is found: of several that are equally near, the arm
+        does not go to another when the mouse rests.
+
+        Raises:
+            CasadiIKError: The question is malformed.
+        """
+        solver = self.solver(asked)
+        found = self._answered(asked, q, solver, diagnose=True)
+        if found.success:
+            return found
+        shown = self.judged(asked, q, solver)
+        if _missed(shown) > NEARER * _missed(found):
+            return found
+        return replace(
+            found,
+            q=q,
+            contacts=shown.contacts,
+            clearance=shown.clearance,
+            closest=shown.closest,
+        )
+
+    def _answered(self, asked: Asked, q: Array, solver: Solver, diagnose: bool) -> Answered:
+        solution = self._preferred(solver, asked.grasp, q, asked, diagnose)
         shown = solution.q
         if solution.diagnosis is not None and solution.status is not Status.COLLISION:
             shown = solution.diagnosis.q
         if not np.isfinite(shown).all():
             shown = q
         found = self.judged(asked, shown, solver)
-        words = f"{solution.method} · {solution.iterations} iterations"
+        words = f"{solution.method} · {counted(solution.iterations, 'iteration')}"
         if solution.restarts:
-            words += f" · {solution.restarts} restarts"
+            words += f" · {counted(solution.restarts, 'restart')}"
+        missed = not (diagnose or solution.success or solution.status is Status.COLLISION)
         return replace(
             found,
             success=solution.success,
-            headline=solution.status.name.replace("_", " "),
+            headline=NOT_MET if missed else solution.status.name.replace("_", " "),
             lines=why_not(solution),
             seconds=solution.time,
             how=words,
+            unexplained=not (diagnose or solution.success),
         )
-
-    def explain(self, asked: Asked, q: Array) -> tuple[str, ...]:
-        """Why a grasp is not solved and what would help, in short lines."""
-        return why_not(self._preferred(self.solver(asked), asked.grasp, q, asked, diagnose=True))
 
     def judged(self, asked: Asked, q: Array, solver: Solver | None = None) -> Answered:
         """How a configuration meets what is asked."""
@@ -141,7 +172,7 @@ class Answerer:
         }
         clearance, closest, free = self._clear(asked, q, solver)
         met = bool(verdict.solved(enforced)[0]) and free
-        word = "MET" if met else "NOT MET"
+        word = "MET" if met else NOT_MET
         return Answered(q, met, word, contacts, clearance=clearance, closest=closest)
 
     def every(self, asked: Asked, q: Array) -> tuple[Alternative, ...]:
@@ -185,6 +216,22 @@ class Answerer:
         return Solver(self.robot, settings.method, settings.tolerance, settings.limits, scene=scene)
 
 
+def counted(number: int, what: str) -> str:
+    """A number of things in words."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _missed(answer: Answered) -> float:
+    """By how much the worst contact is missed, in tolerances."""
+    parts = [0.0]
+    for one in answer.contacts.values():
+        parts += [
+            one.position_error / one.tolerance.position,
+            one.angle_error / one.tolerance.angle,
+        ]
+    return float(np.nanmax(parts))
+
+
 def why_not(solution: Solution) -> tuple[str, ...]:
     """Why a grasp is not solved, in short lines."""
     if solution.success:
@@ -193,9 +240,7 @@ def why_not(solution: Solution) -> tuple[str, ...]:
         return solution.collision.lines
     if solution.diagnosis is not None:
         return solution.diagnosis.lines
-    if solution.status is Status.COLLISION:
-        return (LOOKING,)
-    return (f"ended as {solution.status.name.lower().replace('_', ' ')}",)
+    return (TOUCHES if solution.status is Status.COLLISION else MISSES,)
 
 
 def _alike(solver: Solver, settings: Settings, before: Scene | None, scene: Scene) -> bool:

@@ -25,10 +25,18 @@ class DrawnClosest:
             "/closest/length", "", anchor="top-center", font_screen_scale=0.8, visible=False
         )
 
-    def place(self, closest: Closest | None, clearance: float | None = None) -> None:
-        """Put it where two shapes are nearest, with their clearance [m]; None: nowhere."""
+    def place(
+        self, closest: Closest | None, clearance: float | None = None, told: bool = True
+    ) -> None:
+        """Put it where two shapes are nearest, with their clearance [m]; None: nowhere.
+
+        Args:
+            closest: The two points.
+            clearance: What is told of them; None: how far they are from each other.
+            told: Whether anything is: not where it would lie over what matters more.
+        """
         shown = closest is not None and closest.distance < FAR
-        self._rod.visible = self._label.visible = shown
+        self._rod.visible, self._label.visible = shown, shown and told
         if closest is None or not shown:
             return
         self._rod.points = closest.ends[None].astype(np.float32)

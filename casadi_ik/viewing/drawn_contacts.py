@@ -11,7 +11,7 @@ import viser
 
 from casadi_ik import palette
 from casadi_ik.arrays import Array
-from casadi_ik.importing.surfaces import Surface
+from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.viewing.asked import Asked, Held
 from casadi_ik.viewing.bodies import arrow, ball, tube
@@ -177,13 +177,12 @@ class _Tip:
     def __init__(self, server: viser.ViserServer, finger: str, above: str) -> None:
         scene, name = server.scene, f"{above}/tips/{finger}"
         self._frame = scene.add_frame(name, show_axes=False)
-        surface = arrow(0.062, 0.0026)
-        self._meshes = [
-            scene.add_icosphere(f"{name}/point", radius=0.0048, cast_shadow=False),
-            scene.add_mesh_simple(
-                f"{name}/normal", surface.points, surface.triangles, cast_shadow=False
-            ),
-        ]
+        # One mesh for point and normal: what a frame costs is counted in meshes.
+        surface = together([ball(0.0048), arrow(0.062, 0.0026)])
+        assert surface is not None
+        self._mesh = scene.add_mesh_simple(
+            f"{name}/reached", surface.points, surface.triangles, cast_shadow=False
+        )
         self._label = scene.add_label(
             f"{name}/errors", "", anchor="bottom-center", font_screen_scale=0.85, visible=False
         )
@@ -200,9 +199,8 @@ class _Tip:
         self._frame.position, self._frame.wxyz = frame[:3, 3], quaternion(frame[:3, :3])
         met = verdict is None or verdict.ok
         color = palette.FAINT if verdict is None else palette.MET if met else palette.MISSED
-        for mesh in self._meshes:
-            if mesh.color != palette.rgb(color):
-                mesh.color = palette.rgb(color)
+        if self._mesh.color != palette.rgb(color):
+            self._mesh.color = palette.rgb(color)
         self._gap.visible = self._label.visible = not met
         if verdict is not None and not met:
             ends = np.stack([frame[:3, 3], held.control[:3, 3]])[None]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from casadi_ik.arrays import Array
@@ -30,7 +32,18 @@ def quaternions(rotations: Array) -> Array:
 
 def quaternion(rotation: Array) -> Array:
     """(4,) of one rotation (3, 3)."""
-    return quaternions(rotation[None])[0]
+    # The same in plain numbers: of a single one, arrays would take ten times as long.
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    squares = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
+    a, b, c, d, e, f = zy - yz, xz - zx, yx - xy, yx + xy, xz + zx, zy + yz
+    rows = (
+        (squares[0], a, b, c),
+        (a, squares[1], d, e),
+        (b, d, squares[2], f),
+        (c, e, f, squares[3]),
+    )
+    chosen = np.array(rows[squares.index(max(squares))])
+    return chosen / math.sqrt(chosen @ chosen)
 
 
 def pose_of(position: Array, wxyz: Array) -> Array:

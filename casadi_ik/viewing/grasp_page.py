@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import viser
 
@@ -14,13 +13,13 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.solving.alternatives.finder import Alternative
-from casadi_ik.viewing.answering import LOOKING, Answered, Answerer, failed
+from casadi_ik.viewing.answering import Answered, Answerer, failed
 from casadi_ik.viewing.asked import Asked
 from casadi_ik.viewing.drawn_closest import DrawnClosest
 from casadi_ik.viewing.drawn_contacts import Drags, DrawnContacts
 from casadi_ik.viewing.drawn_robot import DrawnRobot
 from casadi_ik.viewing.drawn_things import OBJECT, DrawnThings, lowest
-from casadi_ik.viewing.newest import PAUSE, REST, Newest
+from casadi_ik.viewing.newest import LOOKS, PAUSE, REST, Newest
 from casadi_ik.viewing.panel import Panel
 from casadi_ik.viewing.robot_parts import robot_parts
 from casadi_ik.viewing.stage import look_at_robot, set_stage
@@ -93,7 +92,7 @@ class GraspPage:
         self.candidates = dict(candidates or {})
         names = (*asked.held, *self._things.names)
         self._panel = Panel(self, names, LEGEND)
-        later = (PAUSE, self._show_motors), (REST, self._explain), (REST, self._list_solutions)
+        later = (PAUSE, self._show_motors), (REST, self._explain), (LOOKS, self._list_solutions)
         self.work = Newest(self._refresh, later)
         self.select(robot.fingers[0])
 
@@ -208,17 +207,18 @@ class GraspPage:
             self._contacts.reach(self.asked, frames, answer.contacts)
             self._things.place(self.asked, self._dragged)
             closest = None if answer.closest is None else answer.closest[1]
-            self._closest.place(closest, answer.clearance)
+            met = all(one.ok for one in answer.contacts.values())
+            self._closest.place(closest, answer.clearance, told=met)
             self._panel.tell(answer)
         self.server.flush()
         self._dragged = ""
 
     def _explain(self) -> None:
         """What takes longer to find out than a drag may take."""
-        if self.answer.lines == (LOOKING,) and self.asked is self._answered_for:
-            lines = self._answerer.explain(self.asked, self.answer.q)
-            self.answer = replace(self.answer, lines=lines)
-            self._panel.tell(self.answer)
+        if self.answer.unexplained and self.asked is self._answered_for:
+            self.answer = self._answerer.explain(self.asked, self.answer.q)
+            self.draw(self.answer)
+            self._show_motors()
 
     def _list_solutions(self) -> None:
         """All solutions, once nothing moves."""

@@ -59,7 +59,7 @@ class LogPage:
         self.server, self.tracks, self.now = server, tuple(tracks), 0
         self._scene = scene
         first = tracks[0]
-        set_stage(server, " / ".join(track.label for track in tracks), lowest(scene))
+        set_stage(server, _title(tracks), lowest(scene))
         middle = len(first.q) // 2
         look_at_robot(server, first.robot, first.q[middle], wide=len(tracks))
         self._shown = [self._add(i, track) for i, track in enumerate(tracks)]
@@ -177,6 +177,13 @@ class LogPage:
             if self._slider.value != self.now:
                 self._slider.value = self.now
         self.server.flush()
+
+
+def _title(tracks: Sequence[Track]) -> str:
+    """Of the panel: methods alone where they tell the solves apart, else it would be cut off."""
+    methods = [track.solve.method for track in tracks]
+    apart = len(set(methods)) == len(methods) > 1
+    return " / ".join(methods if apart else [track.label for track in tracks])
 
 
 def _nothing(*_: Any) -> None:

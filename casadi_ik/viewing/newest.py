@@ -25,6 +25,9 @@ PAUSE = 0.02
 REST = 0.15
 """After so long nothing moves any more [s]; in a drag, changes are 0.05 s apart."""
 
+LOOKS = 0.5
+"""After so long whoever drags looks, and does not go on at once [s]: time for what takes long."""
+
 
 class Newest:
     """A thread that does the newest change of every key, then draws, then what can wait."""

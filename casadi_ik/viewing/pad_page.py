@@ -234,8 +234,8 @@ class PadPage:
             turn = float(np.rad2deg(np.arccos(cosine)))
             moved = f"{step:.1f} mm, {turn:.1f}°" if new else "as in the file"
             link = self.robot.description.finger(finger).link
-            point = " ".join(f"{1e3 * value + 0.0:.1f}" for value in pad.point)
-            normal = " ".join(f"{value + 0.0:.2f}" for value in pad.normal)
+            point = " ".join(f"{round(1e3 * value, 1) + 0.0:.1f}" for value in pad.point)
+            normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal)
             color = palette.LINES[0] if new else palette.INK
             rows.append(
                 f'<tr style="color:{color}" class="ik-pad"><td><b>{html.escape(finger)}</b><br>'

@@ -118,7 +118,7 @@ def look_at_robot(server: viser.ViserServer, robot: ArmHand, q: Array, wide: int
         views.append(way / np.linalg.norm(way))
     share = 0.62 if wide == 1 else 0.0
     target = (1 - share) * (low + high) / 2 + share * hand
-    look_at(server, target, (0.72 if wide == 1 else 1.0) * size, max(views, key=apart))
+    look_at(server, target, (0.72 if wide == 1 else 0.78) * size, max(views, key=apart))
 
 
 def look_at_hand(server: viser.ViserServer, robot: ArmHand, q: Array) -> None:
@@ -131,7 +131,9 @@ def look_at_hand(server: viser.ViserServer, robot: ArmHand, q: Array) -> None:
     low, high = every.min(axis=0), every.max(axis=0)
     size = max(float(np.linalg.norm(high - low)), 0.1)
     # Across the way from palm to thumb, along which the pads are seen from the side.
-    view = palm[:3, 0] + 0.35 * palm[:3, 2] + 0.25 * palm[:3, 1]
+    aside = 0.35 * palm[:3, 2] + 0.25 * palm[:3, 1]
+    # Of its two sides the one that is seen from above the ground.
+    view = max(palm[:3, 0] + aside, aside - palm[:3, 0], key=lambda one: one[2])
     look_at(server, (low + high) / 2, 1.25 * size, view + np.array([0.0, 0.0, 0.3]))
 
 

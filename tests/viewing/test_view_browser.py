@@ -14,7 +14,7 @@ from browser import CHROMIUM, Browser, Page
 from drag_latency.probes import NO_PAINTING
 
 import casadi_ik as ik
-from casadi_ik.viewing import Viewer, files, view_log
+from casadi_ik.viewing import Viewer, files, view_log, view_pads
 from casadi_ik.viewing.drawn_contacts import SIZE
 from casadi_ik.viewing.frames import pose_of
 
@@ -22,7 +22,13 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (Debian: a
 
 WINDOW = (700, 420)
 
-KNOWN = ("THREE.Clock", "KHR_parallel_shader_compile", "GPU stall", "RenderTargets")
+KNOWN = (
+    "THREE.Clock",
+    "KHR_parallel_shader_compile",
+    "GPU stall",
+    "RenderTargets",
+    "preventDefault",
+)
 """What viser's client says of itself, and of a browser without a graphics card."""
 
 
@@ -47,7 +53,9 @@ def opened(browser: Browser, viewer: Viewer, painted: bool = False) -> tuple[Pag
     while not server.get_clients() and time.monotonic() < end:
         time.sleep(0.1)
     client = list(server.get_clients().values())[-1]
-    page.wait("document.querySelector('.ik-status, .ik-iteration') !== null")
+    page.wait("document.querySelector('.ik-status, .ik-iteration, .ik-pad') !== null")
+    # That there is no graphics card is told in a note that lies over the picture.
+    page.evaluate("document.querySelector('.mantine-Notification-closeButton')?.click()")
     return page, client
 
 
@@ -63,13 +71,13 @@ def pixel(page: Page, client: Any, point: np.ndarray) -> np.ndarray:
     return np.array(box[:2]) + np.array(box[2:]) / 2 + focal * seen[:2] / seen[2]
 
 
-def drag_along(page: Page, client: Any, pose: np.ndarray, far: float) -> None:
+def drag_along(page: Page, client: Any, pose: np.ndarray, far: float, size: float = SIZE) -> None:
     """Drag that arrow of a control at a pose that is seen longest, so far [m]."""
     here = pixel(page, client, pose[:3, 3])
-    tips = [pixel(page, client, pose[:3, 3] + SIZE * pose[:3, i]) for i in range(3)]
+    tips = [pixel(page, client, pose[:3, 3] + size * pose[:3, i]) for i in range(3)]
     axis = int(np.argmax([np.linalg.norm(tip - here) for tip in tips]))
     start = here + 0.92 * (tips[axis] - here)
-    end = start + far / SIZE * (tips[axis] - here)
+    end = start + far / size * (tips[axis] - here)
     page.drag((float(start[0]), float(start[1])), (float(end[0]), float(end[1])), steps=4)
 
 
@@ -158,6 +166,37 @@ def test_two_browsers_see_one_drag_and_save_it(
     assert image.shape[:2] == (200, 320)
     assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 100
     assert complaints(page) == []
+    page.close()
+
+
+def test_guessed_pads_are_corrected_by_mouse_and_saved(description: Path, browser: Browser) -> None:
+    guessed = ik.load_robot(description)
+    points, normals = guessed.contacts(guessed.home)
+    viewer = view_pads(description)
+    page, client = opened(browser, viewer)
+    time.sleep(1.0)  # the camera comes to rest
+    shown = viewer.page
+    # One by its arrows, which it has from the beginning, the other's normal by its own arrow.
+    drag_along(page, client, shown.asked.held["first"].control, 0.004, 0.7 * SIZE)
+    pose = shown.asked.held["second"].control
+    tip = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0])
+    aside = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0] + 0.012 * pose[:3, 2])
+    page.drag((float(tip[0]), float(tip[1])), (float(aside[0]), float(aside[1])), steps=4)
+    page.wait("[...document.querySelectorAll('.ik-pad')].every(p => / mm, /.test(p.innerText))")
+    press(page, "Save to my_hand.yaml")
+    page.wait("(document.querySelector('.ik-said')?.innerText ?? '').startsWith('saved')")
+    after = ik.load_robot(description)
+    moved, faced = after.contacts(after.home)
+    for i, finger in enumerate(after.fingers):
+        control = shown.asked.held[finger].control
+        assert np.allclose(moved[i], control[:3, 3], atol=1e-6)
+        assert np.allclose(faced[i], control[:3, 0], atol=1e-6)
+    assert 1e-3 < np.linalg.norm(moved[0] - points[0]) < 0.02
+    assert np.allclose(moved[1], points[1], atol=1e-6)
+    assert np.allclose(faced[0], normals[0], atol=1e-6)
+    assert 10.0 < np.rad2deg(np.arccos(faced[1] @ normals[1])) < 60.0
+    assert complaints(page) == []
+    viewer.stop()
     page.close()
 
 

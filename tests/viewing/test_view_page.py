@@ -11,7 +11,7 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.errors import InputError
 from casadi_ik.viewing import Viewer, view_grasp
-from casadi_ik.viewing.answering import Answered
+from casadi_ik.viewing.answering import MISSES, NOT_MET, Answered
 from casadi_ik.viewing.asked import Settings
 from casadi_ik.viewing.drawn_things import OBJECT
 from casadi_ik.viewing.frames import pose_of
@@ -118,6 +118,29 @@ def test_an_unreachable_contact_shows_why_and_what_is_nearest(cup: Viewer) -> No
     shown = [answer.contacts[finger].position_error for finger in robot.fingers]
     assert np.allclose(position, shown)
     assert "too far for the arm" in page._panel._verdict.content
+
+
+def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
+    cup: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, drawn, draw = cup.page, [], cup.page.draw
+    monkeypatch.setattr(page, "draw", lambda answer: (drawn.append(answer), draw(answer)))
+    page.drag_control("thumb", shifted(page.asked.held["thumb"].control, 0.0, 0.0, 0.05))
+    assert page.work.settle()
+    at_once, at_rest = drawn
+    assert at_once.headline == NOT_MET
+    assert at_once.lines == (MISSES,)
+    assert at_once.unexplained
+    # What is drawn at once is as near as what the diagnosis comes to.
+    far, nearest = (max(one.position_error for one in answer.contacts.values()) for answer in drawn)
+    assert nearest > 5e-3
+    assert far <= 1.05 * nearest
+    # Where nothing nearer is found, the arm stays where it is when the reason comes.
+    assert np.array_equal(at_rest.q, at_once.q)
+    assert at_rest is page.answer
+    assert at_rest.headline == "UNREACHABLE"
+    assert not at_rest.unexplained
+    assert any("thumb" in line for line in at_rest.lines)
 
 
 def test_the_object_takes_its_contacts_along(cup: Viewer) -> None:

@@ -77,8 +77,9 @@ def each_finger(robot: RobotDescription) -> FunctionGraph:
     f, hand = len(robot.finger_names), len(robot.hand_actuators)
     name = ca.Function.fix_name(f"each_finger_{robot.name}")
     inputs = {"points": (f, 3), "normals": (f, 3), "posture": (hand, 1)}
+    outputs = ((hand, 1), (1, 1))
     return FunctionGraph(
-        name, lambda: _build(name, robot), inputs, ((hand, 1), (1, 1)), recipe(name, robot)
+        name, lambda: _build(name, robot), inputs, outputs, recipe(name, robot), loops=True
     )
 
 

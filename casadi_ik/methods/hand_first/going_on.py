@@ -9,10 +9,13 @@ CARRIED = (
 """What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
 were balanced in vain, and what was found."""
 
-RETURNS = 16
+RETURNS, RETURNS_OF_MANY = 16, 160
 """When so many fits and balances have ended where one had before, no table holds another kind. With
 eight a reachable target was given up one round too early; sixteen cost a tenth more time where the
-contacts contradict each other."""
+contacts contradict each other. A hand with more than `MANY` motors comes back to a minimum that
+just misses from many sides before it finds the way past it: of 2,400 targets near limits of a Panda
+with a LEAP hand three were missed with 16, two with 64, none with 160, and those that just cannot
+be reached take five times as long."""
 
 SURE = 1e-8
 """Cost (0.01 mm, 0.1 mrad) above which this is a minimum, and not a long flat valley."""
@@ -42,6 +45,11 @@ def goes_on(number: int) -> bool:
     other round, since what has come to a valley's lowest place has to leave it.
     """
     return number % 2 == 0
+
+
+def most_returns(motors: int) -> int:
+    """`RETURNS` of a hand of so many motors."""
+    return RETURNS_OF_MANY if motors > MANY else RETURNS
 
 
 def near_cost(motors: int, late: bool) -> float:

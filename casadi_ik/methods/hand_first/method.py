@@ -20,11 +20,11 @@ from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.going_on import (
     CARRIED,
     EARLY,
-    RETURNS,
     SURE,
     TINY,
     VARIED,
     goes_on,
+    most_returns,
     near_cost,
 )
 from casadi_ik.methods.hand_first.one_target import OneTarget
@@ -79,6 +79,7 @@ class HandFirstMethod(LoopedMethod):
         self.rounds = options.rounds + LATER
         motors = len(robot.hand_actuators)
         self._near = near_cost(motors, late=False), near_cost(motors, late=True)
+        self._returns = most_returns(motors)
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(
             robot, arm_form(robot) or held_arm(robot), options.candidates, self._kinds
@@ -124,15 +125,15 @@ class HandFirstMethod(LoopedMethod):
         return states, parameters
 
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
-        """Whether a round may still help: see RETURNS and `restarts.RUGGED`."""
+        """Whether a round may still help: see `most_returns` and `restarts.RUGGED`."""
         layout = self.step.layouts.state
         returns, cost = (states[:, layout.slice(name).start] for name in ("returns", "best_cost"))
         rugged = number - (self.rounds - RUGGED)
         if rugged >= 0:
-            return (returns < RETURNS) & (cost < self._near[rugged >= EARLY])
+            return (returns < self._returns) & (cost < self._near[rugged >= EARLY])
         # No more hands of tables if their fits come back to a minimum that just misses.
         tables = VARIED <= number < self.options.rounds
-        return (returns < RETURNS) | (cost < SURE) | (not tables)
+        return (returns < self._returns) | (cost < SURE) | (not tables)
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """The step counts them."""

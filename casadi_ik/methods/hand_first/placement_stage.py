@@ -5,7 +5,14 @@ from __future__ import annotations
 import casadi as ca
 
 from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, NO_MARGIN, place_arm
-from casadi_ik.methods.common.form_search import PLACEMENT, THOROUGH, WINDOWS, place_form, trials
+from casadi_ik.methods.common.form_search import (
+    PLACEMENT,
+    THOROUGH,
+    WINDOWS,
+    beginnings,
+    place_form,
+    trials,
+)
 from casadi_ik.methods.common.held_search import holds, place_held
 from casadi_ik.methods.common.nearly_closed import brought_to
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
@@ -63,7 +70,8 @@ def _placed(layouts: HandFirstLayouts, most: tuple[int, int], exact: bool) -> ca
     # What is looked for in a part of the range is not compared with what was found before.
     former = s["margin"]
     if most[0] < most[1]:
-        former = ca.if_else(s["spent"] == most[0], NO_MARGIN, former)
+        begins = sum((s["spent"] == trial for trial in beginnings(THOROUGH)), ca.SX(0))
+        former = ca.if_else(begins > 0, NO_MARGIN, former)
     hits = ca.SX.sym("hits")
     better = margin > former
     best_margin = ca.fmax(margin, former)

@@ -119,7 +119,7 @@ class RoundsPlan:
             "RUGGED": restarts.RUGGED,
             "EARLY": going_on.EARLY,
             "VARIED": going_on.VARIED,
-            "RETURNS": going_on.RETURNS,
+            "RETURNS": going_on.most_returns(len(layouts.robot.hand_actuators)),
             "POOL": restarts.MENDED if self.mends else restarts.POOL,
             "MENDS": int(self.mends),
             "SPREAD": restarts.SPREAD,
