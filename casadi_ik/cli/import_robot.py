@@ -149,7 +149,8 @@ def _differences(robot: ArmHand, found: Imported) -> dict[str, float]:
     lines = found.written
     values: dict[str, float] = {}
     if arm is not None and lines.arm is not None:
-        values[arm.name] = largest_difference(robot, arm, q, lines.arm.locked)
+        difference = largest_difference(robot, arm, q, lines.arm.locked, carried=hand)
+        values[str(arm) if arm.name == hand.name else arm.name] = difference
     values[hand.name] = largest_difference(robot, hand, q, lines.hand.locked, arm)
     return values
 

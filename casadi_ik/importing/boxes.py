@@ -60,7 +60,8 @@ def fit_boxes(triangles: Array, most: int = 3) -> list[FittedBox]:
     while len(parts) < most:
         options = []
         for i, part in enumerate(parts):
-            for two in halves(part):
+            for below in halves(part):
+                two = part[below], part[~below]
                 pair = [box_around(one.reshape(-1, 3)) for one in two]
                 saved = found[i].volume - pair[0].volume - pair[1].volume
                 options.append((saved, i, two, pair))

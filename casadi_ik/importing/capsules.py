@@ -11,8 +11,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
+
+Rows = NDArray[np.intp]
 
 LEAST_SAVING = 0.04
 """Part of the volume that another capsule has to save, unless told."""
@@ -34,6 +37,10 @@ CORNERS = 160
 
 PIECES = 12
 """Triangles are cut until no edge is longer than this part of the mesh."""
+
+
+BLOCK, SOME = 64, 16
+"""Samples whose distances are taken at once, and which part of the points is looked at first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,21 +104,28 @@ def fit(
         show.
     """
     pieces = cut(triangles)
-    parts = [pieces]
-    found = [around(pieces.reshape(-1, 3))]
+    corners, numbers = _apart(pieces)
+    parts = [np.arange(len(pieces))]
+
+    def held(rows: NDArray[np.intp]) -> FittedCapsule:
+        apart = np.zeros(len(corners), bool)
+        apart[numbers[rows]] = True
+        return around(pieces[rows].reshape(-1, 3), corners[apart])
+
+    found = [held(parts[0])]
     inside = _inside(found[0])
     volume = 1.0
-    cuts: list[list[tuple[tuple[Array, Array], list[FittedCapsule]]] | None] = [None]
+    cuts: list[list[tuple[tuple[Rows, Rows], list[FittedCapsule]]] | None] = [None]
     while len(parts) < most:
-        options: list[tuple[float, int, tuple[Array, Array], list[FittedCapsule]]] = []
+        options: list[tuple[float, int, tuple[Rows, Rows], list[FittedCapsule]]] = []
         for i in range(len(parts)):
             rest = [one for j, one in enumerate(found) if j != i]
             if cuts[i] is None:
-                halved = halves(parts[i])
-                cuts[i] = [(two, [around(one.reshape(-1, 3)) for one in two]) for two in halved]
+                halved = [(parts[i][below], parts[i][~below]) for below in halves(pieces[parts[i]])]
+                cuts[i] = [(two, [held(one) for one in two]) for two in halved]
             for two, pair in cuts[i] or ():
-                held = np.min([one.beyond(inside) for one in (*rest, *pair)], axis=0) <= 0
-                options.append((float(held.mean()), i, two, pair))
+                within = np.min([one.beyond(inside) for one in (*rest, *pair)], axis=0) <= 0
+                options.append((float(within.mean()), i, two, pair))
         if not options:
             break
         least, i, two, pair = min(options, key=lambda option: option[0])
@@ -119,17 +133,36 @@ def fit(
             break
         volume = least
         parts[i : i + 1], found[i : i + 1], cuts[i : i + 1] = two, pair, [None, None]
-    corners = pieces.reshape(-1, 3)
     return found, excess(found, np.concatenate([corners, pieces.mean(axis=1)]))
 
 
-def around(points: Array) -> FittedCapsule:
-    """A small capsule that holds points (k, 3) [m]."""
+def _apart(pieces: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Corners (k, 3) of triangles (t, 3, 3), each once, and which (t, 3) a triangle has.
+
+    A corner is one of some six triangles; what is asked of corners takes so much less.
+    """
+    every = pieces.reshape(-1, 3)
+    order = np.lexsort(every.T)
+    rows = every[order]
+    new = np.concatenate([[True], (rows[1:] != rows[:-1]).any(axis=1)])
+    numbers = np.empty(len(every), np.intp)
+    numbers[order] = np.cumsum(new) - 1
+    return rows[new], numbers.reshape(-1, 3)
+
+
+def around(points: Array, apart: Array) -> FittedCapsule:
+    """A small capsule that holds points.
+
+    Args:
+        points: (k, 3) corners of triangles [m], as often as they have them: how they are spread
+            says which axes are tried.
+        apart: (m, 3) the same, each once.
+    """
     middle = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(CORNERS, 3))
-    picked = points[np.unique((points @ ways.T).argmax(axis=0))]
+    picked = apart[np.unique((ways @ np.ascontiguousarray(apart.T)).argmax(axis=1))]
     best, axis = _along(picked, axes)
     spread = 0.3
     for _ in range(TURNS):
@@ -138,7 +171,7 @@ def around(points: Array) -> FittedCapsule:
         if one.volume < best.volume:
             best, axis = one, way
         spread *= 0.5
-    held = best.radius + float(np.maximum(best.beyond(points), 0).max()) + 1e-9
+    held = best.radius + float(np.maximum(best.beyond(apart), 0).max()) + 1e-9
     return FittedCapsule(best.first, best.last, held)
 
 
@@ -179,8 +212,8 @@ def _inside(capsule: FittedCapsule) -> Array:
     return points[capsule.beyond(points) <= 0][:INSIDE]
 
 
-def halves(part: Array) -> list[tuple[Array, Array]]:
-    """Ways to cut triangles (t, 3, 3) in two."""
+def halves(part: Array) -> list[NDArray[np.bool_]]:
+    """Ways to cut triangles (t, 3, 3) in two: which are on one side."""
     middles = part.mean(axis=1)
     _, _, axes = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)
     found = []
@@ -189,7 +222,7 @@ def halves(part: Array) -> list[tuple[Array, Array]]:
         for share in (0.3, 0.5, 0.7):
             below = place < place.min() + share * np.ptp(place)
             if 4 <= below.sum() <= len(part) - 4:
-                found.append((part[below], part[~below]))
+                found.append(below)
     return found
 
 
@@ -227,10 +260,22 @@ def excess(shapes: Sequence[Holder], points: Array) -> float:
     skin = np.concatenate([one.skin() for one in shapes])
     inside = np.min([one.beyond(skin) for one in shapes], axis=0) < -1e-6
     skin = skin[~inside]
-    worst = 0.0
     squares = (points**2).sum(axis=1)
-    for i in range(0, len(skin), 64):
-        block = skin[i : i + 64]
-        apart = (block**2).sum(axis=1)[:, None] - 2 * block @ points.T + squares
-        worst = max(worst, float(np.sqrt(np.maximum(apart.min(axis=1), 0).max())))
-    return worst
+    # No sample is farther from all points than from some: those that these say are near are done.
+    most = _squared(skin, points[::SOME], squares[::SOME])
+    worst = 0.0
+    for block in np.split(np.argsort(-most), np.arange(BLOCK, len(skin), BLOCK)):
+        if not len(block) or most[block[0]] <= worst:
+            break
+        worst = max(worst, float(_squared(skin[block], points, squares).max()))
+    return float(np.sqrt(worst))
+
+
+def _squared(samples: Array, points: Array, squares: Array) -> Array:
+    """(k,) squared distances of samples (k, 3) from the nearest of points [m^2]."""
+    least = np.empty(len(samples))
+    turned = np.ascontiguousarray(-2 * points.T)
+    for i in range(0, len(samples), BLOCK):
+        block = samples[i : i + BLOCK]
+        least[i : i + BLOCK] = (block @ turned + squares).min(axis=1) + (block**2).sum(axis=1)
+    return np.maximum(least, 0)

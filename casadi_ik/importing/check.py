@@ -11,6 +11,7 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.importing.mounted import hand_links
 from casadi_ik.robots.part import PREFIX
 from casadi_ik.robots.robot_files.mjcf_file import joint_name, mujoco_model
 from casadi_ik.robots.robot_files.read import read_tree, robot_element
@@ -43,6 +44,7 @@ def largest_difference(
     q: Array,
     locked: Mapping[str, float] | None = None,
     beside: Path | None = None,
+    carried: Path | None = None,
 ) -> float:
     """How far the links of a robot are from where its file's library has them.
 
@@ -52,6 +54,8 @@ def largest_difference(
         q: (k, n) positions of the actuators [rad or m].
         locked: Joints that the description holds, and where.
         beside: The file of the arm that this file's hand is on, whose names go before.
+        carried: The file of the hand that is on this file's arm: a name that it has too may be of
+            a link beyond the arm's tip, which the robot does not have.
 
     Returns:
         The largest entry of the difference of any two poses, relative to the first link of the
@@ -65,6 +69,9 @@ def largest_difference(
     known = oracle(path)
     taken = set() if beside is None else _names(read_tree(beside))
     links = {link: _ours(link, robot.description.links, taken) for link in tree.links}
+    if beside is not None or carried is not None:
+        hand = hand_links(robot.description)
+        links = {link: ours for link, ours in links.items() if (ours in hand) == (carried is None)}
     joints = {
         one.name: _ours(one.name, robot.description.joint_names, taken) for one in tree.joints
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from casadi_ik.importing.fitted import fitted
+from casadi_ik.importing.mounted import hand_links
 from casadi_ik.importing.surfaces import Surface, checked_surfaces
 from casadi_ik.importing.touching import may_touch
 from casadi_ik.robots.collision import Touching
@@ -30,12 +31,17 @@ def robot_shapes(
     simple: dict[str, list[ShapeEntry]] = {}
     notes: list[str] = []
     taken: set[str] = set()
+    hand = hand_links(robot)
     for file in files:
         if file is None:
             continue
         tree = read_tree(file)
         ours = {link: _ours(link, robot.links, taken) for link in tree.links}
-        wanted = {link: name for link, name in ours.items() if name in robot.links}
+        wanted = {
+            link: name
+            for link, name in ours.items()
+            if name in robot.links and (None in files or (name in hand) == (file is files[1]))
+        }
         found, said = checked_surfaces(file, wanted)
         surfaces |= {wanted[link]: surface for link, surface in found.items()}
         entries = tree.shapes.entries

@@ -14,7 +14,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.reading import Frame, convert, frame_matrix
 from casadi_ik.files.units import in_si
-from casadi_ik.importing import imported
+from casadi_ik.importing import capsules, imported
 from casadi_ik.importing.shape_lines import collision_lines
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.robots import load_description
@@ -153,3 +153,23 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     assert entry.links["b"] == shapes["b"]
     assert entry.touching[0].depth == 0.003
     assert len(capsules_of(entry.links["b"][0])) == 1
+
+
+def test_how_far_capsules_stand_out_is_found_by_looking_at_few_points():
+    """The same as every sample against every point, and every corner held."""
+    rng = np.random.default_rng(0)
+    turned, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    low, high = np.array([-0.05, -0.02, -0.1]), np.array([0.05, 0.03, 0.1])
+    corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)]) @ turned
+    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6)]
+    triangles = corners[np.array([*faces, (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)])]
+    found, beyond = capsules.fit(triangles, 3)
+    points = capsules.cut(triangles).reshape(-1, 3)
+    held = np.min([one.beyond(points) for one in found], axis=0)
+    assert held.max() <= 1e-12
+    skin = np.concatenate([one.skin() for one in found])
+    skin = skin[np.min([one.beyond(skin) for one in found], axis=0) >= -1e-6]
+    every = np.concatenate([points, capsules.cut(triangles).mean(axis=1)])
+    nearest = np.linalg.norm(skin[:, None] - every, axis=2).min(axis=1)
+    assert beyond == pytest.approx(nearest.max(), abs=1e-9)
+    assert len(found) > 1

@@ -9,6 +9,7 @@ from imported_files import FINGERS, arm, describe, hand, joint, link, urdf
 import casadi_ik as ik
 from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.importing.check import largest_difference
+from casadi_ik.importing.robot_shapes import robot_shapes
 
 MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"
 
@@ -24,9 +25,9 @@ def both(tmp_path, arm_text="", hand_text="", more=MOUNT, hand_changes=(), joint
     return ik.load_robot(path)
 
 
-def check(robot, path, rng, locked=None, beside=None):
+def check(robot, path, rng, locked=None, beside=None, carried=None):
     q = robot.random(rng, 5)
-    assert largest_difference(robot, path, q, locked, beside) < 1e-12
+    assert largest_difference(robot, path, q, locked, beside, carried) < 1e-12
     assert (robot.beyond_limits(q) <= 1e-9).all()
 
 
@@ -52,6 +53,22 @@ def test_clashing_joints_of_the_hand_get_a_prefix(tmp_path, rng):
     assert "hand_joint_1" in robot.actuators
     # Its follower found it again, and pinocchio agrees.
     check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
+
+
+def test_a_link_beyond_the_tip_may_be_called_like_one_of_the_hand(tmp_path, rng):
+    """An arm's file that ends in a `right_hand`, with which the hand's begins."""
+    path, box = arm(tmp_path, 6), '<geometry><box size="0.3 0.2 0.1"/></geometry>'
+    more = f'<link name="left_tip"><collision>{box}</collision></link>'
+    more += joint("wrist_plate", "flange", "left_tip", "fixed", xyz="0.3 0 0", rpy="0 1 0")
+    path.write_text(path.read_text().replace("</robot>", f"{more}</robot>"))
+    hand_path = hand(tmp_path)
+    text = f"arm: {{file: arm.urdf, tip: flange}}\nhand: {{file: hand.urdf}}\n{MOUNT}"
+    robot = ik.load_robot(describe(tmp_path, text))
+    assert "left_tip" in robot.description.links
+    check(robot, path, rng, carried=hand_path)
+    check(robot, hand_path, rng, beside=path)
+    shapes, _, _ = robot_shapes(robot.description, (path, hand_path))
+    assert "left_tip" not in shapes
 
 
 def test_one_file_with_its_palm(tmp_path, rng):
