@@ -1,4 +1,7 @@
-"""Whether all links of the built site lead somewhere: `python docs/building/links.py DIR`."""
+"""Whether all links of the built site lead somewhere, and all text was read as what it is.
+
+`python docs/building/links.py DIR`
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,9 @@ from urllib.parse import unquote
 
 LINK = re.compile(r"""<(?:a|img|link|script|source)\b[^>]*?\b(?:href|src)="([^"]+)\"""")
 NAMED = re.compile(r"""\b(?:id|name)="([^"]+)\"""")
+
+RAW = re.compile(r"<p>[^<]*?(\|\s*---\s*\||\$[^$<]+\$)")
+"""A table or a formula in Markdown that stands in a paragraph as it was written."""
 
 
 @cache
@@ -33,5 +39,13 @@ def broken(folder: Path) -> Iterator[str]:
                 yield f"{page.relative_to(folder)}: {link}: no such place"
 
 
+def unread(folder: Path) -> Iterator[str]:
+    """Tables and formulas that stand on a page as they were written, one line each."""
+    for page in sorted(folder.rglob("*.html")):
+        for found in RAW.findall(page.read_text(encoding="utf-8")):
+            yield f"{page.relative_to(folder)}: {found}: is not drawn"
+
+
 if __name__ == "__main__":
-    sys.exit("\n".join(broken(Path(sys.argv[1]).resolve())) or 0)
+    site = Path(sys.argv[1]).resolve()
+    sys.exit("\n".join([*broken(site), *unread(site)]) or 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 
-from building.links import broken
+from building.links import broken, unread
 
 SCRIPT = Path(__file__).parents[2] / "docs" / "building" / "links.py"
 
@@ -23,6 +23,17 @@ def test_broken_links_are_named(tmp_path: Path) -> None:
     assert sorted(broken(tmp_path)) == [
         "a.html: deep/b.html#nowhere: no such place",
         "a.html: gone.png: no such file",
+    ]
+
+
+def test_what_stands_as_it_was_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text(
+        "<p>| solves | share |\n| --- | --- |\n| 12 | 67 % |</p><p>of $H_p$ alone</p>"
+        "<pre>| --- | $H_p$</pre><p>5 $ and no more</p><p><code>$x$</code></p>"
+    )
+    assert list(unread(tmp_path)) == [
+        "a.html: | --- |: is not drawn",
+        "a.html: $H_p$: is not drawn",
     ]
 
 

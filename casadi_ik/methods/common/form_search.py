@@ -64,8 +64,9 @@ TRIES = 3
 PARTS = 4
 """Parts of the range that are searched one after the other."""
 
-WINDOWS = 8
-"""Ways to go through the parts: which comes first, and the positions between the others' ones."""
+WINDOWS, GOLDEN = 32, (np.sqrt(5) - 1) / 2
+"""Ways to go through the parts, and by how much the positions of the next way are moved on [their
+distance]: with eight ways 3 of 12,000 poses of a Panda near limits were found in none."""
 
 THOROUGH = (
     *PLACEMENT,
@@ -263,7 +264,7 @@ def _positions(
 ) -> list[Expr]:
     """Positions of the swept joint that a trial looks at."""
     middle, half = (lower + upper) / 2, ca.fmin((upper - lower) / 2, np.pi)
-    between = (ca.floor(window / PARTS) + 0.5) * PARTS / WINDOWS
+    between = ca.fmod(GOLDEN * window, 1.0)
     centre, width = middle, half
     for i, look in enumerate(looks):
         inside, reach, by = middle, half, ca.SX(look.by)
