@@ -13,6 +13,7 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.problems import Problems, target_arrays
 from casadi_ik.problem.status import Phase
 from casadi_ik.solving.alternatives.form_branches import FormBranches
+from casadi_ik.solving.alternatives.passing_branches import branches_of
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 from casadi_ik.symbolic.closed_arms.recognise import closed_form
@@ -36,7 +37,7 @@ def solver(panda) -> ik.Solver:
     return ik.Solver(panda, tolerance=EXACT)
 
 
-@pytest.mark.parametrize("arm", [*SINGLE, "kinova_gen3"])
+@pytest.mark.parametrize("arm", [*SINGLE, "kinova_gen3", "xarm6", "sawyer"])
 def test_the_arm_follows_at_once(arm):
     """Six joints in one evaluation; an arm that is only nearly of its form is refined."""
     robot = robot_of(arm)
@@ -134,9 +135,12 @@ def test_what_is_near_a_panda_is_found(panda, solver):
     assert np.median(near_by) < 0.5 * np.median(far_by)
 
 
-def test_all_its_stages_go_side_by_side(panda):
-    method = HandFirstMethod(panda.description, HandFirstParameters())
-    assert "lanes_one_by_one(&alone" not in lanes_source(method.graph.function, "", 4)
+@pytest.mark.parametrize(("arm", "alone"), [("panda", 0), ("sawyer", 1)])
+def test_all_its_stages_go_side_by_side(arm, alone):
+    """But for the table that the search of later rounds begins with."""
+    method = HandFirstMethod(robot_of(arm).description, HandFirstParameters())
+    source = lanes_source(method.graph.function, "", 4)
+    assert source.count("lanes_one_by_one(&alone") == alone
 
 
 @pytest.mark.parametrize("arm", ["panda", "kinova_gen3", "xarm7"])
@@ -179,6 +183,22 @@ def test_an_arm_of_six_joints_has_single_branches(arm):
         palm = robot.palm(q)
         found = branches.find(palm, robot.lower[columns], robot.upper[columns])
         assert all(branch.swivel is None for branch in found)
+        arms = [branches.arms(palm, branch, np.zeros(1))[0] for branch in found]
+        apart = [np.abs(np.angle(np.exp(1j * (a - q[columns])))).max() for a in arms]
+        assert min(apart) < 1e-6
+
+
+def test_an_arm_off_its_sphere_has_its_arms_listed():
+    """An xArm 6: the arm that a palm pose was made with, turned by whole turns, is among them."""
+    robot = robot_of("xarm6")
+    form = closed_form(robot.description)
+    branches = branches_of(form, compiled=False)
+    columns = list(robot.description.arm_actuators)
+    lower, upper = robot.lower[columns], robot.upper[columns]
+    for q in robot.random(np.random.default_rng(2), 10):
+        palm = robot.palm(q)
+        found = branches.find(palm, lower, upper)
+        assert len(set(found)) == len(found)
         arms = [branches.arms(palm, branch, np.zeros(1))[0] for branch in found]
         apart = [np.abs(np.angle(np.exp(1j * (a - q[columns])))).max() for a in arms]
         assert min(apart) < 1e-6
