@@ -39,8 +39,9 @@ def test_robots(run: Command, robot: ik.ArmHand) -> None:
     words = done.out.replace(",", " ").split()
     for name in (robot.name, *robot.fingers, *robot.actuators, "Kermani"):
         assert name in words
-    # How an arm is solved: an S-R-S arm, a swept one, one of three parallel axes, and one searched.
-    for word in ("shoulder", "swept", "parallel", "searched"):
+    # How an arm is solved: an S-R-S arm, a swept one, one of three parallel axes, one nearly of a
+    # form, and one whose last axis passes by its wrist.
+    for word in ("shoulder", "swept", "parallel", "nearly", "off"):
         assert word in words
 
 

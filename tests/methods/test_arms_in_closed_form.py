@@ -13,6 +13,7 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.problems import Problems, target_arrays
 from casadi_ik.problem.status import Phase
 from casadi_ik.solving.alternatives.form_branches import FormBranches
+from casadi_ik.solving.alternatives.passing_branches import branches_of
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 from casadi_ik.symbolic.closed_arms.recognise import closed_form
@@ -36,7 +37,7 @@ def solver(panda) -> ik.Solver:
     return ik.Solver(panda, tolerance=EXACT)
 
 
-@pytest.mark.parametrize("arm", [*SINGLE, "kinova_gen3"])
+@pytest.mark.parametrize("arm", [*SINGLE, "kinova_gen3", "xarm6", "sawyer"])
 def test_the_arm_follows_at_once(arm):
     """Six joints in one evaluation; an arm that is only nearly of its form is refined."""
     robot = robot_of(arm)
@@ -71,6 +72,56 @@ def test_targets_of_a_panda_with_a_joint_next_to_its_limit(panda, solver):
     assert solver.solve_batch(*panda.contacts(q)).success.all()
 
 
+def held_hand(robot):
+    """A hand that cannot move: where the palm has to be is known, and the arm has to follow."""
+    description = robot.description
+    hand = list(description.hand_actuators)
+    middle = (robot.lower + robot.upper)[hand] / 2
+    return dict(zip((description.actuators[i].name for i in hand), middle.tolist(), strict=True))
+
+
+def with_hand(robot, arms, hand):
+    return np.concatenate([arms, np.tile(list(hand.values()), (len(arms), 1))], axis=1)
+
+
+def test_short_stretches_of_the_swept_joint_are_found(panda, solver):
+    """With six of seven joints next to their limits some are a few ten-thousandths long."""
+    hand = held_hand(panda)
+    one = [0.12332358, -1.75856779, 2.88167321, -0.95126358, -2.89537776, -0.01444861, 2.88507954]
+    many = near_limits(panda, np.random.default_rng(12), 1000)[:, :7]
+    q = with_hand(panda, np.concatenate([[one], many]), hand)
+    batch = solver.solve_batch(*panda.contacts(q), fixed=hand)
+    assert np.flatnonzero(~batch.success).tolist() == []
+    # What the first round misses, most of the second's first trials find.
+    again = batch.restarts[batch.restarts > 0]
+    assert len(again) > 3
+    assert np.median(again) == HandFirstParameters().candidates
+
+
+def test_a_straight_arm_that_is_nearly_in_closed_form():
+    """There Newton's steps lead nowhere from the ideal arm: it is searched for."""
+    robot = robot_of("kinova_gen3")
+    hand = held_hand(robot)
+    arms = [
+        [
+            -2.25590562,
+            1.11213278,
+            0.174661621,
+            -3.82220308e-3,
+            4.56551379,
+            -1.40069069,
+            -2.57414118,
+        ],
+        [-5.8510545, -1.55882184, 0.104356153, 0.0169097239, -5.75443661, 2.06294144, -4.37043832],
+    ]
+    q = with_hand(robot, np.array(arms), hand)
+    method = HandFirstMethod(robot.description, HandFirstParameters(), compiled=False)
+    contacts = target_arrays(*robot.contacts(q), len(robot.fingers))
+    fixed = np.concatenate([np.full(7, np.nan), list(hand.values())])
+    asked = Problems(*contacts, EXACT, True, fixed=fixed)
+    assert Engine(robot, method).solve(asked, Run()).success.all()
+
+
 def test_what_is_near_a_panda_is_found(panda, solver):
     q = panda.random(np.random.default_rng(4), 200)
     start = np.clip(
@@ -84,9 +135,12 @@ def test_what_is_near_a_panda_is_found(panda, solver):
     assert np.median(near_by) < 0.5 * np.median(far_by)
 
 
-def test_all_its_stages_go_side_by_side(panda):
-    method = HandFirstMethod(panda.description, HandFirstParameters())
-    assert "lanes_one_by_one(&alone" not in lanes_source(method.graph.function, "", 4)
+@pytest.mark.parametrize(("arm", "alone"), [("panda", 0), ("sawyer", 1)])
+def test_all_its_stages_go_side_by_side(arm, alone):
+    """But for the table that the search of later rounds begins with."""
+    method = HandFirstMethod(robot_of(arm).description, HandFirstParameters())
+    source = lanes_source(method.graph.function, "", 4)
+    assert source.count("lanes_one_by_one(&alone") == alone
 
 
 @pytest.mark.parametrize("arm", ["panda", "kinova_gen3", "xarm7"])
@@ -129,6 +183,22 @@ def test_an_arm_of_six_joints_has_single_branches(arm):
         palm = robot.palm(q)
         found = branches.find(palm, robot.lower[columns], robot.upper[columns])
         assert all(branch.swivel is None for branch in found)
+        arms = [branches.arms(palm, branch, np.zeros(1))[0] for branch in found]
+        apart = [np.abs(np.angle(np.exp(1j * (a - q[columns])))).max() for a in arms]
+        assert min(apart) < 1e-6
+
+
+def test_an_arm_off_its_sphere_has_its_arms_listed():
+    """An xArm 6: the arm that a palm pose was made with, turned by whole turns, is among them."""
+    robot = robot_of("xarm6")
+    form = closed_form(robot.description)
+    branches = branches_of(form, compiled=False)
+    columns = list(robot.description.arm_actuators)
+    lower, upper = robot.lower[columns], robot.upper[columns]
+    for q in robot.random(np.random.default_rng(2), 10):
+        palm = robot.palm(q)
+        found = branches.find(palm, lower, upper)
+        assert len(set(found)) == len(found)
         arms = [branches.arms(palm, branch, np.zeros(1))[0] for branch in found]
         apart = [np.abs(np.angle(np.exp(1j * (a - q[columns])))).max() for a in arms]
         assert min(apart) < 1e-6

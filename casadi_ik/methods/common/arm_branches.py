@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 
 from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.methods.common.passing_roots import passing_at
 from casadi_ik.symbolic.closed_arms.form import SIGNS, ClosedForm
 from casadi_ik.symbolic.closed_arms.held import HeldArm
+from casadi_ik.symbolic.closed_arms.passing import ROOTS, PassingArm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.srs_arm import SrsArm, at_angle, euler_angles, limit_roots, swivel
 from casadi_ik.symbolic.subexpressions import shared
@@ -52,12 +56,15 @@ def arm_edges(arm: SrsArm) -> ca.Function:
 
 
 def form_at(form: ClosedForm) -> ca.Function:
-    """The eight arms at a position of the swept joint.
+    """The arms at a position of the swept joint, eight of them unless branches have several roots.
 
     Returns:
         (rotation (3, 3), origin (3, 1) [m], position [rad]) -> configurations (8, n) [rad], a row
         for each of `closed_arms.form.SIGNS`, and the slack (8, 1) of each: >= 0 within reach.
+        Of a `PassingArm` there are `ROOTS` rows for each.
     """
+    if isinstance(form, PassingArm):
+        return passing_at(form)
     inputs, palm, position = _inputs()
     bends = form.bends(palm, position)
     arms = ca.horzcat(*(arm for bend in bends for arm in bend.arms())).T
@@ -91,6 +98,11 @@ def places_of(arm: SrsArm | ClosedForm | HeldArm) -> int:
     return 2 if isinstance(arm, SrsArm) else 1
 
 
+def rows_of(arm: ClosedForm | HeldArm) -> int:
+    """How many arms there are at a place."""
+    return len(SIGNS) * (ROOTS if isinstance(arm, PassingArm) else 1)
+
+
 def arms_graph(arm: SrsArm | ClosedForm | HeldArm, name: str, recipe: str) -> FunctionGraph:
     """All arms at a place of what the arm is free in, of one vector.
 
@@ -106,11 +118,12 @@ def arms_graph(arm: SrsArm | ClosedForm | HeldArm, name: str, recipe: str) -> Fu
         slack of each: >= 0 within reach.
     """
     alone = isinstance(arm, SrsArm)
-    sides, joints = (len(SIDES), 7) if isinstance(arm, SrsArm) else (len(SIGNS), len(arm.screws))
+    sides, joints = (len(SIDES), 7) if isinstance(arm, SrsArm) else (rows_of(arm), len(arm.screws))
     size = 12 + places_of(arm)
 
     def build() -> ca.Function:
-        x = ca.SX.sym("x", size)
+        symbols: Any = ca.MX if isinstance(arm, PassingArm) else ca.SX
+        x = symbols.sym("x", size)
         palm = [ca.reshape(x[:9], 3, 3).T, x[9:12]]
         if isinstance(arm, HeldArm):
             arms, slack = held_at(arm)(*palm, x[12:])
@@ -118,7 +131,9 @@ def arms_graph(arm: SrsArm | ClosedForm | HeldArm, name: str, recipe: str) -> Fu
             at = arm_at(arm) if isinstance(arm, SrsArm) else form_at(arm)
             arms, slack = at(*palm, *ca.vertsplit(x[12:]))
         slacks = ca.repmat(slack, sides, 1) if alone else slack
-        return ca.Function(name, [x], shared(ca.vertcat(ca.vec(arms.T), slacks)), ["x"], ["arms"])
+        both = ca.vertcat(ca.vec(arms.T), slacks)
+        outputs = [both] if isinstance(arm, PassingArm) else shared(both)
+        return ca.Function(name, [x], outputs, ["x"], ["arms"])
 
     outputs = ((sides * (joints + 1), 1),)
     return FunctionGraph(name, build, {"x": (size, 1)}, outputs, recipe)

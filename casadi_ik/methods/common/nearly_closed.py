@@ -19,15 +19,16 @@ from casadi_ik.symbolic.subexpressions import shared
 RIGHT = 1e-12
 """What is left [m and rad] when an arm is right to rounding."""
 
-CLOSE = 1e-3
-"""An arm that is off by more [m and rad] is searched for where its form has found none."""
-
 
 def is_searched_later(arm: ArmForm | HeldArm) -> bool:
-    """Whether rounds after the first search for the arm."""
+    """Whether rounds after the first search for the arm.
+
+    So do those of every arm that its form is a little off from: near a singularity Newton's steps
+    lead from the ideal arm nowhere near.
+    """
     if isinstance(arm, SrsArm):
         return False
-    return isinstance(arm, HeldArm) or arm.off > CLOSE
+    return isinstance(arm, HeldArm) or not arm.exact
 
 
 def steps(off: float) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.kernels.swing_kernel import ArmPlaces
-from casadi_ik.methods.common.arm_branches import SIDES
+from casadi_ik.methods.common.arm_branches import SIDES, rows_of
 from casadi_ik.methods.common.arm_placement import ALLOWED
 from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.symbolic.closed_arms.form import SIGNS
@@ -40,7 +40,7 @@ def arm_places(robot: ArmHand, arm: ArmForm | HeldArm) -> ArmPlaces:
     sides, first, last = len(SIDES), 0.0, TURN
     swept = True
     if not isinstance(arm, SrsArm):
-        sides, swept = len(SIGNS), arm.swept_joint is not None
+        sides, swept = rows_of(arm), arm.swept_joint is not None
         if arm.swept_joint is not None:
             first, last = _swept(robot, columns[arm.swept_joint])
     step = (last - first) / SWIVELS

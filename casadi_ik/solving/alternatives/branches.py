@@ -42,6 +42,8 @@ class ArmBranch:
             None for an arm without one. S-R-S: the angle of the elbow about the line from shoulder
             to wrist, a whole turn if none is out. Other arms of seven joints: the position of the
             joint that is swept, see `ClosedForm.swept_joint`.
+        root: Number of the arm among those of the same signs, at each position of a swept joint:
+            a wrist whose last axis passes by it may have several. 0 of other arms.
 
     Example:
         >>> branch = solver.solve_all(grasp, limit=1)[0].branch
@@ -53,6 +55,7 @@ class ArmBranch:
     elbow: int
     wrist: int
     swivel: tuple[float, float] | None
+    root: int = 0
 
 
 class Branches(Protocol):

@@ -22,7 +22,7 @@ from casadi_ik.problem.preference import CLEARANCE, preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, Branches, best_arm
-from casadi_ik.solving.alternatives.form_branches import branches_of
+from casadi_ik.solving.alternatives.passing_branches import PassingBranches, branches_of
 from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.measures import manipulability
@@ -224,15 +224,20 @@ class AlternativeFinder:
             whole[:, self._arm] = arms
             return limits.clip(whole)
 
+        def valued(arms: Array) -> Array:
+            return self._valued(with_arm(arms), q0, prefer, around, True)
+
         found = []
+        if isinstance(self._branches, PassingBranches):
+            best = self._branches.best(palm, lower, upper, valued)
+            found = [_Found(with_arm(arm[None])[0], posture, *branch) for arm, *branch in best]
+            # A stretch may be shorter than the positions are apart.
+            found += [_Found(arm, posture) for arm in self._searched(problems, q, seed)]
+            parts = self._parts(np.stack([item.q for item in found]), self._arm)
+            return [found[i] for i in _distinct(parts, DISTINCT)]
         for branch in self._branches.find(palm, lower, upper):
             stop_if_cancelled()
-            arm, swivel = best_arm(
-                self._branches,
-                palm,
-                branch,
-                lambda arms: self._valued(with_arm(arms), q0, prefer, around, True),
-            )
+            arm, swivel = best_arm(self._branches, palm, branch, valued)
             found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
         return self._exact(problems, found) or [_Found(q, posture)]
 

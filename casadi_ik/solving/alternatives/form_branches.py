@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.methods.common.arm_branches import form_at
+from casadi_ik.methods.common.arm_branches import form_at, rows_of
 from casadi_ik.methods.common.arm_placement import ALLOWED
-from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches, Branches
+from casadi_ik.solving.alternatives.branches import ArmBranch
 from casadi_ik.symbolic.closed_arms.form import SIGNS, ClosedForm
-from casadi_ik.symbolic.closed_arms.recognise import ArmForm
-from casadi_ik.symbolic.srs_arm import SrsArm
 
 POSITIONS = 361
 """Positions of the swept joint looked at along its range."""
@@ -50,7 +48,7 @@ class FormBranches:
         grid = np.linspace(middle - half, middle + half, POSITIONS)
         margins = self._margins(palm, grid, lower, upper)
         found = []
-        for side in range(len(SIGNS)):
+        for side in range(rows_of(self._form)):
 
             def inside(positions: Array, side: int = side) -> NDArray[np.bool_]:
                 return self._margins(palm, positions, lower, upper)[:, side] >= ALLOWED
@@ -72,14 +70,19 @@ class FormBranches:
         """Configurations (k, n) [rad] of a branch at positions (k,) of the swept joint."""
         signs = tuple(getattr(branch, part) for part in self._form.parts)
         arms, _ = self._at(palm[:3, :3], palm[:3, 3], swivels)
-        return arms[:, SIGNS.index(signs)]
+        return arms[:, SIGNS.index(signs) * self._roots + branch.root]
 
     def _branch(self, side: int, stretch: tuple[float, float] | None) -> ArmBranch:
-        signs = dict(zip(self._form.parts, SIGNS[side], strict=True))
-        return ArmBranch(**signs, swivel=stretch)
+        number, root = divmod(side, self._roots)
+        signs = dict(zip(self._form.parts, SIGNS[number], strict=True))
+        return ArmBranch(**signs, swivel=stretch, root=root)
+
+    @property
+    def _roots(self) -> int:
+        return rows_of(self._form) // len(SIGNS)
 
     def _margins(self, palm: Array, positions: Array, lower: Array, upper: Array) -> Array:
-        """(k, 8) of every branch; the slack where it is out of reach."""
+        """(k, 8) or more, of every branch; the slack where it is out of reach."""
         arms, slack = self._at(palm[:3, :3], palm[:3, 3], positions)
         margin = np.minimum(arms - lower, upper - arms).min(axis=2)
         slack = slack.reshape(margin.shape)
@@ -102,13 +105,6 @@ class FormBranches:
             low, high = np.split(tried, 2)
             first, last = np.where(low < high, near, first), np.where(low < high, last, far)
         return (first + last) / 2
-
-
-def branches_of(form: ArmForm, compiled: bool = True) -> Branches:
-    """The branches of an arm in closed form."""
-    if isinstance(form, SrsArm):
-        return ArmBranches(form, compiled)
-    return FormBranches(form, compiled)
 
 
 def _crossings(

@@ -110,16 +110,22 @@ class ClosedForm(ABC):
             palm: Desired pose of the palm, base frame.
             swept: Position of the swept joint [rad]; not looked at if there is none.
         """
-        motion = self.screws.motion(palm)
+        moved = self.left(palm, swept)
         if not self.swept:
-            return self._bends(motion)
-        back = Turn(ca.cos(swept), -ca.sin(swept)).about(self.screws.axes[0])
-        point = ca.DM(self.screws.points[0])
-        moved = Pose(back @ motion.rotation, point + back @ (motion.origin - point))
+            return self._bends(moved)
         joint = self.screws.joints[0]
         return [
             Bend(bend.joints | {joint: swept}, bend.ends, bend.slack) for bend in self._bends(moved)
         ]
+
+    def left(self, palm: Pose, swept: Expr) -> Pose:
+        """The motion for a palm pose that the swept joint leaves to the other six."""
+        motion = self.screws.motion(palm)
+        if not self.swept:
+            return motion
+        back = Turn(ca.cos(swept), -ca.sin(swept)).about(self.screws.axes[0])
+        point = ca.DM(self.screws.points[0])
+        return Pose(back @ motion.rotation, point + back @ (motion.origin - point))
 
     def angle(self, place: int, turn: Turn) -> dict[int, Expr]:
         """The angle of a screw's joint in the turn centred on its range."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.closed_arms.form import ClosedForm
 from casadi_ik.symbolic.closed_arms.held import held_arm
+from casadi_ik.symbolic.closed_arms.passing import PassingArm
 from casadi_ik.symbolic.closed_arms.recognise import arm_form
 from casadi_ik.symbolic.srs_arm import SrsArm
 
@@ -30,4 +31,4 @@ def form_in_words(robot: RobotDescription) -> str:
 
 
 def _words(form: ClosedForm) -> str:
-    return form.kind if form.exact else f"nearly {form.kind}"
+    return form.kind if form.exact or isinstance(form, PassingArm) else f"nearly {form.kind}"

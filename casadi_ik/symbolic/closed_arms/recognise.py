@@ -11,8 +11,9 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.closed_arms.form import ClosedForm, SphericalEnd
+from casadi_ik.symbolic.closed_arms.form import EXACT, ClosedForm, SphericalEnd
 from casadi_ik.symbolic.closed_arms.parallel import ParallelTriple
+from casadi_ik.symbolic.closed_arms.passing import PassingArm
 from casadi_ik.symbolic.closed_arms.screws import (
     Screws,
     arm_screws,
@@ -20,7 +21,7 @@ from casadi_ik.symbolic.closed_arms.screws import (
     meeting_point,
     obliqueness,
 )
-from casadi_ik.symbolic.closed_arms.spherical import MeetingAxes, ParallelPair
+from casadi_ik.symbolic.closed_arms.spherical import MeetingAxes, ParallelPair, SphericalArm
 from casadi_ik.symbolic.srs_arm import SrsArm, srs_arm
 
 NEAR = 1e-2
@@ -28,6 +29,9 @@ NEAR = 1e-2
 
 APART = 1e-2
 """Links [m] and angles [rad] below which an arm is too degenerate to be solved like this."""
+
+LEFT = 1e-3
+"""How far [m and rad] the search for the turn of a joint off a sphere may end from it."""
 
 
 ArmForm: TypeAlias = SrsArm | ClosedForm
@@ -50,11 +54,19 @@ def closed_form(robot: RobotDescription) -> ClosedForm:
     Raises:
         UnsupportedError: None is known for it; the message says what was looked for.
     """
-    screws = arm_screws(robot)
-    found = recognised(screws)
+    return form_of_screws(robot.name, arm_screws(robot))
+
+
+def form_of_screws(name: str, screws: Screws) -> ClosedForm:
+    """The same of its screws.
+
+    Raises:
+        UnsupportedError: None is known.
+    """
+    found = recognised(screws) or passing(screws)
     if found is None:
         raise UnsupportedError(
-            f"robot {robot.name!r}: the arm has no closed form: found no three axes that meet at "
+            f"robot {name!r}: the arm has no closed form: found no three axes that meet at "
             "one of its ends, with two more that meet or are parallel, nor three parallel ones"
         )
     return found
@@ -77,7 +89,27 @@ def recognised(screws: Screws) -> ClosedForm | None:
     return min(found, key=lambda form: 0.0 if form.exact else form.off, default=None)
 
 
-def _meeting(screws: Screws, swept: bool) -> ClosedForm | None:
+def passing(screws: Screws) -> PassingArm | None:
+    """The form of a chain whose last axis passes by where the two before it meet, or None."""
+    if len(screws) not in (6, 7):
+        return None
+    swept, found = len(screws) == 7, []
+    for chain in (screws, screws.reversed()):
+        *_, fifth, sixth = _places(swept)
+        point, passes = meeting_point(chain, (fifth - 1, fifth))
+        if passes > EXACT:
+            continue
+        away, axis = chain.points[sixth] - point, chain.axes[sixth]
+        aside = away - axis * (axis @ away)
+        beside = _through(chain, (sixth,), point)
+        for recognise in (_meeting, _parallel_pair):
+            ideal = recognise(beside, swept)
+            if ideal is not None and ideal.exact:
+                found.append(PassingArm(chain, swept, LEFT, ideal, aside))
+    return min(found, key=lambda form: float(np.linalg.norm(form.aside)), default=None)
+
+
+def _meeting(screws: Screws, swept: bool) -> SphericalArm | None:
     first, second, third, *_ = _places(swept)
     end = _spherical_end(screws, swept)
     if end is None or divergence(screws, first, second) < APART:
@@ -92,7 +124,7 @@ def _meeting(screws: Screws, swept: bool) -> ClosedForm | None:
     return MeetingAxes(screws, swept, max(off, passes), sphere, shoulder)
 
 
-def _parallel_pair(screws: Screws, swept: bool) -> ClosedForm | None:
+def _parallel_pair(screws: Screws, swept: bool) -> SphericalArm | None:
     first, second, third, *_ = _places(swept)
     end = _spherical_end(screws, swept)
     if end is None or divergence(screws, first, second) < APART:

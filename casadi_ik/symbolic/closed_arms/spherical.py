@@ -6,7 +6,10 @@ if the second and third are parallel; then the last three make the rotation that
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -21,6 +24,9 @@ from casadi_ik.symbolic.closed_arms.turns import (
 )
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr, safe_norm
+
+Signs: TypeAlias = tuple[Expr, Expr]
+"""First and second sign of a bend."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +44,21 @@ class SphericalArm(ClosedForm):
         """Where the sphere is, and which joint is swept."""
         sphere = f"spherical {'shoulder' if self.screws.reverse else 'wrist'}"
         return f"{sphere}, joint {self.screws.joints[0] + 1} swept" if self.swept else sphere
+
+    @abstractmethod
+    def bent(self, motion: Pose, signs: Signs | None) -> list[Bend]:
+        """The four bends for a motion of the six, or that of two signs (1 or -1)."""
+
+    @abstractmethod
+    def beyond_reach(self, motion: Pose, lower: Expr, upper: Expr) -> Expr:
+        """`beyond` for a motion of all screws."""
+
+    def beyond(self, palm: Pose, lower: Expr, upper: Expr) -> Expr:
+        """By where the sphere's point has to be."""
+        return self.beyond_reach(self.screws.motion(palm), lower, upper)
+
+    def _bends(self, motion: Pose) -> list[Bend]:
+        return self.bent(motion, None)
 
     def _base(self, joints: dict[int, Expr], turns: list[Turn], motion: Pose, slack: Expr) -> Bend:
         """A bend of the first three screws, and what they leave to the sphere."""
@@ -89,7 +110,8 @@ class MeetingAxes(SphericalArm):
             return ("elbow", "wrist", "shoulder")
         return ("elbow", "shoulder", "wrist")
 
-    def _bends(self, motion: Pose) -> list[Bend]:
+    def bent(self, motion: Pose, signs: Signs | None) -> list[Bend]:
+        """The four bends, or that of two signs."""
         first, second, third = self.places[:3]
         axes = self.screws.axes
         from_shoulder = self._target(motion) - ca.DM(self.shoulder)
@@ -102,12 +124,12 @@ class MeetingAxes(SphericalArm):
         )
         bends = []
         height = ca.dot(ca.DM(axes[first]), from_shoulder)
-        for elbow in elbows:
+        for elbow in _picked(elbows, signs, 0):
             point = ca.DM(constant) + ca.DM(cosine) * elbow.cosine + ca.DM(sine) * elbow.sine
             parts = (ca.dot(ca.DM(axes[first]), part) for part in about_axis(axes[second], point))
             still, ahead_, aside_ = parts
             *tilts, tiltable = turns_to_height(ahead_, aside_, height - still)
-            for tilt in tilts:
+            for tilt in _picked(tilts, signs, 1):
                 tilted = tilt.about(axes[second]) @ point
                 pan = turn_between(axes[first], tilted, from_shoulder)
                 joints = self.angle(first, pan) | self.angle(second, tilt)
@@ -116,11 +138,10 @@ class MeetingAxes(SphericalArm):
                 bends.append(self._base(joints, [pan, tilt, elbow], motion, slack))
         return bends
 
-    def beyond(self, palm: Pose, lower: Expr, upper: Expr) -> Expr:
+    def beyond_reach(self, motion: Pose, lower: Expr, upper: Expr) -> Expr:
         """By the distance of the sphere's point from where the first two meet."""
         constant, cosine, sine = self._swing(self.places[2])
         near, far = self._span((constant - self.shoulder, cosine, sine), lower, upper)
-        motion = self.screws.motion(palm)
         if not self.swept:
             return _outside(safe_norm(self._target(motion) - ca.DM(self.shoulder)), near, far)
         # Turned about the swept axis the two points pass each other on circles.
@@ -149,7 +170,8 @@ class ParallelPair(SphericalArm):
             return ("wrist", "elbow", "shoulder")
         return ("shoulder", "elbow", "wrist")
 
-    def _bends(self, motion: Pose) -> list[Bend]:
+    def bent(self, motion: Pose, signs: Signs | None) -> list[Bend]:
+        """The four bends, or that of two signs."""
         first, second, third = self.places[:3]
         axes, points = self.screws.axes, self.screws.points
         target = self._target(motion)
@@ -167,12 +189,12 @@ class ParallelPair(SphericalArm):
         bent, bent_aside = 2 * float(constant @ cosine), 2 * float(constant @ sine)
         fixed = float(constant @ constant + cosine @ cosine)
         bends = []
-        for pan in pans:
+        for pan in _picked(pans, signs, 0):
             inside = pan.back.about(axes[first]) @ out + ca.DM(base - hinge)
             inside = inside - ca.DM(across) * ca.dot(ca.DM(across), inside)
             height = ca.sumsqr(inside) - fixed
             *elbows, bendable = turns_to_height(ca.SX(bent), ca.SX(bent_aside), height)
-            for elbow in elbows:
+            for elbow in _picked(elbows, signs, 1):
                 point = ca.DM(constant) + ca.DM(cosine) * elbow.cosine + ca.DM(sine) * elbow.sine
                 tilt = turn_between(axes[second], point, inside)
                 joints = self.angle(first, pan) | self.angle(second, tilt)
@@ -181,10 +203,9 @@ class ParallelPair(SphericalArm):
                 bends.append(self._base(joints, [pan, tilt, elbow], motion, slack))
         return bends
 
-    def beyond(self, palm: Pose, lower: Expr, upper: Expr) -> Expr:
+    def beyond_reach(self, motion: Pose, lower: Expr, upper: Expr) -> Expr:
         """By the distance of the sphere's point from the first two axes."""
         first, second, third = self.places[:3]
-        motion = self.screws.motion(palm)
         if self.swept:
             return ca.SX(0)
         constant, cosine, sine = self._swing(third)
@@ -204,6 +225,16 @@ class ParallelPair(SphericalArm):
             _outside(ca.sqrt((wide - s * arm) ** 2 + up**2 + 1e-24), near, far) for s in (1, -1)
         ]
         return ca.if_else(ca.fabs(reaches[0]) <= ca.fabs(reaches[1]), *reaches)
+
+
+def _picked(turns: Sequence[Turn], signs: Signs | None, place: int) -> Sequence[Turn]:
+    """Both turns, or the one of a sign."""
+    if signs is None:
+        return turns
+    one, other = turns
+    first = signs[place] > 0
+    cosine = ca.if_else(first, one.cosine, other.cosine)
+    return (Turn(cosine, ca.if_else(first, one.sine, other.sine)),)
 
 
 def _largest_cosine(first: Expr, last: Expr) -> Expr:
