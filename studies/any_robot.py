@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,8 @@ def solve(pair: Pair) -> tuple[Pair, dict[str, Any]]:
 def run(options: argparse.Namespace) -> None:
     """Try the pairs that have not been."""
     todo = [pair for pair in pairs(options) if not _path(pair, options.out).exists()]
+    # Mixed, so that a run that is stopped has seen something of every arm and every hand.
+    todo.sort(key=lambda pair: zlib.crc32(pair.robot.encode()))
     if not todo:
         return
     options.out.mkdir(parents=True, exist_ok=True)

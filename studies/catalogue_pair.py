@@ -74,8 +74,15 @@ def finger_sets(robot: ik.ArmHand) -> dict[str, list[int]]:
 
 def targets(robot: ik.ArmHand, pair: Pair, kind: str, fingers: list[int]) -> tuple[Array, ...]:
     """Configurations (k, n) and their contacts, (k, f, 3) each, NaN for fingers that are free."""
+    return _asked(robot, _drawn(robot, pair, kind), fingers)
+
+
+def _drawn(robot: ik.ArmHand, pair: Pair, kind: str) -> Array:
     rng = np.random.default_rng([pair.seed, *(zlib.crc32(w.encode()) for w in (pair.robot, kind))])
-    q = SETS[kind](robot, rng, pair.count)
+    return SETS[kind](robot, rng, pair.count)
+
+
+def _asked(robot: ik.ArmHand, q: Array, fingers: list[int]) -> tuple[Array, ...]:
     points, normals = robot.contacts(q)
     free = np.setdiff1d(np.arange(len(robot.fingers)), fingers)
     points[:, free] = normals[:, free] = np.nan
@@ -108,9 +115,10 @@ def try_pair(pair: Pair) -> dict[str, Any]:
             for solver in solvers.values():
                 solver.solve_batch(*warm)
                 solver.solve_batch(warm[0][:LATE] + off, warm[1][:LATE])
+            drawn = {kind: _drawn(robot, pair, kind) for kind in KINDS}
             cells = {
                 f"{fingers}/{kind}/{name}": _cell(
-                    solvers[name], targets(robot, pair, kind, places), scale, name
+                    solvers[name], _asked(robot, drawn[kind], places), scale, name
                 )
                 for fingers, places in finger_sets(robot).items()
                 for kind in KINDS

@@ -40,8 +40,9 @@ SIMILAR = 0.25
 POOL = 3
 """From so many times as many postures as are wanted those that differ are taken."""
 
-MENDED = 6
-"""The same where they are mended finger by finger before."""
+MENDED = 3
+"""The same where they are mended finger by finger before: twice as many take longer than the fits
+they save."""
 
 SPREAD = 96
 """Postures that are mended for a round after the second: not those that look like the target any
