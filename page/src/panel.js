@@ -13,7 +13,7 @@ export class Panel {
       chip.dataset.robot = robot.name;
       chip.append(robot.title);
       const small = document.createElement("small");
-      small.textContent = `${robot.what} · ${(robot.size / 1e6).toFixed(1)} MB`;
+      small.textContent = `${robot.what} ·\u00a0${(robot.size / 1e6).toFixed(1)}\u00a0MB`;
       chip.append(small);
       chip.addEventListener("click", () => choose(robot));
       return chip;
