@@ -91,14 +91,15 @@ def measure(pair: Pair, names: list[str], restarts: int) -> dict[str, Any]:
         solver = ik.Solver(robot, tolerance=tolerance)
         solver.solve_batch(points, normals)
         solver.solve_batch(points[:LATE] + off, normals[:LATE])
-        again = tuple(np.tile(array, (len(points) // pair.count, 1, 1)) for array in asked)
+        copies = len(points) // pair.count, 1, 1
+        again = np.tile(asked[0], copies), np.tile(asked[1], copies)
         runs, ours = dict[str, Run](), [_batch(solver, again)]
         runs[SINGLE] = _single(solver, asked, tolerance)
         for peer in names:
             runs[peer] = run_peer(peer, robot, asked, tolerance, restarts)
             ours.append(_batch(solver, again))
-        times = np.concatenate([run.times for run in ours])
-        same = Run(ours[0].solved, ours[0].first, times)
+        spent = np.concatenate([run.times for run in ours])
+        same = Run(ours[0].solved, ours[0].first, spent)
         runs = {BATCH: same, LONG: _batch(solver, (points, normals)), **runs}
         cells[name] = {
             solver: {
@@ -108,7 +109,7 @@ def measure(pair: Pair, names: list[str], restarts: int) -> dict[str, Any]:
                 "mean": 1e6 * float(run.times.mean()),
                 "median": 1e6 * float(np.median(run.times)),
                 "p99": 1e6 * float(np.quantile(run.times, 0.99)),
-                "ratio": float(run.times.mean() / times.mean()),
+                "ratio": float(run.times.mean() / spent.mean()),
                 "ratio, single": float(run.times.mean() / runs[SINGLE].times.mean()),
             }
             for solver, run in runs.items()

@@ -45,10 +45,10 @@ def placement_stage(layouts: HandFirstLayouts, form: ArmForm | HeldArm) -> ca.Fu
         window = ca.fmod(s["candidate"] + s["earlier"] / layouts.candidates, WINDOWS)
         arm, margin, swivel = place_form(form, palm, *bounds, s["spent"], s["swivel"], window)
         most = trials(form, PLACEMENT), trials(form, THOROUGH)
-    exact = isinstance(form, SrsArm) or form.exact
-    if not exact:
-        off = form.off
-        arm, hits = brought_to(layouts.robot, arm, palm, p["lower"], p["upper"], off)
+    exact = True
+    if not isinstance(form, SrsArm) and not form.exact:
+        exact = False
+        arm, hits = brought_to(layouts.robot, arm, palm, p["lower"], p["upper"], form.off)
     place = _placed(layouts, most, exact)
     outputs = place(state, parameters, arm, margin, swivel, hits)
     return ca.Function("placement", [state, parameters], list(outputs))

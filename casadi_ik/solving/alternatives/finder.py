@@ -230,7 +230,10 @@ class AlternativeFinder:
         found = []
         if isinstance(self._branches, PassingBranches):
             best = self._branches.best(palm, lower, upper, valued)
-            found = [_Found(with_arm(arm[None])[0], posture, *branch) for arm, *branch in best]
+            found = [
+                _Found(with_arm(arm[None])[0], posture, branch, place)
+                for arm, branch, place in best
+            ]
             # A stretch may be shorter than the positions are apart.
             found += [_Found(arm, posture) for arm in self._searched(problems, q, seed)]
             parts = self._parts(np.stack([item.q for item in found]), self._arm)
