@@ -91,6 +91,30 @@ def test_every_round_begins_elsewhere(hand, rng):
     size = options.candidates, len(description.hand_actuators)
     assert all(found.shape == (4, *size) for found in rounds)
     assert (rounds[0] != rounds[1]).any(axis=2).mean() > 0.9
+    # Half of them begin at the best so far but for a finger or two.
+    found = hands.mended(problems, 2, np.array(hand.random(rng, 4)))
+    assert found.shape == (4, *size)
+    assert (found != rounds[0]).any()
+    assert hands.kept.shape == (15, 10)
+    # AR10: two motors a finger, one or two of its five fingers anew.
+    assert sorted(hands.kept.sum(axis=1)) == [6] * 10 + [8] * 5
+
+
+def test_one_finger_that_came_to_rest_is_taken_out(hand, rng):
+    """The rest of the hand is right: what is begun from is nearer than any hand of the table."""
+    description = hand.description
+    options = HandFirstParameters(table=64, wide_table=512)
+    hands = Restarts(description, description.hand_actuators, options, compiled=False)
+    q = np.array(hand.random(rng, 8))
+    problems = Problems(*hand.contacts(q), ik.Tolerance(), True)
+    best = np.array(q)
+    columns = list(description.finger_actuators(hand.fingers[2]))
+    best[:, columns] = hand.random(rng, 8)[:, columns]
+    apart = [
+        np.abs(found - q[:, None]).sum(axis=2).min(axis=1).mean()
+        for found in (hands.mended(problems, 2, best), hands.mended(problems, 2))
+    ]
+    assert apart[0] < 0.5 * apart[1]
 
 
 def test_what_is_out_of_reach_ends_the_same_alone_and_in_a_batch(hand, rng):

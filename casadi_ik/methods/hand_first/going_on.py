@@ -20,15 +20,15 @@ be reached take five times as long."""
 SURE = 1e-8
 """Cost (0.01 mm, 0.1 mrad) above which this is a minimum, and not a long flat valley."""
 
-NEAR, NEAR_OF_MANY, MANY = 0.02, 0.5, 9
+NEAR, NEAR_OF_MANY, MANY = 0.02, (0.5, 0.06), 9
 """Cost (14 mm, 8 deg) from which on a target that still misses is taken to be out of reach; of a
-hand with more than `MANY` motors another (70 mm, 40 deg): its fits end in so many places that how
-far off the best of them is tells little, and four in five of the targets that were given up are
-solved for the time that it takes."""
+hand with more than `MANY` motors others (70 mm, 40 deg; later 25 mm, 14 deg): its fits end in so
+many places that how far off the best of them is tells little, and four in five of the targets that
+were given up are solved for the time that it takes."""
 
 EARLY = 4
-"""Rounds in which `NEAR_OF_MANY` counts; then `NEAR` does for every hand: of 4000 targets that can
-be reached those left by then had a tenth of it, of those that cannot seven in ten have more."""
+"""Rounds in which the first of `NEAR_OF_MANY` counts: of 4000 targets that can be reached those
+left by then had a tenth of it, of those that cannot seven in ten have more than `NEAR`."""
 
 VARIED = 2
 """Rounds of tables in any case: the second takes hands that differ from each other."""
@@ -59,4 +59,4 @@ def near_cost(motors: int, late: bool) -> float:
         motors: Of the hand.
         late: Whether `EARLY` rounds have gone by in which it is asked for.
     """
-    return NEAR_OF_MANY if motors > MANY and not late else NEAR
+    return NEAR_OF_MANY[late] if motors > MANY else NEAR

@@ -229,7 +229,8 @@ class HandFirstMethod(LoopedMethod):
         """What a round begins with, the memory of those before aside."""
         later, layouts = number - self.options.rounds, self.step.layouts
         if later < 0 or last is None:
-            postures = self.postures(problems, number)
+            best = None if last is None else last[:, layouts.state.slice("best_q")]
+            postures = self.hands.from_tables(problems, number, best)
             if problems.prefer == NEAREST:
                 postures = self.order(problems, q0, postures, own=last is None)
             return self.rows(problems, q0, postures, begun=last is not None)
@@ -240,7 +241,7 @@ class HandFirstMethod(LoopedMethod):
         anywhere = self.hands.anywhere(problems, later - VALLEYS)
         whole = np.repeat(anywhere[:1], len(last), axis=0)
         if self.hands.mends(problems):
-            hands = self.hands.mended(problems, number)
+            hands = self.hands.mended(problems, number, last[:, layouts.state.slice("best_q")])
         else:
             hand = list(self.robot.hand_actuators)
             hands = np.repeat(anywhere[None][:, :, hand], len(last), axis=0)

@@ -15,8 +15,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -51,39 +53,10 @@ more, but as many others in every round. What one round misses the next finds as
 CHUNK = 256
 """Targets whose postures are compared with each other at once."""
 
-STRIDES = (
-    0.05,
-    -0.05,
-    0.1,
-    -0.1,
-    0.2,
-    -0.2,
-    0.4,
-    -0.4,
-    0.03,
-    -0.03,
-    0.15,
-    -0.15,
-    0.3,
-    -0.3,
-    0.8,
-    -0.8,
-    0.5,
-    -0.5,
-    0.6,
-    -0.6,
-    0.7,
-    -0.7,
-    0.25,
-    -0.25,
-    1.0,
-    -1.0,
-    1.2,
-    -1.2,
-    1.5,
-    -1.5,
-    2.0,
-    -2.0,
+STRIDES = tuple(
+    sign * size
+    for size in (0.05, 0.1, 0.2, 0.4, 0.03, 0.15, 0.3, 0.8, 0.5, 0.6, 0.7, 0.25, 1.0, 1.2, 1.5, 2.0)
+    for sign in (1, -1)
 )
 """How far along a valley a hand begins anew [rad of the motor that moves most], round by round."""
 
@@ -179,12 +152,13 @@ class Restarts:
         own = (self.table, self.wide_table)
         return own if enforce_limits else (*own, self.free_table)
 
-    def from_tables(self, problems: Problems, number: int) -> Array:
+    def from_tables(self, problems: Problems, number: int, best: Array | None = None) -> Array:
         """Postures (k, candidates, hand) of a round whose postures look like the targets.
 
         Args:
             problems: k targets.
             number: The round, from 0.
+            best: (k, n) the best so far, if rounds went before.
         """
         count = self._options.candidates
         points, normals = problems.points, problems.normals
@@ -195,7 +169,7 @@ class Restarts:
         table = self.free_table if free else self.wide_table
         mend = self.mends(problems)
         if mend and number >= VARIED:
-            return self.mended(problems, number)
+            return self.mended(problems, number, best)
         wanted = number * count
         pool = min((MENDED if mend else POOL) * wanted, len(table.postures))
         parts = [np.empty((0, count, len(self._hand)))]
@@ -209,20 +183,46 @@ class Restarts:
         """Whether every finger by itself mends the postures that rounds begin from."""
         return problems.enforce_limits and self.each_finger is not None
 
-    def mended(self, problems: Problems, number: int) -> Array:
+    def mended(self, problems: Problems, number: int, best: Array | None = None) -> Array:
         """Mended postures (k, candidates, hand), other ones in every round.
+
+        The first half of them are the best hand so far with one or two fingers anew: often one has
+        come to rest by itself where it cannot reach its contact.
 
         Args:
             problems: k targets.
             number: The round, from 0.
+            best: (k, n) the best so far, if rounds went before.
         """
         table, count = self.wide_table, self._options.candidates
         rows = np.arange(number * SPREAD, (number + 1) * SPREAD) % len(table.postures)
+        fresh = table.postures[rows]
+        halves = [(fresh, None, count)]
+        if best is not None:
+            mixed, others = np.split(fresh, 2)
+            kept = self.kept[np.arange(len(mixed)) % len(self.kept)]
+            halves = [(mixed, kept, (count + 1) // 2), (others, None, count // 2)]
+        hands = np.empty((len(problems), 0)) if best is None else best[:, self._hand]
         parts = [np.empty((0, count, len(self._hand)))]
-        for asked in _chunks(problems.points, problems.normals):
-            pool = np.broadcast_to(table.postures[rows], (len(asked[0]), SPREAD, len(self._hand)))
-            parts.append(differing(self._mended(pool, *asked), table.ranges, count, SIMILAR))
+        for points, normals, hand in _chunks(problems.points, problems.normals, hands):
+            chosen = []
+            for half, kept, wanted in halves:
+                pool = np.broadcast_to(half, (len(points), *half.shape))
+                pool = pool if kept is None else np.where(kept, hand[:, None], pool)
+                better = self._mended(pool, points, normals)
+                chosen.append(differing(better, table.ranges, wanted, SIMILAR))
+            parts.append(np.concatenate(chosen, axis=1))
         return np.concatenate(parts)
+
+    @cached_property
+    def kept(self) -> NDArray[np.bool_]:
+        """(c, hand) motors of all fingers but one or two, for all of these."""
+        description = self._robot.description
+        fingers = [description.finger_actuators(name) for name in description.finger_names]
+        few = [some for count in (1, 2) for some in combinations(fingers, count)]
+        return ~np.array(
+            [np.isin(self._hand, [i for motors in some for i in motors]) for some in few]
+        )
 
     @cached_property
     def each_finger(self) -> FunctionKernel | None:

@@ -90,8 +90,8 @@ static int mend(rounds *job, int64_t pool) {
 }
 #endif
 
-/* Of the pool of postures those that differ, best first; the last of them are the round's. */
-static void vary(rounds *job, int table, int64_t pool, int64_t count) {
+/* Of the pool of postures those that differ, best first, without the first of them. */
+static void vary(rounds *job, int table, int64_t pool, int64_t count, int64_t first, double *into) {
   int64_t i, k, place, pick;
   for (i = 0; i < pool; ++i) {
     for (k = 0; k < N_HAND; ++k) {
@@ -116,26 +116,33 @@ static void vary(rounds *job, int table, int64_t pool, int64_t count) {
       const double off = apart(job->places + i * N_HAND, job->places + pick * N_HAND);
       if (off < job->closest[i]) job->closest[i] = off;
     }
-    if (place < count - N_CANDIDATES) continue;
-    for (k = 0; k < N_HAND; ++k) {
-      job->postures[(place - count + N_CANDIDATES) * N_HAND + k] =
-          job->near[pick * N_HAND + k];
-    }
+    if (place < first) continue;
+    memcpy(into + (place - first) * N_HAND, job->near + pick * N_HAND, N_HAND * sizeof(double));
   }
 }
 
 #if MENDS
-/* Mended postures that do not look like the target in particular, other ones in every round. */
+/* Mended postures that do not look like the target in particular, other ones in every round: first
+ * the best hand so far with one or two fingers of these. */
 static int from_spread(rounds *job, int64_t number) {
-  int64_t i;
+  static const int64_t rows[] = {0, SPREAD / 2, SPREAD};
+  static const int64_t places[] = {0, (N_CANDIDATES + 1) / 2, N_CANDIDATES};
+  int64_t i, half;
   int code, k;
-  for (i = 0; i < SPREAD; ++i) {
-    const int64_t row = (number * SPREAD + i) % TABLE_ROWS[1];
-    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, row, k);
+  for (half = 0; half < 2; ++half) {
+    const int64_t count = rows[half + 1] - rows[half];
+    for (i = 0; i < count; ++i) {
+      const int64_t row = (number * SPREAD + rows[half] + i) % TABLE_ROWS[1];
+      for (k = 0; k < N_HAND; ++k) {
+        const int best = !half && KEPT[i % N_KEPT][k] > 0;
+        job->near[i * N_HAND + k] = best ? job->last[STATE_BEST_Q + HAND[k]] : posture(1, row, k);
+      }
+    }
+    code = mend(job, count);
+    if (code != DONE) return code;
+    vary(job, 1, count, places[half + 1] - places[half], 0, job->postures + places[half] * N_HAND);
   }
-  code = mend(job, SPREAD);
-  if (code == DONE) vary(job, 1, SPREAD, N_CANDIDATES);
-  return code;
+  return DONE;
 }
 #endif
 
@@ -192,7 +199,7 @@ static int from_table(rounds *job, int64_t number) {
     code = mend(job, pool);
     if (code != DONE) return code;
 #endif
-    vary(job, table, pool, wanted);
+    vary(job, table, pool, wanted, wanted - N_CANDIDATES, job->postures);
   } else {
     memcpy(job->postures, job->near, sizeof job->postures);
   }

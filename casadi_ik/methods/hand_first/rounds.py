@@ -123,6 +123,7 @@ class RoundsPlan:
             "POOL": restarts.MENDED if self.mends else restarts.POOL,
             "MENDS": int(self.mends),
             "SPREAD": restarts.SPREAD,
+            "N_KEPT": len(self.hands.kept),
             "ENFORCE_LIMITS": int(self.enforce_limits),
             "HAS_ARM": int(bool(layouts.robot.arm_actuators)),
             "SOLVED_STATUS": int(Status.SOLVED),
@@ -168,6 +169,7 @@ class RoundsPlan:
         fresh, state = fresh_fit(), self.layouts.state
         return {
             "HAND": np.array(hand),
+            "KEPT": np.asarray(hands.kept, dtype=float),
             "CARRIED": np.array(self._carried),
             "FRESH_PLACES": np.array([state.slice(name).start for name in fresh]),
             "FRESH_VALUES": np.array([float(value) for value in fresh.values()]),
