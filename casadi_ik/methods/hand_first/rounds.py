@@ -167,9 +167,9 @@ class RoundsPlan:
         hand, spreads = list(robot.hand_actuators), hands.spreads
         lower, upper = hands.anywhere_bounds(self.enforce_limits)
         fresh, state = fresh_fit(), self.layouts.state
-        return {
+        kept = {"KEPT": np.asarray(hands.kept, dtype=np.int16)} if self.mends else {}
+        return kept | {
             "HAND": np.array(hand),
-            "KEPT": np.asarray(hands.kept, dtype=float),
             "CARRIED": np.array(self._carried),
             "FRESH_PLACES": np.array([state.slice(name).start for name in fresh]),
             "FRESH_VALUES": np.array([float(value) for value in fresh.values()]),
