@@ -135,6 +135,21 @@ def test_what_is_near_a_panda_is_found(panda, solver):
     assert np.median(near_by) < 0.5 * np.median(far_by)
 
 
+def test_what_is_near_an_arm_whose_last_joint_is_searched_is_found():
+    """A search on the branches would pass it by: it begins where the robot is."""
+    robot = robot_of("xarm6")
+    method = HandFirstMethod(robot.description, HandFirstParameters(), compiled=False)
+    rng = np.random.default_rng(4)
+    q = robot.random(rng, 40)
+    start = np.clip(q + rng.normal(scale=0.2, size=q.shape), robot.lower, robot.upper)
+    contacts = target_arrays(*robot.contacts(q), len(robot.fingers))
+    asked = Problems(*contacts, EXACT, True, prefer="q0")
+    batch = Engine(robot, method).solve(asked, Run(q0=start))
+    assert batch.success.all()
+    moved, known = (np.abs(each - start)[:, :6].max(axis=1) for each in (batch.q, q))
+    assert (moved < 1.5 * known + 0.05).mean() > 0.9
+
+
 @pytest.mark.parametrize(("arm", "alone"), [("panda", 0), ("sawyer", 1)])
 def test_all_its_stages_go_side_by_side(arm, alone):
     """But for the table that the search of later rounds begins with."""

@@ -43,6 +43,7 @@ from casadi_ik.problem.contacts.kinds import Kinds, suffix
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.closed_arms.held import HeldArm
+from casadi_ik.symbolic.closed_arms.passing import PassingArm
 from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
@@ -113,7 +114,7 @@ class HandFirstStep:
         if self.robot.arm_actuators:
             stages[Phase.HAND_FIT] = self._hand_fit()
             stages[Phase.ARM_PLACEMENT] = self._placement()
-        if self.placed is not None:
+        if self.placed is not None and not self._searched_if_near:
             stages[Phase.ARM_CHOICE] = choice_stage(layouts, self.placed)
         phases = [phase for phase in STAGES if phase in stages]
         cases = [stages[phase] for phase in phases]
@@ -134,6 +135,8 @@ class HandFirstStep:
         state = ca.MX.sym("state", layouts.state.size)
         parameters = ca.MX.sym("parameters", layouts.parameters.size)
         later = layouts.state.unpack(state)["earlier"] > 0
+        if self._searched_if_near:
+            later = ca.logic_or(later, layouts.parameters.unpack(parameters)["nearest"])
         stages = numeric_stage(layouts), placement_stage(layouts, placed)
         outputs = ca.Function.if_else("held_or_searched", *stages)(later, state, parameters)
         return ca.Function("placement", [state, parameters], list(outputs))
@@ -235,8 +238,13 @@ class HandFirstStep:
         first = ca.logic_and(s["candidate"] + s["earlier"] <= 0, s["spent"] < 1)
         return ca.logic_and(first, p["nearest"])
 
+    @property
+    def _searched_if_near(self) -> bool:
+        """Whether what is near is searched from there: a search over two joints passes it by."""
+        return isinstance(self.placed, PassingArm)
+
     def _arm_stage(self, p: dict[str, Expr]) -> Expr:
-        if self.placed is None:
+        if self.placed is None or self._searched_if_near:
             return ca.SX(float(Phase.ARM_PLACEMENT))
         return ca.if_else(p["nearest"], float(Phase.ARM_CHOICE), float(Phase.ARM_PLACEMENT))
 
