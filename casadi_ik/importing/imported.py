@@ -109,6 +109,11 @@ def import_robot(
     Raises:
         CasadiIKError: A file cannot be read, or nothing says what to choose.
     """
+    if arm is not None and arm.exists() and hand.exists() and arm.samefile(hand):
+        raise InputError(
+            f"{hand}: arm and hand are the same file, expected a file of each, or one file that has "
+            "both (casadi-ik import ROBOT --palm LINK)"
+        )
     tree = read_tree(hand)
     palm_link, palm_how = the_palm(tree, palm)
     joints = kept_joints(tree, palm_link, below=True)

@@ -177,6 +177,7 @@ REFUSALS = {
     "mount of three": (("arm.urdf", "hand.urdf", "--mount", "1", "2", "3"), "found 3 numbers"),
     "mount without arm": (("hand.urdf", "--mount", *"123456"), "--mount: there is no arm"),
     "an arm for a hand": (("arm.urdf", "hand.urdf", "--palm", "mf_3"), "no joint moves below"),
+    "one file twice": (("arm.urdf", "arm.urdf"), "arm.urdf: arm and hand are the same file"),
     "two arms": (("two.urdf",), "--palm: missing; from 'base' of two.urdf go chains as long"),
     "arm that branches": (("two.urdf", "hand.urdf"), "--tip: missing; two.urdf branches at 'base'"),
     "description": (("hand.yaml",), "is a description already, expected --picture and no --out"),
