@@ -111,7 +111,7 @@ def import_robot(
     """
     if arm is not None and arm.exists() and hand.exists() and arm.samefile(hand):
         raise InputError(
-            f"{hand}: arm and hand are the same file, expected a file of each, or one file that has "
+            f"{hand}: arm and hand are the same file, expected one of each, or one that has "
             "both (casadi-ik import ROBOT --palm LINK)"
         )
     tree = read_tree(hand)
