@@ -185,7 +185,7 @@ def _heat_map(found: dict[Pair, dict[str, Any]], path: Path) -> None:
         i, j = arms.index(pair.arm), hands.index(pair.hand)
         ratios[i, j] = entry["cells"][f"all fingers/{KINDS[0]}/{finest}"]["ratio"]
         missed = sum(len(cell["missed"]) for cell in entry["cells"].values())
-        text = f"{ratios[i, j]:.1f}" + (f"\n{missed} missed" if missed else "")
+        text = f"{ratios[i, j]:.1f}" + (f"\n({missed})" if missed else "")
         color = "white" if ratios[i, j] > DARK else "#c0392b" if missed else "black"
         axes.text(j, i, text, ha="center", va="center", fontsize=7, color=color)
     image = axes.imshow(ratios, cmap="YlGnBu", vmin=0, vmax=8, alpha=0.7, aspect="auto")
@@ -193,7 +193,7 @@ def _heat_map(found: dict[Pair, dict[str, Any]], path: Path) -> None:
     axes.set_yticks(range(len(arms)), arms)
     bar = drawn.colorbar(image, ax=axes, shrink=0.6)
     bar.set_label("mean time of a target, ratio")
-    title(axes, f"random targets, all fingers, {finest}", "hand", "arm")
+    title(axes, f"random targets, all fingers, {finest}; (missed of all kinds)", "hand", "arm")
     drawn.tight_layout()
     drawn.savefig(path)
 
