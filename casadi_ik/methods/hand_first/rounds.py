@@ -167,7 +167,7 @@ class RoundsPlan:
         hand, spreads = list(robot.hand_actuators), hands.spreads
         lower, upper = hands.anywhere_bounds(self.enforce_limits)
         fresh, state = fresh_fit(), self.layouts.state
-        kept = {"KEPT": np.asarray(hands.kept, dtype=np.int16)} if self.mends else {}
+        kept = {"KEPT": np.asarray(hands.kept, dtype=float)} if self.mends else {}
         return kept | {
             "HAND": np.array(hand),
             "CARRIED": np.array(self._carried),
