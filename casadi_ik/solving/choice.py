@@ -25,7 +25,8 @@ from casadi_ik.problem.ranking import Choice, Ranking
 from casadi_ik.problem.solution import Solution
 from casadi_ik.problem.status import Status
 from casadi_ik.solving.alternatives.choosing import Answers, answers_of
-from casadi_ik.solving.alternatives.finder import APART, checked_distance
+from casadi_ik.solving.alternatives.distinct import checked_distance
+from casadi_ik.solving.alternatives.finder import APART
 from casadi_ik.solving.alternatives.swings import Preference
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.solved_part import judged

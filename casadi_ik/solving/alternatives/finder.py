@@ -22,6 +22,7 @@ from casadi_ik.problem.preference import CLEARANCE, preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, Branches, best_arm
+from casadi_ik.solving.alternatives.distinct import checked_distance, distinct
 from casadi_ik.solving.alternatives.passing_branches import PassingBranches, branches_of
 from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
 from casadi_ik.symbolic.actuated import actuated
@@ -161,7 +162,7 @@ class AlternativeFinder:
         keys = np.stack([self._valued(q, q0, prefer, around), self._margins(q, self._arm)])
         order = [int(i) for i in np.lexsort(-keys[::-1]) if solved[i]]
         parts = self._parts(q[order], list(range(q.shape[1])))
-        kept = _distinct(parts, apart, limit)
+        kept = distinct(parts, apart, limit)
         return tuple(self._described(problems, found[order[i]], q0) for i in kept)
 
     def best_arm(self, problems: Problems, q: Array, q0: Array, seed: int, prefer: str) -> Array:
@@ -198,7 +199,7 @@ class AlternativeFinder:
             # Reachable thanks to the tolerances only, if at all.
             q = np.concatenate([q, trials.run(states, loose)])
             kept = q[trials.solved(problems, q, problems.enforce_limits)]
-        return [kept[i] for i in _distinct(self._parts(kept, self.hand), DISTINCT)]
+        return [kept[i] for i in distinct(self._parts(kept, self.hand), DISTINCT)]
 
     def _arms(
         self,
@@ -237,7 +238,7 @@ class AlternativeFinder:
             # A stretch may be shorter than the positions are apart.
             found += [_Found(arm, posture) for arm in self._searched(problems, q, seed)]
             parts = self._parts(np.stack([item.q for item in found]), self._arm)
-            return [found[i] for i in _distinct(parts, DISTINCT)]
+            return [found[i] for i in distinct(parts, DISTINCT)]
         for branch in self._branches.find(palm, lower, upper):
             stop_if_cancelled()
             arm, swivel = best_arm(self._branches, palm, branch, valued)
@@ -262,7 +263,7 @@ class AlternativeFinder:
         ends = np.concatenate([q[None], ends])
         same = (np.abs(self._parts(ends - q, self.hand)) < DISTINCT).all(axis=1)
         kept = ends[same & self.trials.solved(problems, ends, problems.enforce_limits)]
-        return [kept[i] for i in _distinct(self._parts(kept, self._arm), DISTINCT)]
+        return [kept[i] for i in distinct(self._parts(kept, self._arm), DISTINCT)]
 
     def _parts(self, q: Array, columns: list[int]) -> Array:
         """Some columns of configurations as parts of their ranges."""
@@ -327,26 +328,3 @@ class AlternativeFinder:
             manipulability=float(self._measured(q)[0]),
             distance=float(-self.score(q, q0, "q0")[0]),
         )
-
-
-def _distinct(parts: Array, apart: float, limit: int | None = None) -> list[int]:
-    """Rows of parts (k, n) that differ from all chosen before them, in their order."""
-    kept: list[int] = []
-    for i in range(len(parts)):
-        if len(kept) == limit:
-            break
-        if (np.abs(parts[i] - parts[kept]).max(axis=1, initial=0.0) >= apart).all():
-            kept.append(i)
-    return kept
-
-
-def checked_distance(apart: float) -> float:
-    """A least difference of configurations.
-
-    Raises:
-        InputError: It is none.
-    """
-    number = isinstance(apart, (int, float, np.integer, np.floating))
-    if not number or isinstance(apart, bool) or not 0 <= apart <= 1:
-        raise InputError(f"apart: found {apart!r}, expected a number from 0 to 1")
-    return float(apart)
