@@ -130,10 +130,10 @@ class PassingArm(ClosedForm):
 
     def bends(self, palm: Pose, swept: Expr) -> list[Bend]:
         """Not in one expression: see `branch`."""
-        raise TypeError("the branches of this arm have roots to be found: ask for `branch`")
+        raise NotImplementedError
 
     def _bends(self, motion: Pose) -> list[Bend]:
-        return self.bends(motion, ca.SX(0))
+        raise NotImplementedError
 
 
 def next_turn() -> ca.Function:
