@@ -13,3 +13,20 @@ int casadi_ik_rounds(rounds *job) {
   job->paused = code == SLICE_OVER;
   return code;
 }
+
+/* The rounds from job->round on: `state` is how those before ended. UNHELPED: none is left that may
+ * help. */
+#if defined(_WIN32)
+__declspec(dllexport)
+#else
+__attribute__((visibility("default")))
+#endif
+int casadi_ik_rounds_on(rounds *job) {
+  job->under_way = 0;
+  job->iterations = 0;
+  job->status = RUNNING;
+  while (job->round < job->rounds && !is_hopeful(job, job->round)) ++job->round;
+  if (job->round >= job->rounds) return UNHELPED;
+  job->paused = 1;
+  return casadi_ik_rounds(job);
+}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.errors import RowError, UnsupportedError
-from casadi_ik.kernels import LoopKernel, StepGraph
+from casadi_ik.kernels import LoopKernel, LoopResult, StepGraph
 from casadi_ik.kernels.rows import opaque
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.problem.contacts.kinds import Kinds
@@ -114,6 +114,25 @@ class LoopedMethod(ABC):
             iterations: (k,) iterations of all rounds.
         """
 
+    def finish(
+        self, problems: Problems, q0: Array, last: LoopResult, number: int, rounds: int
+    ) -> LoopResult | None:
+        """All rounds from one on for targets that are not solved, if there is a shorter way.
+
+        Args:
+            problems: k targets.
+            q0: (k, n).
+            last: How the rounds before ended, its statuses codes of `Status`.
+            number: The first of the rounds.
+            rounds: How many there are with those before.
+
+        Returns:
+            How they end, likewise, with the iterations and seconds of these rounds alone; None:
+            they are made one after the other, for all targets at once.
+        """
+        del problems, q0, last, number, rounds
+        return None
+
     def restarts(self, states: Array) -> Counts:
         """(k,) how often the solves began anew, from their last states (k, ns)."""
         return np.zeros(len(states), dtype=np.int64)
@@ -193,11 +212,21 @@ class LoopedMethod(ABC):
         states = np.empty((count, self.graph.state.size))
         status = np.empty(count, dtype=np.int64)
         left, some, here, last = np.arange(count), problems, q0, None
-        for number in range(self.rounds if rounds is None else rounds):
+        every = self.rounds if rounds is None else rounds
+        for number in range(every):
             if number:
                 left = np.flatnonzero(status != Status.SOLVED)
                 if not len(left):
                     break
+                if not trace:
+                    codes = status[left].astype(np.int32)
+                    before = LoopResult(states[left], iterations[left], codes, seconds[left])
+                    ends = self.finish(problems.rows(left), q0[left], before, number, every)
+                    if ends is not None:
+                        states[left], status[left] = ends.states, ends.status
+                        iterations[left] += ends.iterations
+                        seconds[left] += ends.time
+                        break
                 left = left[self.hopeful(states[left], number)]
                 if not len(left):
                     continue

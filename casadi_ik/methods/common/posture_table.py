@@ -49,20 +49,23 @@ class PostureTable:
             bounds: (n,) lower and upper, the robot's limits unless given.
         """
         columns = list(hand)
-        lower, upper = (ends[columns] for ends in bounds or (robot.lower, robot.upper))
+        self._lower, upper = (ends[columns] for ends in bounds or (robot.lower, robot.upper))
+        self.ranges = upper - self._lower
+        self._squeeze = 1 - at_limits
         q = np.tile(robot.home, (size, 1))
-        spread = (evenly(size, len(columns)) - 0.5) / (1 - at_limits) + 0.5
-        spread = np.clip(spread, 0.0, 1.0)
-        q[:, columns] = lower + spread * (upper - lower)
-        self.postures = q[:, columns]
+        q[:, columns] = self.postures = self.spread(0, size)
         self._pulled = pull > 0
-        self.ranges = upper - lower
         half_ranges = self.ranges / 2
         scales = np.sqrt(pull / len(columns)) / half_ranges
         key = contact_shape(len(robot.fingers), scales if self._pulled else ())
         contacts = robot.contacts(q)
         rows = (*contacts, self.postures) if self._pulled else contacts
         self.lookup = LookupKernel(key, rows, compiled)
+
+    def spread(self, first: int, count: int) -> Array:
+        """(count, k) postures spread like those of the table, from one on: it may be beyond it."""
+        spread = (evenly(count, len(self.ranges), first) - 0.5) / self._squeeze + 0.5
+        return self._lower + np.clip(spread, 0.0, 1.0) * self.ranges
 
     def nearest(
         self, points: Array, normals: Array, count: int, near: Array | None = None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -17,19 +19,21 @@ from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.common.posture_table import squared_distance
 from casadi_ik.methods.hand_first.beginning import beginning
+from casadi_ik.methods.hand_first.beginning import terms as terms_of
 from casadi_ik.methods.hand_first.going_on import (
     CARRIED,
-    EARLY,
+    NEAR_SHRINKS,
     SURE,
     TINY,
     VARIED,
     goes_on,
     most_returns,
     near_cost,
+    rugged,
 )
 from casadi_ik.methods.hand_first.one_target import OneTarget
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.restarts import LATER, RUGGED, VALLEYS, Restarts
+from casadi_ik.methods.hand_first.restarts import VALLEYS, Restarts, later
 from casadi_ik.methods.hand_first.rounds import RoundsPlan
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
@@ -45,6 +49,10 @@ from casadi_ik.symbolic.closed_arms.recognise import arm_form
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
+
+ALONE = 16
+"""Targets left to a batch from which on they are solved one by one. What is done once a round in
+Python outweighs that four would be solved side by side."""
 
 NEAREST = "q0"
 """The preference for what is near the start."""
@@ -76,15 +84,15 @@ class HandFirstMethod(LoopedMethod):
         """Recognise the arm and lay out the step; point and normal if no kinds are given."""
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
-        self.rounds = options.rounds + LATER
         motors = len(robot.hand_actuators)
-        self._near = near_cost(motors, late=False), near_cost(motors, late=True)
-        self._returns = most_returns(motors)
+        self.rounds = options.rounds + later(motors)
+        self._rugged = self.rounds - rugged(motors)
+        self._near, self._returns = near_cost(motors), most_returns(motors)
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(
             robot, arm_form(robot) or held_arm(robot), options.candidates, self._kinds
         )
-        self._ready: dict[bool, list[OneTarget]] = {True: [], False: []}
+        self._ready: dict[tuple[bool, bool], list[OneTarget]] = {}
         self._kept: tuple[Any, Array] | None = None
 
     def step_graph(self) -> StepGraph:
@@ -125,12 +133,13 @@ class HandFirstMethod(LoopedMethod):
         return states, parameters
 
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
-        """Whether a round may still help: see `most_returns` and `restarts.RUGGED`."""
+        """Whether a round may still help: see `most_returns` and `rugged`."""
         layout = self.step.layouts.state
         returns, cost = (states[:, layout.slice(name).start] for name in ("returns", "best_cost"))
-        rugged = number - (self.rounds - RUGGED)
-        if rugged >= 0:
-            return (returns < self._returns) & (cost < self._near[rugged >= EARLY])
+        further = number - self._rugged
+        if further >= 0:
+            near = min(self._near, NEAR_SHRINKS / (further + 1))
+            return (returns < self._returns) & (cost < near)
         # No more hands of tables if their fits come back to a minimum that just misses.
         tables = VARIED <= number < self.options.rounds
         return (returns < self._returns) | (cost < SURE) | (not tables)
@@ -154,19 +163,49 @@ class HandFirstMethod(LoopedMethod):
         """The first round of one target; see `QuickMethod.quick`."""
         if not self.kernel.compiled:
             return None
-        ready = self._ready[problems.enforce_limits]
+        with self._one_target(problems, whole=False) as one:
+            one.here[...], one.terms[...] = q0, self.terms(problems)
+            self._asked(problems, 0, one)
+            status = one()
+            return one.quick(not one.more) if status == Status.SOLVED else None
+
+    def finish(
+        self, problems: Problems, q0: Array, last: LoopResult, number: int, rounds: int
+    ) -> LoopResult | None:
+        """Few targets are solved one by one in compiled code; see `LoopedMethod.finish`."""
+        if not self.kernel.compiled or len(problems) > ALONE:
+            return None
+        states, status = last.states.copy(), last.status.copy()
+        iterations, seconds = np.zeros_like(last.iterations), np.zeros_like(last.time)
+        terms = np.broadcast_to(self.terms(problems), (len(problems), terms_of(self.robot).size))
+        with self._one_target(problems, whole=True) as one:
+            for row in range(len(problems)):
+                begun = time.perf_counter()
+                one.here[...], one.terms[...], one.state[...] = q0[row], terms[row], states[row]
+                self._asked(problems, row, one)
+                ended = one.go_on(number, rounds)
+                if ended is not None:
+                    states[row], status[row] = one.state, ended
+                    iterations[row] = one.iterations
+                seconds[row] = time.perf_counter() - begun
+        return LoopResult(states, iterations, status, seconds)
+
+    @contextmanager
+    def _one_target(self, problems: Problems, whole: bool) -> Iterator[OneTarget]:
+        """Memory for one target at a time, of which there is one for every thread at work."""
+        ready = self._ready.setdefault((problems.enforce_limits, whole), [])
         try:
             one = ready.pop()
         except IndexError:
-            one = OneTarget(self.rounds_plan(problems.enforce_limits), whole=False)
-        one.points[...], one.normals[...], one.here[...] = problems.points, problems.normals, q0
-        one.terms[...] = self.terms(problems)
-        for vectors, name in zip(one.more, self.step.layouts.contacts.data[2:], strict=True):
-            vectors[...] = problems.vectors(f"{name}s")
-        status = one()
-        found = one.quick(not one.more) if status == Status.SOLVED else None
+            one = OneTarget(self.rounds_plan(problems.enforce_limits), whole)
+        yield one
         ready.append(one)
-        return found
+
+    def _asked(self, problems: Problems, row: int, one: OneTarget) -> None:
+        """Take up the contacts of a target."""
+        one.points[...], one.normals[...] = problems.points[row], problems.normals[row]
+        for vectors, name in zip(one.more, self.step.layouts.contacts.data[2:], strict=True):
+            vectors[...] = problems.vectors(f"{name}s")[row]
 
     def rounds_plan(self, enforce_limits: bool) -> RoundsPlan:
         """All rounds of one target, as compiled code makes them."""
@@ -229,8 +268,7 @@ class HandFirstMethod(LoopedMethod):
         """What a round begins with, the memory of those before aside."""
         later, layouts = number - self.options.rounds, self.step.layouts
         if later < 0 or last is None:
-            best = None if last is None else last[:, layouts.state.slice("best_q")]
-            postures = self.hands.from_tables(problems, number, best)
+            postures = self.hands.from_tables(problems, number)
             if problems.prefer == NEAREST:
                 postures = self.order(problems, q0, postures, own=last is None)
             return self.rows(problems, q0, postures, begun=last is not None)
@@ -241,7 +279,7 @@ class HandFirstMethod(LoopedMethod):
         anywhere = self.hands.anywhere(problems, later - VALLEYS)
         whole = np.repeat(anywhere[:1], len(last), axis=0)
         if self.hands.mends(problems):
-            hands = self.hands.mended(problems, number, last[:, layouts.state.slice("best_q")])
+            hands = self.hands.mended(problems, number)
         else:
             hand = list(self.robot.hand_actuators)
             hands = np.repeat(anywhere[None][:, :, hand], len(last), axis=0)

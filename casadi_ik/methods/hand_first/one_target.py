@@ -22,8 +22,8 @@ from casadi_ik.problem.method import Quick
 
 SYMBOL = "casadi_ik_rounds"
 
-MALFORMED = -9
-"""What it returns for a question that is none."""
+MALFORMED, UNHELPED = -9, -10
+"""What it returns for a question that is none, and where no round is left that may help."""
 
 KERNELS = {
     "look_up": "lookup_job",
@@ -46,6 +46,7 @@ class OneTarget:
         more: (f, 3) each, the contacts' other vectors; write into them.
         here: (n,) where the robot is; write into it.
         terms: What `beginning` calls so; write into it.
+        state: (ns,) in which the loop ended; to be set before `go_on`.
         q: (n,) the answer; a call overwrites it, as all below.
         position_error: (f,) [m], where there are points and normals only.
         angle_error: (f,) [rad], likewise.
@@ -69,6 +70,7 @@ class OneTarget:
         if library is None:
             raise KernelError(f"{self._name}: the compiler that made the other kernels is gone")
         self._run: Any = library[SYMBOL]
+        self._run_on: Any = library[f"{SYMBOL}_on"]
         self._job = job = _structure(sizes)()
         job.rounds = plan.rounds if whole else 1
         self._kept = hands.tables(plan.enforce_limits) if whole else (hands.table,)
@@ -89,7 +91,8 @@ class OneTarget:
         self.more = list(self._view("more")[:-1].reshape(-1, f, 3))
         self.here, self.terms, self.q = map(self._view, ("here", "terms", "q"))
         self.position_error, self.angle_error = map(self._view, ("position_error", "angle_error"))
-        self._counts = self._view("state")[plan.layouts.state.slice("counts")]
+        self.state = self._view("state")
+        self._counts = self.state[plan.layouts.state.slice("counts")]
         self._reference = ctypes.byref(job)
 
     def _link(self, name: str, kernel: FunctionKernel | LookupKernel | LoopKernel) -> None:
@@ -108,11 +111,30 @@ class OneTarget:
         Raises:
             KernelError: No work memory.
         """
+        return self._ended(self._run(self._reference))
+
+    def go_on(self, number: int, rounds: int) -> int | None:
+        """Make later rounds for what stands in the arrays, after others that ended in `state`.
+
+        Args:
+            number: The first of them.
+            rounds: How many there are with those before.
+
+        Returns:
+            As above; None: no round is left that may help.
+
+        Raises:
+            KernelError: No work memory.
+        """
         job = self._job
-        code = self._run(self._reference)
+        job.round, job.rounds = number, rounds
+        return self._ended(self._run_on(self._reference))
+
+    def _ended(self, code: int) -> int | None:
+        job = self._job
         if code == DriverCode.DONE:
             return job.status
-        if code == MALFORMED:
+        if code in (MALFORMED, UNHELPED):
             return None
         try:
             while code != DriverCode.DONE:
@@ -121,6 +143,11 @@ class OneTarget:
         finally:
             job.paused = 0
         return job.status
+
+    @property
+    def iterations(self) -> int:
+        """Of the last call."""
+        return self._job.iterations
 
     def quick(self, judged: bool) -> Quick:
         """The last answer, copied.
@@ -152,7 +179,8 @@ def _driver(plan: RoundsPlan) -> str:
     return "".join(
         (
             "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
-            f"enum {{ DONE = 0, SLICE_OVER = 1, MALFORMED = {MALFORMED} }};\n",
+            "enum { DONE = 0, SLICE_OVER = 1, "
+            f"MALFORMED = {MALFORMED}, UNHELPED = {UNHELPED} }};\n",
             *jobs,
             f"#define OWN_FIELDS \\\n{fields}{calls}",
             "#define TILES(table) (job->tiles[table])\n",

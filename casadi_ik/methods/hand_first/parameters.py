@@ -16,7 +16,7 @@ class HandFirstParameters:
         candidates: Of those, how many a round of the compiled loop may start from.
         wide_table: The same for the rounds after the first.
         rounds: Rounds that begin from the tables, each from the next best candidates. After them
-            some begin elsewhere (`restarts.LATER`), before a target is given up.
+            some begin elsewhere (`restarts.later`), before a target is given up.
     """
 
     table: int = 1024

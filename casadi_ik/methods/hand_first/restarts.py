@@ -15,10 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -26,7 +24,7 @@ from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.methods.common.posture_table import PostureTable, differing
 from casadi_ik.methods.hand_first.each_finger import each_finger, mends
-from casadi_ik.methods.hand_first.going_on import VARIED
+from casadi_ik.methods.hand_first.going_on import VARIED, rugged
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.valley import valley
 from casadi_ik.problem.contacts.conditions import LENGTH
@@ -46,9 +44,12 @@ MENDED = 3
 """The same where they are mended finger by finger before: twice as many take longer than the fits
 they save."""
 
-SPREAD = 96
-"""Postures that are mended for a round after the second: not those that look like the target any
-more, but as many others in every round. What one round misses the next finds as often as not."""
+SPREAD, NARROWER, NARROW = 64, 24, 12
+"""Postures that are mended for a round after the second, and for one after so many: not those that
+look like the target any more, but as many others in every round. What the best of many is not near
+in one round it is not in the next, so later rounds take the best of fewer: of 64,000 targets of a
+LEAP hand near limits 100 are left after 16 rounds and 8 after 64; with 96 in all rounds 160 and
+16."""
 
 CHUNK = 256
 """Targets whose postures are compared with each other at once."""
@@ -75,11 +76,10 @@ VALLEYS = 3
 ANYWHERE = 2
 """Rounds from anywhere that every target gets which is not solved before."""
 
-RUGGED = 40
-"""More of them for a target whose fits end somewhere else each time."""
 
-LATER = VALLEYS + ANYWHERE + RUGGED
-"""Rounds after those of the tables, at most."""
+def later(motors: int) -> int:
+    """Rounds after those of the tables, at most, of a hand of so many motors."""
+    return VALLEYS + ANYWHERE + rugged(motors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +152,12 @@ class Restarts:
         own = (self.table, self.wide_table)
         return own if enforce_limits else (*own, self.free_table)
 
-    def from_tables(self, problems: Problems, number: int, best: Array | None = None) -> Array:
+    def from_tables(self, problems: Problems, number: int) -> Array:
         """Postures (k, candidates, hand) of a round whose postures look like the targets.
 
         Args:
             problems: k targets.
             number: The round, from 0.
-            best: (k, n) the best so far, if rounds went before.
         """
         count = self._options.candidates
         points, normals = problems.points, problems.normals
@@ -169,7 +168,7 @@ class Restarts:
         table = self.free_table if free else self.wide_table
         mend = self.mends(problems)
         if mend and number >= VARIED:
-            return self.mended(problems, number, best)
+            return self.mended(problems, number)
         wanted = number * count
         pool = min((MENDED if mend else POOL) * wanted, len(table.postures))
         parts = [np.empty((0, count, len(self._hand)))]
@@ -183,46 +182,21 @@ class Restarts:
         """Whether every finger by itself mends the postures that rounds begin from."""
         return problems.enforce_limits and self.each_finger is not None
 
-    def mended(self, problems: Problems, number: int, best: Array | None = None) -> Array:
+    def mended(self, problems: Problems, number: int) -> Array:
         """Mended postures (k, candidates, hand), other ones in every round.
-
-        The first half of them are the best hand so far with one or two fingers anew: often one has
-        come to rest by itself where it cannot reach its contact.
 
         Args:
             problems: k targets.
             number: The round, from 0.
-            best: (k, n) the best so far, if rounds went before.
         """
         table, count = self.wide_table, self._options.candidates
-        rows = np.arange(number * SPREAD, (number + 1) * SPREAD) % len(table.postures)
-        fresh = table.postures[rows]
-        halves = [(fresh, None, count)]
-        if best is not None:
-            mixed, others = np.split(fresh, 2)
-            kept = self.kept[np.arange(len(mixed)) % len(self.kept)]
-            halves = [(mixed, kept, (count + 1) // 2), (others, None, count // 2)]
-        hands = np.empty((len(problems), 0)) if best is None else best[:, self._hand]
+        fresh = table.spread(number * SPREAD, SPREAD if number < NARROW else NARROWER)
         parts = [np.empty((0, count, len(self._hand)))]
-        for points, normals, hand in _chunks(problems.points, problems.normals, hands):
-            chosen = []
-            for half, kept, wanted in halves:
-                pool = np.broadcast_to(half, (len(points), *half.shape))
-                pool = pool if kept is None else np.where(kept, hand[:, None], pool)
-                better = self._mended(pool, points, normals)
-                chosen.append(differing(better, table.ranges, wanted, SIMILAR))
-            parts.append(np.concatenate(chosen, axis=1))
+        for points, normals in _chunks(problems.points, problems.normals):
+            near = np.broadcast_to(fresh, (len(points), *fresh.shape))
+            better = self._mended(near, points, normals)
+            parts.append(differing(better, table.ranges, count, SIMILAR))
         return np.concatenate(parts)
-
-    @cached_property
-    def kept(self) -> NDArray[np.bool_]:
-        """(c, hand) motors of all fingers but one or two, for all of these."""
-        description = self._robot.description
-        fingers = [description.finger_actuators(name) for name in description.finger_names]
-        few = [some for count in (1, 2) for some in combinations(fingers, count)]
-        return ~np.array(
-            [np.isin(self._hand, [i for motors in some for i in motors]) for some in few]
-        )
 
     @cached_property
     def each_finger(self) -> FunctionKernel | None:
@@ -282,7 +256,7 @@ class Restarts:
         """Whole configurations (candidates, n), evenly spread, other ones in every round."""
         lower, upper = self.anywhere_bounds(problems.enforce_limits)
         count = self._options.candidates
-        spread = evenly((number + 1) * count, len(lower))[-count:]
+        spread = evenly(count, len(lower), number * count)
         return lower + spread * (upper - lower)
 
     def anywhere_bounds(self, enforce_limits: bool) -> tuple[Array, Array]:

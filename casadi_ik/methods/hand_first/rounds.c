@@ -1,8 +1,9 @@
 /* All rounds of hand-first for one target, as method.py and restarts.py make them for a batch.
  *
  * Calls the compiled kernels by the macros LOOK_UP, BEGIN, SOLVE, CONTACTS, VALLEY, EACH_FINGER (if
- * MENDS) and JUDGE, which take a pointer to a job of the drivers. The constants come from rounds.py. Bit for bit the answers
- * of a batch: what is computed here is computed in the same order there.
+ * MENDS) and JUDGE, which take a pointer to a job of the drivers. The constants come from
+ * rounds.py. Bit for bit the answers of a batch: what is computed here is computed in the same
+ * order there.
  */
 
 static const int64_t ALONE[] = {0, 0, 0, 0, 0, 0, 0, 0};
@@ -122,27 +123,17 @@ static void vary(rounds *job, int table, int64_t pool, int64_t count, int64_t fi
 }
 
 #if MENDS
-/* Mended postures that do not look like the target in particular, other ones in every round: first
- * the best hand so far with one or two fingers of these. */
+/* Mended postures that do not look like the target in particular, other ones in every round. */
 static int from_spread(rounds *job, int64_t number) {
-  static const int64_t rows[] = {0, SPREAD / 2, SPREAD};
-  static const int64_t places[] = {0, (N_CANDIDATES + 1) / 2, N_CANDIDATES};
-  int64_t i, half;
+  const int64_t count = number < NARROW ? SPREAD : NARROWER;
+  int64_t i;
   int code, k;
-  for (half = 0; half < 2; ++half) {
-    const int64_t count = rows[half + 1] - rows[half];
-    for (i = 0; i < count; ++i) {
-      const int64_t row = (number * SPREAD + rows[half] + i) % TABLE_ROWS[1];
-      for (k = 0; k < N_HAND; ++k) {
-        const int best = !half && KEPT[i % N_KEPT][k] > 0;
-        job->near[i * N_HAND + k] = best ? job->last[STATE_BEST_Q + HAND[k]] : posture(1, row, k);
-      }
-    }
-    code = mend(job, count);
-    if (code != DONE) return code;
-    vary(job, 1, count, places[half + 1] - places[half], 0, job->postures + places[half] * N_HAND);
+  for (i = 0; i < count; ++i) {
+    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, number * SPREAD + i, k);
   }
-  return DONE;
+  code = mend(job, count);
+  if (code == DONE) vary(job, 1, count, N_CANDIDATES, 0, job->postures);
+  return code;
 }
 #endif
 
@@ -344,7 +335,9 @@ static int begin_round(rounds *job, int64_t number) {
 static int is_hopeful(const rounds *job, int64_t number) {
   const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
   const int64_t rugged = number - (ROUNDS - RUGGED);
-  if (rugged >= 0) return returns < RETURNS && cost < (rugged < EARLY ? NEAR_COST : NEAR_AT_LAST);
+  if (rugged >= 0) {
+    return returns < RETURNS && cost < NEAR_COST && cost < NEAR_SHRINKS / (double) (rugged + 1);
+  }
   return returns < RETURNS || cost < SURE || number < VARIED || number >= TABLE_ROUNDS;
 }
 

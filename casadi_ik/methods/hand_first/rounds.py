@@ -116,14 +116,14 @@ class RoundsPlan:
             "TABLE_ROUNDS": self.options.rounds,
             "ROUNDS": self.rounds,
             "VALLEYS": restarts.VALLEYS,
-            "RUGGED": restarts.RUGGED,
-            "EARLY": going_on.EARLY,
+            "RUGGED": going_on.rugged(len(layouts.robot.hand_actuators)),
             "VARIED": going_on.VARIED,
             "RETURNS": going_on.most_returns(len(layouts.robot.hand_actuators)),
             "POOL": restarts.MENDED if self.mends else restarts.POOL,
             "MENDS": int(self.mends),
             "SPREAD": restarts.SPREAD,
-            "N_KEPT": len(self.hands.kept),
+            "NARROW": restarts.NARROW,
+            "NARROWER": restarts.NARROWER,
             "ENFORCE_LIMITS": int(self.enforce_limits),
             "HAS_ARM": int(bool(layouts.robot.arm_actuators)),
             "SOLVED_STATUS": int(Status.SOLVED),
@@ -141,8 +141,8 @@ class RoundsPlan:
         hand = len(self.layouts.robot.hand_actuators)
         return {
             "SURE": going_on.SURE,
-            "NEAR_COST": going_on.near_cost(hand, late=False),
-            "NEAR_AT_LAST": going_on.near_cost(hand, late=True),
+            "NEAR_COST": going_on.near_cost(hand),
+            "NEAR_SHRINKS": going_on.NEAR_SHRINKS,
             "AT_END": restarts.AT_END,
             "HELD": restarts.HELD,
             "NUDGE": restarts.NUDGE,
@@ -167,8 +167,7 @@ class RoundsPlan:
         hand, spreads = list(robot.hand_actuators), hands.spreads
         lower, upper = hands.anywhere_bounds(self.enforce_limits)
         fresh, state = fresh_fit(), self.layouts.state
-        kept = {"KEPT": np.asarray(hands.kept, dtype=float)} if self.mends else {}
-        return kept | {
+        return {
             "HAND": np.array(hand),
             "CARRIED": np.array(self._carried),
             "FRESH_PLACES": np.array([state.slice(name).start for name in fresh]),
