@@ -7,9 +7,10 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.kernels import FunctionKernel
+from casadi_ik.methods.hand_first import method
 from casadi_ik.methods.hand_first.each_finger import each_finger, mends
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.restarts import Restarts
+from casadi_ik.methods.hand_first.restarts import NARROW, SPREAD, Restarts
 from casadi_ik.problem.problems import Problems
 
 
@@ -91,41 +92,51 @@ def test_every_round_begins_elsewhere(hand, rng):
     size = options.candidates, len(description.hand_actuators)
     assert all(found.shape == (4, *size) for found in rounds)
     assert (rounds[0] != rounds[1]).any(axis=2).mean() > 0.9
-    # Half of them begin at the best so far but for a finger or two.
-    found = hands.mended(problems, 2, np.array(hand.random(rng, 4)))
-    assert found.shape == (4, *size)
-    assert (found != rounds[0]).any()
-    assert hands.kept.shape == (15, 10)
-    # AR10: two motors a finger, one or two of its five fingers anew.
-    assert sorted(hands.kept.sum(axis=1)) == [6] * 10 + [8] * 5
+    # Late ones are by turns the best of fewer, and what no finger has mended.
+    table = hands.wide_table
+    for number in (NARROW, NARROW + 1):
+        late = hands.mended(problems, number)
+        plain = table.spread(number * SPREAD, options.candidates)
+        assert late.shape == (4, *size)
+        assert (late == plain).all() == bool(number % 2)
+    np.testing.assert_array_equal(table.spread(0, 512), table.postures)
 
 
-def test_one_finger_that_came_to_rest_is_taken_out(hand, rng):
-    """The rest of the hand is right: what is begun from is nearer than any hand of the table."""
-    description = hand.description
-    options = HandFirstParameters(table=64, wide_table=512)
-    hands = Restarts(description, description.hand_actuators, options, compiled=False)
-    q = np.array(hand.random(rng, 8))
-    problems = Problems(*hand.contacts(q), ik.Tolerance(), True)
-    best = np.array(q)
-    columns = list(description.finger_actuators(hand.fingers[2]))
-    best[:, columns] = hand.random(rng, 8)[:, columns]
-    apart = [
-        np.abs(found - q[:, None]).sum(axis=2).min(axis=1).mean()
-        for found in (hands.mended(problems, 2, best), hands.mended(problems, 2))
-    ]
-    assert apart[0] < 0.5 * apart[1]
-
-
-def test_what_is_out_of_reach_ends_the_same_alone_and_in_a_batch(hand, rng):
-    """All rounds are made for it: in compiled code for one target, in Python for a batch."""
+@pytest.mark.parametrize("prefer", ["limits", "q0"])
+def test_what_is_out_of_reach_ends_the_same_alone_and_in_a_batch(hand, rng, monkeypatch, prefer):
+    """All rounds are made for it: in compiled code for few targets, in Python for many."""
     points, normals = hand.contacts(hand.random(rng, 6))
     points = points + rng.normal(0, 0.008, points.shape)
     solver = ik.Solver(hand)
-    batch = solver.solve_batch(points, normals)
-    assert not batch.success.all()
-    assert batch.restarts.max() > 100
+    few = solver.solve_batch(points, normals, prefer=prefer)
+    assert not few.success.all()
+    assert few.restarts.max() > 100
+    monkeypatch.setattr(method, "ALONE", 0)
+    many = solver.solve_batch(points, normals, prefer=prefer)
+    for name in ("q", "status", "restarts", "iterations"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(many, name))
+    for name, spent in many.phases.items():
+        np.testing.assert_array_equal(few.phases[name], spent)
     alone = solver.fast()
     for row in range(len(points)):
-        q, _ = alone(points[row], normals[row])
-        np.testing.assert_array_equal(q, batch.q[row])
+        start = hand.home if prefer == "q0" else None
+        q, _ = alone(points[row], normals[row], start)
+        np.testing.assert_array_equal(q, many.q[row])
+
+
+def test_so_many_rounds_and_no_more(rng):
+    """Whatever makes them."""
+    hand = ik.load_robot("kuka_lwr_barrett")
+    points, normals = hand.contacts(hand.random(rng, 4))
+    points += 0.02 * rng.normal(size=points.shape)
+    problems = Problems(points, normals, ik.Tolerance(), True)
+    tried = method.HandFirstMethod(hand.description, HandFirstParameters())
+    start = np.tile(hand.home, (4, 1))
+    every = [(trace, rounds) for trace in (False, True) for rounds in (1, 3)]
+    outcomes = [tried.run(problems, start, 0, *asked) for asked in every]
+    few, more = outcomes[:2], outcomes[2:]
+    for one, other in zip(few, more, strict=True):
+        np.testing.assert_array_equal(one.q, other.q)
+        np.testing.assert_array_equal(one.restarts, other.restarts)
+        np.testing.assert_array_equal(one.status, other.status)
+    assert few[0].restarts.max() < few[1].restarts.max() < 24

@@ -12,7 +12,8 @@ class HandFirstParameters:
     """Parameters of the method.
 
     Attributes:
-        table: Hand postures the targets' shapes are compared with.
+        table: Hand postures the targets' shapes are compared with; of hands with few motors and
+            more than three fingers fewer (`restarts.FEWER_ROWS`).
         candidates: Of those, how many a round of the compiled loop may start from.
         wide_table: The same for the rounds after the first.
         rounds: Rounds that begin from the tables, each from the next best candidates. After them

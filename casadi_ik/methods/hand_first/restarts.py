@@ -24,12 +24,18 @@ from casadi_ik.kernels import FunctionKernel
 from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.methods.common.posture_table import PostureTable, differing
 from casadi_ik.methods.hand_first.each_finger import each_finger, mends
-from casadi_ik.methods.hand_first.going_on import VARIED, rugged
+from casadi_ik.methods.hand_first.going_on import MANY, VARIED, rugged
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.valley import valley
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
+
+USUAL_FINGERS, FEWER_ROWS = 3, 3 / 8
+"""Part of the first table's rows that a hand with few motors and more fingers is compared with: the
+shape of its contacts is more telling, and each row costs as much as three of three fingers. Of
+4,000 targets of a Panda with a hand of five fingers and six motors 16 instead of 4 need a second
+posture, and all of them take an eighth less time."""
 
 AT_LIMITS = 0.5
 """Part of the range that the wide table moves to the limits."""
@@ -48,8 +54,9 @@ SPREAD, NARROWER, NARROW = 64, 24, 12
 """Postures that are mended for a round after the second, and for one after so many: not those that
 look like the target any more, but as many others in every round. What the best of many is not near
 in one round it is not in the next, so later rounds take the best of fewer: of 64,000 targets of a
-LEAP hand near limits 100 are left after 16 rounds and 8 after 64; with 96 in all rounds 160 and
-16."""
+LEAP hand near limits 100 are left after 16 rounds and 8 after 64; with 96 in all rounds 140 and
+16. By turns with these there are rounds of postures that are not mended: where mending leads away
+from all that fits, they alone get there."""
 
 CHUNK = 256
 """Targets whose postures are compared with each other at once."""
@@ -127,10 +134,18 @@ class Restarts:
         """Those of the three tables."""
         own, options = (self._robot.lower, self._robot.upper), self._options
         return (
-            Spread(options.table, 0.0, *own),
+            Spread(self._first_rows, 0.0, *own),
             Spread(options.wide_table, AT_LIMITS, *own),
             Spread(options.wide_table, 0.0, *self._everywhere),
         )
+
+    @property
+    def _first_rows(self) -> int:
+        """Postures of the first table."""
+        few, least = len(self._hand) <= MANY, self._options.candidates * self._options.rounds
+        if not few or len(self._robot.fingers) <= USUAL_FINGERS:
+            return self._options.table
+        return max(int(FEWER_ROWS * self._options.table), least)
 
     @cached_property
     def table(self) -> PostureTable:
@@ -183,13 +198,16 @@ class Restarts:
         return problems.enforce_limits and self.each_finger is not None
 
     def mended(self, problems: Problems, number: int) -> Array:
-        """Mended postures (k, candidates, hand), other ones in every round.
+        """Mended postures (k, candidates, hand), other ones in every round; see `NARROWER`.
 
         Args:
             problems: k targets.
             number: The round, from 0.
         """
         table, count = self.wide_table, self._options.candidates
+        if number >= NARROW and number % 2:
+            plain = table.spread(number * SPREAD, count)
+            return np.tile(plain, (len(problems), 1, 1))
         fresh = table.spread(number * SPREAD, SPREAD if number < NARROW else NARROWER)
         parts = [np.empty((0, count, len(self._hand)))]
         for points, normals in _chunks(problems.points, problems.normals):

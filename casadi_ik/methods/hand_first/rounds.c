@@ -123,13 +123,19 @@ static void vary(rounds *job, int table, int64_t pool, int64_t count, int64_t fi
 }
 
 #if MENDS
-/* Mended postures that do not look like the target in particular, other ones in every round. */
+/* Mended postures that do not look like the target in particular, other ones in every round; late
+ * ones by turns as they are. */
 static int from_spread(rounds *job, int64_t number) {
-  const int64_t count = number < NARROW ? SPREAD : NARROWER;
+  const int plain = number >= NARROW && number % 2;
+  const int64_t count = plain ? N_CANDIDATES : number < NARROW ? SPREAD : NARROWER;
   int64_t i;
   int code, k;
   for (i = 0; i < count; ++i) {
     for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, number * SPREAD + i, k);
+  }
+  if (plain) {
+    memcpy(job->postures, job->near, sizeof job->postures);
+    return DONE;
   }
   code = mend(job, count);
   if (code == DONE) vary(job, 1, count, N_CANDIDATES, 0, job->postures);
