@@ -32,7 +32,7 @@ SCALE = 1000
 WARM = 300
 """Targets solved before times are taken."""
 
-LATE, MOVED = 2, 0.03
+LATE, MOVED = 2, 0.2
 """So many of them again, each point moved by about so much [m]: these go through all rounds, so
 that what late rounds need is compiled and no target's time holds it."""
 
