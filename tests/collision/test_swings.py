@@ -118,9 +118,10 @@ def test_the_first_hand_of_a_target_with_an_arm_is_enough(swings, robot, hands, 
     np.testing.assert_allclose(plain.q, compiled.q, atol=1e-9)
 
 
-def test_an_arm_with_a_wrist_is_seen_with_the_wrist_anywhere():
+@pytest.mark.parametrize(("name", "sides"), [("ur5e+shadow", 8), ("xarm6+shadow", 32)])
+def test_an_arm_with_a_wrist_is_seen_with_the_wrist_anywhere(name, sides):
     """All arms at the wrist of a posture have its palm; one of them is the posture's own."""
-    robot = ik.load_robot("ur5e+shadow")
+    robot = ik.load_robot(name)
     arm = held_arm(robot.description)
     assert arm is not None
     assert len(arm.held) == 2
@@ -131,13 +132,14 @@ def test_an_arm_with_a_wrist_is_seen_with_the_wrist_anywhere():
         palm = robot.palm(q)
         wrist = q[columns][list(arm.held)]
         found = np.array(at(np.concatenate([palm[:3, :3].ravel(), palm[:3, 3], wrist]))).ravel()
-        arms, slack = found[:-8].reshape(8, len(columns)), found[-8:]
-        whole = np.tile(q, (8, 1))
+        arms, slack = found[:-sides].reshape(sides, len(columns)), found[-sides:]
+        whole = np.tile(q, (sides, 1))
         whole[:, columns] = arms
         reached = robot.palm(whole[slack >= 0])
         np.testing.assert_allclose(reached, np.tile(palm, (len(reached), 1, 1)), atol=1e-8)
         off = np.abs(np.angle(np.exp(1j * (arms - q[columns])))).max(axis=1)
         assert off[slack >= 0].min() < 1e-6
+    assert places.sides == sides
     for level in places.levels:
         assert level.shape[1] == 2
         assert (level >= robot.lower[columns][list(arm.held)]).all()

@@ -135,9 +135,10 @@ def test_what_is_near_a_panda_is_found(panda, solver):
     assert np.median(near_by) < 0.5 * np.median(far_by)
 
 
-def test_what_is_near_an_arm_whose_last_joint_is_searched_is_found():
+@pytest.mark.parametrize("name", ["xarm6+barrett_bh8_280", "xarm6+shadow"])
+def test_what_is_near_an_arm_whose_last_joint_is_searched_is_found(name):
     """A search on the branches would pass it by: it begins where the robot is."""
-    robot = robot_of("xarm6")
+    robot = ik.load_robot(name)
     method = HandFirstMethod(robot.description, HandFirstParameters(), compiled=False)
     rng = np.random.default_rng(4)
     q = robot.random(rng, 40)

@@ -73,22 +73,33 @@ def form_at(form: ClosedForm) -> ca.Function:
 
 
 def held_at(arm: HeldArm) -> ca.Function:
-    """The eight arms with the held joints at given angles.
+    """The arms with the held joints at given angles, as many as `form_at` gives.
 
     Returns:
         (rotation (3, 3), origin (3, 1) [m], angles of the held joints and position of the swept
         one, if there is one [rad]) -> configurations (8, n) [rad] of the whole arm and the slack
         (8, 1) of each, as `form_at`.
     """
-    rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
+    symbols: Any = ca.MX if arm.passes else ca.SX
+    rotation, origin = symbols.sym("rotation", 3, 3), symbols.sym("origin", 3)
     held = len(arm.held)
-    place = ca.SX.sym("place", places_of(arm))
-    angles, position = place[:held], place[held] if arm.form.swept else ca.SX(0)
-    seen = arm.seen(Pose(rotation, origin), angles)
-    found, slack = form_at(arm.form)(seen.rotation, seen.origin, position)
-    rows = [arm.joined(found[i, :].T, angles).T for i in range(len(SIGNS))]
-    outputs = shared(ca.vertcat(*rows), slack)
+    place = symbols.sym("place", places_of(arm))
+    angles, position = place[:held], place[held] if arm.form.swept else symbols(0)
+    seen = seen_by(arm)(rotation, origin, angles)
+    found, slack = form_at(arm.form)(*seen, position)
+    rows = [arm.joined(found[i, :].T, angles).T for i in range(rows_of(arm))]
+    outputs = [ca.vertcat(*rows), slack]
+    outputs = outputs if arm.passes else shared(*outputs)
     return ca.Function("held_at", [rotation, origin, place], outputs)
+
+
+def seen_by(arm: HeldArm) -> ca.Function:
+    """(rotation, origin, angles of the held joints) -> the pose left to the solved joints."""
+    rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
+    angles = ca.SX.sym("angles", len(arm.held))
+    seen = arm.seen(Pose(rotation, origin), angles)
+    outputs = shared(ca.densify(seen.rotation), ca.densify(seen.origin))
+    return ca.Function("held_seen", [rotation, origin, angles], outputs)
 
 
 def places_of(arm: SrsArm | ClosedForm | HeldArm) -> int:
@@ -100,7 +111,11 @@ def places_of(arm: SrsArm | ClosedForm | HeldArm) -> int:
 
 def rows_of(arm: ClosedForm | HeldArm) -> int:
     """How many arms there are at a place."""
-    return len(SIGNS) * (ROOTS if isinstance(arm, PassingArm) else 1)
+    return len(SIGNS) * (ROOTS if _passes(arm) else 1)
+
+
+def _passes(arm: SrsArm | ClosedForm | HeldArm) -> bool:
+    return arm.passes if isinstance(arm, HeldArm) else isinstance(arm, PassingArm)
 
 
 def arms_graph(arm: SrsArm | ClosedForm | HeldArm, name: str, recipe: str) -> FunctionGraph:
@@ -122,7 +137,7 @@ def arms_graph(arm: SrsArm | ClosedForm | HeldArm, name: str, recipe: str) -> Fu
     size = 12 + places_of(arm)
 
     def build() -> ca.Function:
-        symbols: Any = ca.MX if isinstance(arm, PassingArm) else ca.SX
+        symbols: Any = ca.MX if _passes(arm) else ca.SX
         x = symbols.sym("x", size)
         palm = [ca.reshape(x[:9], 3, 3).T, x[9:12]]
         if isinstance(arm, HeldArm):
@@ -132,7 +147,7 @@ def arms_graph(arm: SrsArm | ClosedForm | HeldArm, name: str, recipe: str) -> Fu
             arms, slack = at(*palm, *ca.vertsplit(x[12:]))
         slacks = ca.repmat(slack, sides, 1) if alone else slack
         both = ca.vertcat(ca.vec(arms.T), slacks)
-        outputs = [both] if isinstance(arm, PassingArm) else shared(both)
+        outputs = [both] if _passes(arm) else shared(both)
         return ca.Function(name, [x], outputs, ["x"], ["arms"])
 
     outputs = ((sides * (joints + 1), 1),)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from casadi_ik.methods.common.arm_branches import seen_by
 from casadi_ik.methods.common.arm_choice import Wanted
 from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.methods.common.form_search import CHOICE, WINDOWS, choose_form, place_form, trials
@@ -45,10 +46,10 @@ SWEPT = (
 """Trials of an arm whose closed form has a swept joint."""
 
 STILL = (
-    *(Hold(number) for number in range(10)),
-    *(Hold(10 + number, 2.0 ** -(1 + number)) for number in range(6)),
+    *(Hold(number, look=number) for number in range(10)),
+    *(Hold(10 + number, 2.0 ** -(1 + number), number) for number in range(6)),
 )
-"""Those of one without."""
+"""Those of one without; their looks begin the search of a joint that passes by its sphere."""
 
 
 def holds(arm: HeldArm) -> tuple[Hold, ...]:
@@ -153,8 +154,7 @@ def _left(arm: HeldArm) -> ca.Function:
     angles, rotation = ca.SX.sym("angles", len(arm.held)), ca.SX.sym("rotation", 3, 3)
     origin = ca.SX.sym("origin", 3)
     bounds = [ca.SX.sym(name, len(arm.screws)) for name in ("lower", "upper")]
-    seen = arm.seen(Pose(rotation, origin), angles)
-    outputs = shared(ca.densify(seen.rotation), ca.densify(seen.origin))
+    outputs = seen_by(arm)(rotation, origin, angles)
     ends = [end[list(arm.solved)] for end in bounds]
     return ca.Function("held_left", [angles, rotation, origin, *bounds], [*outputs, *ends])
 

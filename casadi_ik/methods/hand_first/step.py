@@ -241,7 +241,8 @@ class HandFirstStep:
     @property
     def _searched_if_near(self) -> bool:
         """Whether what is near is searched from there: a search over two joints passes it by."""
-        return isinstance(self.placed, PassingArm)
+        placed = self.placed
+        return placed.passes if isinstance(placed, HeldArm) else isinstance(placed, PassingArm)
 
     def _arm_stage(self, p: dict[str, Expr]) -> Expr:
         if self.placed is None or self._searched_if_near:

@@ -9,7 +9,6 @@ from casadi_ik.kernels.swing_kernel import ArmPlaces
 from casadi_ik.methods.common.arm_branches import SIDES, rows_of
 from casadi_ik.methods.common.arm_placement import ALLOWED
 from casadi_ik.methods.common.even_spread import evenly
-from casadi_ik.symbolic.closed_arms.form import SIGNS
 from casadi_ik.symbolic.closed_arms.held import HeldArm
 from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.srs_arm import SrsArm
@@ -92,7 +91,7 @@ def _held_places(robot: ArmHand, arm: HeldArm) -> ArmPlaces:
         np.array(columns, dtype=np.int64),
         robot.lower[columns],
         robot.upper[columns],
-        len(SIGNS),
+        rows_of(arm),
         (low + width * grid, low + width * spread),
         step * np.linspace(-1, 1, CLOSER + 2)[1:-1],
         ALLOWED,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import casadi as ca
 import numpy as np
@@ -16,7 +17,8 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.closed_arms.form import ClosedForm
-from casadi_ik.symbolic.closed_arms.recognise import recognised
+from casadi_ik.symbolic.closed_arms.passing import PassingArm
+from casadi_ik.symbolic.closed_arms.recognise import passing, recognised
 from casadi_ik.symbolic.closed_arms.screws import Screws, arm_screws
 from casadi_ik.symbolic.kinematics import Pose, axis_rotation
 from casadi_ik.symbolic.se3 import Transform, compose, inverse
@@ -43,6 +45,11 @@ class HeldArm:
     def exact(self) -> bool:
         """Whether the closed form is that of the real arm."""
         return self.form.exact
+
+    @property
+    def passes(self) -> bool:
+        """Whether the form is one whose last axis passes by its sphere."""
+        return isinstance(self.form, PassingArm)
 
     @property
     def off(self) -> float:
@@ -83,17 +90,18 @@ class HeldArm:
 def held_arm(robot: RobotDescription) -> HeldArm | None:
     """How an arm that has no closed form has one with joints held, or None.
 
-    As few joints as possible are held, rather the last ones than the first.
+    As few joints as possible are held, rather the last ones than the first, and rather so that the
+    form needs no search of its own.
     """
     try:
         screws = arm_screws(robot)
     except UnsupportedError:
         return None
     count = len(screws)
-    for length in (7, 6):
+    for length, known in product((7, 6), (recognised, passing)):
         for first in range(count - length + 1 if count > length else 0):
             solved = tuple(range(first, first + length))
-            form = recognised(_part(screws, solved))
+            form = known(_part(screws, solved))
             if form is not None:
                 held = tuple(joint for joint in range(count) if joint not in solved)
                 return HeldArm(form, screws, solved, held)
