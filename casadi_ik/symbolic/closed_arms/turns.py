@@ -19,6 +19,9 @@ from casadi_ik.symbolic.smooth import Expr
 TINY = 1e-24
 """Squared length below which a vector has no direction."""
 
+TINIEST = TINY * TINY
+"""Likewise of a product of two vectors: of those that are longer each has one."""
+
 
 @dataclass(frozen=True, eq=False)
 class Turn:
@@ -59,8 +62,8 @@ class Turn:
 def turn(cosine: Expr, sine: Expr) -> Turn:
     """The turn towards a direction of any length; none where it has no length."""
     squared = cosine * cosine + sine * sine
-    scale = 1 / ca.sqrt(ca.fmax(squared, TINY))
-    known = squared > TINY
+    scale = 1 / ca.sqrt(ca.fmax(squared, TINIEST))
+    known = squared > TINIEST
     return Turn(ca.if_else(known, cosine * scale, 1.0), ca.if_else(known, sine * scale, 0.0))
 
 
