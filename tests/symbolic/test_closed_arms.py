@@ -132,6 +132,24 @@ def test_every_arm_brings_the_palm_there_and_one_is_that_it_was_made_with(name):
             assert (np.abs(rows - middle) <= np.pi + 1e-9).all() or form_of(name).swept
 
 
+@pytest.mark.parametrize(
+    ("name", "straight"), [("ur5e", 0.0), ("ur10e", np.pi), ("puma560", 0.0), ("irb140", 0.0)]
+)
+def test_next_to_a_singular_wrist_every_arm_brings_the_palm_there(name, straight):
+    """However near: what the directions of two short vectors say is not taken for nothing."""
+    robot, rng = robot_of(name), np.random.default_rng(3)
+    for power in range(3, 13):
+        for q in robot.random(rng, 5):
+            q[columns(name)[4]] = straight + 10.0**-power
+            palm = robot.palm(q)
+            rows, slack = arms(name, palm, 0.0)
+            reached = palms(name, rows[slack >= 0])
+            assert len(reached)
+            np.testing.assert_allclose(
+                reached, np.broadcast_to(palm, (len(reached), 4, 4)), atol=1e-7
+            )
+
+
 def moved_screws(screws: Screws, rng: np.random.Generator) -> Screws:
     """The same arm on another base, with another zero."""
     turn, shift = Rotation.random(random_state=rng.integers(1000)).as_matrix(), rng.normal(size=3)
