@@ -19,6 +19,10 @@ from casadi_ik.solving.alternatives.swings import Preference
 TOGETHER = 1024
 """Candidates that are worked on at once."""
 
+ROUNDS = 51
+"""Of hands that a candidate gets at most: hands of many motors go on much longer for a single
+grasp, and most of many candidates are out of reach."""
+
 CLOSER = 8
 """So many times as many answers as are wanted are looked at closer."""
 
@@ -81,8 +85,7 @@ def answers_of(
         prefer: What is preferred.
         limit: How many answers are wanted.
         seed: Of random arms.
-        thorough: Whether to look as far as for a single grasp, instead of at the first round of
-            hands.
+        thorough: Whether to look at `ROUNDS` of hands, instead of at the first.
     """
     parts = []
     for first in range(0, len(problems), TOGETHER):
@@ -113,7 +116,7 @@ class _Part:
     def run(self, seed: int, thorough: bool) -> Answers:
         """Their answers."""
         method = self.trials.method
-        rounds = None if thorough else 1
+        rounds = ROUNDS if thorough else 1
         outcome = method.run(self.problems, self.starts, seed, False, rounds)
         good = self.trials.solved(self.problems, outcome.q, self.problems.enforce_limits)
         rows = np.flatnonzero(good)
