@@ -7,8 +7,9 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.methods.hand_first import method
+from casadi_ik.methods.hand_first import one_by_one
 from casadi_ik.methods.hand_first.each_finger import each_finger, mends
+from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.restarts import NARROW, SPREAD, Restarts
 from casadi_ik.problem.problems import Problems
@@ -111,7 +112,7 @@ def test_what_is_out_of_reach_ends_the_same_alone_and_in_a_batch(hand, rng, monk
     few = solver.solve_batch(points, normals, prefer=prefer)
     assert not few.success.all()
     assert few.restarts.max() > 100
-    monkeypatch.setattr(method, "ALONE", 0)
+    monkeypatch.setattr(one_by_one, "ALONE", 0)
     many = solver.solve_batch(points, normals, prefer=prefer)
     for name in ("q", "status", "restarts", "iterations"):
         np.testing.assert_array_equal(getattr(few, name), getattr(many, name))
@@ -130,7 +131,7 @@ def test_so_many_rounds_and_no_more(rng):
     points, normals = hand.contacts(hand.random(rng, 4))
     points += 0.02 * rng.normal(size=points.shape)
     problems = Problems(points, normals, ik.Tolerance(), True)
-    tried = method.HandFirstMethod(hand.description, HandFirstParameters())
+    tried = HandFirstMethod(hand.description, HandFirstParameters())
     start = np.tile(hand.home, (4, 1))
     every = [(trace, rounds) for trace in (False, True) for rounds in (1, 3)]
     outcomes = [tried.run(problems, start, 0, *asked) for asked in every]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -18,8 +16,8 @@ from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.common.posture_table import squared_distance
+from casadi_ik.methods.hand_first import one_by_one
 from casadi_ik.methods.hand_first.beginning import beginning
-from casadi_ik.methods.hand_first.beginning import terms as terms_of
 from casadi_ik.methods.hand_first.going_on import (
     CARRIED,
     NEAR_SHRINKS,
@@ -31,7 +29,7 @@ from casadi_ik.methods.hand_first.going_on import (
     near_cost,
     rugged,
 )
-from casadi_ik.methods.hand_first.one_target import OneTarget
+from casadi_ik.methods.hand_first.one_by_one import OneByOne
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.restarts import VALLEYS, Restarts, later
 from casadi_ik.methods.hand_first.rounds import RoundsPlan
@@ -41,7 +39,7 @@ from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Quick
 from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.closed_arms.held import held_arm
@@ -49,10 +47,6 @@ from casadi_ik.symbolic.closed_arms.recognise import arm_form
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
-
-ALONE = 16
-"""Targets left to a batch from which on they are solved one by one. What is done once a round in
-Python outweighs that four would be solved side by side."""
 
 NEAREST = "q0"
 """The preference for what is near the start."""
@@ -92,7 +86,7 @@ class HandFirstMethod(LoopedMethod):
         self.step = HandFirstStep(
             robot, arm_form(robot) or held_arm(robot), options.candidates, self._kinds
         )
-        self._ready: dict[tuple[bool, bool], list[OneTarget]] = {}
+        self._alone = OneByOne(self.step.layouts, self.rounds_plan)
         self._kept: tuple[Any, Array] | None = None
 
     def step_graph(self) -> StepGraph:
@@ -163,49 +157,15 @@ class HandFirstMethod(LoopedMethod):
         """The first round of one target; see `QuickMethod.quick`."""
         if not self.kernel.compiled:
             return None
-        with self._one_target(problems, whole=False) as one:
-            one.here[...], one.terms[...] = q0, self.terms(problems)
-            self._asked(problems, 0, one)
-            status = one()
-            return one.quick(not one.more) if status == Status.SOLVED else None
+        return self._alone.first(problems, q0, self.terms(problems))
 
     def finish(
         self, problems: Problems, q0: Array, last: LoopResult, number: int, rounds: int
     ) -> LoopResult | None:
         """Few targets are solved one by one in compiled code; see `LoopedMethod.finish`."""
-        if not self.kernel.compiled or len(problems) > ALONE:
+        if not self.kernel.compiled or len(problems) > one_by_one.ALONE:
             return None
-        states, status = last.states.copy(), last.status.copy()
-        iterations, seconds = np.zeros_like(last.iterations), np.zeros_like(last.time)
-        terms = np.broadcast_to(self.terms(problems), (len(problems), terms_of(self.robot).size))
-        with self._one_target(problems, whole=True) as one:
-            for row in range(len(problems)):
-                begun = time.perf_counter()
-                one.here[...], one.terms[...], one.state[...] = q0[row], terms[row], states[row]
-                self._asked(problems, row, one)
-                ended = one.go_on(number, rounds)
-                if ended is not None:
-                    states[row], status[row] = one.state, ended
-                    iterations[row] = one.iterations
-                seconds[row] = time.perf_counter() - begun
-        return LoopResult(states, iterations, status, seconds)
-
-    @contextmanager
-    def _one_target(self, problems: Problems, whole: bool) -> Iterator[OneTarget]:
-        """Memory for one target at a time, of which there is one for every thread at work."""
-        ready = self._ready.setdefault((problems.enforce_limits, whole), [])
-        try:
-            one = ready.pop()
-        except IndexError:
-            one = OneTarget(self.rounds_plan(problems.enforce_limits), whole)
-        yield one
-        ready.append(one)
-
-    def _asked(self, problems: Problems, row: int, one: OneTarget) -> None:
-        """Take up the contacts of a target."""
-        one.points[...], one.normals[...] = problems.points[row], problems.normals[row]
-        for vectors, name in zip(one.more, self.step.layouts.contacts.data[2:], strict=True):
-            vectors[...] = problems.vectors(f"{name}s")[row]
+        return self._alone.rest(problems, q0, self.terms(problems), last, number, rounds)
 
     def rounds_plan(self, enforce_limits: bool) -> RoundsPlan:
         """All rounds of one target, as compiled code makes them."""
