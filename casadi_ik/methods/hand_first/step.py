@@ -34,7 +34,6 @@ from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.common.whole_contacts import WholeStep
 from casadi_ik.methods.hand_first.balance_stage import balance_stage
 from casadi_ik.methods.hand_first.choice_stage import choice_stage
-from casadi_ik.methods.hand_first.going_on import MANY
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
 from casadi_ik.methods.hand_first.placement_stage import placement_stage
@@ -55,15 +54,6 @@ OWN_HAND = 0.5
 BEFORE_THE_ARM = 0.999
 """Part of the tolerances that a hand is fitted to: the arm that follows it adds its rounding, which
 at 1e-6 has made an answer of 1.0000006e-6."""
-
-
-SEARCHED_OF_MANY = 3
-"""Of so many later rounds of a hand with many motors one searches for arms that are not quite of
-their form by steps: rather its hand is in the way than the arm. Targets of a Gen3 with a LEAP hand
-take a tenth to a quarter less time."""
-
-ROOM = 0.5
-"""Between whole numbers."""
 
 
 class HandFirstStep:
@@ -144,11 +134,7 @@ class HandFirstStep:
         # so is what Newton's steps did not lead to from the ideal arm.
         state = ca.MX.sym("state", layouts.state.size)
         parameters = ca.MX.sym("parameters", layouts.parameters.size)
-        earlier = layouts.state.unpack(state)["earlier"]
-        later = earlier > 0
-        if len(self.robot.hand_actuators) > MANY:
-            some = ca.fmod(earlier / layouts.candidates, SEARCHED_OF_MANY) < ROOM
-            later = ca.logic_and(later, some)
+        later = layouts.state.unpack(state)["earlier"] > 0
         if self._searched_if_near:
             later = ca.logic_or(later, layouts.parameters.unpack(parameters)["nearest"])
         stages = numeric_stage(layouts), placement_stage(layouts, placed)
