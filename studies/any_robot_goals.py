@@ -40,7 +40,7 @@ LATE = (
     "targets near limits may take a hundred rounds with hands of 16 motors; arms that are not "
     "quite of their form are searched by steps in later rounds"
 )
-ALONE = "arms with most joints at limits stand in one place alone, within a thousandth of a radian"
+CORNERED = "an arm with most joints at limits has few places to stand in, and narrow ones"
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def goal_rows(found: Entries) -> list[list[str]]:
         ]
         lost = sum(len(cell["missed"]) for cell in cells)
         count = sum(cell["count"] for cell in cells)
-        rows.append(_row(f"missed, {tolerance}", "0", f"{lost} of {count:,}", not lost, ALONE))
+        rows.append(_row(f"missed, {tolerance}", "0", f"{lost} of {count:,}", not lost, CORNERED))
     for goal in goals():
         values = {pair.robot: goal.measure(entry) for pair, entry in found.items()}
         known = {name: value for name, value in values.items() if value is not None}

@@ -3,11 +3,11 @@
 The first round compares the target with a table of postures. The next ones compare it with a table
 many times as large, half of it at limits, and take only postures that differ from each other: the
 neighbours of one that failed fail as well. Hands of many motors are mended before, see
-`each_finger`. What all of them miss is one of two things. Its fit has
-come to rest in a long valley, where the contacts hardly move while the hand does: so the next
-round begins along it, to either side of the best fit so far. Or no table holds its like: then
-postures drawn from anywhere follow, and a whole configuration of arm and hand; many of them where
-the fits end somewhere else each time, as with many joints at their limits.
+`each_finger`. What all of them miss is one of two things. Its fit has come to rest in a long
+valley, where the contacts hardly move while the hand does: so the next round begins along it, to
+either side of the best fit so far. Or no table holds its like: then postures drawn from anywhere
+follow, and a whole configuration of arm and hand; many of them where the fits end somewhere else
+each time, as with many joints at their limits.
 """
 
 from __future__ import annotations
