@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.viewing.asked import Asked, Held
 from casadi_ik.viewing.bodies import arrow, ball, tube
-from casadi_ik.viewing.frames import facing, pose_of, quaternion
+from casadi_ik.viewing.frames import facing, pose_of, quaternion, usable
 from casadi_ik.viewing.words import errors
 
 SIZE = 0.06
@@ -130,16 +131,19 @@ class _Target:
         self.handles(False)
 
     def _connect(self, finger: str, drags: Drags) -> None:
-        # Asynchronous callbacks keep their order; they only put down what is to be done.
+        # Asynchronous callbacks keep their order; they only put down what is to be done. What is
+        # no place is left out: viser would tell the terminal.
         @self.control.on_update
         async def _(_: Any) -> None:
-            drags.control(finger, pose_of(self.control.position, self.control.wxyz))
+            with suppress(ValueError):
+                drags.control(finger, pose_of(self.control.position, self.control.wxyz))
 
         for part in self._parts:
 
             @part.on_drag("left")
             async def _(event: Any) -> None:
-                drags.point(finger, np.array(event.end_position))
+                with suppress(ValueError):
+                    drags.point(finger, usable(event.end_position, 3))
 
             @part.on_click
             async def _(_: Any) -> None:
@@ -147,9 +151,10 @@ class _Target:
 
         @self._arrow.on_drag("left")
         async def _(event: Any) -> None:
-            way = np.array(event.end_position) - self.control.position
-            if np.linalg.norm(way) > 1e-3:
-                drags.normal(finger, way)
+            with suppress(ValueError):
+                way = usable(event.end_position, 3) - usable(self.control.position, 3)
+                if np.linalg.norm(way) > 1e-3:
+                    drags.normal(finger, way)
 
         @self._arrow.on_click
         async def _(_: Any) -> None:

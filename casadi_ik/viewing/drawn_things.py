@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -139,7 +140,8 @@ class DrawnThings:
 
         @control.on_update
         async def _(_: Any) -> None:
-            moved(name, pose_of(control.position, control.wxyz))
+            with suppress(ValueError):
+                moved(name, pose_of(control.position, control.wxyz))
 
         for i, (surface, color, opacity) in enumerate(parts):
             mesh = server.scene.add_mesh_simple(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 import struct
 import zlib
@@ -12,6 +13,8 @@ import numpy as np
 
 from casadi_ik.grasps import Grasp
 from casadi_ik.viewing.grasp_text import grasp_text
+
+logger = logging.getLogger(__name__)
 
 SIZE = (1600, 1000)
 """Of a picture [pixels]."""
@@ -29,8 +32,12 @@ def save_grasp(client: Any, grasp: Grasp, solved: bool) -> None:
 
 
 def save_picture(client: Any, name: str) -> None:
-    """Send what a browser sees, drawn by it anew in print size."""
-    image = client.get_render(SIZE[1], SIZE[0], transport_format="png", timeout=PATIENCE)
+    """Send what a browser sees, drawn by it anew in print size, if it does draw."""
+    try:
+        image = client.get_render(SIZE[1], SIZE[0], transport_format="png", timeout=PATIENCE)
+    except Exception as error:  # whatever it sends instead is read by imageio
+        logger.debug("no picture: %s", error)
+        return
     client.send_file_download(name, png(np.asarray(image)), save_immediately=True)
 
 

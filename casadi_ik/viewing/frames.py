@@ -5,8 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
+
+MOST = 1e6
+"""Of a number that a browser sends [m, deg or mm]."""
 
 
 def quaternions(rotations: Array) -> Array:
@@ -47,16 +51,36 @@ def quaternion(rotation: Array) -> Array:
 
 
 def pose_of(position: Array, wxyz: Array) -> Array:
-    """(4, 4) of a position (3,) and a quaternion (4,)."""
-    w, x, y, z = np.asarray(wxyz, dtype=float) / np.linalg.norm(wxyz)
+    """(4, 4) of a position (3,) and a quaternion (4,).
+
+    Raises:
+        ValueError: They are not of these sizes, or not finite.
+    """
+    turn = usable(wxyz, 4)
+    length = float(np.linalg.norm(turn))
+    if length == 0:
+        raise ValueError("found a quaternion of no length")
+    w, x, y, z = turn / length
     pose = np.eye(4)
     pose[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    pose[:3, 3] = position
+    pose[:3, 3] = usable(position, 3)
     return pose
+
+
+def usable(numbers: ArrayLike, count: int) -> Array:
+    """Numbers (count,) that a browser has sent.
+
+    Raises:
+        ValueError: They are not so many, not finite, or too large to be drawn.
+    """
+    found = np.asarray(numbers, dtype=float)
+    if found.shape != (count,) or not (np.abs(found) <= MOST).all():
+        raise ValueError(f"found {found}, expected {count} numbers up to {MOST:g}")
+    return found
 
 
 def facing(point: Array, normal: Array, like: Array | None = None) -> Array:

@@ -152,7 +152,7 @@ class LogPage:
             self.jump(self._jumps.value == "next")
 
     def _play(self) -> None:
-        while not self._ended.wait(1.0 / SPEEDS[str(self._speed.value)]):
+        while not self._ended.wait(1.0 / SPEEDS.get(str(self._speed.value), 10.0)):
             self._playing.wait()
             if self._ended.is_set():
                 return

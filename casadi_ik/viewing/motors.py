@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from casadi_ik.arrays import Array
+from casadi_ik.viewing.frames import usable
 from casadi_ik.viewing.words import bars, block
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ class Motors:
         async def _(event: Any) -> None:
             if event.client is not None:
                 robot = self._page.robot
-                q = np.array([one.value for one in self._sliders]) / self._scales
+                q = usable([one.value for one in self._sliders], len(self._sliders)) / self._scales
                 self._page.drag_motors(np.clip(q, robot.lower, robot.upper))
 
 

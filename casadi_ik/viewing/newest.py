@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from casadi_ik.errors import shortened
 from casadi_ik.kernels.cancellation import CancelledError, cancellable
 
 logger = logging.getLogger(__name__)
@@ -27,6 +28,9 @@ REST = 0.15
 
 LOOKS = 0.5
 """After so long whoever drags looks, and does not go on at once [s]: time for what takes long."""
+
+FAULTS = 20
+"""So many different ones are told of."""
 
 
 class Newest:
@@ -46,6 +50,7 @@ class Newest:
         self._busy = self._stopped = False
         self._awaited = 0
         self._moved_on = threading.Event()
+        self._told: set[str] = set()
         self.dropped = 0
         self._thread = threading.Thread(target=self._run, name="casadi-ik view", daemon=True)
         self._thread.start()
@@ -123,6 +128,11 @@ class Newest:
     def _do(self, work: Work) -> None:
         try:
             work()
-        except Exception:
-            # One thing that goes wrong must not end the page.
-            logger.exception("the view could not do what was asked")
+        except Exception as error:
+            # One thing that goes wrong must not end the page, nor be told at every movement.
+            text = shortened(f"{type(error).__name__}: {error}").partition("\n")[0]
+            first = text not in self._told and len(self._told) < FAULTS
+            self._told.add(text)
+            level = logging.WARNING if first else logging.DEBUG
+            debugged = logger.isEnabledFor(logging.DEBUG)
+            logger.log(level, "the view could not do what was asked: %s", text, exc_info=debugged)

@@ -194,10 +194,15 @@ class PadPage:
         self._chosen = gui.add_dropdown("Pad", self.robot.fingers)
         skin = gui.add_button("Put it on the skin", icon=None)
         back = gui.add_button("As in the file", icon=None, color="gray")
-        self._save = save = gui.add_button(
+        self._save = gui.add_button(
             f"Save to {self.path.name}", icon=None, color="green", disabled=not writable
         )
         gui.add_html(legend(LEGEND))
+        if writable:  # a disabled button can be pressed by who writes the messages by hand
+
+            @self._save.on_click
+            async def _(_: Any) -> None:
+                self.save()
 
         @self._chosen.on_update
         async def _(event: Any) -> None:
@@ -211,10 +216,6 @@ class PadPage:
         @back.on_click
         async def _(_: Any) -> None:
             self.reset()
-
-        @save.on_click
-        async def _(_: Any) -> None:
-            self.save()
 
     def _draw(self) -> None:
         with self.server.atomic():

@@ -16,6 +16,7 @@ from casadi_ik.files.reading import read_yaml
 from casadi_ik.grasps import Grasp
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.logs.read.one_solve import OneSolve
+from casadi_ik.viewing.access import LOOPBACK
 from casadi_ik.viewing.asked import Asked, Settings, asked_of
 from casadi_ik.viewing.grasp_page import GraspPage
 from casadi_ik.viewing.log_page import LogPage
@@ -23,9 +24,6 @@ from casadi_ik.viewing.log_track import track_of
 from casadi_ik.viewing.meshes import robot_meshes
 from casadi_ik.viewing.pad_page import PadPage
 from casadi_ik.viewing.server import HOST, Viewer, serve
-
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
-"""Where nobody else sees a page."""
 
 
 def view_grasp(
@@ -100,7 +98,8 @@ def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None =
 
     Args:
         path: Its description, as `casadi-ik import` has written it.
-        host: As for `view_grasp`; what others may see they may not have written.
+        host: As for `view_grasp`; what others may see they may not have written, and of what is
+            written from here the address has a token.
         port: As for `view_grasp`.
 
     Raises:
@@ -112,6 +111,7 @@ def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None =
     if not isinstance(read_yaml(file).get("fingers"), dict):
         raise DescriptionError(f"{file}: fingers: expected the pads of the fingers, by name")
     surfaces = robot_meshes(robot, file)
-    server = serve(host, port)
-    page = PadPage(server, robot, file, surfaces, writable=host in LOOPBACK)
+    writable = host in LOOPBACK
+    server = serve(host, port, secret=writable)
+    page = PadPage(server, robot, file, surfaces, writable)
     return Viewer(server, page, page.stop)

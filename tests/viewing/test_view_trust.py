@@ -1,0 +1,244 @@
+"""Pages asked by web pages of others, by clients that are none, and with messages that are none."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec.msgpack
+import numpy as np
+import pytest
+import viser
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
+from websockets.typing import Origin, Subprotocol
+
+from casadi_ik.viewing import Viewer, view_pads
+
+VERSION = f"viser-v{viser.__version__}"
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1, 0, 0, 0],
+    "position": [1, 1, 1],
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 10.0,
+    "image_height": 10,
+    "image_width": 10,
+    "look_at": [0, 0, 0],
+    "up_direction": [0, 0, 1],
+}
+
+
+def opened(
+    url: str, host: str = "", origin: str | None = None, version: str | None = VERSION
+) -> Connection:
+    """A websocket to a page's address, as a browser opens it that was led there by a name."""
+    there = urlsplit(url)
+    assert there.hostname is not None
+    assert there.port is not None
+    named = f"ws://{host or there.netloc}{there.path.rstrip('/')}"
+    way = socket.create_connection((there.hostname, there.port))
+    spoken = None if version is None else [Subprotocol(version)]
+    whose = None if origin is None else Origin(origin)
+    return connect(named, sock=way, origin=whose, subprotocols=spoken, max_size=None)
+
+
+def send(page: Connection, *messages: Any) -> None:
+    for one in messages:
+        page.send(one if isinstance(one, bytes | str) else msgspec.msgpack.encode(one))
+
+
+def greeted(page: Connection) -> bool:
+    """Whether the page sends what is on it."""
+    send(page, CAMERA)
+    return len(page.recv(10)) > 100
+
+
+def asked(url: str, **headers: str) -> tuple[int, bytes]:
+    """Status and text of a page."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+@pytest.fixture
+def pads(description: Path) -> Iterator[Viewer]:
+    viewer = view_pads(description)
+    yield viewer
+    viewer.stop()
+
+
+def dragged(viewer: Viewer) -> dict[str, Any]:
+    """What a browser sends when the first contact is moved."""
+    control = viewer.page._contacts._targets[viewer.page.robot.fingers[0]].control
+    moved = control.position + np.array([0.0, 0.002, 0.0])
+    return {
+        "type": "TransformControlsUpdateMessage",
+        "name": control.name,
+        "wxyz": [1, 0, 0, 0],
+        "position": moved.tolist(),
+    }
+
+
+def pressed(handle: Any) -> dict[str, Any]:
+    """What a browser sends when a button is pressed."""
+    return {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": True}}
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("", "http://evil.example"),
+        ("", "http://127.0.0.1:1"),
+        ("", "null"),
+        ("evil.example", "http://evil.example"),
+        ("127.0.0.1.evil.example:8080", None),
+    ],
+)
+def test_a_foreign_page_is_refused(cup: Viewer, host: str, origin: str | None) -> None:
+    with pytest.raises(InvalidStatus) as caught:
+        opened(cup.url, host, origin)
+    assert caught.value.response.status_code == 403
+    headers = {"Host": host or urlsplit(cup.url).netloc} | ({"Origin": origin} if origin else {})
+    assert asked(cup.url, **headers)[0] == 403
+
+
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
+def test_the_page_itself_is_answered(cup: Viewer, name: str) -> None:
+    """Also through a tunnel: the port may be another one."""
+    there = urlsplit(cup.url)
+    assert b"<html" in asked(cup.url, Host=f"{name}:9999")[1].lower()
+    for host in (f"{name}:{there.port}", f"{name}:9999"):
+        with opened(cup.url, host, f"http://{host}") as page:
+            assert greeted(page)
+
+
+def test_where_can_be_written_the_address_has_a_token(pads: Viewer, description: Path) -> None:
+    there, before = urlsplit(pads.url), description.read_text()
+    assert len(there.path) > 20
+    assert asked(pads.url)[0] == 200
+    for path in ("", "/", "/x", there.path[:-2]):
+        bare = f"http://{there.netloc}{path}"
+        assert asked(bare)[0] == 403
+        with pytest.raises(InvalidStatus):
+            opened(bare)
+    with opened(pads.url, origin=f"http://{there.netloc}") as page:
+        assert greeted(page)
+        send(page, dragged(pads), pressed(pads.page._save))
+        while not pads.page.said:
+            page.recv(10)
+    assert pads.page.work.settle()
+    assert pads.page.said.startswith("saved to")
+    assert description.read_text() != before
+
+
+def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
+    before, viewer = description.read_text(), view_pads(description, host="0.0.0.0")
+    with opened(viewer.url) as page:
+        assert greeted(page)
+        send(page, dragged(viewer))
+        assert viewer.page.work.settle()
+        send(page, pressed(viewer.page._save), CAMERA | {"fov": 0.5})
+        page.ping().wait(10)
+    assert viewer.page.work.settle()
+    assert description.read_text() == before
+    with opened(viewer.url, f"192.0.2.1:{urlsplit(viewer.url).port}") as page:  # seen from afar
+        assert greeted(page)
+    with pytest.raises(InvalidStatus):
+        opened(viewer.url, "evil.example")
+    viewer.stop()
+
+
+def test_nothing_is_shared(cup: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+
+    def tunnel(*words: Any) -> None:
+        made.append(words)
+        raise RuntimeError
+
+    monkeypatch.setattr("viser._viser.ViserTunnel", tunnel)
+    with opened(cup.url) as page:
+        assert greeted(page)
+        send(page, {"type": "ShareUrlRequest"}, CAMERA, {"type": "ShareUrlDisconnect"})
+        page.ping().wait(10)
+        assert cup._server.request_share_url() is None
+    assert made == []
+
+
+def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path: Path) -> None:
+    code = (
+        "from casadi_ik.viewing import view_grasp; import casadi_ik as ik, sys\n"
+        "viewer = view_grasp(ik.load_robot('kuka_lwr_barrett'), ik.load_grasp('cup'))\n"
+        "panel, targets = viewer.page._panel, viewer.page._contacts._targets\n"
+        "print(viewer.url, panel._drag._impl.uuid, targets['thumb'].control.name,\n"
+        "      panel._motors._sliders[0]._impl.uuid, flush=True)\n"
+        "sys.stdin.read(); assert viewer.page.work.settle(); viewer.stop()\n"
+        "print(viewer.page.asked.grasp.contacts['thumb'].point.tolist())\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert process.stdout is not None
+    url, menu, control, slider = process.stdout.readline().split()
+    nan = float("nan")
+    drag = {"type": "TransformControlsUpdateMessage", "name": control}
+    values = {"type": "GuiUpdateMessage", "uuid": menu}
+    broken: list[Any] = [
+        "text",
+        b"",
+        b"\xc1",
+        b"\x93\x01\x02\x03",
+        {},
+        {"type": "Nothing"},
+        {"type": []},
+        {"type": "GuiUpdateMessage"},
+        CAMERA | {"fov": "wide"},
+        CAMERA | {"wxyz": [1]},
+        values | {"updates": {"nothing": 1}},
+        values | {"updates": {"value": {"a": 1}}},
+        values | {"updates": {"value": "no such finger"}},
+        values | {"uuid": slider, "updates": {"value": "x"}},
+        values | {"uuid": slider, "updates": {"value": nan}},
+        drag | {"wxyz": [1, 0, 0, 0], "position": [nan, nan, nan]},
+        drag | {"wxyz": [0, 0, 0, 0], "position": [0, 0, 0]},
+        drag | {"wxyz": [1, 0], "position": [0.1]},
+        drag | {"wxyz": [1, 0, 0, 0], "position": [1e300, 0, 0]},
+    ]
+    with socket.create_connection((str(urlsplit(url).hostname), urlsplit(url).port or 0)) as raw:
+        raw.sendall(b"\x16\x03\x01 no request at all\r\n\r\n")
+        raw.recv(100)
+    for version in ("viser-v0", None):
+        with opened(url, version=version) as page, pytest.raises(ConnectionClosed):
+            page.recv(10)
+    for one in broken:
+        with opened(url) as page:
+            assert greeted(page)
+            with suppress(ConnectionClosed):
+                send(page, one)
+                page.ping().wait(10)
+    good = drag | {"wxyz": [1, 0, 0, 0], "position": [-0.83, 0.15, 0.41]}
+    with opened(url) as page:
+        assert greeted(page)
+        send(page, good)
+        page.ping().wait(10)
+    out, err = process.communicate("", timeout=60)
+    # Nothing was said but of the finger that there is none of, and the last message was followed.
+    assert err.splitlines() == []
+    assert out.splitlines() == ["[-0.83, 0.15, 0.41]"]
