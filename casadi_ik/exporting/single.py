@@ -27,7 +27,7 @@ TOKEN = re.compile(
 
 _TURNS = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
 _OTHERS = ("exp", "log", "log10", "pow", "sqrt", "hypot", "fabs", "floor", "ceil", "fmod", "fmax")
-LIBM = frozenset((*_TURNS, *_OTHERS, "fmin", "rint", "round", "copysign"))
+LIBM = frozenset((*_TURNS, *_OTHERS, "fmin", "rint", "round", "copysign", "frexp", "ldexp"))
 """Functions of the C library whose forms for single precision have an f behind their name."""
 
 FLOAT = np.finfo(np.float32)
@@ -49,6 +49,9 @@ it, and an arm would be searched for from every start, in thirteen times as many
 NUDGE = EPSILON**0.5
 """Difference [rad or m] from which slopes are taken: its own rounding and that of what it causes
 weigh the same."""
+
+SMALL, LARGE = 1e-15, 1e15
+"""Between these the squares of a length are neither rounded to zero nor infinite."""
 
 SAMPLES = 1024
 """Random configurations that say how far a robot reaches."""
@@ -128,7 +131,13 @@ class SinglePrecision:
     @property
     def reals(self) -> dict[str, float]:
         """Numbers of rounds.c that follow the precision."""
-        return {"NUDGE": NUDGE, "LIMIT_SLACK": 0.0, "TOLERANCE_SLACK": 0.0}
+        return {
+            "NUDGE": NUDGE,
+            "LIMIT_SLACK": 0.0,
+            "TOLERANCE_SLACK": 0.0,
+            "SMALL_LENGTH": SMALL,
+            "LARGE_LENGTH": LARGE,
+        }
 
     @property
     def arrays(self) -> dict[str, Array]:

@@ -6,10 +6,12 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import casadi_ik as ik
 from casadi_ik.cli.main import main
+from casadi_ik.errors import InputError
 from casadi_ik.exporting.generated import standing_alone
 from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
 from casadi_ik.exporting.scene_targets import SceneTargets
@@ -86,6 +88,73 @@ def test_in_a_scene_arms_swing_out_of_the_way(robot):
     assert sum(moved) > 20
     ends = {ik.Status(target["status"]).name for target in after}
     assert {"SOLVED", "COLLISION"} <= ends
+
+
+ASKED = """
+#include <stdio.h>
+#include "arm.h"
+static arm_solver solver;
+int main(void) { /* rows of numbers: whether there is a q0, points, normals, q0 */
+  double row[1 + 6 * ARM_FINGERS + ARM_MOTORS];
+  arm_init(&solver);
+  while (fread(row, sizeof row, 1, stdin) == 1) {
+    const double *points = row + 1, *normals = points + 3 * ARM_FINGERS;
+    const double *q0 = normals + 3 * ARM_FINGERS;
+    int i;
+    printf("%d", arm_solve(&solver, points, normals, *row ? q0 : 0));
+    for (i = 0; i < ARM_MOTORS; ++i) printf(" %a", solver.q[i]);
+    puts("");
+  }
+  return 0;
+}
+"""
+ODD = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-320, 1e-200, 1e-99, 1e30, 1e101, 1e200, 1.7e308)
+
+
+def malformed(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, ...]:
+    """Targets of which most hold a number that is none, or huge, or a wrong mix of free vectors."""
+    rng = np.random.default_rng(0)
+    q = robot.random(rng, count)
+    (points, normals), q0 = robot.contacts(q), q + 0.01
+    for row in range(count):
+        for _ in range(rng.integers(3)):
+            array = (points, normals, q0[:, None])[rng.integers(3)]
+            vector = array[row, rng.integers(array.shape[1])]
+            odd, whole = rng.choice(ODD), rng.random() < 0.8
+            # Most others are out of reach, which takes long.
+            some = slice(None) if whole or np.isfinite(odd) else rng.integers(len(vector))
+            vector[some] = odd * (vector[some] if array is normals or rng.random() < 0.2 else 1.0)
+    return points, normals, q0, rng.random(count) < 0.5
+
+
+@needs_gcc
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid")
+def test_malformed_targets_end_as_in_python(plain_project):
+    """What Python refuses is bad input in C; all else ends alike, in the same configuration."""
+    robot, count = ik.load_robot("ar10"), 1500
+    (plain_project / "asked.c").write_text(ASKED)
+    sources = [str(path.relative_to(plain_project)) for path in plain_project.glob("src/*.c")]
+    compiled(plain_project, "-O1", "asked.c", *sources, "-o", "asked", "-lm")
+    points, normals, q0, near = malformed(robot, count)
+    rows = np.hstack([near[:, None], *(a.reshape(count, -1) for a in (points, normals, q0))])
+    done = subprocess.run([plain_project / "asked"], input=rows.tobytes(), capture_output=True)
+    assert done.returncode == 0, done.stderr[:2000]
+    found = [line.split() for line in done.stdout.decode().splitlines()]
+
+    fast, refused, ends = ik.Solver(robot).fast(), 0, set()
+    for row in range(count):
+        status, *words = found[row]
+        try:
+            q, ended = fast(points[row], normals[row], q0[row] if near[row] else None)
+        except InputError as error:
+            assert status == "-2", (row, error)
+            refused += 1
+            continue
+        assert int(status) == ended, row
+        np.testing.assert_array_equal(q, [float.fromhex(word) for word in words], f"row {row}")
+        ends.add(ended.name)
+    assert 200 < refused < 1300
+    assert {"SOLVED", "STALLED", "INVALID"} <= ends
 
 
 @needs_gcc

@@ -25,7 +25,7 @@ enum { @GUARD@_FINGERS = @FINGERS@, @GUARD@_MOTORS = @MOTORS@ };
 
 /* How a solve ended. */
 enum {
-  @GUARD@_BAD_INPUT = -2,     /* the target or q0 is malformed; nothing was solved */
+  @GUARD@_BAD_INPUT = -2,     /* the target or q0 is malformed (what Python refuses); nothing was solved */
   @GUARD@_INVALID = -1,       /* a number was no longer finite */
   @GUARD@_RUNNING = 0,        /* not ended yet: call @PREFIX@_run again */
   @GUARD@_SOLVED = 1,         /* every contact within tolerance, every motor and joint within limits */

@@ -105,8 +105,7 @@ class OneTarget:
         """Solve what stands in the arrays.
 
         Returns:
-            Code of `Status`, after the verdict where there is one; None: the target is malformed,
-            or has a normal of a length that only `unit_vectors` can normalise.
+            Code of `Status`, after the verdict where there is one; None: the target is malformed.
 
         Raises:
             KernelError: No work memory.

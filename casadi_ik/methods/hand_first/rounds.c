@@ -377,16 +377,30 @@ static int finish(rounds *job) {
   return DONE;
 }
 
-/* A vector that is free, or whose length is made one as `unit_vectors` does it; 0 where it is neither. */
+static double length_of(const double *vector) {
+  return sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]);
+}
+
+/* Whether a vector is free, or a direction: that gets length one as `unit_vectors` makes it. */
 static int made_unit(double *vector) {
   double length;
+  int i;
   if (vector[0] != vector[0]) return vector[1] != vector[1] && vector[2] != vector[2];
-  length = sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]);
-  if (!(length >= SMALL_LENGTH && length <= LARGE_LENGTH)) return 0;
+  if (!(is_finite(vector[0]) && is_finite(vector[1]) && is_finite(vector[2]))) return 0;
+  length = length_of(vector);
+  if (!(length >= SMALL_LENGTH && length <= LARGE_LENGTH)) {
+    /* By powers of two, which change no digit; in two halves, as one may be out of range. */
+    double most = 0;
+    int power, half;
+    for (i = 0; i < 3; ++i) most = fabs(vector[i]) > most ? fabs(vector[i]) : most;
+    (void) frexp(most, &power);
+    half = (-power - (power & 1)) / 2;
+    for (i = 0; i < 3; ++i) vector[i] = ldexp(ldexp(vector[i], half), -power - half);
+    length = length_of(vector);
+  }
+  if (length == 0) return 0;
   if (length - 1 < UNIT && 1 - length < UNIT) return 1;
-  vector[0] /= length;
-  vector[1] /= length;
-  vector[2] /= length;
+  for (i = 0; i < 3; ++i) vector[i] /= length;
   return 1;
 }
 
