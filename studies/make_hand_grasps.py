@@ -7,9 +7,10 @@ Run it again whenever an object, a hand or the recipes change::
 
 The thumb presses against the two fingers after it. Where the object may be in the hand follows from
 the pads of the hand half closed: amid them, its y axis (that the thumb presses along) from the
-fingers to the thumb, its z axis along the row of fingers. The pinch is taken that needs least
-friction among those that keep the axes of phalanges clear of the object and in which the robot's
-shapes touch nothing but what they hold, with the table there as well.
+fingers to the thumb, its z axis along the row of fingers. A gripper's one finger is no row: there
+z is across finger and palm, and the gripper opens by the object's width. The pinch is taken that
+needs least friction among those that keep the axes of phalanges clear of the object and in which
+the robot's shapes touch nothing but what they hold, with the table there as well.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 from grasp_synthesis.clearing import MARGIN, cleared, surroundings
 from grasp_synthesis.fingertip_pinch import TipPinch, TipPinchProblem
 from grasp_synthesis.holding import Scene, hold
+from grasp_synthesis.jaw_pinch import jaw_pinches
 from grasp_synthesis.writing import grasp_text, made_by, placed_at
 
 import casadi_ik as ik
@@ -38,6 +40,8 @@ HANDS = {
     "leap": ("leap", ("thumb", "index", "ring"), 0.060),
     "shadow": ("shadow", ("thumb", "index", "middle"), 0.022),
     "robotiq_3f": ("robotiq_3f", ("thumb", "finger_1", "finger_2"), 0.030),
+    "panda_hand": ("panda_hand", ("left", "right"), 0.0),
+    "robotiq_2f85": ("robotiq_2f85", ("left", "right"), 0.0),
 }
 """By the first word of a file: the hand, the fingers that touch, the thumb first, and how far two
 of them on the same side are apart at least [m]. Two neighbours of leap's fingers are too thick to
@@ -46,8 +50,8 @@ press side by side on what the thumb reaches: the middle one keeps aside."""
 UP = (0.0, 0.0, 1.0)
 UPRIGHT = {
     **dict.fromkeys(("tomato_soup_can", "cup", "mug", "mustard_bottle"), UP),
-    **dict.fromkeys(("potted_meat_can", "bleach_cleanser"), UP),
-    **dict.fromkeys(("orange",), None),
+    **dict.fromkeys(("potted_meat_can", "bleach_cleanser", "sugar_box"), UP),
+    **dict.fromkeys(("orange", "tennis_ball"), None),
 }
 """By object the axis that points up; None for balls."""
 
@@ -56,6 +60,8 @@ ITEMS = {
     "leap": ("tomato_soup_can", "mustard_bottle", "bleach_cleanser"),
     "shadow": ("tomato_soup_can", "cup", "orange"),
     "robotiq_3f": ("mustard_bottle", "potted_meat_can", "bleach_cleanser"),
+    "panda_hand": ("mustard_bottle", "tomato_soup_can", "sugar_box"),
+    "robotiq_2f85": ("potted_meat_can", "tennis_ball"),
 }
 """What each hand pinches. Four motors touch no ball with three exact pads."""
 
@@ -130,24 +136,31 @@ def make(
     item, description = load_object(recipe.item), robot.description
     root, still = description.palm_link, idle(robot)
     middle, axes = where(robot, recipe)
-    if isinstance(item.shape, Box | EllipticCylinder):
-        # These are pinched along their x axis.
+    _, touching, apart = HANDS[recipe.hand]
+    gripper = len(touching) == 2
+    # Along their x axis boxes are pinched, by hands also what is narrower the other way.
+    along_x = isinstance(item.shape, Box if gripper else Box | EllipticCylinder)
+    if along_x:
         axes = axes[[1, 0, 2]] * [[1], [-1], [1]]
-    problem = TipPinchProblem(
-        description,
-        root,
-        item,
-        recipe.sides,
-        axes.tolist(),
-        0,
-        EDGE,
-        still,
-        (middle - ROOM, middle + ROOM),
-        HANDS[recipe.hand][2],
-    )
+    if gripper:
+        pinches = jaw_pinches(robot, item, touching, axes, 1 - along_x, still, rng, starts)
+    else:
+        problem = TipPinchProblem(
+            description,
+            root,
+            item,
+            recipe.sides,
+            axes.tolist(),
+            0,
+            EDGE,
+            still,
+            (middle - ROOM, middle + ROOM),
+            apart,
+        )
+        pinches = problem.solve(rng, starts)
     alone = SceneCheck(robot, ik.Scene(margin=MARGIN))
     table = SceneCheck(robot, ik.load_scene("table"))
-    for found in problem.solve(rng, starts):
+    for found in pinches:
         if found.residual > 1e-9 or found.friction > FRICTION:
             continue
         pinch = cleared(alone, recipe.item, recipe.sides, found, rng)
@@ -172,11 +185,12 @@ def where(robot: ik.ArmHand, recipe: Recipe) -> tuple[Array, Array]:
     q = robot.home
     root = robot.links(q)[robot.description.palm_link]
     points = (robot.contacts(q)[0] - root[:3, 3]) @ root[:3, :3]
-    thumb, first, *_, last = (points[robot.fingers.index(name)] for name in recipe.sides)
-    fingers = (first + last) / 2
+    thumb, *others = (points[robot.fingers.index(name)] for name in recipe.sides)
+    fingers = (others[0] + others[-1]) / 2
     y = thumb - fingers
     y = y / np.linalg.norm(y)
-    z = last - first
+    # A finger alone is no row: then along the palm, across the fingers.
+    z = others[-1] - others[0] if len(others) > 1 else root[:3, :3].T @ robot.palm(q)[:3, 0]
     z = z - y * (y @ z)
     z = z / np.linalg.norm(z)
     return (thumb + fingers) / 2, np.stack([np.cross(y, z), y, z])
@@ -198,6 +212,8 @@ def clear(robot: ik.ArmHand, item: GraspObject, touching: dict[str, int], pinch:
             line.append(tip)
         for a, b in pairwise(line):
             samples.append(a + np.linspace(0, 1, 41)[:, None] * (b - a))
+    # Fingers that slide have no phalanges: then the palm's middle.
+    samples = samples or [robot.palm(pinch.q)[None, :3, 3]]
     inside = np.concatenate(samples) @ hand[:3, :3].T + hand[:3, 3]
     pose = pinch.object_in_hand
     return float(item.signed_distance((inside - pose[:3, 3]) @ pose[:3, :3]).min())
@@ -219,8 +235,9 @@ def text_of(
     ]
     hand = set(robot.description.hand_actuators)
     posture = [
-        f"  {name}: {value:.12f}  # {np.rad2deg(value):.3f} deg"
-        for i, (name, value) in enumerate(zip(robot.actuators, q, strict=True))
+        f"  {one.name}: {value:.12f}  # "
+        + (f"{np.rad2deg(value):.3f} deg" if one.unit == "rad" else f"{1e3 * value:.3f} mm")
+        for i, (one, value) in enumerate(zip(robot.description.actuators, q, strict=True))
         if i in hand
     ]
     points, normals = robot.contacts(q)
