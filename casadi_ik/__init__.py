@@ -5,7 +5,7 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.collision.scene import Scene, load_scene
 from casadi_ik.control import ScrewControl
-from casadi_ik.datasets import load_candidates
+from casadi_ik.datasets import Candidates, load_candidates
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
@@ -36,6 +36,7 @@ __all__ = [
     "ArmBranch",
     "ArmHand",
     "BatchSolution",
+    "Candidates",
     "CasadiIKError",
     "Choice",
     "CollisionReport",

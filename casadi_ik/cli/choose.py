@@ -23,8 +23,7 @@ from casadi_ik.cli.question import (
 )
 from casadi_ik.cli.report import clearance, duration, files, headline, table
 from casadi_ik.cli.solve import as_json
-from casadi_ik.datasets import load_candidates
-from casadi_ik.grasps import Grasp
+from casadi_ik.datasets import Candidates, load_candidates
 from casadi_ik.problem.ranking import Ranking
 
 
@@ -45,6 +44,8 @@ def choose(arguments: argparse.Namespace) -> Answer:
         take=arguments.take,
         grasped=arguments.object,
         of=arguments.of,
+        scale=arguments.scale,
+        invalid=arguments.invalid,
     )
     check_outputs([("--out", out)], inputs=[path])
     solver = Solver(robot, tolerance=the_tolerance(arguments), scene=the_scene(arguments))
@@ -56,7 +57,7 @@ def choose(arguments: argparse.Namespace) -> Answer:
     return Answer(report, Exit.DONE if ranking.entries else Exit.NOT_SOLVED)
 
 
-def _ranked(ranking: Ranking, grasps: tuple[Grasp, ...]) -> dict[str, Any]:
+def _ranked(ranking: Ranking, grasps: Candidates) -> dict[str, Any]:
     return {
         "candidates": ranking.candidates,
         "answered": ranking.answered,
@@ -75,12 +76,13 @@ def _ranked(ranking: Ranking, grasps: tuple[Grasp, ...]) -> dict[str, Any]:
 
 
 def _report(
-    name: str, solver: Solver, ranking: Ranking, grasps: tuple[Grasp, ...], out: Path
+    name: str, solver: Solver, ranking: Ranking, grasps: Candidates, out: Path
 ) -> RenderableType:
     found = f"{ranking.answered} of {ranking.candidates} candidates of {name} have an answer"
     seconds = sum(one.solution.time for one in ranking.entries[:1]) * ranking.candidates
     parts: list[RenderableType] = [
-        headline(bool(ranking.entries), "FOUND" if ranking.entries else "NONE FOUND", found)
+        headline(bool(ranking.entries), "FOUND" if ranking.entries else "NONE FOUND", found),
+        *(Text(f"  {note}") for note in grasps.notes),
     ]
     if ranking.entries:
         best = table("candidate", "name", "score", "clearance", right=("score",))

@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from casadi_ik.cli.shared_options import add_object_pose, add_scene, add_tolerances
-from casadi_ik.cli.values import file_name, numbers, one_of, whole
+from casadi_ik.cli.values import file_name, numbers, one_of, positive, whole
 from casadi_ik.problem.preference import PREFERENCES
 
 if TYPE_CHECKING:
@@ -89,6 +89,21 @@ def add_choose(commands: Any) -> None:
         "--of",
         metavar="NAME",
         help="of which object's grasps, by the file's own name, where it has those of several",
+    )
+    parser.add_argument(
+        "--scale",
+        metavar="S",
+        type=positive,
+        help="of which size of the object, by the file's own scale, where it has several",
+    )
+    parser.add_argument(
+        "--invalid",
+        metavar="error|drop|clip",
+        type=one_of("error", "drop", "clip"),
+        default="error",
+        help="what becomes of rows of a data set or table with joints beyond their limits or with "
+        "no grasp in them: the file is refused, they are left out, or joints are put at their "
+        "limits (default: error)",
     )
     add_scene(parser)
     parser.add_argument(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ from casadi_ik.datasets.unpickling import Packed, read_npy
 from casadi_ik.errors import DescriptionError
 from casadi_ik.grasps.pose import inverse
 
-STAGE = 1
-"""Of the stages pregrasp, grasp and squeeze: the second."""
+STAGES = ("pregrasp", "grasp", "squeeze")
+"""Of a grasp, in this order."""
 
 TRANSLATION, TURN = ("WRJTx", "WRJTy", "WRJTz"), ("WRJRx", "WRJRy", "WRJRz")
 """Where DexGraspNet has the pose of a hand among its joints."""
@@ -40,11 +41,15 @@ def getagrip(path: Path, content: Any) -> HandPoses:
 
 
 def dexgraspnet(path: Path, content: Any) -> HandPoses:
-    """A list of dictionaries with qpos: translation, angles about fixed axes, joints by name."""
+    """A list of dictionaries with qpos: translation, angles about fixed axes, joints by name.
+
+    Their scale is that of the object's mesh.
+    """
     entries = content if isinstance(content, list) else [content]
     if not entries:
         raise DescriptionError(f"{path}: found no grasps, expected at least one")
     rows: list[list[float]] = []
+    scales: list[float] = []
     names: tuple[str, ...] = ()
     for i, entry in enumerate(entries):
         where = f"{path}: row {i}"
@@ -61,30 +66,51 @@ def dexgraspnet(path: Path, content: Any) -> HandPoses:
             odd = sorted(map(str, set(qpos) ^ set(order)))[0]
             raise DescriptionError(f"{where}: qpos.{odd}: expected the joints of row 0")
         rows.append([_number(f"{where}: qpos.{key}", qpos[key]) for key in order])
+        if "scale" in entry:
+            scales.append(_scale(where, _number(f"{where}: scale", entry["scale"])))
+    if scales and len(scales) != len(rows):
+        raise DescriptionError(f"{path}: scale: found {len(scales)}, expected {len(rows)} or none")
     values = np.array(rows)
-    return HandPoses(str(path), values[:, :3], of_fixed_axes(values[:, 3:6]), values[:, 6:], names)
+    return HandPoses(
+        str(path),
+        values[:, :3],
+        of_fixed_axes(values[:, 3:6]),
+        values[:, 6:],
+        names,
+        scales=tuple(scales),
+    )
 
 
 def bodex(path: Path, content: Any) -> HandPoses:
     """A dictionary: robot_pose (1, k, stages, 7 + joints), the pose as x y z, w x y z."""
     where, found = str(path), _mapping(path, content)
     rows = numbers(where, found, "robot_pose")
-    if rows.ndim != 4 or rows.shape[0] != 1 or rows.shape[2] <= STAGE or rows.shape[3] <= 7:
+    if rows.ndim != 4 or rows.shape[0] != 1 or rows.shape[2] < 2 or rows.shape[3] <= 7:
         raise DescriptionError(
             f"{path}: robot_pose: found shape {rows.shape}, expected (1, k, stages, 7 + joints)"
         )
-    return _of_rows(where, rows[0, :, STAGE], _object_pose(where, found))
+    stages = {name: rows[0, :, i] for i, name in enumerate(STAGES[: rows.shape[2]])}
+    return _of_stages(where, found, stages)
 
 
 def dexgraspbench(path: Path, content: Any) -> HandPoses:
-    """A dictionary: grasp_qpos (7 + joints) or (k, 7 + joints), the pose as x y z, w x y z."""
+    """A dictionary: grasp_qpos (7 + joints) or (k, 7 + joints), the pose as x y z, w x y z.
+
+    Beside it, in the same shape, pregrasp_qpos and squeeze_qpos.
+    """
     where, found = str(path), _mapping(path, content)
-    rows = np.atleast_2d(numbers(where, found, "grasp_qpos"))
-    if rows.ndim != 2 or rows.shape[1] <= 7:
-        raise DescriptionError(
-            f"{path}: grasp_qpos: found shape {rows.shape}, expected (k, 7 + joints)"
-        )
-    return _of_rows(where, rows, _object_pose(where, found))
+    stages: dict[str, Array] = {}
+    for name in STAGES:
+        key = f"{name}_qpos"
+        if key not in found and name != "grasp":
+            continue
+        rows = np.atleast_2d(numbers(where, found, key))
+        if rows.ndim != 2 or rows.shape[1] <= 7:
+            raise DescriptionError(
+                f"{path}: {key}: found shape {rows.shape}, expected (k, 7 + joints)"
+            )
+        stages[name] = rows
+    return _of_stages(where, found, stages)
 
 
 def multidex(path: Path, content: Any) -> HandPoses:
@@ -201,11 +227,46 @@ def _object_pose(where: str, found: Mapping[str, Any]) -> Array:
     held = HandPoses(
         f"{where}: obj_pose", row[None, :3], of_quaternions(row[None, 3:]), np.zeros((1, 0))
     )
+    if held.faults:
+        raise DescriptionError(f"{where}: obj_pose: {held.faults[0]}")
     return held.poses[0]
 
 
-def _of_rows(where: str, rows: Array, object_pose: Array) -> HandPoses:
-    """Rows (k, 7 + joints) with poses as x y z, w x y z."""
-    held = HandPoses(where, rows[:, :3], of_quaternions(rows[:, 3:7]), rows[:, 7:])
-    poses = inverse(object_pose) @ held.poses
-    return HandPoses(where, poses[:, :3, 3], poses[:, :3, :3], held.joints)
+def _of_stages(where: str, found: Mapping[str, Any], stages: Mapping[str, Array]) -> HandPoses:
+    """Rows (k, 7 + joints) of the stages, with poses as x y z, w x y z."""
+    shape = stages["grasp"].shape
+    back = inverse(_object_pose(where, found))
+    made: dict[str, HandPoses] = {}
+    for name, rows in stages.items():
+        if rows.shape != shape:
+            raise DescriptionError(f"{where}: {name}: found shape {rows.shape}, expected {shape}")
+        given = HandPoses(where, rows[:, :3], of_quaternions(rows[:, 3:7]), rows[:, 7:])
+        poses = back @ given.poses
+        made[name] = replace(given, position=poses[:, :3, 3], rotation=poses[:, :3, :3])
+    scales = _scales(where, found, len(stages["grasp"]))
+    return replace(
+        made["grasp"], scales=scales, pregrasp=made.get("pregrasp"), squeeze=made.get("squeeze")
+    )
+
+
+def _scales(where: str, found: Mapping[str, Any], count: int) -> tuple[float, ...]:
+    """Of the object of each grasp; none where none is said."""
+    if "obj_scale" not in found:
+        return ()
+    value = found["obj_scale"]
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        value = np.array([value], dtype=float)
+    values = numbers(where, {"obj_scale": value}, "obj_scale").reshape(-1)
+    if len(values) == count:
+        return tuple(_scale(where, one) for one in values)
+    if not len(values) or (values != values[0]).any():
+        raise DescriptionError(
+            f"{where}: obj_scale: found {len(values)} numbers, expected one or {count}"
+        )
+    return (_scale(where, values[0]),) * count
+
+
+def _scale(where: str, value: float) -> float:
+    if not 0 < value < np.inf:
+        raise DescriptionError(f"{where}: scale: found {value:g}, expected a number > 0")
+    return float(value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,10 +13,12 @@ from numpy.typing import ArrayLike
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.batches.target_file import TargetFile
+from casadi_ik.datasets.candidates import INVALIDS, Candidates, Invalid, kept_rows
 from casadi_ik.datasets.conventions import Convention, convention_for, of_robot
 from casadi_ik.datasets.hand_poses import FAR, HandPoses
-from casadi_ik.datasets.hands import joints_at, motor_positions, palms_of
+from casadi_ik.datasets.hands import palms_of
 from casadi_ik.datasets.layouts import LAYOUTS, READERS, read_layout
+from casadi_ik.datasets.postures import HandPostures, hand_postures
 from casadi_ik.datasets.tables import SUFFIXES, read_table
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.grasps import Contact, Grasp, GraspObject, load_object
@@ -48,8 +51,13 @@ def load_candidates(
     take: Take = "palm",
     grasped: str | GraspObject | None = None,
     of: str | None = None,
-) -> tuple[Grasp, ...]:
+    scale: float | None = None,
+    invalid: Invalid = "error",
+) -> Candidates:
     """Grasps of a file or a folder, as `Solver.choose` takes them.
+
+    Where the data have joints free that are coupled in the hand, the posture is the one whose
+    fingertips are nearest to those of the data; how far they are away is `Candidates.shift`.
 
     Args:
         path: A YAML file with one grasp or a list (``candidates:``); a folder of such files; an npz
@@ -67,15 +75,22 @@ def load_candidates(
         grasped: The object, or its shipped name: of "contacts" only pads nearer to its surface
             than 10 mm count, and they are where the surface is; collisions know it by its name.
         of: Whose grasps, by the file's own name, where a file has those of several objects.
+        scale: Which size of the object, where a file has grasps of several.
+        invalid: What becomes of a row of a data set or table with a joint beyond its limits, with
+            numbers that are none, or of whose fingertips none touches the object. "error": the
+            file is refused, "drop": the row is left out, "clip": joints are put at their limits,
+            and what else is wrong is refused.
 
     Returns:
-        The grasps in the order of the file, at least one.
+        The grasps in the order of the file, at least one; how many were left out or clipped, and
+        how far fingertips were shifted.
 
     Raises:
-        DescriptionError: The file is missing or malformed; the message names file, row and key.
+        DescriptionError: The file is missing or malformed, has invalid rows, or grasps of several
+            objects or sizes; the message names file, row and key.
         UnsupportedError: The robot has not the hand of the data.
         UnknownNameError: No such robot, layout, convention or object.
-        InputError: No rigid object_pose, or another word than those of `take`.
+        InputError: No rigid object_pose, or another word than those of `take` and `invalid`.
 
     Example:
         >>> points, normals = robot.contacts(robot.random(np.random.default_rng(2), 20))
@@ -91,14 +106,16 @@ def load_candidates(
         raise UnknownNameError(f"layout: found {layout!r}, expected one of {known}")
     if take not in TAKES:
         raise InputError(f"take: found {take!r}, expected one of {', '.join(TAKES)}")
+    if invalid not in INVALIDS:
+        raise InputError(f"invalid: found {invalid!r}, expected one of {', '.join(INVALIDS)}")
     if not file.exists():
         raise DescriptionError(f"{file}: no such file or folder, expected candidates")
     thing = load_object(grasped) if isinstance(grasped, str) else grasped
-    grasps = _loaded(file, held, layout, hand, take, thing, of)
-    _refuse_other_units(file, grasps)
+    found = _loaded(file, held, layout, hand, take, thing, of, scale, invalid)
+    _refuse_other_units(file, found)
     if object_pose is None:
-        return grasps
-    return tuple(grasp.in_object_frame().at(object_pose) for grasp in grasps)
+        return found
+    return replace(found, grasps=tuple(g.in_object_frame().at(object_pose) for g in found))
 
 
 def _loaded(
@@ -109,11 +126,16 @@ def _loaded(
     take: Take,
     thing: GraspObject | None,
     of: str | None,
-) -> tuple[Grasp, ...]:
+    scale: float | None,
+    invalid: Invalid,
+) -> Candidates:
     kind = path.suffix.lower()
     if kind in READERS and layout != TABLE:
         given, found = read_layout(path, layout)
-        return _of_hand(given.of(of), robot, convention_for(robot, found, hand), take, thing)
+        one = given.of(of).of_scale(scale)
+        return _of_hand(one, robot, convention_for(robot, found, hand), take, thing, invalid)
+    if scale is not None:
+        raise InputError(f"scale: found {scale:g}, but {path.name} says of no size")
     if of is not None:
         raise InputError(f"of: found {of!r}, but {path.name} has grasps of one object")
     if kind in SUFFIXES and (layout == TABLE or (layout is None and not _has_targets(path))):
@@ -121,19 +143,19 @@ def _loaded(
         known = (*robot.description.joint_names, *robot.actuators)
         names = tuple(name for name in given.names if name in known)
         own = _own(robot, names) if hand is None else convention_for(robot, TABLE, hand)
-        return _of_hand(given, robot, own, take, thing)
+        return _of_hand(given, robot, own, take, thing, invalid)
     if layout is not None:
         expected = ", ".join(READERS if layout != TABLE else SUFFIXES)
         raise DescriptionError(f"{path}: found no {expected} file, expected one of {layout}")
     if kind == ".npz":
-        return tuple(_of_targets(path, robot.fingers))
+        return Candidates(tuple(_of_targets(path, robot.fingers)))
     grasps = load_grasp_files(path)
     for grasp in grasps:
         try:
             grasp.arrays(robot.fingers)
         except InputError as error:
             raise DescriptionError(f"{path}: {grasp.name}: {error}") from error
-    return grasps
+    return Candidates(grasps)
 
 
 def _refuse_other_units(path: Path, grasps: Sequence[Grasp]) -> None:
@@ -164,41 +186,67 @@ def _has_targets(path: Path) -> bool:
 
 
 def _of_hand(
-    given: HandPoses, robot: ArmHand, convention: Convention, take: Take, thing: GraspObject | None
-) -> tuple[Grasp, ...]:
+    given: HandPoses,
+    robot: ArmHand,
+    convention: Convention,
+    take: Take,
+    thing: GraspObject | None,
+    invalid: Invalid,
+) -> Candidates:
     """Grasps of hands whose poses and joints are given in the object's frame."""
     joints = convention.positions(given)
-    motors, postures = (), np.zeros((len(given.poses), 0))
+    hands = None
     if take == "palm" or not set(finger_joints(robot.description)) <= set(joints):
-        motors, postures = motor_positions(robot, given.where, joints)
-        joints = joints_at(robot, motors, postures) | joints
-    frames = convention.frames(given)
-    palms, points, normals = palms_of(robot, convention.link, frames, joints)
+        hands = hand_postures(robot, given.where, joints)
+        joints = hands.joints
+    palms, points, normals = palms_of(robot, convention.link, convention.frames(given), joints)
+    faults = dict(given.faults)
+    beyond = {} if hands is None else {given.rows[i]: text for i, text in hands.beyond.items()}
+    contacts: dict[int, dict[str, Contact]] = {}
+    for i, row in enumerate(given.rows if take == "contacts" else ()):
+        try:
+            contacts[i] = _contacts(robot, points[i], normals[i], thing)
+        except DescriptionError as error:
+            faults.setdefault(row, str(error))
+    kept = kept_rows(given.where, given.rows, faults, beyond, invalid)
+    stages = {
+        name: _palm_grasps(stage.select(kept), robot, convention)
+        for name, stage in (("pregrasp", given.pregrasp), ("squeeze", given.squeeze))
+        if stage is not None
+    }
     stem, name = Path(given.where).stem, "" if thing is None else thing.name
-    if take == "palm":
-        return tuple(
-            Grasp(
-                robot=robot.name,
-                name=f"{stem}[{i}]",
-                object=name,
-                palm=palm,
-                posture=dict(zip(motors, postures[i].tolist(), strict=True)),
-            )
-            for i, palm in enumerate(palms)
-        )
-    return tuple(
-        Grasp(
-            _contacts(f"{given.where}: row {i}", robot, points[i], normals[i], thing),
-            robot.name,
-            f"{stem}[{i}]",
-            name,
-        )
-        for i in range(len(palms))
+    grasps = []
+    for place, i in enumerate(kept):
+        asked: dict[str, Any]
+        asked = {"contacts": contacts[i]} if take == "contacts" else _palm(palms[i], hands, i)
+        asked |= {stage: found[place] for stage, found in stages.items()}
+        title = f"{stem}[{given.rows[i]}]"
+        grasps.append(Grasp(robot=robot.name, name=title, object=name, **asked))
+    return Candidates(
+        tuple(grasps),
+        tuple(given.rows[i] for i in kept),
+        len(given.rows) - len(kept),
+        sum(given.rows[i] in beyond for i in kept),
+        hands.shift[kept] if take == "palm" and hands is not None else np.zeros(len(kept)),
+        given.scales[0] if given.scales else None,
     )
 
 
+def _palm(pose: Array, hands: HandPostures | None, row: int) -> dict[str, Any]:
+    assert hands is not None
+    posture = dict(zip(hands.motors, hands.positions[row].tolist(), strict=True))
+    return {"palm": pose, "posture": posture}
+
+
+def _palm_grasps(given: HandPoses, robot: ArmHand, convention: Convention) -> list[Grasp]:
+    """Palms and postures as they are given, or as near as the hand can take them."""
+    hands = hand_postures(robot, given.where, convention.positions(given))
+    palms = palms_of(robot, convention.link, convention.frames(given), hands.joints)[0]
+    return [Grasp(robot=robot.name, **_palm(palms[i], hands, i)) for i in range(len(palms))]
+
+
 def _contacts(
-    where: str, robot: ArmHand, points: Array, normals: Array, thing: GraspObject | None
+    robot: ArmHand, points: Array, normals: Array, thing: GraspObject | None
 ) -> dict[str, Contact]:
     """Contacts of pads (f, 3), where the object is if there is one."""
     if thing is None:
@@ -213,8 +261,8 @@ def _contacts(
     }
     if not found:
         raise DescriptionError(
-            f"{where}: no pad is within {1e3 * TOUCHING:g} mm of {thing.name}'s surface: the "
-            f"nearest is {1e3 * float(np.abs(off).min()):.1f} mm away"
+            f"no pad is within {1e3 * TOUCHING:g} mm of {thing.name}'s surface: the nearest is "
+            f"{1e3 * float(np.abs(off).min()):.1f} mm away"
         )
     return found
 

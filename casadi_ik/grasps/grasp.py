@@ -131,6 +131,8 @@ class Grasp:
             palm the posture to take, a number for every motor that moves a finger [rad or m].
         palm: (4, 4) pose of the robot's palm frame in the base frame: then the hand is as the
             posture has it, and only the arm is looked for. None: the contacts say all.
+        pregrasp: The same hand before it closes, if it is known: a palm and a posture.
+        squeeze: The same hand as it squeezes, if it is known: a palm and a posture.
 
     Raises:
         InputError: No contact at all, a palm that is no rigid motion, has no posture or has
@@ -154,6 +156,8 @@ class Grasp:
     object_pose: Array | None = None
     posture: Mapping[str, float] = field(default_factory=dict)
     palm: Array | None = None
+    pregrasp: Grasp | None = None
+    squeeze: Grasp | None = None
 
     def __post_init__(self) -> None:
         if self.palm is not None:
@@ -174,7 +178,7 @@ class Grasp:
     def __reduce__(self) -> tuple[type[Grasp], tuple[Any, ...]]:
         """Its fields; the mapping that cannot be changed is made anew."""
         held = self.robot, self.name, self.object, self.object_pose, dict(self.posture), self.palm
-        return type(self), (dict(self.contacts), *held)
+        return type(self), (dict(self.contacts), *held, self.pregrasp, self.squeeze)
 
     def at(self, pose: ArrayLike) -> Grasp:
         """The grasp moved as a whole: given in an object's frame, it is placed with the object.
@@ -186,7 +190,8 @@ class Grasp:
                 given.
 
         Returns:
-            The contacts or the palm, and the object where there is one, in the base frame.
+            The contacts or the palm, what comes before and after, and the object where there is
+            one, in the base frame.
 
         Raises:
             InputError: Another shape, a number that is not finite, or no rigid motion.
@@ -206,7 +211,15 @@ class Grasp:
             place = motion
         contacts = {finger: contact.at(motion) for finger, contact in self.contacts.items()}
         palm = None if self.palm is None else motion @ self.palm
-        return replace(self, contacts=contacts, object_pose=place, palm=palm)
+        before, after = (one and one.at(motion) for one in (self.pregrasp, self.squeeze))
+        return replace(
+            self,
+            contacts=contacts,
+            object_pose=place,
+            palm=palm,
+            pregrasp=before,
+            squeeze=after,
+        )
 
     def in_object_frame(self) -> Grasp:
         """The contacts as the object sees them, to be placed by `at`.

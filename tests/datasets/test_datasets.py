@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from make_grasp_sets import ROBOTS, TABLES, made
+from make_grasp_sets import ROBOTS, TABLES, Written, made
 
 import casadi_ik as ik
+from casadi_ik.cli.main import main
 from casadi_ik.cli.report import reasons
 from casadi_ik.datasets.conventions import load_convention
 from casadi_ik.datasets.hand_poses import HandPoses
 from casadi_ik.datasets.hands import link_poses
 from casadi_ik.errors import DescriptionError, UnknownNameError, UnsupportedError
+from casadi_ik.grasps import load_object
 from casadi_ik.problem.hand_motors import hand_motors
 
 PUBLISHED = json.loads((Path(__file__).parent / "published_hands.json").read_text())
@@ -235,7 +237,7 @@ def _getagrip(**changes: Any) -> dict[str, Any]:
         ({"a": 1}, "its layout is none of getagrip"),
         ([{"qpos": {"WRJTx": 0.0}}], r"row 0: qpos\.WRJTy: missing"),
         ({"robot_pose": np.zeros((2, 3))}, r"robot_pose: found shape \(2, 3\)"),
-        ({"grasp_qpos": np.zeros(29)}, "row 0: rotation: holds NaN"),
+        ({"grasp_qpos": np.zeros(23)}, "row 0: rotation: holds NaN"),
     ],
 )
 def test_bad_data_sets(content: Any, says: str, tmp_path: Path) -> None:
@@ -255,15 +257,150 @@ def test_another_hand(tmp_path: Path) -> None:
         ik.load_candidates(path, KUKA, layout="mine")
 
 
-def test_a_coupled_joint_that_is_elsewhere(tmp_path: Path) -> None:
-    """Distal joints of the Shadow hand follow the middle ones; fingertips can still be asked."""
+SIZES = (0.06, 0.08, 0.1, 0.12, 0.15)
+
+
+def _dexgraspnet(tmp_path: Path, beyond: int = 0) -> Written:
+    """A file as the data set has them: distal joints free, five sizes of the object by turns."""
     written = made("dexgraspnet_shadow", tmp_path)
-    entries = np.load(written.path, allow_pickle=True)
-    entries[0]["qpos"]["robot0:FFJ0"] += 0.2
+    entries, rng = np.load(written.path, allow_pickle=True), np.random.default_rng(1)
+    for i, entry in enumerate(entries):
+        for finger in ("FF", "MF", "RF", "LF"):
+            entry["qpos"] |= {f"robot0:{finger}J{n}": rng.uniform(0, 1.5) for n in (0, 1)}
+        entry |= {"scale": SIZES[i % 5], "qpos_st": dict(entry["qpos"]), "energy": 1.0}
+        entry["qpos"]["robot0:THJ2"] += 0.5 * (i < beyond)
     np.save(written.path, entries)
-    with pytest.raises(DescriptionError, match=r"row 0: shadow_ffj1: .*take='contacts'"):
+    return written
+
+
+def _tips(robot: ik.ArmHand, grasp: ik.Grasp, postures: np.ndarray) -> np.ndarray:
+    """(k, f, 3) fingertips in the frame of the palm, of postures (k, m)."""
+    q = np.tile(robot.home, (len(postures), 1))
+    q[:, [robot.actuators.index(name) for name in grasp.posture]] = postures
+    palms = robot.palm(q)
+    return (robot.contacts(q)[0] - palms[:, None, :3, 3]) @ palms[:, :3, :3]
+
+
+def test_joints_that_are_free_in_the_data(tmp_path: Path) -> None:
+    """Distal joints of the Shadow hand follow the middle ones; no posture's tips are nearer."""
+    written = _dexgraspnet(tmp_path)
+    robot, rng = written.robot, np.random.default_rng(2)
+    grasps = ik.load_candidates(written.path, robot, scale=SIZES[0])
+    assert grasps.rows == (0, 5)
+    assert grasps.scale == SIZES[0]
+    assert grasps[1].name == "dexgraspnet_shadow[5]"
+    asked = ik.load_candidates(written.path, robot, scale=SIZES[0], take="contacts")
+    for grasp, contacts, shift in zip(grasps, asked, grasps.shift, strict=True):
+        palm = grasp.palm
+        assert palm is not None
+        theirs = (contacts.arrays(robot.fingers)[0] - palm[:3, 3]) @ palm[:3, :3]
+        posture = np.array(list(grasp.posture.values()))
+        (ours,) = _tips(robot, grasp, posture[None])
+        off = np.linalg.norm(ours - theirs, axis=1)
+        assert shift == pytest.approx(off.max(), abs=1e-6)
+        assert shift < 0.02
+        around = posture + rng.normal(size=(4000, len(posture))) * rng.choice(
+            [0.01, 0.1], (4000, 1)
+        )
+        columns = [robot.actuators.index(name) for name in grasp.posture]
+        others = _tips(robot, grasp, np.clip(around, robot.lower[columns], robot.upper[columns]))
+        assert (np.linalg.norm(others - theirs, axis=2).min(axis=0) >= off - 2e-5).sum() >= 4
+        assert ((others - theirs) ** 2).sum(axis=(1, 2)).min() >= (off**2).sum() - 1e-9
+    moved = [one for one in grasps.shift if one > 1e-4]
+    assert any("shifted" in note for note in grasps.notes) == bool(moved)
+
+
+def test_sizes_of_an_object(tmp_path: Path) -> None:
+    written = _dexgraspnet(tmp_path)
+    says = r"found grasps of 5 sizes \(scale 0\.06: 2 rows, 0\.08: 1 rows, .*; say which \(scale"
+    with pytest.raises(DescriptionError, match=says):
         ik.load_candidates(written.path, written.robot)
-    assert len(ik.load_candidates(written.path, written.robot, take="contacts")) == len(entries)
+    with pytest.raises(DescriptionError, match=r"scale: found 0\.07, expected one of 5 sizes"):
+        ik.load_candidates(written.path, written.robot, scale=0.07)
+    with pytest.raises(ik.CasadiIKError, match=r"scale: found 1, but grasps\.csv says of no size"):
+        ik.load_candidates(_table(tmp_path), KUKA, scale=1.0)
+    bodex = made("bodex_shadow", tmp_path)
+    assert ik.load_candidates(bodex.path, bodex.robot).scale == pytest.approx(0.06)
+
+
+def test_rows_beyond_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They refuse the file, are left out or put at their limits; each is counted and said."""
+    written = _dexgraspnet(tmp_path, beyond=1)
+    given = {"path": written.path, "robot": written.robot, "scale": SIZES[0]}
+    says = r"row 0: shadow_thj3: found .*; 1 of 2 rows are invalid; invalid='drop'.*'clip'.*--inv"
+    with pytest.raises(DescriptionError, match=says) as caught:
+        ik.load_candidates(**given)
+    assert "\n" not in str(caught.value)
+    whole = ik.load_candidates(**given, invalid="clip")
+    assert (len(whole), whole.dropped, whole.clipped) == (2, 0, 1)
+    at = written.robot.actuators.index("shadow_thj3")
+    assert whole[0].posture["shadow_thj3"] == written.robot.upper[at]
+    assert whole.shift[0] > 1e-3
+    assert "1 of 2 rows have joints put at their limits" in str(whole)
+    fewer = ik.load_candidates(**given, invalid="drop")
+    assert (fewer.rows, fewer.dropped, fewer.clipped) == ((5,), 1, 0)
+    assert "1 of 2 rows left out" in str(fewer)
+    again = _dexgraspnet(tmp_path, beyond=2)
+    with pytest.raises(DescriptionError, match=r"row 1: shadow_thj3: .*; 1 of 1 rows are invalid$"):
+        ik.load_candidates(again.path, again.robot, scale=SIZES[1], invalid="drop")
+    with pytest.raises(ik.CasadiIKError, match="invalid: found 'no', expected one of error, drop"):
+        ik.load_candidates(**given, invalid="no")  # pyright: ignore[reportArgumentType]
+    words = ["choose", str(written.path), "--robot", "ur5e+shadow", "--out", str(tmp_path / "r")]
+    assert main([*words, "--scale", "0.06"]) == 2
+    assert "--invalid" in capsys.readouterr().err
+    assert main([*words, "--scale", "0.06", "--invalid", "clip"]) in (0, 1)
+    assert "1 of 2 rows have joints put at their limits" in capsys.readouterr().out
+
+
+def test_rows_that_are_no_grasps(tmp_path: Path) -> None:
+    """NaN, millimetres, no rotation, or no pad at the object: such rows can be left out."""
+    arrays, robot = _getagrip(), ik.load_robot("panda+allegro_right")
+    wrong = {name: np.repeat(array, 3, axis=0) for name, array in arrays.items()}
+    wrong["trans"][1, 0], wrong["trans"][2, 0], wrong["rot"][3] = np.nan, 310.0, 0.0
+    path = tmp_path / "set.npy"
+    np.save(path, np.array(arrays, dtype=object))
+    thumb = ik.load_candidates(path, robot, take="contacts")[0].contacts["thumb"].point
+    wrong["trans"][[0, 5]] = [0, 0, load_object("apple").mesh()[0][:, 2].max()] - thumb
+    np.save(path, np.array(wrong, dtype=object))
+    with pytest.raises(DescriptionError, match=r"row 1: position: holds NaN.*; 3 of 6 rows"):
+        ik.load_candidates(path, robot, invalid="clip")
+    assert ik.load_candidates(path, robot, invalid="drop").rows == (0, 4, 5)
+    wrong["trans"][4] = 0.0, 0.5, 0.0
+    np.save(path, np.array(wrong, dtype=object))
+    with pytest.raises(DescriptionError, match="4 of 6 rows are invalid; invalid='drop'"):
+        ik.load_candidates(path, robot, take="contacts", grasped="apple")
+    assert ik.load_candidates(
+        path, robot, invalid="drop", take="contacts", grasped="apple"
+    ).rows == (0, 5)
+
+
+@pytest.mark.parametrize("name", ["bodex_allegro", "dexgraspbench_leap"])
+def test_stages_before_and_after(name: str, tmp_path: Path) -> None:
+    """Pregrasp and squeeze stay with the candidate and move with it."""
+    written = made(name, tmp_path)
+    place = np.eye(4)
+    place[:3, 3] = 0.4, 0.1, 0.2
+    found = ik.load_candidates(written.path, written.robot, object_pose=place)
+    robot = written.robot
+    for grasp, q in zip(found, written.q, strict=True):
+        before, after = grasp.pregrasp, grasp.squeeze
+        assert before is not None
+        assert after is not None
+        assert after.palm is not None
+        for motor, position in before.posture.items():
+            i = robot.actuators.index(motor)
+            half, twice = (
+                np.clip(share * q[i], robot.lower[i], robot.upper[i]) for share in (0.5, 2)
+            )
+            assert position == pytest.approx(half, abs=1e-6)
+            assert after.posture[motor] == pytest.approx(twice, abs=1e-6)
+    still = ik.load_candidates(written.path, robot)
+    assert found[0].pregrasp is not None
+    assert still[0].pregrasp is not None
+    assert still[0].pregrasp.palm is not None
+    assert found[0].pregrasp.palm == pytest.approx(place @ still[0].pregrasp.palm)
+    again = pickle.loads(pickle.dumps(found[0]))
+    assert again.squeeze.posture == found[0].squeeze.posture
 
 
 class _Runs:
