@@ -43,15 +43,13 @@ def backend(
         InputError: No scheduler answers, it has no worker, or a worker has not what is needed.
         UnsupportedError: joblib or Dask is not installed here.
     """
-    try:
-        import joblib
-    except ImportError as error:
-        raise UnsupportedError("parts: need joblib: pip install casadi-ik[cluster]") from error
+    check_installed(dask)
+    import joblib
+
     if dask is None:
         with joblib.parallel_config(backend="loky", n_jobs=jobs):
             yield None
         return
-    _dask()
     with _quiet(), _client(dask) as client:
         _check(client, dask, packages)
         with joblib.parallel_config(backend="dask"):
@@ -77,9 +75,23 @@ def _quiet() -> Iterator[None]:
             logger.disabled = disabled
 
 
-def _dask() -> None:
+def check_installed(dask: str | None) -> None:
+    """See to it that there is what parts need.
+
+    Raises:
+        UnsupportedError: joblib or Dask is not installed here.
+    """
     try:
-        import dask.distributed  # noqa: F401 - makes its loggers
+        import joblib  # noqa: F401
+    except ImportError as error:
+        raise UnsupportedError(
+            "batches in parts (--resume, --part-size, --dask, Parquet, folders) need joblib: "
+            "pip install casadi-ik[cluster]"
+        ) from error
+    if dask is None:
+        return
+    try:
+        import dask.distributed  # makes its loggers
     except ImportError as error:
         raise UnsupportedError("--dask: needs Dask: pip install casadi-ik[cluster]") from error
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from casadi_ik.api import Solver
+from casadi_ik.batches.backend import check_installed
 from casadi_ik.batches.code import code_version
 from casadi_ik.batches.folder import BatchFolder
 from casadi_ik.batches.part import Asked
@@ -45,10 +46,12 @@ def batch_in_parts(arguments: argparse.Namespace) -> Answer:
     """Solve targets part by part.
 
     Raises:
-        CasadiIKError: Bad input, an output that cannot be written, or a cluster that is not there.
+        CasadiIKError: Bad input, an output that cannot be written, a cluster that is not there, or
+            an extra that is not installed.
         KeyboardInterrupt: Ctrl-C; the finished parts stay.
     """
     path, out = Path(arguments.targets), arguments.out
+    check_installed(arguments.dask)
     robot = the_robot(arguments.robot)
     q0, fixed = the_start(arguments, robot), the_fixed(arguments, robot)
     source = source_of(path, robot.fingers, arguments.part_size or PART_SIZE)

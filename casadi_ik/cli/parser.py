@@ -16,7 +16,7 @@ from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.reach_parser import add_reach
 from casadi_ik.cli.say import PROGRAM
 from casadi_ik.cli.shared_options import add_object_pose, add_scene, add_tolerances
-from casadi_ik.cli.values import assignment, file_name, numbers, one_of, whole
+from casadi_ik.cli.values import assignment, file_name, npz_or_folder, numbers, one_of, whole
 from casadi_ik.cli.view_parser import add_view
 from casadi_ik.errors import InputError
 from casadi_ik.problem.preference import PREFERENCES
@@ -191,7 +191,7 @@ def _add_batch(commands: Any) -> None:
     parser.add_argument(
         "--out",
         metavar="OUT",
-        type=file_name(),
+        type=npz_or_folder,
         required=True,
         help="write the solutions: to OUT.npz, or in parts into a folder (a name without suffix)",
     )

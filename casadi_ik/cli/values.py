@@ -75,6 +75,14 @@ def file_name(*suffixes: str) -> Callable[[str], Path]:
     return parse
 
 
+def npz_or_folder(text: str) -> Path:
+    """An npz file to be written, or a folder: one that is there, or a name without suffix."""
+    path = file_name()(text)
+    if path.suffix.lower() not in ("", ".npz") and not path.is_dir():
+        raise ArgumentTypeError(f"found {text!r}, expected OUT.npz or a folder without suffix")
+    return path
+
+
 def assignment(text: str) -> tuple[str, float]:
     """A name and its number, ``NAME=V``.
 

@@ -213,3 +213,32 @@ def test_bad_targets(name: str, says: str, tmp_path: Path, capsys):
     assert says in error
     assert error.count("\n") == 1
     assert not out.exists()
+
+
+@pytest.mark.parametrize(("missing", "said"), [("joblib", "cluster"), ("polars", "dataframes")])
+def test_an_extra_that_is_missing_leaves_nothing(
+    missing: str, said: str, robot: ik.ArmHand, tmp_path: Path, capsys, monkeypatch
+):
+    """It is said before anything is written that would ask for --resume."""
+    points, normals = robot.contacts(robot.random(np.random.default_rng(4), 2))
+    path = tmp_path / "targets.npz"
+    np.savez(path, points=points, normals=normals)
+    if missing == "polars":
+        path = path.rename(tmp_path / "targets.parquet")
+    monkeypatch.setitem(sys.modules, missing, None)
+    for out in (tmp_path / "out.npz", tmp_path / "out"):
+        assert main(["batch", str(path), *ROBOT, "--resume", "--out", str(out)]) == 2
+        error = capsys.readouterr().err
+        assert f"pip install casadi-ik[{said}]" in error
+        assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_answers_are_an_npz_or_a_folder(targets: Path, tmp_path: Path, capsys):
+    """Another suffix would be a wrong one: a zip is no Parquet file."""
+    for name in ("out.parquet", "out.csv"):
+        assert main(["batch", str(targets), *ROBOT, "--out", str(tmp_path / name)]) == 2
+        error = capsys.readouterr().err
+        assert f"{name}', expected OUT.npz or a folder" in error
+        assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
