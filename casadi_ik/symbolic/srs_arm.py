@@ -49,6 +49,19 @@ class Spherical:
     lower: Array
     upper: Array
 
+    def triples(self, matrix: Expr, lower: Expr, upper: Expr) -> tuple[Expr, Expr]:
+        """Both triples of `euler_angles`, held joints of more than a turn where they are held.
+
+        Args:
+            matrix: (3, 3), see `euler_matrix`.
+            lower: (3, 1) bounds [rad].
+            upper: (3, 1).
+        """
+        one, other = euler_angles(self, matrix)
+        if (self.upper - self.lower < AROUND).all():
+            return one, other
+        return at_held(one, lower, upper), at_held(other, lower, upper)
+
     def euler_matrix(self, rotation: Expr) -> Expr:
         """The rotation as Rz(t1) Ry(t2 + offset) Rz(t3), (3, 3)."""
         local = ca.DM(self.frame.T) @ rotation @ ca.DM(self.frame)
@@ -217,6 +230,25 @@ def euler_angles(spherical: Spherical, matrix: Expr) -> tuple[Expr, Expr]:
         for triple in triples
     ]
     return centred[0], centred[1]
+
+
+AROUND = 2 * np.pi - 1e-6
+"""Range [rad] of a joint from which on it may stand the same way at several angles."""
+
+
+def at_held(angles: Expr, lower: Expr, upper: Expr) -> Expr:
+    """Angles (k, 1) [rad] moved by whole turns to where their joints are held, if they are.
+
+    A closed form gives each angle in the turn centred on its joint's range, but a joint of more
+    than a turn may be held in another.
+
+    Args:
+        angles: (k, 1) [rad].
+        lower: (k, 1) bounds [rad]; a joint whose bounds are equal is held.
+        upper: (k, 1).
+    """
+    turns = ca.floor((lower - angles) / (2 * np.pi) + 0.5)
+    return ca.if_else(lower < upper, angles, angles + 2 * np.pi * turns)
 
 
 def limit_roots(

@@ -15,7 +15,7 @@ import numpy as np
 from casadi_ik.methods.common.arm_placement import ALLOWED
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.srs_arm import Spherical, SrsArm, at_angle, euler_angles, swivel
+from casadi_ik.symbolic.srs_arm import Spherical, SrsArm, at_angle, swivel
 from casadi_ik.symbolic.subexpressions import shared
 
 SAMPLES = 12
@@ -154,7 +154,8 @@ class _Best:
 
 def _sphere(spherical: Spherical, matrix: Expr, wanted: Wanted) -> tuple[Expr, Expr, Expr]:
     """The nearer of a sphere's two triples among those within bounds, its cost and margin."""
-    found = [(triple, *wanted.cost(triple)) for triple in euler_angles(spherical, matrix)]
+    triples = spherical.triples(matrix, wanted.lower, wanted.upper)
+    found = [(triple, *wanted.cost(triple)) for triple in triples]
     scores = [ca.if_else(margin >= ALLOWED, -cost, OUTSIDE + margin) for _, cost, margin in found]
     keep = scores[0] >= scores[1]
     first, second, third = (ca.if_else(keep, one, other) for one, other in zip(*found, strict=True))

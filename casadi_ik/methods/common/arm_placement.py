@@ -16,7 +16,6 @@ from casadi_ik.symbolic.srs_arm import (
     Spherical,
     SrsArm,
     at_angle,
-    euler_angles,
     limit_roots,
     swivel,
 )
@@ -123,7 +122,7 @@ def _best(
 def _sphere(spherical: Spherical, matrix: Expr, lower: Expr, upper: Expr) -> tuple[Expr, Expr]:
     """The better of a sphere's two triples, and its margin."""
     pairs = []
-    for triple in euler_angles(spherical, matrix):
+    for triple in spherical.triples(matrix, lower, upper):
         pairs.append((triple, ca.mmin(ca.fmin(triple - lower, upper - triple))))
     return _better(pairs[0], pairs[1])
 

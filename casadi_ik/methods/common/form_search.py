@@ -21,6 +21,7 @@ from casadi_ik.symbolic.closed_arms.form import Bend, ClosedForm
 from casadi_ik.symbolic.closed_arms.passing import PassingArm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.srs_arm import AROUND, at_held
 from casadi_ik.symbolic.subexpressions import shared
 
 TURN = 2 * np.pi
@@ -128,14 +129,15 @@ def place_form(
         its bounds [rad], negative if outside), and its swept position.
     """
     if isinstance(form, PassingArm):
-        at = best_at(form, "place_at", _placed, near=False)
+        at = best_at(form, "place_at", _placed(form), near=False)
         begin = form.middle + TURN / TRIES * ca.fmod(trial, TRIES)
         given = (palm.rotation, palm.origin, lower, upper, begin)
         return _looked(form, "place", at, THOROUGH, given)(trial, around, window)
     symbols = _Symbols(form)
     best: tuple[Expr, ...] = ()
     ends = symbols.lower, symbols.upper
-    for bend in form.bends(symbols.palm, symbols.position):
+    for found in form.bends(symbols.palm, symbols.position):
+        bend = _at_held(form, found, *ends)
         margins = [_margin(end, *ends) for end in bend.ends]
         common = ca.fmin(_margin(bend.joints, *ends), _short(bend))
         arm = ca.if_else(margins[0] >= margins[1], *bend.arms())
@@ -183,9 +185,15 @@ def choose_form(
     return _looked(form, "choose", at, CHOICE, given)(trial, around, 0.0)
 
 
-def _placed(arm: Expr, short: Expr, lower: Expr, upper: Expr, _: Expr) -> tuple[Expr, Expr]:
-    """An arm and its margin."""
-    return arm, ca.fmin(_margin(dict(enumerate(ca.vertsplit(arm))), lower, upper), short)
+def _placed(form: ClosedForm) -> Scored:
+    """An arm, its held joints moved by whole turns, and its margin."""
+
+    def scored(arm: Expr, short: Expr, lower: Expr, upper: Expr, _: Expr) -> tuple[Expr, Expr]:
+        found = Bend(dict(enumerate(ca.vertsplit(arm))), ({}, {}), short)
+        joints = _at_held(form, found, lower, upper).joints
+        return ca.vertcat(*joints.values()), ca.fmin(_margin(joints, lower, upper), short)
+
+    return scored
 
 
 def _chosen(form: ClosedForm, scales: ca.DM) -> Scored:
@@ -283,24 +291,30 @@ def _positions(
 
 def _nearest_turns(form: ClosedForm, bend: Bend, wanted: Wanted) -> Bend:
     """Joints that turn more than once moved by whole turns towards the given arm."""
-    screws = form.screws
-    more = {
-        joint
-        for place, joint in enumerate(screws.joints)
-        if screws.upper[place] - screws.lower[place] > TURN
-    }
 
-    def moved(joints: dict[int, Expr]) -> dict[int, Expr]:
-        found = dict(joints)
-        for joint in more & set(joints):
-            angle = joints[joint]
-            turns = ca.floor((wanted.near[joint] - angle) / TURN + 0.5)
-            near = angle + TURN * turns
-            inside = ca.logic_and(near >= wanted.lower[joint], near <= wanted.upper[joint])
-            found[joint] = ca.if_else(inside, near, angle)
-        return found
+    def nearest(joint: int, angle: Expr) -> Expr:
+        turns = ca.floor((wanted.near[joint] - angle) / TURN + 0.5)
+        moved = angle + TURN * turns
+        margin = ca.fmin(moved - wanted.lower[joint], wanted.upper[joint] - moved)
+        return ca.if_else(margin >= ALLOWED, moved, angle)
 
-    return Bend(moved(bend.joints), (moved(bend.ends[0]), moved(bend.ends[1])), bend.slack)
+    return _turned(form, bend, nearest)
+
+
+def _at_held(form: ClosedForm, bend: Bend, lower: Expr, upper: Expr) -> Bend:
+    """Joints that turn more than once moved by whole turns to where they are held, if they are."""
+    return _turned(form, bend, lambda i, angle: at_held(angle, lower[i], upper[i]))
+
+
+def _turned(form: ClosedForm, bend: Bend, moved: Callable[[int, Expr], Expr]) -> Bend:
+    """The bend with every joint that turns all around moved, given its number and its angle."""
+    ranges = form.screws.upper - form.screws.lower
+    around = [i for i, wide in zip(form.screws.joints, ranges >= AROUND, strict=True) if wide]
+
+    def each(joints: dict[int, Expr]) -> dict[int, Expr]:
+        return {i: moved(i, angle) if i in around else angle for i, angle in joints.items()}
+
+    return Bend(each(bend.joints), (each(bend.ends[0]), each(bend.ends[1])), bend.slack)
 
 
 def _margin(joints: dict[int, Expr], lower: Expr, upper: Expr) -> Expr:

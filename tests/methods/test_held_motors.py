@@ -1,0 +1,55 @@
+"""Motors that are held: wherever they stand within their limits, no reachable target is lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from toy_robots import copy_shipped_robot
+
+import casadi_ik as ik
+
+
+def all_solved(
+    robot: ik.ArmHand, fixed: dict[str, float], prefer: str = "limits", k: int = 12
+) -> bool:
+    """Whether k targets that the robot reaches with motors held are solved, and keep them there."""
+    q = robot.random(np.random.default_rng(17), k)
+    columns = [robot.actuators.index(name) for name in fixed]
+    q[:, columns] = list(fixed.values())
+    solver = ik.Solver(robot, compiled=False)
+    batch = solver.solve_batch(*robot.contacts(q), q0=robot.home, prefer=prefer, fixed=fixed)
+    np.testing.assert_array_equal(batch.q[:, columns], q[:, columns])
+    return bool(batch.success.all())
+
+
+@pytest.mark.parametrize("prefer", ["limits", "q0"])
+@pytest.mark.parametrize(
+    ("name", "fixed"),
+    [
+        ("ur10e+robotiq_3f", {"ur10e_joint_1": 4.2, "ur10e_joint_6": -5.1}),
+        ("puma560+jaco_3f", {"puma560_joint_4": -4.2}),
+        ("xarm6+barrett_bh8_280", {"xarm6_joint_1": -4.2, "xarm6_joint_6": 5.1}),
+        ("xarm7+trifinger", {"xarm7_joint_1": 4.2, "xarm7_joint_3": 4.2, "xarm7_joint_5": -5.1}),
+    ],
+)
+def test_a_joint_may_be_held_in_another_turn(name, fixed, prefer):
+    """A form of the arm gives each joint in the middle turn of its range; it may be held outside."""
+    assert all_solved(ik.load_robot(name), fixed, prefer)
+
+
+@pytest.mark.parametrize("value", [np.pi, -np.pi])
+def test_a_joint_may_be_held_where_two_turns_meet(value):
+    robot = ik.load_robot("ur10e+robotiq_3f")
+    assert all_solved(robot, {"ur10e_joint_1": value, "ur10e_joint_5": value / 2})
+
+
+@pytest.mark.parametrize("prefer", ["limits", "q0"])
+def test_a_joint_of_an_arm_with_two_spheres_may_be_held_in_another_turn(tmp_path, prefer):
+    path = copy_shipped_robot(tmp_path)
+    arm = yaml.safe_load((tmp_path / "arm.yaml").read_text())
+    for joint in arm["joints"]:
+        if joint["name"][-1] in "17":
+            joint["limits"] = ["-360 deg", "360 deg"]
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(arm))
+    assert all_solved(ik.load_robot(path), {"lwr_joint_1": 4.2, "lwr_joint_7": -5.1}, prefer)
