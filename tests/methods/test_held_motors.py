@@ -34,7 +34,7 @@ def all_solved(
     ],
 )
 def test_a_joint_may_be_held_in_another_turn(name, fixed, prefer):
-    """A form of the arm gives each joint in the middle turn of its range; it may be held outside."""
+    """A form of the arm gives each joint in the middle turn of its range."""
     assert all_solved(ik.load_robot(name), fixed, prefer)
 
 
@@ -42,6 +42,26 @@ def test_a_joint_may_be_held_in_another_turn(name, fixed, prefer):
 def test_a_joint_may_be_held_where_two_turns_meet(value):
     robot = ik.load_robot("ur10e+robotiq_3f")
     assert all_solved(robot, {"ur10e_joint_1": value, "ur10e_joint_5": value / 2})
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_turn_it_is_held_in_costs_neither_alternatives_nor_free_answers(compiled):
+    robot = ik.load_robot("ur10e+robotiq_3f")
+    solver = ik.Solver(robot, compiled=compiled)
+    free = ik.Solver(robot, scene=ik.load_scene("table"), compiled=compiled)
+    q = robot.random(np.random.default_rng(1), 8)
+    counts = []
+    for turn in (0.0, 2 * np.pi):
+        fixed = {robot.actuators[0]: turn - 2.0}
+        q[:, 0] = turn - 2.0
+        points, normals = robot.contacts(q)
+        solved = free.solve_batch(points, normals, fixed=fixed).success
+        places = zip(robot.fingers, points[0], normals[0], strict=True)
+        grasp = ik.Grasp({name: ik.Contact(*place) for name, *place in places})
+        alternatives = solver.solve_all(grasp, limit=9, fixed=fixed)
+        counts.append((len(alternatives), solved.tolist()))
+    assert counts[0] == counts[1]
+    assert counts[0][0] > 1
 
 
 @pytest.mark.parametrize("prefer", ["limits", "q0"])

@@ -142,13 +142,16 @@ static int mapped(const swings_job *job, KERNEL(kernel, map_job), const double *
   return code;
 }
 
-/* Puts an arm into its bounds and the asked turn; whether it was within, as far as rounding goes. */
+/* Puts an arm into its bounds and the asked turn, that of a held joint where it is held; whether it
+ * was within, as far as rounding goes. */
 static int admit(const swings_job *job, double *arm, const double *start) {
   int64_t j;
   for (j = 0; j < job->n_arm; ++j) {
     const double low = job->lower[j], high = job->upper[j];
     double x = arm[j];
-    if (job->order == NEAR_START) {
+    if (low >= high) {
+      x += TURN * floor((low - x) / TURN + 0.5);
+    } else if (job->order == NEAR_START) {
       const double turned = x + TURN * floor((start[job->columns[j]] - x) / TURN + 0.5);
       if (turned >= low && turned <= high) x = turned;
     }

@@ -218,7 +218,7 @@ class AlternativeFinder:
         if self._branches is None:
             return [_Found(arm, posture) for arm in self._searched(problems, q, seed)]
         palm = self.robot.palm(q)
-        lower, upper = limits.lower[self._arm], limits.upper[self._arm]
+        lower, upper = (self._seen_by_form(end, limits) for end in (limits.lower, limits.upper))
 
         def with_arm(arms: Array) -> Array:
             whole = np.tile(q, (len(arms), 1))
@@ -244,6 +244,13 @@ class AlternativeFinder:
             arm, swivel = best_arm(self._branches, palm, branch, valued)
             found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
         return self._exact(problems, found) or [_Found(q, posture)]
+
+    def _seen_by_form(self, end: Array, limits: Bounds) -> Array:
+        """(a,) bounds of the arm, those of held joints in the turn in which a form gives them."""
+        middle = (self.robot.lower + self.robot.upper) / 2
+        turns = np.floor((end - middle + np.pi) / (2 * np.pi))
+        moved = np.where(limits.lower < limits.upper, end, end - 2 * np.pi * turns)
+        return moved[self._arm]
 
     def _exact(self, problems: Problems, found: list[_Found]) -> list[_Found]:
         """Arms that are only nearly of their form are brought to the contacts."""

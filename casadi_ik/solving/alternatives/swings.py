@@ -241,8 +241,10 @@ class _Slow:
         return [owner[rows], found, places[rows], bent * self.places.sides + side]
 
     def _turned(self, arms: Array, starts: Array) -> Array:
-        """Arms in the turn that is nearest to the start, where that is preferred."""
+        """Arms in the turn that is nearest to the start, where that is preferred, or held in."""
         lower, upper = self.bounds
+        held = arms + TURN * np.floor((lower - arms) / TURN + 0.5)
+        arms = np.where(lower < upper, arms, held)
         if self.prefer != "q0":
             return arms
         turned = arms + TURN * np.floor((starts - arms) / TURN + 0.5)
