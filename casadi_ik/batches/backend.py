@@ -75,8 +75,11 @@ def _quiet() -> Iterator[None]:
             logger.disabled = disabled
 
 
-def check_installed(dask: str | None) -> None:
+def check_installed(cluster: str | None) -> None:
     """See to it that there is what parts need.
+
+    Args:
+        cluster: Address of a Dask scheduler; None: this machine.
 
     Raises:
         UnsupportedError: joblib or Dask is not installed here.
@@ -88,10 +91,10 @@ def check_installed(dask: str | None) -> None:
             "batches in parts (--resume, --part-size, --dask, Parquet, folders) need joblib: "
             "pip install casadi-ik[cluster]"
         ) from error
-    if dask is None:
+    if cluster is None:
         return
     try:
-        import dask.distributed  # makes its loggers
+        import dask.distributed  # noqa: F401 - makes its loggers
     except ImportError as error:
         raise UnsupportedError("--dask: needs Dask: pip install casadi-ik[cluster]") from error
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +12,9 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.cli.question import located, the_object_pose, the_robot
+from casadi_ik.cli.ranked_file import read_ranked
 from casadi_ik.collision.scene import Scene
 from casadi_ik.datasets import load_candidates
-from casadi_ik.errors import InputError
 
 if TYPE_CHECKING:
     from casadi_ik.viewing.asked import Asked, Settings
@@ -56,30 +55,16 @@ def ranked_of(
     """
     from casadi_ik.viewing.asked import asked_of
 
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))["ranked"]
-        found = [(one, one["solution"]["q"], one["solution"]["robot"]) for one in entries]
-        labels = [
-            f"{one.get('name') or 'candidate'} ({one['candidate']}), score {one['score']:.4g}"
-            for one in entries
-        ]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: expected what `casadi-ik choose` writes (ranked: ...)"
-        ) from error
-    if not found:
-        raise InputError(f"{path}: ranked: found none, expected at least one answer")
+    found = read_ranked(path)
     with located(f"{path}: ranked[0].solution.robot"):
-        robot = the_robot(arguments.robot or str(found[0][2]))
+        robot = the_robot(arguments.robot or found[0].solution.robot)
     choices: Choices = {}
-    for place, (label, (_, values, _)) in enumerate(zip(labels, found, strict=True), 1):
+    for place, one in enumerate(found, 1):
         with located(f"{path}: ranked[{place - 1}].solution.q"):
-            q = robot.configuration(np.array(values, dtype=float))
+            q = robot.configuration(np.array([one.solution.q]))[0]
 
         def ask(q: Array = q) -> tuple[Asked, Array]:
             return asked_of(robot, None, q, scene, settings), q
 
-        choices[f"{place}. {label}"] = ask
+        choices[f"{place}. {one.label}"] = ask
     return robot, choices

@@ -66,6 +66,35 @@ def test_candidates_and_ranked_answers(view, robot: ik.ArmHand, tmp_path: Path) 
     assert np.allclose(shown.answer.q, solution.q)
 
 
+RANKED = (
+    '{"ranked": [{"candidate": 0, "score": 1, "solution": {"robot": "kuka_lwr_barrett", "q": %s}}]}'
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"ranked": ' + 100_000 * "[" + 100_000 * "]" + "}", "expected what `casadi-ik choose`"),
+        (RANKED % '["a", 0]', "expected `float`, got `str` - at `ranked[0].solution.q[0]`"),
+        (RANKED % "[[0]]", "solution.q[0]`"),
+        (RANKED % "[]", "ranked[0].solution.q: q: found shape (1, 0), expected"),
+        (RANKED % "[1e999]", "expected what `casadi-ik choose` writes"),
+        ('{"ranked": []}', "ranked: found none"),
+        ('{"ranked": [{"candidate": "x"}]}', "ranked[0].candidate`"),
+        ("\xff", "expected what `casadi-ik choose` writes"),
+    ],
+)
+def test_ranked_files_that_are_none(
+    text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "ranked.json"
+    path.write_text(text, encoding="latin1")
+    assert main(["view", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert message.lower() in said.lower()
+    assert said.count("\n") == 1
+
+
 def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None:
     paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
     for path, grasp in zip(paths, ("cup", "mug"), strict=True):
