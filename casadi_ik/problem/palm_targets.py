@@ -141,7 +141,7 @@ def _stiffness(points: Array, normals: Array) -> Array:
         moved[:, 3 + i, :f] = np.cross(axis, off)
         moved[:, 3 + i, f:] = np.cross(axis, normals)
     values = np.linalg.svd(moved.reshape(len(points), 6, -1), compute_uv=False)
-    return np.asarray(values[:, -1])
+    return np.asarray(values[:, -1], dtype=np.float64)
 
 
 def held_too(postures: Array, fixed: Array | None, actuators: Sequence[str]) -> Array:
