@@ -55,6 +55,11 @@ def add_import(commands: Any) -> None:
         "--srdf", metavar="FILE.srdf", help="links that may touch, beside those that are found to"
     )
     parser.add_argument(
+        "--xacro",
+        action="store_true",
+        help="expand the macros of files that are not called .xacro",
+    )
+    parser.add_argument(
         "--picture",
         metavar="FILE.png",
         type=file_name(".png"),

@@ -67,6 +67,7 @@ def import_robot(arguments: argparse.Namespace) -> Answer:
         palm=arguments.palm,
         mount=_mount(arguments),
         shapes=draw is not None,
+        xacro=arguments.xacro,
     )
     robots: list[ArmHand] = []
     differences: dict[str, float] = {}
@@ -111,6 +112,7 @@ def _command(arguments: argparse.Namespace) -> str:
     for option in ("tip", "palm"):
         if getattr(arguments, option) is not None:
             words += [f"--{option}", getattr(arguments, option)]
+    words += ["--xacro"] if arguments.xacro else []
     if arguments.srdf is not None:
         words += ["--srdf", arguments.srdf]
     if arguments.mount is not None:
@@ -150,8 +152,8 @@ def _differences(robot: ArmHand, found: Imported) -> dict[str, float]:
     values: dict[str, float] = {}
     if arm is not None and lines.arm is not None:
         difference = largest_difference(robot, arm, q, lines.arm.locked, carried=hand)
-        values[str(arm) if arm.name == hand.name else arm.name] = difference
-    values[hand.name] = largest_difference(robot, hand, q, lines.hand.locked, arm)
+        values[str(arm.path) if arm.path.name == hand.path.name else arm.path.name] = difference
+    values[hand.path.name] = largest_difference(robot, hand, q, lines.hand.locked, arm)
     return values
 
 

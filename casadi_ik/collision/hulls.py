@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,27 +52,6 @@ def hull(points: Array, where: str) -> Solid:
     if float(np.abs(outward).sum()) < THIN:
         raise DescriptionError(f"{where}: encloses no volume, expected a body")
     return convex(points, normals)
-
-
-def mesh_points(path: Path, where: str) -> Array:
-    """(k, 3) corners of a mesh's file.
-
-    Raises:
-        DescriptionError: There is no such file, or no mesh in it.
-        MissingExtraError: coal is not installed.
-    """
-    if not path.is_file():
-        raise DescriptionError(f"{where}: no such file {str(path)!r}")
-    coal = _coal(where)
-    try:
-        model = coal.MeshLoader().load(str(path), np.ones(3))
-    except (RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise DescriptionError(f"{where}: {path.name} cannot be read: {reason}") from error
-    points = np.array(model.vertices(), dtype=float).reshape(-1, 3)
-    if not len(points):
-        raise DescriptionError(f"{where}: {path.name} is an empty mesh, expected triangles")
-    return points
 
 
 def _coal(where: str) -> Any:

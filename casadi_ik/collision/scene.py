@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.hulls import hull, mesh_points
+from casadi_ik.collision.hulls import hull
 from casadi_ik.collision.scene_file import (
     BoxEntry,
     CapsuleEntry,
@@ -27,6 +27,7 @@ from casadi_ik.collision.scene_file import (
 )
 from casadi_ik.collision.solids import Solid, box, capsule, cylinder, half_space, of_object
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
+from casadi_ik.files.mesh_file import read_mesh
 from casadi_ik.files.reading import (
     Frame,
     convert,
@@ -257,7 +258,7 @@ def _parts(entry: SolidEntry, where: str, path: Path) -> list[tuple[Solid, Array
         case MeshEntry():
             file = Path(entry.file).expanduser()
             file = file if file.is_absolute() else path.parent / file
-            points = mesh_points(file, f"{where}.file")
+            points, _ = read_mesh(file, f"{where}.file")
             return [(hull(entry.scale * points, f"{where}.file"), here)]
         case ObjectEntry():
             try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Protocol
 from xml.etree import ElementTree
 
@@ -13,8 +12,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.importing.mounted import hand_links
 from casadi_ik.robots.part import PREFIX
-from casadi_ik.robots.robot_files.mjcf_file import joint_name, mujoco_model
-from casadi_ik.robots.robot_files.read import read_tree, robot_element
+from casadi_ik.robots.robot_files.mjcf_file import joint_name
 from casadi_ik.robots.robot_files.tree import RobotTree
 from casadi_ik.robots.robot_files.urdf_file import bare, pinocchio
 
@@ -27,30 +25,31 @@ class Oracle(Protocol):
         ...
 
 
-def oracle(path: Path) -> Oracle:
+def oracle(tree: RobotTree) -> Oracle:
     """Pinocchio for URDF, MuJoCo for MJCF.
 
     Raises:
-        DescriptionError: The file cannot be read.
         MissingExtraError: The library is not installed.
     """
-    element = robot_element(path)
-    return _MuJoCo(path) if element.tag == "mujoco" else _Pinocchio(element)
+    if tree.model is not None:
+        return _MuJoCo(*tree.model)
+    assert tree.element is not None
+    return _Pinocchio(tree.element)
 
 
 def largest_difference(
     robot: ArmHand,
-    path: Path,
+    tree: RobotTree,
     q: Array,
     locked: Mapping[str, float] | None = None,
-    beside: Path | None = None,
-    carried: Path | None = None,
+    beside: RobotTree | None = None,
+    carried: RobotTree | None = None,
 ) -> float:
     """How far the links of a robot are from where its file's library has them.
 
     Args:
         robot: The robot, imported from the file, alone or as a part.
-        path: The file.
+        tree: The file.
         q: (k, n) positions of the actuators [rad or m].
         locked: Joints that the description holds, and where.
         beside: The file of the arm that this file's hand is on, whose names go before.
@@ -62,12 +61,10 @@ def largest_difference(
         file that the robot has.
 
     Raises:
-        DescriptionError: The file cannot be read.
         MissingExtraError: Its library is not installed.
     """
-    tree = read_tree(path)
-    known = oracle(path)
-    taken = set() if beside is None else _names(read_tree(beside))
+    known = oracle(tree)
+    taken = set() if beside is None else _names(beside)
     links = {link: _ours(link, robot.description.links, taken) for link in tree.links}
     if beside is not None or carried is not None:
         hand = hand_links(robot.description)
@@ -143,9 +140,9 @@ class _Pinocchio:
 
 
 class _MuJoCo:
-    def __init__(self, path: Path) -> None:
-        self._mujoco, self._model = mujoco_model(path)
-        self._data = self._mujoco.MjData(self._model)
+    def __init__(self, mujoco: Any, model: Any) -> None:
+        self._mujoco, self._model = mujoco, model
+        self._data = mujoco.MjData(model)
 
     def poses(self, values: Mapping[str, float]) -> dict[str, Array]:
         model, data = self._model, self._data

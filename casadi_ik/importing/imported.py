@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import DescriptionError, InputError
@@ -22,12 +23,13 @@ from casadi_ik.importing.home import guess_home
 from casadi_ik.importing.pads import Pad, guess_pads
 from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.robot_shapes import robot_shapes
-from casadi_ik.importing.surfaces import Surface, checked_surfaces
+from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.importing.thumb import guess_palm_frame, guess_thumb
 from casadi_ik.importing.write import FileLine, Written
 from casadi_ik.robots.file_parts import hand_from_file
 from casadi_ik.robots.load import load_description
 from casadi_ik.robots.robot_files.read import read_tree
+from casadi_ik.robots.robot_files.tree import RobotTree
 from casadi_ik.robots.schema import HandFromFile
 
 
@@ -47,7 +49,7 @@ class Imported:
     branches: tuple[Branch, ...]
     pads: tuple[Pad, ...]
     surfaces: dict[str, Surface]
-    files: tuple[Path | None, Path]
+    files: tuple[RobotTree | None, RobotTree]
 
     def at_home(self, path: Path) -> Imported:
         """With a home, found for the description as it was written to a path.
@@ -78,7 +80,7 @@ class Imported:
             shapes=shapes,
             touching=touching,
             srdf=text,
-            notes=[*self.written.notes, *(n for n in notes if n not in self.written.notes)],
+            notes=notes,
         )
         return replace(self, written=written)
 
@@ -93,6 +95,7 @@ def import_robot(
     palm: str | None = None,
     mount: Sequence[float] | None = None,
     shapes: bool = False,
+    xacro: bool = False,
 ) -> Imported:
     """Choose and guess everything that a description needs but home.
 
@@ -105,6 +108,7 @@ def import_robot(
         palm: Link that the fingers hang on; None: guessed.
         mount: (6,) pose of the hand's base on the tip [m, rad]; None: on it.
         shapes: Whether the shapes of all links are wanted, for a picture.
+        xacro: Whether macros are expanded in files that are not called ``.xacro``.
 
     Raises:
         CasadiIKError: A file cannot be read, or nothing says what to choose.
@@ -114,13 +118,14 @@ def import_robot(
             f"{hand}: arm and hand are the same file, expected one of each, or one that has "
             "both (casadi-ik import ROBOT --palm LINK)"
         )
-    tree = read_tree(hand)
+    tree = read_tree(hand, xacro)
     palm_link, palm_how = the_palm(tree, palm)
     joints = kept_joints(tree, palm_link, below=True)
     moved = sum(joint.type != "fixed" for joint in tree.chain(tree.root, palm_link, str(hand)))
     key = "robot" if arm is None and moved else "hand"
     limits, locked = assumed_limits(joints), assumed_locks(joints)
-    entry = HandFromFile(str(hand.resolve()), palm_link, locked=locked, limits=limits)
+    told = xacro and hand.suffix != ".xacro"
+    entry = HandFromFile(str(hand.resolve()), palm_link, None, locked, limits, told)
     part = hand_from_file(entry, {}, key, out)
     postures = Postures(part)
     branches = find_fingers(postures, palm_link)
@@ -131,14 +136,15 @@ def import_robot(
         if shapes
         else {one for branch in branches for one in _ends_of(postures, branch)}
     )
-    surfaces, notes = checked_surfaces(hand, wanted)
+    surfaces, notes = link_surfaces(tree, wanted)
     pads = guess_pads(postures, palm_link, branches, surfaces)
     thumb, thumb_how = guess_thumb(postures, branches, pads)
     frame = guess_palm_frame(postures, palm_link, branches, pads, thumb)
     if not any(branch.name == "thumb" for branch in branches):
         branches[thumb] = replace(branches[thumb], name="thumb")
     order = [thumb, *(i for i in range(len(branches)) if i != thumb)]
-    arm_line = None if arm is None else _arm_line(arm, out, tip)
+    arm_tree = None if arm is None else read_tree(arm, xacro)
+    arm_line = None if arm_tree is None else _arm_line(arm_tree, out, tip, xacro)
     if arm is None and (tip is not None or mount is not None):
         option = "--tip" if tip is not None else "--mount"
         raise InputError(f"{option}: there is no arm in a file of its own")
@@ -146,7 +152,7 @@ def import_robot(
         command=command,
         name=out.stem,
         arm=arm_line,
-        hand=FileLine(file_text(hand, out), palm_link, palm_how, limits, locked),
+        hand=FileLine(file_text(hand, out), palm_link, palm_how, limits, locked, entry.xacro),
         key=key,
         mount=None if arm is None else list(mount or [0.0] * 6),
         mount_how="--mount" if mount else "GUESS: the hand's base on the arm's tip",
@@ -160,7 +166,7 @@ def import_robot(
         tuple(branches[i] for i in order),
         tuple(pads[i] for i in order),
         surfaces,
-        (arm, hand),
+        (arm_tree, tree),
     )
 
 
@@ -169,21 +175,34 @@ def _ends_of(postures: Postures, branch: Branch) -> list[str]:
     return [link for joint in branch.chain[-2:] for link in postures.rigid(joint.child)]
 
 
-def _arm_line(arm: Path, out: Path, tip: str | None) -> FileLine:
-    tree = read_tree(arm)
+def _arm_line(tree: RobotTree, out: Path, tip: str | None, xacro: bool) -> FileLine:
     if tip is None:
         link, how = the_tip(tree)
     elif tip in tree.links:
         link, how = tip, "--tip"
     else:
-        raise InputError(f"--tip: {arm.name} has no link {tip!r}; it has {', '.join(tree.links)}")
+        raise InputError(
+            f"--tip: {tree.path.name} has no link {tip!r}; it has {', '.join(tree.links)}"
+        )
     joints = kept_joints(tree, link, below=False)
-    return FileLine(file_text(arm, out), link, how, assumed_limits(joints), assumed_locks(joints))
+    limits, locked = assumed_limits(joints), assumed_locks(joints)
+    told = xacro and tree.path.suffix != ".xacro"
+    return FileLine(file_text(tree.path, out), link, how, limits, locked, told)
 
 
 def loaded(path: Path) -> ArmHand:
     """The robot of a description that was written."""
     return ArmHand(load_description(path))
+
+
+def tree_of(path: Path, entry: Mapping[str, Any]) -> RobotTree:
+    """The file that a description's ``arm``, ``hand`` or ``robot`` points to.
+
+    Raises:
+        CasadiIKError: It cannot be read.
+    """
+    file = path.parent / Path(str(entry["file"])).expanduser()
+    return read_tree(file, entry.get("xacro") is True)
 
 
 def described_surfaces(path: Path) -> dict[str, Surface]:
@@ -196,9 +215,8 @@ def described_surfaces(path: Path) -> dict[str, Surface]:
     entry = raw.get("hand") or raw.get("robot")
     if not isinstance(entry, dict) or "file" not in entry:
         return {}
-    file = path.parent / Path(str(entry["file"])).expanduser()
-    tree = read_tree(file)
+    tree = tree_of(path, entry)
     palm = entry.get("palm") or tree.root
     palm = palm["link"] if isinstance(palm, dict) else palm
     links = {palm, *(joint.child for joint in tree.below(palm))}
-    return checked_surfaces(file, links)[0]
+    return link_surfaces(tree, links)[0]

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from casadi_ik.importing.fitted import fitted
 from casadi_ik.importing.mounted import hand_links
-from casadi_ik.importing.surfaces import Surface, checked_surfaces
+from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.importing.touching import may_touch
 from casadi_ik.robots.collision import Touching
 from casadi_ik.robots.collision_entries import ShapeEntry
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.robots.part import PREFIX
-from casadi_ik.robots.robot_files.read import read_tree
+from casadi_ik.robots.robot_files.tree import RobotTree
 
 
 def robot_shapes(
-    robot: RobotDescription, files: tuple[Path | None, Path]
+    robot: RobotDescription, files: tuple[RobotTree | None, RobotTree]
 ) -> tuple[dict[str, list[ShapeEntry]], list[Touching], list[str]]:
     """Shapes by link of the robot, links that may touch, and what could not be read.
 
@@ -35,19 +33,18 @@ def robot_shapes(
     for file in files:
         if file is None:
             continue
-        tree = read_tree(file)
-        ours = {link: _ours(link, robot.links, taken) for link in tree.links}
+        ours = {link: _ours(link, robot.links, taken) for link in file.links}
         wanted = {
             link: name
             for link, name in ours.items()
             if name in robot.links and (None in files or (name in hand) == (file is files[1]))
         }
-        found, said = checked_surfaces(file, wanted)
+        found, said = link_surfaces(file, wanted)
         surfaces |= {wanted[link]: surface for link, surface in found.items()}
-        entries = tree.shapes.entries
+        entries = file.shapes.entries
         simple |= {wanted[link]: list(entries[link]) for link in wanted if link in entries}
         notes += said
-        taken |= set(tree.links)
+        taken |= set(file.links)
     ordered = {link: surfaces[link] for link in robot.links if link in surfaces}
     shapes = fitted(ordered, {robot.palm_link}, simple)
     return shapes, may_touch(robot, shapes, surfaces), notes

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection
-from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.robots.robot_files.mjcf_file import mujoco_model
-from casadi_ik.robots.robot_files.read import robot_element
-from casadi_ik.robots.robot_files.urdf_file import bare, pinocchio, silent
+from casadi_ik.files.mesh_file import FARTHEST, read_mesh
+from casadi_ik.robots.robot_files.file_shapes import pose_of, simple_shape, values_of
+from casadi_ik.robots.robot_files.foreign import package_folders
+from casadi_ik.robots.robot_files.tree import RobotTree
+from casadi_ik.robots.robot_files.xml_text import Element
 
 AROUND = 24
 """Points around an axis."""
@@ -92,100 +91,129 @@ def together(surfaces: list[Surface]) -> Surface | None:
     return Surface(np.concatenate([one.points for one in surfaces]), np.concatenate(triangles))
 
 
-def link_surfaces(path: Path, links: Collection[str]) -> tuple[dict[str, Surface], list[str]]:
+def link_surfaces(tree: RobotTree, links: Collection[str]) -> tuple[dict[str, Surface], list[str]]:
     """Shapes of a file's links: those for collisions, else those that are seen.
 
     Args:
-        path: The file.
+        tree: The file.
         links: Those that are wanted: fine meshes take a second each.
 
     Returns:
-        By link its shape in its frame; and what is not there: a line each.
-
-    Raises:
-        DescriptionError: The file cannot be read.
-        MissingExtraError: What reads it is not installed.
+        By link its shape in its frame; and what is not there, a line each.
     """
-    element = robot_element(path)
-    if element.tag == "mujoco":
-        found = _of_mjcf(path)
+    if tree.model is not None:
+        found = _of_mjcf(*tree.model)
         return {link: found[link] for link in links if link in found}, []
-    missing: list[str] = []
-    found = _of_urdf(element, path, "collision", links, missing)
+    assert tree.element is not None
+    missing = Missing(tree.path)
+    found = _of_urdf(tree.element, "collision", links, missing)
     rest = [link for link in links if link not in found]
-    found |= _of_urdf(element, path, "visual", rest, missing)
-    return found, list(dict.fromkeys(missing))
+    found |= _of_urdf(tree.element, "visual", rest, missing)
+    return found, missing.lines()
+
+
+class Missing:
+    """Meshes that are not there, or cannot be read."""
+
+    def __init__(self, path: Path) -> None:
+        """Of a robot's file."""
+        self.path = path
+        self._packages: dict[str, list[str]] = {}
+        self._files: list[str] = []
+        self._broken: list[str] = []
+
+    def absent(self, name: str) -> None:
+        """There is no such mesh."""
+        scheme, _, inside = name.partition("://")
+        package = inside.partition("/")[0] if scheme in PACKAGED else ""
+        if package and not any(package_folders(package, self.path)):
+            self._packages.setdefault(package, []).append(name)
+        else:
+            self._files.append(name)
+
+    def broken(self, reason: str) -> None:
+        """A mesh cannot be read."""
+        self._broken.append(reason)
+
+    def lines(self) -> list[str]:
+        """What to say: a line for each package, one for all other files, one for each fault."""
+        found = [
+            f"{self.path.name}: package {name!r} is not found ({_counted(meshes)}): name the "
+            "folder that holds it in the environment, ROS_PACKAGE_PATH=FOLDER casadi-ik import ..."
+            for name, meshes in self._packages.items()
+        ]
+        if self._files:
+            found.append(f"{self.path.name}: there is no such file ({_counted(self._files)})")
+        return found + list(dict.fromkeys(self._broken))
+
+
+def _counted(meshes: list[str]) -> str:
+    """Meshes by their number and the first one's name."""
+    once = list(dict.fromkeys(meshes))
+    return f"mesh {once[0]!r}" if len(once) == 1 else f"{len(once)} meshes, one is {once[0]!r}"
 
 
 def _of_urdf(
-    element: ElementTree.Element, path: Path, kind: str, links: Collection[str], missing: list[str]
+    element: Element, kind: str, links: Collection[str], missing: Missing
 ) -> dict[str, Surface]:
-    plain = bare(element)
-    for ours, theirs in zip(plain.findall("link"), element.findall("link"), strict=True):
-        if ours.get("name") not in links:
-            continue
-        for shape in theirs.findall(kind):
-            copy = deepcopy(shape)
-            mesh = copy.find("geometry/mesh")
-            if mesh is not None:
-                place = mesh_file(mesh.get("filename", ""), path)
-                if place is None:
-                    missing.append(f"{path.name}: no mesh {mesh.get('filename')!r}")
-                    continue
-                mesh.set("filename", str(place))
-            for look in copy.findall("material"):
-                copy.remove(look)
-            ours.append(copy)
-    module = pinocchio()
-    text = ElementTree.tostring(plain, encoding="unicode")
-    wanted = module.GeometryType.COLLISION if kind == "collision" else module.GeometryType.VISUAL
-    with silent() as said:
-        try:
-            model = module.buildModelFromXML(text)
-            shapes = module.buildGeomFromUrdfString(model, text, wanted)
-        except (ValueError, RuntimeError) as error:
-            missing.append(f"{path.name}: its {kind} shapes cannot be read: {said() or error}")
-            return {}
-    by_link: dict[str, list[Surface]] = {}
-    for one in shapes.geometryObjects:
-        frame = model.frames[one.parentFrame]
-        pose = (frame.placement.inverse() * one.placement).homogeneous
-        surface = _of_coal(one.geometry)
-        if surface is not None:
-            by_link.setdefault(frame.name, []).append(surface.moved(pose))
-    return {link: one for link, parts in by_link.items() if (one := together(parts)) is not None}
+    found: dict[str, Surface] = {}
+    for link in element.findall("link"):
+        name = link.get("name", "")
+        if name in links:
+            parts = [_of_element(one, missing) for one in link.findall(kind)]
+            whole = together([one for one in parts if one is not None])
+            if whole is not None:
+                found[name] = whole
+    return found
+
+
+def _of_element(shape: Element, missing: Missing) -> Surface | None:
+    """An element ``collision`` or ``visual`` in its link's frame."""
+    mesh, simple, pose = shape.find("geometry/mesh"), simple_shape(shape), pose_of(shape)
+    surface = None
+    if mesh is not None:
+        surface = _of_mesh(mesh, missing)
+    elif simple is not None and simple[0] == "box":
+        surface = box_shape(np.array(simple[1]) / 2)
+    elif simple is not None:
+        kind, (radius, length) = simple[0], (*simple[1], 0.0)[:2]
+        surface = round_shape(radius, length / 2, kind.capitalize())
+    return None if surface is None or pose is None else surface.moved(pose)
+
+
+def _of_mesh(element: Element, missing: Missing) -> Surface | None:
+    name = element.get("filename", "")
+    place = mesh_file(name, missing.path)
+    if place is None:
+        missing.absent(name)
+        return None
+    scale = values_of(element.get("scale", "1 1 1"))
+    try:
+        points, triangles = read_mesh(place, missing.path.name)
+    except DescriptionError as error:
+        missing.broken(str(error))
+        return None
+    if len(triangles) > MOST_TRIANGLES:
+        triangles = triangles[:0]
+    if len(scale) != 3 or max(map(abs, scale)) > FARTHEST:
+        missing.broken(f"{missing.path.name}: mesh {name!r}: scale: expected three finite numbers")
+        return None
+    return Surface(points * scale, triangles)
+
+
+PACKAGED = ("package", "model")
+"""Schemes of meshes that are named by their package."""
 
 
 def mesh_file(name: str, path: Path) -> Path | None:
     """Where a mesh is that a URDF names; packages are looked for above the file."""
-    for scheme in ("package://", "model://"):
-        if name.startswith(scheme):
-            inside = name.removeprefix(scheme)
-            package, _, rest = inside.partition("/")
-            places = [parent / inside for parent in path.resolve().parents]
-            places += [p / rest for p in path.resolve().parents if p.name == package]
-            known = os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)
-            places += [Path(folder) / inside for folder in known if folder]
-            break
-    else:
+    scheme, _, inside = name.partition("://")
+    if scheme not in PACKAGED:
         places = [path.parent / name.removeprefix("file://")]
+    else:
+        package, _, rest = inside.partition("/")
+        places = [one / rest for found in package_folders(package, path) for one in found]
     return next((place for place in places if place.is_file()), None)
-
-
-def _of_coal(shape: Any) -> Surface | None:
-    kind = type(shape).__name__
-    if kind == "Box":
-        return box_shape(np.asarray(shape.halfSide))
-    if kind in ("Sphere", "Capsule", "Cylinder"):
-        return round_shape(float(shape.radius), float(getattr(shape, "halfLength", 0.0)), kind)
-    if not hasattr(shape, "vertices") or not hasattr(shape, "num_tris"):
-        return None
-    points = np.asarray(shape.vertices())
-    if shape.num_tris > MOST_TRIANGLES:
-        return Surface(points, np.zeros((0, 3), dtype=np.int64))
-    corners = map(shape.tri_indices, range(shape.num_tris))
-    triangles = [(one[0], one[1], one[2]) for one in corners]
-    return Surface(points, np.array(triangles, dtype=np.int64).reshape(-1, 3))
 
 
 def box_shape(half: Array) -> Surface:
@@ -216,8 +244,7 @@ def round_shape(radius: float, half: float, kind: str) -> Surface:
     return Surface(np.concatenate(rings), triangles)
 
 
-def _of_mjcf(path: Path) -> dict[str, Surface]:
-    mujoco, model = mujoco_model(path)
+def _of_mjcf(mujoco: Any, model: Any) -> dict[str, Surface]:
     by_body: dict[int, list[tuple[bool, Surface]]] = {}
     for geom in range(model.ngeom):
         surface = _of_geom(mujoco, model, geom)
@@ -259,11 +286,3 @@ def _of_geom(mujoco: Any, model: Any, geom: int) -> Surface | None:
     first, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     points = np.array(model.mesh_vert[start : start + count], dtype=float)
     return Surface(points, np.array(model.mesh_face[first : first + faces], dtype=np.int64))
-
-
-def checked_surfaces(path: Path, links: Collection[str]) -> tuple[dict[str, Surface], list[str]]:
-    """`link_surfaces`; where they cannot be had at all, none and the reason."""
-    try:
-        return link_surfaces(path, links)
-    except DescriptionError as error:
-        return {}, [str(error)]

@@ -31,6 +31,7 @@ class FileLine:
         how: How the end was found.
         limits: What is assumed of joints without limits.
         locked: Joints that stand still.
+        xacro: Whether its macros are expanded although it is not called so.
     """
 
     file: str
@@ -38,6 +39,7 @@ class FileLine:
     how: str
     limits: Mapping[str, tuple[float, float]]
     locked: Mapping[str, float]
+    xacro: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +123,7 @@ def _file_lines(key: str, line: FileLine, end: str, ends: Iterable[str]) -> list
     found = [
         f"{key}:",
         f"  file: {scalar(line.file)}",
+        *(["  xacro: true"] if line.xacro else []),
         *(f"  {text}" for text in more),
         f"  {end}: {value}  # {_guess(line.how)}",
     ]

@@ -117,7 +117,7 @@ def leaves(tree: RobotTree, root: str) -> list[str]:
 
 def _tree(entry: Entry, beside: Path) -> RobotTree:
     path = Path(entry.file).expanduser()
-    return read_tree(path if path.is_absolute() else beside.parent / path)
+    return read_tree(path if path.is_absolute() else beside.parent / path, entry.xacro)
 
 
 def _shapes(tree: RobotTree, root: str, joints: list[Joint]) -> Shapes:

@@ -160,6 +160,7 @@ class ArmFromFile(Struct, frozen=True):
         root: Link that it begins with; left out: the file's.
         locked: Joints that stand still, and where [rad or m].
         limits: Limits by joint that go before the file's [rad or m].
+        xacro: Whether its macros are expanded although it is not called ``.xacro``.
     """
 
     file: str
@@ -167,6 +168,7 @@ class ArmFromFile(Struct, frozen=True):
     root: str | None = None
     locked: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     limits: dict[str, tuple[AnyValue, AnyValue]] = msgspec.field(default_factory=dict)
+    xacro: bool = False
 
 
 class HandFromFile(Struct, frozen=True):
@@ -178,6 +180,7 @@ class HandFromFile(Struct, frozen=True):
         root: Link that it begins with; left out: the file's.
         locked: Joints that stand still, and where [rad or m].
         limits: Limits by joint that go before the file's [rad or m].
+        xacro: Whether its macros are expanded although it is not called ``.xacro``.
     """
 
     file: str
@@ -185,6 +188,7 @@ class HandFromFile(Struct, frozen=True):
     root: str | None = None
     locked: dict[str, AnyValue] = msgspec.field(default_factory=dict)
     limits: dict[str, tuple[AnyValue, AnyValue]] = msgspec.field(default_factory=dict)
+    xacro: bool = False
 
 
 class PadEntry(Struct, frozen=True):

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.files.reading import read_yaml
-from casadi_ik.importing.surfaces import Surface, checked_surfaces
+from casadi_ik.importing.imported import tree_of
+from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.robots.part import PREFIX
 
 
@@ -29,12 +30,11 @@ def robot_meshes(robot: ArmHand, path: Path) -> dict[str, Surface]:
         entry = raw.get(key)
         if not isinstance(entry, dict) or "file" not in entry:
             continue
-        file = path.parent / Path(str(entry["file"])).expanduser()
         prefix = PREFIX if key == "hand" else ""
         # A name that arm and hand both have is prefixed in the hand.
         named = {link.removeprefix(prefix) if prefix else link: link for link in links}
         named |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}
-        surfaces, _ = checked_surfaces(file, list(named))
+        surfaces, _ = link_surfaces(tree_of(path, entry), list(named))
         for link, surface in surfaces.items():
             found.setdefault(named[link], surface)
     return found

@@ -71,7 +71,7 @@ def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, list[Su
             ):
                 holder[joint.child] = holder[joint.parent]
                 changed = True
-    found, missing = link_surfaces(file, list(holder))
+    found, missing = link_surfaces(tree, list(holder))
     for line in missing:
         print("  ", line)
     parts: dict[str, list[Surface]] = {}

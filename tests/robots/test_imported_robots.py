@@ -10,6 +10,7 @@ import casadi_ik as ik
 from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.importing.check import largest_difference
 from casadi_ik.importing.robot_shapes import robot_shapes
+from casadi_ik.robots.robot_files.read import read_tree
 
 MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"
 
@@ -27,7 +28,8 @@ def both(tmp_path, arm_text="", hand_text="", more=MOUNT, hand_changes=(), joint
 
 def check(robot, path, rng, locked=None, beside=None, carried=None):
     q = robot.random(rng, 5)
-    assert largest_difference(robot, path, q, locked, beside, carried) < 1e-12
+    trees = [None if one is None else read_tree(one) for one in (path, beside, carried)]
+    assert largest_difference(robot, trees[0], q, locked, *trees[1:]) < 1e-12
     assert (robot.beyond_limits(q) <= 1e-9).all()
 
 
@@ -67,7 +69,7 @@ def test_a_link_beyond_the_tip_may_be_called_like_one_of_the_hand(tmp_path, rng)
     assert "left_tip" in robot.description.links
     check(robot, path, rng, carried=hand_path)
     check(robot, hand_path, rng, beside=path)
-    shapes, _, _ = robot_shapes(robot.description, (path, hand_path))
+    shapes, _, _ = robot_shapes(robot.description, (read_tree(path), read_tree(hand_path)))
     assert "left_tip" not in shapes
 
 

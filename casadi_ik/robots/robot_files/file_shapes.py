@@ -6,7 +6,6 @@ stand in its description.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +21,7 @@ from casadi_ik.robots.collision_entries import (
     ShapeEntry,
     SphereEntry,
 )
-from casadi_ik.robots.robot_files.xml_text import Element
+from casadi_ik.robots.robot_files.xml_text import LARGEST, Element
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,32 +114,41 @@ def entry_of(kind: str, size: Sequence[float], pose: Array) -> ShapeEntry:
 
 def _of_element(collision: Element) -> ShapeEntry | None:
     """A shape of a URDF; None if it is a mesh, or not what URDF knows."""
-    geometry, origin = collision.find("geometry"), collision.find("origin")
+    shape, pose = simple_shape(collision), pose_of(collision)
+    return None if shape is None or pose is None else entry_of(*shape, pose)
+
+
+def simple_shape(element: Element) -> tuple[str, list[float]] | None:
+    """Kind and sizes [m] of an element ``collision`` or ``visual``; None: a mesh, or nonsense."""
+    geometry = element.find("geometry")
     if geometry is None or len(geometry) != 1:
         return None
     (shape,) = geometry
     keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}
-    size = [v for key in keys.get(shape.tag, ()) for v in _values(shape.get(key, ""))]
-    place = [_values((Element("x") if origin is None else origin).get(k, "0 0 0")) for k in PLACE]
+    size = [v for key in keys.get(shape.tag, ()) for v in values_of(shape.get(key, ""))]
     expected = {"box": 3, "sphere": 1, "cylinder": 2}.get(shape.tag, 0)
-    if not expected or len(size) != expected or [len(one) for one in place] != [3, 3]:
+    sound = expected and len(size) == expected and min(size) > 0
+    return (shape.tag, size) if sound else None
+
+
+def pose_of(element: Element) -> Array | None:
+    """(4, 4) of the element's origin; None if that is nonsense."""
+    origin = element.find("origin")
+    xyz, rpy = (
+        values_of("0 0 0" if origin is None else origin.get(key, "0 0 0")) for key in ("xyz", "rpy")
+    )
+    if [len(xyz), len(rpy)] != [3, 3]:
         return None
-    xyz, rpy = place
-    frame = Frame((xyz[0], xyz[1], xyz[2]), (rpy[0], rpy[1], rpy[2]))
-    return entry_of(shape.tag, size, frame_matrix(frame)) if min(size) > 0 else None
+    return frame_matrix(Frame((xyz[0], xyz[1], xyz[2]), (rpy[0], rpy[1], rpy[2])))
 
 
-PLACE = ("xyz", "rpy")
-"""Attributes of an origin."""
-
-
-def _values(text: str) -> list[float]:
-    """The finite numbers of an attribute; none if one is not."""
+def values_of(text: str) -> list[float]:
+    """The numbers of an attribute; none if one is not finite, or larger than any robot's."""
     try:
         values = [float(word) for word in text.split()]
     except ValueError:
         return []
-    return values if all(map(math.isfinite, values)) else []
+    return values if all(abs(one) <= LARGEST for one in values) else []
 
 
 def _told(entries: dict[str, list[ShapeEntry]], meshes: set[str]) -> FileShapes:

@@ -9,13 +9,18 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.errors import DescriptionError, MissingExtraError
+from casadi_ik.errors import DescriptionError
 from casadi_ik.robots.couplings import Coupling, Linear, Polynomial
+from casadi_ik.robots.robot_files.confined import MODEL, confined
 from casadi_ik.robots.robot_files.file_shapes import mjcf_shapes
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, fixed, turned
 
 WORLD = "world"
 """MuJoCo's name of what does not move."""
+
+
+SAVED = "model.mjb"
+"""What MuJoCo is told that a model is called, which it had saved."""
 
 
 def mujoco_model(path: Path) -> tuple[Any, Any]:
@@ -25,18 +30,11 @@ def mujoco_model(path: Path) -> tuple[Any, Any]:
         DescriptionError: MuJoCo cannot read it.
         MissingExtraError: MuJoCo is not installed.
     """
-    try:
-        import mujoco
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{path}: is MJCF; to read it: pip install casadi-ik[mujoco]"
-        ) from error
-    try:
-        library: Any = mujoco  # its types are made when it is imported
-        return library, library.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise DescriptionError(f"{path}: MuJoCo cannot read it: {reason}") from error
+    saved = confined(MODEL, path)
+    import mujoco
+
+    library: Any = mujoco  # its types are made when it is imported
+    return library, library.MjModel.from_binary_path(SAVED, {SAVED: saved})
 
 
 def read_mjcf(path: Path) -> RobotTree:
@@ -64,7 +62,8 @@ def read_mjcf(path: Path) -> RobotTree:
     if len(roots) == 1 and roots[0].type in ("fixed", "free"):
         root = roots[0].child
         joints.remove(roots[0])
-    return RobotTree(path, root, tuple(joints), motors, mjcf_shapes(mujoco, model, names))
+    shapes = mjcf_shapes(mujoco, model, names)
+    return RobotTree(path, root, tuple(joints), motors, shapes, model=(mujoco, model))
 
 
 def joint_name(model: Any, joint: int) -> str:

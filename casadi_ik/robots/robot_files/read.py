@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-import os
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
-from casadi_ik.errors import DescriptionError, MissingExtraError
+from casadi_ik.errors import DescriptionError
+from casadi_ik.robots.robot_files.confined import MACROS, confined
 from casadi_ik.robots.robot_files.mjcf_file import read_mjcf
 from casadi_ik.robots.robot_files.tree import RobotTree
 from casadi_ik.robots.robot_files.urdf_file import read_urdf
-from casadi_ik.robots.robot_files.xml_text import Element, parse_xml, read_text
+from casadi_ik.robots.robot_files.xml_text import parse_xml, read_text
 
-MACROS = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
+MACRO_TAGS = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
 """How the tags of macros begin."""
 
 SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
 """Of the files that are read."""
 
 
-def read_tree(path: Path) -> RobotTree:
+def read_tree(path: Path, xacro: bool = False) -> RobotTree:
     """Read a robot's file.
 
     Args:
         path: URDF, xacro or MJCF.
+        xacro: Whether its macros are expanded although it is not called ``.xacro``.
 
     Raises:
         DescriptionError: It is missing or malformed; the message names file and joint.
@@ -34,45 +34,25 @@ def read_tree(path: Path) -> RobotTree:
         stamp = path.stat().st_mtime_ns
     except OSError as error:
         raise DescriptionError(f"{path}: cannot be read: {error.strerror}") from error
-    return _read(path, stamp)
+    return _read(path, stamp, xacro or path.suffix == ".xacro")
 
 
 @lru_cache(maxsize=8)
-def _read(path: Path, _: int) -> RobotTree:
-    element = robot_element(path)
-    if element.tag == "mujoco":
-        return read_mjcf(path)
-    return read_urdf(element, path)
-
-
-def robot_element(path: Path) -> Element:
-    """The outermost element of a robot's file, macros expanded.
-
-    Raises:
-        DescriptionError: See `read_tree`.
-        MissingExtraError: It has macros and xacro is not installed.
-    """
+def _read(path: Path, _: int, xacro: bool) -> RobotTree:
     text = read_text(path)
     element = parse_xml(text, path)
-    if path.suffix == ".xacro" or any(one.tag.startswith(MACROS) for one in element.iter()):
-        element = parse_xml(_expanded(path), path)
+    if xacro and element.tag == "robot":
+        element = parse_xml(confined(MACROS, path).decode(), path)
     if element.tag not in ("robot", "mujoco"):
         raise DescriptionError(
             f"{path}: found <{element.tag}>, expected a URDF (<robot>) or an MJCF (<mujoco>)"
         )
-    return element
-
-
-def _expanded(path: Path) -> str:
-    try:
-        import xacro
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{path}: has xacro macros; to read them: pip install casadi-ik[xacro]"
-        ) from error
-    try:
-        document: Any = xacro.process_file(os.fspath(path))
-        return str(document.toxml())
-    except Exception as error:  # whatever its macros evaluate to
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise DescriptionError(f"{path}: xacro cannot expand it: {reason}") from error
+    if element.tag == "mujoco":
+        return read_mjcf(path)
+    for one in element.iter():
+        if one.tag.startswith(MACRO_TAGS):
+            raise DescriptionError(
+                f"{path}: found macros (<xacro:{one.tag.rpartition('}')[2]}>), expected plain "
+                "URDF; to have them expanded, call the file .xacro, or import it with --xacro"
+            )
+    return read_urdf(element, path)

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.robots.couplings import Coupling
 from casadi_ik.robots.robot_files.file_shapes import NO_FILE_SHAPES, FileShapes
+from casadi_ik.robots.robot_files.xml_text import Element
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,8 @@ class RobotTree:
         joints: All joints, parents before children.
         motors: Lower and upper end of motors that are no joints (a tendon's), by name.
         shapes: Those of its links for collisions.
+        element: Of a URDF what it was read from, its macros expanded.
+        model: Of an MJCF the module and its model.
     """
 
     path: Path
@@ -60,6 +64,8 @@ class RobotTree:
     joints: tuple[TreeJoint, ...]
     motors: dict[str, tuple[float, float]] = field(default_factory=dict)
     shapes: FileShapes = NO_FILE_SHAPES
+    element: Element | None = None
+    model: tuple[Any, Any] | None = None
 
     @cached_property
     def links(self) -> tuple[str, ...]:

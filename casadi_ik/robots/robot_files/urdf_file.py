@@ -59,7 +59,7 @@ def read_urdf(element: Element, path: Path) -> RobotTree:
     model = _model(element, links, joints, path)
     found = {joint.name: joint for joint in _from_model(model, joints, path)}
     ordered = parents_first([found[name] for name in joints], root)
-    return RobotTree(path, root, ordered, shapes=urdf_shapes(element))
+    return RobotTree(path, root, ordered, shapes=urdf_shapes(element), element=element)
 
 
 def bare(element: Element) -> Element:

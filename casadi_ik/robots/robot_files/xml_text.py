@@ -9,6 +9,9 @@ from xml.parsers import expat
 
 from casadi_ik.errors import DescriptionError
 
+LARGEST = 1e6
+"""No length or angle of a robot is larger [m or rad]."""
+
 LARGEST_FILE = 16 * 2**20
 """Bytes of a file."""
 

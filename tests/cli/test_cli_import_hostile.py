@@ -1,0 +1,159 @@
+"""`casadi-ik import` of files that nobody means well with: one line, soon, and nothing runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from command_line import Command
+
+import casadi_ik as ik
+
+NAMESPACE = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+
+ROBOT = """<robot name="hand" {namespace}>{head}
+<link name="palm"/><link name="left_1"/><link name="left_2"/><link name="right_1"/>
+<link name="right_2"/>
+<joint name="a" type="revolute"><parent link="palm"/><child link="left_1"/>
+<origin xyz="0 0.04 {place}"/><axis xyz="1 0 0"/><limit lower="0" upper="1.5" velocity="1"/></joint>
+<joint name="b" type="revolute"><parent link="left_1"/><child link="left_2"/>
+<origin xyz="0 0 0.05"/><axis xyz="1 0 0"/><limit lower="0" upper="1.5" velocity="1"/></joint>
+<joint name="c" type="revolute"><parent link="palm"/><child link="right_1"/>
+<origin xyz="0 -0.04 0.1"/><axis xyz="-1 0 0"/><limit lower="0" upper="1.5" velocity="1"/></joint>
+<joint name="d" type="revolute"><parent link="right_1"/><child link="right_2"/>
+<origin xyz="0 0 0.05"/><axis xyz="-1 0 0"/><limit lower="0" upper="1.5" velocity="1"/></joint>
+</robot>"""
+
+
+def robot(path: Path, head: str = "", place: str = "0.1") -> Path:
+    """A hand of two fingers; what stands in it may hold macros."""
+    path.write_text(ROBOT.format(namespace=NAMESPACE, head=head, place=place))
+    return path
+
+
+SYSTEM = (
+    "${{(lambda: [c for c in ().__class__.__base__.__subclasses__() "
+    "if c.__name__ == '_wrap_close'][0].__init__.__globals__['system']('touch {mark}'))()}}"
+)
+
+ATTACKS = {
+    "classes": SYSTEM,
+    "in a property": '<xacro:property name="x" value="' + SYSTEM + '"/>${{x}}',
+    "generator": "${{[f('touch {mark}') for f in [print.__self__.__import__('os').system]]}}",
+    "of a function": "${{round.__self__.__import__('os').system('touch {mark}')}}",
+    "of math": "${{math.pi.__class__.__base__.__subclasses__()}}",
+    "getattr": "${{python.type(1).mro()}}",
+    "format": "${{'{{0.__class__}}'.format(1)}}",
+    "interpolated": "${{f'{{(1).__class__}}'}}",
+    "map": "${{list(map(python.vars, [pi]))}}",
+    "yaml": "${{xacro.load_yaml('{secret}')}}",
+    "yaml of old": "${{load_yaml('{secret}')}}",
+    "eval": "$(eval ().__class__.__base__.__subclasses__())",
+    "eval of math": "$(eval pow.__self__.__loader__)",
+    "environment": "$(env CASADI_IK_SECRET)",
+    "environment in eval": "$(eval env('CASADI_IK_SECRET'))",
+    "include": '<xacro:include filename="{secret}"/>',
+    "package": '<xacro:include filename="$(find etc)/passwd"/>',
+}
+
+
+@pytest.mark.parametrize(
+    ("attack", "name"),
+    [*((one, name) for one in ATTACKS for name in ("x.urdf", "x.xacro")), ("classes", "asked")],
+)
+def test_a_file_runs_no_code_and_reads_no_other(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, attack: str, name: str
+) -> None:
+    monkeypatch.setenv("CASADI_IK_SECRET", "hush")
+    (tmp_path / "elsewhere").mkdir()
+    secret, mark = tmp_path / "elsewhere" / "secret.yaml", tmp_path / "mark"
+    secret.write_text("hush: [hush")
+    (tmp_path / "robots" / "mine").mkdir(parents=True)
+    text = ATTACKS[attack].format(mark=mark, secret=secret)
+    if name == "x.urdf" and "xacro:" not in text:  # nothing of it is looked at but where it counts
+        path = robot(tmp_path / "robots" / "mine" / name, place=text.replace('"', "'"))
+    else:
+        path = robot(tmp_path / "robots" / "mine" / "x.urdf", head=f"<material>{text}</material>")
+        path = path.rename(path.with_name(name)) if name != "asked" else path
+    words = ("--xacro",) if name == "asked" else ()
+    done = run("import", path, "--out", tmp_path / "mine.yaml", *words)
+    assert path.name in done.error
+    assert "hush" not in done.error
+    assert not mark.exists()
+    assert not (tmp_path / "mine.yaml").exists()
+
+
+GROWING = {
+    "power": '<link name="${9 ** 9 ** 9 ** 9}"/>',
+    "text": "<link name=\"${len('a' * 10 ** 12)}\"/>",
+    "macros": "".join(
+        f'<xacro:macro name="m{i}">{f"<xacro:m{i - 1}/>" * 9 if i else "<x/>"}</xacro:macro>'
+        for i in range(30)
+    )
+    + "<xacro:m29/>",
+    "itself": '<xacro:macro name="m"><xacro:m/><xacro:m/></xacro:macro><xacro:m/>',
+}
+
+
+@pytest.mark.parametrize("case", GROWING)
+def test_macros_that_grow_without_end(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    monkeypatch.setenv("CASADI_IK_LIMITS", "0.1")
+    path = robot(tmp_path / "x.xacro", GROWING[case])
+    assert "x.xacro: xacro cannot expand it: " in run("import", path, "--out", "a.yaml").error
+
+
+def test_macros_are_expanded_where_they_are_asked_for(run: Command, tmp_path: Path) -> None:
+    path, out = robot(tmp_path / "hand.urdf", place="${0.05 * 2}"), tmp_path / "mine.yaml"
+    head = '<xacro:property name="unused" value="1"/>'
+    assert "import it with --xacro" in run("import", robot(path, head), "--out", out).error
+    robot(path, head, "${0.05 * 2}")
+    assert run("import", path, "--xacro", "--out", out, "--check").exit == 0
+    found = ik.load_robot(out)  # which goes by what stands in the description
+    assert found.links(found.home)["left_1"][2, 3] == pytest.approx(0.1, abs=1e-15)
+    assert "  xacro: true\n" in out.read_text()
+
+
+HEAD = """<xacro:arg name="side" default="left"/>
+<xacro:property name="sizes" value="${xacro.load_yaml('sizes.yaml')}"/>
+<xacro:property name="long" value="${sizes['hand']['long']}"/>
+<xacro:include filename="$(find its_parts)/urdf/parts.xacro"/>
+<xacro:if value="${'$(arg side)' == 'left' and not long &lt; 0}">
+<xacro:part name="more"/></xacro:if>
+"""
+
+
+@pytest.mark.parametrize("lead", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "beside"])
+def test_what_robots_are_written_with_is_expanded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Command, lead: str
+) -> None:
+    """Properties, arguments, conditions, yaml of the folder, and packages, wherever they are."""
+    own = tmp_path / "robots" / "hand" / "urdf"
+    own.mkdir(parents=True)
+    (own / "sizes.yaml").write_text("hand: {long: 0.05, angle: !degrees 90}\n")
+    place = "${max(long, 0.01) * 2 * sin(sizes.hand.angle) + (0 if true else 1)}"
+    path = robot(own / "hand.xacro", HEAD.replace("true", "True"), place.replace("true", "True"))
+    packages = {
+        "ROS_PACKAGE_PATH": tmp_path / "src",
+        "AMENT_PREFIX_PATH": tmp_path / "prefix" / "share",
+        "beside": tmp_path / "robots",
+    }
+    part = packages[lead] / "its_parts" / "urdf"
+    out = tmp_path / "mine.yaml"
+    if lead != "beside":
+        assert "package 'its_parts' is not found" in run("import", path, "--out", out).error
+        folder = packages[lead].parent if lead.startswith("AMENT") else packages[lead]
+        monkeypatch.setenv(lead, f"{tmp_path}:{folder}")
+    part.mkdir(parents=True)
+    (part.parent / "package.xml").write_text("<package/>")
+    (part / "parts.xacro").write_text(
+        f'<robot {NAMESPACE}><xacro:macro name="part" params="name"><link name="${{name}}"/>'
+        '<joint name="${name}_fixed" type="fixed"><parent link="palm"/><child link="${name}"/>'
+        "</joint></xacro:macro></robot>"
+    )
+    done = run("import", path, "--out", out, "--check")
+    assert (done.exit, done.err) == (0, ""), done
+    found = ik.load_robot(out)
+    assert found.links(found.home)["left_1"][2, 3] == pytest.approx(0.1)
+    assert "more" in found.links(found.home)

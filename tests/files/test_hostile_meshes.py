@@ -1,0 +1,124 @@
+"""Meshes that are broken, or larger than any robot's: a line each, and the process lives on."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import casadi_ik as ik
+from casadi_ik.errors import DescriptionError
+
+DAE = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="cm" meter="0.01"/><up_axis>Y_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh><source id="p">
+<float_array id="pa" count="15">{corners} 100 100 100</float_array><technique_common>
+<accessor source="#pa" count="5" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4" material="none"><input semantic="VERTEX" source="#v" offset="0"/>
+<p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node id="n"><translate>1 0 0</translate>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+"""In centimetres, moved by one; a corner is of no triangle, and there is no such material."""
+
+CORNERS = np.array([[0, 0, 0], [10, 0, 0], [0, 20, 0], [0, 0, 30]])
+
+SCENE = """import sys, casadi_ik as ik
+for path in sys.argv[1:]:
+    try:
+        ik.load_scene(path)
+    except ik.CasadiIKError as error:
+        assert len(str(error).splitlines()) == 1, error
+print("lived")
+"""
+
+
+def tetrahedron(folder: Path, kind: str) -> Path:
+    """A body of four corners [cm, or m], in one of the formats."""
+    path = folder / f"body.{kind.removeprefix('ascii_')}"
+    if kind == "dae":
+        path.write_text(DAE.format(corners=" ".join(map(str, CORNERS.ravel()))))
+        return path
+    faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    mesh = trimesh.Trimesh(CORNERS, faces, process=False)
+    if kind == "ascii_stl":
+        mesh.export(path, file_type="stl_ascii")
+    else:
+        more = {"encoding": "ascii"} if kind == "ascii_ply" else {}
+        mesh.export(path, file_type=path.suffix[1:], **more)
+    return path
+
+
+KINDS = ("stl", "ascii_stl", "obj", "ply", "ascii_ply", "dae", "off", "glb")
+
+
+def scene(mesh: Path, scale: float = 0.01) -> Path:
+    """A scene of that mesh."""
+    path = mesh.with_name(f"{mesh.name}.yaml")
+    text = f"{{kind: mesh, file: {mesh.name}, scale: {scale}}}"
+    path.write_text(f"name: one\nsolids: {{body: {text}}}\n")
+    return path
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mesh_is_read_in_metres(tmp_path: Path, kind: str) -> None:
+    path = tetrahedron(tmp_path, kind)
+    found = ik.load_scene(scene(path, 1.0 if kind == "dae" else 0.01))
+    ((solid, _),) = found.items["body"].parts
+    corners = CORNERS / 100 + [0.01 if kind == "dae" else 0, 0, 0]
+    outside = corners @ solid.planes[:, :3].T - solid.planes[:, 3]
+    np.testing.assert_allclose(np.sort(outside)[:, -3:], 0, atol=1e-7)  # each on three planes
+
+
+SHARDS = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\xc0\x7f", b"nan", b"-1", b"9" * 11)
+
+
+def damaged(data: bytes, rng: random.Random) -> bytes:
+    """A file's bytes, of which some are lost, doubled, changed or said to be more."""
+    found = bytearray(data)
+    for _ in range(rng.choice((1, 2, 8))):
+        i = rng.randrange(len(found) + 1)
+        match rng.randrange(4):
+            case 0:
+                del found[i : i + rng.choice((1, 4, 40))]
+            case 1:
+                found[i:i] = found[: rng.choice((1, 4, 40))]
+            case 2:
+                found[i : i + 4] = rng.choice(SHARDS)
+            case _:
+                found = found[:i] if i > len(found) / 2 else found
+    return bytes(found)
+
+
+def test_broken_meshes_end_no_process(tmp_path: Path) -> None:
+    rng, paths = random.Random(0), []
+    for kind in KINDS:
+        data = tetrahedron(tmp_path, kind).read_bytes()
+        for i in range(25):
+            path = tmp_path / f"{kind}_{i}.{kind.removeprefix('ascii_')}"
+            path.write_bytes(damaged(data, rng))
+            paths.append(str(scene(path)))
+    done = subprocess.run([sys.executable, "-c", SCENE, *paths], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "lived\n", "")
+
+
+def test_meshes_that_are_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "ball.ply"
+    trimesh.creation.icosphere(subdivisions=1).export(path)  # 80 triangles in less than 2 kB
+    for factor, says in (
+        ("1e-5", "is larger than"),
+        ("3e-5", "found 80 triangles, expected at mo"),
+    ):
+        monkeypatch.setenv("CASADI_IK_LIMITS", factor)
+        with pytest.raises(DescriptionError, match=says) as caught:
+            ik.load_scene(scene(path))
+        assert "ball.ply" in str(caught.value)
+        assert "CASADI_IK_LIMITS" in str(caught.value)
