@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import lzma
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -16,6 +13,8 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
+from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.npz import UNREADABLE
 from casadi_ik.problem.contacts.arrays import NAMES
 from casadi_ik.problem.problems import DIRECTIONS
 
@@ -34,21 +33,6 @@ LONGEST_HEADER = 10_064
 
 HARMLESS, MOST_UNPACKED = 2**28, 200
 """Bytes that any member may unpack to, and beyond that how many times its own size."""
-
-_UNREADABLE = (
-    ValueError,
-    EOFError,
-    MemoryError,
-    NotImplementedError,
-    OverflowError,
-    RuntimeError,
-    SyntaxError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-)
-"""What numpy and zipfile were seen to raise on a damaged or encrypted member."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +109,7 @@ class TargetFile:
             archive = zipfile.ZipFile(self.path)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read: {error.strerror or error}") from error
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             raise InputError(f"{self.path}: damaged: {error}") from error
         with archive:
             yield archive
@@ -145,7 +129,7 @@ class TargetFile:
             if header is None:
                 raise ValueError("a version of the npy format that is not for numbers")
             shape, column_major, dtype = header(stream)
-        except (*_UNREADABLE, OSError) as error:
+        except (*UNREADABLE, OSError) as error:
             raise InputError(f"{where}: cannot be read: {error}") from error
         with stream:
             if dtype.kind not in "fiu":
@@ -166,10 +150,19 @@ def _check_size(where: str, member: zipfile.ZipInfo, size: int) -> None:
     if not size <= member.file_size <= size + LONGEST_HEADER:
         problem = "fewer" if member.file_size < size else "more"
         raise InputError(f"{where}: damaged: {problem} bytes than its shape says")
-    if member.file_size > max(HARMLESS, MOST_UNPACKED * member.compress_size):
+    refuse_bombs(where, member.file_size, member.compress_size)
+
+
+def refuse_bombs(where: str, unpacked: int, packed: int) -> None:
+    """Refuse what unpacks to much more bytes than it has.
+
+    Raises:
+        InputError: It does.
+    """
+    if unpacked > limit(max(HARMLESS, MOST_UNPACKED * packed)):
         raise InputError(
-            f"{where}: unpacks to {member.file_size >> 20} MiB from {member.compress_size} bytes, "
-            f"expected at most {MOST_UNPACKED} times its size"
+            f"{where}: unpacks to {unpacked >> 20} MiB from {packed} bytes, expected at most "
+            f"{limit(MOST_UNPACKED)} times its size {RAISED}"
         )
 
 
@@ -217,5 +210,5 @@ class _Member:
     def _bytes(self, size: int) -> bytes:
         try:
             return self._stream.read(size)
-        except (*_UNREADABLE, OSError) as error:
+        except (*UNREADABLE, OSError) as error:
             raise InputError(f"{self._where}: cannot be read: {error}") from error

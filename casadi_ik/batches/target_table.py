@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from casadi_ik.arrays import Array
+from casadi_ik.batches.target_file import refuse_bombs
 from casadi_ik.errors import InputError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ class TargetTable:
                     )
         if not count:
             raise InputError(f"{self.path}: found no rows, expected at least one")
+        width = sum(len(names) for names in self._columns().values())
+        refuse_bombs(str(self.path), 8 * width * count, self.path.stat().st_size)
         return count
 
     def blocks(self, size: Callable[[], int]) -> Iterator[dict[str, Array]]:

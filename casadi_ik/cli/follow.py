@@ -19,6 +19,7 @@ from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import located, the_robot, the_scene, the_start, the_tolerance
 from casadi_ik.cli.report import fields
 from casadi_ik.errors import InputError
+from casadi_ik.files.limits import RAISED, limit
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.following import FollowStatus
 from casadi_ik.motion.motion import Motion
@@ -26,6 +27,9 @@ from casadi_ik.motion.retarget import Retarget, Retargeter, load_retarget, usual
 
 FRAMES_AT_ONCE = 1024
 """Cycles whose targets are in memory at once."""
+
+MOST_CYCLES = 4_000_000
+"""Of a motion: an hour at a kilohertz."""
 
 
 def follow(arguments: argparse.Namespace) -> Answer:
@@ -45,6 +49,11 @@ def follow(arguments: argparse.Namespace) -> Answer:
     check_outputs([("--out", out)], inputs)
     solver = Solver(robot, tolerance=the_tolerance(arguments), scene=the_scene(arguments))
     start = np.asarray(the_start(arguments, robot) or _start(solver, frames))
+    if frames.last / arguments.period > limit(MOST_CYCLES):
+        raise InputError(
+            f"{path}: times: found {frames.last:g} s, expected at most "
+            f"{limit(MOST_CYCLES) * arguments.period:g} s at this period {RAISED}"
+        )
     follower = solver.follow(start, arguments.period)
     times = np.arange(1, int(np.ceil(frames.last / arguments.period)) + 2) * arguments.period
     q = np.empty((len(times) + 1, len(robot.actuators)))

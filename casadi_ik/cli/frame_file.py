@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
+from casadi_ik.files.npz import read_npz
 from casadi_ik.motion.retarget import KEYPOINTS
 
 RATE = 30.0
@@ -20,7 +19,7 @@ FAR = 5.0
 """Contacts farther from the base than this [m], or keypoints from each other, are in mm."""
 
 MOST = 2**28
-"""Numbers of an array, at most."""
+"""Bytes of all arrays: hours of keypoints."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +65,10 @@ def read_frames(path: Path, fingers: int) -> Frames:
         fingers: How many the robot has.
 
     Raises:
-        InputError: Missing, damaged, or other arrays than expected; the message names file and
-            key.
+        DescriptionError: Missing, damaged or too large; the message names the file.
+        InputError: Other arrays than expected; the message names file and key.
     """
-    arrays = _arrays(path)
+    arrays = read_npz(path, MOST)
     known = {"keypoints", "points", "normals", "times"}
     if ("keypoints" in arrays) == ("points" in arrays):
         found = ", ".join(arrays) or "nothing"
@@ -116,25 +115,3 @@ def _refuse_other_units(where: str, frames: Array, key: str) -> None:
             f"{'middle of the hand' if key == 'keypoints' else 'base'}, expected at most {FAR:g} m "
             "(numbers in mm?)"
         )
-
-
-def _arrays(path: Path) -> dict[str, Array]:
-    found: dict[str, Array] = {}
-    try:
-        if not zipfile.is_zipfile(path):
-            path.open("rb").close()
-            raise InputError(f"{path}: not an npz file, expected one with keypoints or points")
-        with np.load(path, allow_pickle=False) as archive:
-            for name in archive.files:
-                found[name] = _numbers(path, name, archive[name])
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError) as error:
-        raise InputError(f"{path}: damaged: {error}") from error
-    return found
-
-
-def _numbers(path: Path, name: str, array: np.ndarray) -> Array:
-    if array.dtype.kind not in "fiu" or array.size > MOST:
-        raise InputError(f"{path}: {name}: found values of type {array.dtype}, expected numbers")
-    return array.astype(np.float64)

@@ -6,7 +6,8 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from casadi_ik.cli.answer import Exit
@@ -14,6 +15,7 @@ from casadi_ik.cli.outputs import OutputError
 from casadi_ik.cli.parser import build_parser
 from casadi_ik.cli.say import say
 from casadi_ik.errors import CasadiIKError, printable
+from casadi_ik.files.limits import VARIABLE
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -51,7 +53,8 @@ def _run(argv: Sequence[str] | None) -> Exit:
         if sys.stdout is not None:
             sys.stdout.flush()
         raise
-    answer = arguments.run(arguments)
+    with _limits(getattr(arguments, "size_limits", None)):
+        answer = arguments.run(arguments)
     try:
         _show(answer.report)
     except BrokenPipeError:
@@ -60,6 +63,21 @@ def _run(argv: Sequence[str] | None) -> Exit:
         _abandon_stdout()
         raise OutputError(f"<stdout>: cannot be written: {error.strerror}") from error
     return answer.exit
+
+
+@contextmanager
+def _limits(factor: float | None) -> Iterator[None]:
+    """All limits of files times a factor meanwhile, in what is started as well."""
+    before = os.environ.get(VARIABLE)
+    if factor is not None:
+        os.environ[VARIABLE] = repr(factor)
+    try:
+        yield
+    finally:
+        if factor is not None:
+            del os.environ[VARIABLE]
+        if before is not None:
+            os.environ[VARIABLE] = before
 
 
 def _show(report: RenderableType) -> None:

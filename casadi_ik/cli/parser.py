@@ -15,7 +15,7 @@ from casadi_ik.cli.import_parser import add_import
 from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.reach_parser import add_reach
 from casadi_ik.cli.say import PROGRAM
-from casadi_ik.cli.shared_options import add_object_pose, add_scene, add_tolerances
+from casadi_ik.cli.shared_options import add_object_pose, add_scene, add_size_limits, add_tolerances
 from casadi_ik.cli.values import assignment, file_name, npz_or_folder, numbers, one_of, whole
 from casadi_ik.cli.view_parser import add_view
 from casadi_ik.errors import InputError
@@ -24,6 +24,9 @@ from casadi_ik.problem.preference import PREFERENCES
 if TYPE_CHECKING:
     from casadi_ik.cli.answer import Answer
 
+
+_READERS = ("solve", "batch", "follow", "reach", "choose", "import", "view")
+"""Commands that read what is somebody else's."""
 
 _DESCRIPTION = """\
 Where must every motor of an arm and its hand stand, so that each fingertip touches a given point
@@ -131,6 +134,8 @@ def build_parser() -> Parser:
         )
     add_log(commands)
     add_view(commands)
+    for name in _READERS:
+        add_size_limits(commands.choices[name])
     return parser
 
 

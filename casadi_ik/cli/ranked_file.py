@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 
 from casadi_ik.errors import InputError
+from casadi_ik.files.limits import RAISED, limit
 
 MOST = 2**26
 """Bytes of a file: ten thousand answers take a third of it."""
@@ -60,8 +61,9 @@ def read_ranked(path: Path) -> list[RankedEntry]:
             message names file and key.
     """
     try:
-        if path.stat().st_size > MOST:
-            raise InputError(f"{path}: found {path.stat().st_size} bytes, expected {MOST} at most")
+        size = path.stat().st_size
+        if size > limit(MOST):
+            raise InputError(f"{path}: found {size} bytes, expected at most {limit(MOST)} {RAISED}")
         found = msgspec.json.decode(path.read_bytes(), type=_RankedFile).ranked
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error

@@ -53,3 +53,13 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
         required=True,
         help="write the motion",
     )
+
+
+def add_size_limits(parser: argparse.ArgumentParser) -> None:
+    """How large a file of somebody else may be."""
+    parser.add_argument(
+        "--size-limits",
+        metavar="FACTOR",
+        type=positive,
+        help="allow files that are so many times as large as usual, packed and unpacked",
+    )

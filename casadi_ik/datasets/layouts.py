@@ -17,12 +17,16 @@ from casadi_ik.datasets.hand_poses import (
     of_two_columns,
 )
 from casadi_ik.datasets.torch_files import read_torch
-from casadi_ik.datasets.unpickling import Packed, read_npy
+from casadi_ik.datasets.unpickling import MOST, Packed, read_npy
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.npz import refuse_giants
 from casadi_ik.grasps.pose import inverse
 
 STAGES = ("pregrasp", "grasp", "squeeze")
 """Of a grasp, in this order."""
+
+WIDEST = 200
+"""Numbers of a grasp, at most."""
 
 TRANSLATION, TURN = ("WRJTx", "WRJTy", "WRJTz"), ("WRJRx", "WRJRy", "WRJRz")
 """Where DexGraspNet has the pose of a hand among its joints."""
@@ -129,7 +133,7 @@ def multidex(path: Path, content: Any) -> HandPoses:
         if not isinstance(entry, (tuple, list)) or len(entry) < 2 or type(entry[1]) is not str:
             raise DescriptionError(f"{row}: expected q and the name of its object")
         q = numbers(row, {"q": entry[0]}, "q")
-        if q.ndim != 1 or len(q) <= 9 or (rows and len(q) != len(rows[0])):
+        if q.ndim != 1 or not 9 < len(q) <= WIDEST or (rows and len(q) != len(rows[0])):
             expected = f"({len(rows[0])},)" if rows else "(9 + joints,)"
             raise DescriptionError(f"{row}: q: found shape {q.shape}, expected {expected}")
         rows.append(q)
@@ -200,6 +204,7 @@ def numbers(where: str, found: Mapping[str, Any], key: str) -> Array:
         value = value.value
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
         raise DescriptionError(f"{where}: {key}: expected an array of numbers")
+    refuse_giants(f"{where}: {key}", 8 * value.size, MOST)
     return value.astype(np.float64)
 
 

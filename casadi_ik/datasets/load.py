@@ -21,6 +21,7 @@ from casadi_ik.datasets.layouts import LAYOUTS, READERS, read_layout
 from casadi_ik.datasets.postures import HandPostures, hand_postures
 from casadi_ik.datasets.tables import SUFFIXES, read_table
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
+from casadi_ik.files.limits import RAISED, limit
 from casadi_ik.grasps import Contact, Grasp, GraspObject, load_object
 from casadi_ik.grasps.candidates import load_grasp_files
 from casadi_ik.problem.contacts.arrays import NAMES
@@ -37,6 +38,9 @@ TABLE = "table"
 
 BLOCK = 4096
 """Rows of targets that are read at once."""
+
+MOST_CANDIDATES = 200_000
+"""Grasps of a file."""
 
 TOUCHING = 0.01
 """A pad that is nearer to the object than this [m] touches it."""
@@ -194,6 +198,7 @@ def _of_hand(
     invalid: Invalid,
 ) -> Candidates:
     """Grasps of hands whose poses and joints are given in the object's frame."""
+    _refuse_too_many(given.where, len(given.rows))
     joints = convention.positions(given)
     hands = None
     if take == "palm" or not set(finger_joints(robot.description)) <= set(joints):
@@ -230,6 +235,13 @@ def _of_hand(
         hands.shift[kept] if take == "palm" and hands is not None else np.zeros(len(kept)),
         given.scales[0] if given.scales else None,
     )
+
+
+def _refuse_too_many(where: str, count: int) -> None:
+    if count > limit(MOST_CANDIDATES):
+        raise DescriptionError(
+            f"{where}: found {count} grasps, expected at most {limit(MOST_CANDIDATES)} {RAISED}"
+        )
 
 
 def _palm(pose: Array, hands: HandPostures | None, row: int) -> dict[str, Any]:
@@ -269,7 +281,9 @@ def _contacts(
 
 def _of_targets(path: Path, fingers: tuple[str, ...]) -> list[Grasp]:
     found: list[Grasp] = []
-    for block in TargetFile(path, len(fingers)).blocks(lambda: BLOCK):
+    file = TargetFile(path, len(fingers))
+    _refuse_too_many(str(path), file.rows())
+    for block in file.blocks(lambda: BLOCK):
         for row in range(len(block["points"])):
             try:
                 given = {name: rows[row] for name, rows in block.items()}

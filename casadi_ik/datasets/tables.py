@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -13,13 +12,14 @@ from casadi_ik.arrays import Array
 from casadi_ik.batches.target_table import polars_module
 from casadi_ik.datasets.hand_poses import HandPoses, of_fixed_axes, of_quaternions
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.npz import read_npz, refuse_giants
 
 PLACE = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ANGLES = ("roll", "pitch", "yaw")
 
 MOST = 2**26
-"""Bytes of a file, or of an array."""
+"""Bytes of a file, and of what is in it."""
 
 SUFFIXES = (".csv", ".npz", ".parquet")
 
@@ -34,8 +34,8 @@ def read_table(path: Path) -> HandPoses:
     readers: Mapping[str, Callable[[Path], Mapping[str, Array]]]
     readers = dict(zip(map(str, SUFFIXES), (_of_csv, _of_npz, _of_parquet), strict=True))
     try:
-        if path.suffix.lower() != ".parquet" and path.stat().st_size > MOST:
-            raise DescriptionError(f"{path}: found more than {MOST} bytes")
+        if path.suffix.lower() == ".csv":
+            refuse_giants(str(path), path.stat().st_size, MOST)
         columns = readers[path.suffix.lower()](path)
     except OSError as error:
         raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -83,22 +83,12 @@ def _of_csv(path: Path) -> dict[str, Array]:
 
 def _of_npz(path: Path) -> dict[str, Array]:
     columns: dict[str, Array] = {}
-    try:
-        with zipfile.ZipFile(path) as members:
-            unpacked = sum(member.file_size for member in members.infolist())
-        if unpacked > MOST:
-            raise DescriptionError(f"{path}: unpacks to {unpacked} bytes, expected {MOST} at most")
-        with np.load(path, allow_pickle=False) as archive:
-            for name in archive.files:
-                array = archive[name]
-                if array.dtype.kind not in "fiu" or array.ndim != 1:
-                    raise DescriptionError(
-                        f"{path}: {name}: found shape {array.shape} of {array.dtype}, expected "
-                        "a column of numbers"
-                    )
-                columns[name] = array.astype(np.float64)
-    except (ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
-        raise DescriptionError(f"{path}: damaged: {error}") from error
+    for name, array in read_npz(path, MOST).items():
+        if array.ndim != 1:
+            raise DescriptionError(
+                f"{path}: {name}: found shape {array.shape}, expected a column of numbers"
+            )
+        columns[name] = array
     if len({len(column) for column in columns.values()}) > 1:
         raise DescriptionError(f"{path}: found columns of different lengths")
     return columns
@@ -107,14 +97,16 @@ def _of_npz(path: Path) -> dict[str, Array]:
 def _of_parquet(path: Path) -> Mapping[str, Array]:
     pl = polars_module()
     try:
-        frame = pl.read_parquet(path)
-    except pl.exceptions.PolarsError as error:
+        scanned = pl.scan_parquet(path)
+        schema = scanned.collect_schema()
+        for name, kind in schema.items():
+            if not kind.is_numeric():
+                raise DescriptionError(
+                    f"{path}: {name}: found values of type {kind}, expected numbers"
+                )
+        count = int(scanned.select(pl.len()).collect().item())
+        refuse_giants(str(path), 8 * len(schema) * count, MOST)
+        frame = scanned.select(pl.all().cast(pl.Float64).fill_null(np.nan)).collect()
+    except (pl.exceptions.PolarsError, OSError) as error:
         raise DescriptionError(f"{path}: no Parquet file: {error}") from error
-    columns: dict[str, Array] = {}
-    for name in frame.columns:
-        if not frame[name].dtype.is_numeric():
-            raise DescriptionError(
-                f"{path}: {name}: found values of type {frame[name].dtype}, expected numbers"
-            )
-        columns[name] = frame[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    return columns
+    return {name: frame[name].to_numpy() for name in frame.columns}

@@ -18,6 +18,7 @@ import numpy as np
 
 from casadi_ik.datasets.unpickling import MOST, Named, Packed, Reader, reading
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.npz import refuse_giants
 
 KINDS = {
     "DoubleStorage": "f8",
@@ -57,7 +58,7 @@ def _rebuilt(numbers: Any, first: Any, shape: Any, apart: Any, *_: Any) -> Packe
     if last >= len(numbers) or math.prod(shape) > len(numbers):
         raise pickle.UnpicklingError("a tensor that is larger than its numbers")
     steps = tuple(step * numbers.itemsize for step in apart)
-    packed.value = np.lib.stride_tricks.as_strided(numbers[first:], shape, steps).copy()
+    packed.value = np.lib.stride_tricks.as_strided(numbers[first:], shape, steps, writeable=False)
     return packed
 
 
@@ -127,8 +128,7 @@ def read_torch(path: Path) -> Any:
             raise DescriptionError(f"{path}: found no zip, expected a file of torch.save")
         with ZipFile(path) as archive:
             size = sum(one.file_size for one in archive.infolist())
-            if size > MOST:
-                raise DescriptionError(f"{path}: found {size} bytes in it, expected {MOST} at most")
+            refuse_giants(str(path), size, MOST)
             held = [n for n in archive.namelist() if n.count("/") <= 1 and n.endswith("data.pkl")]
             if not held:
                 raise DescriptionError(f"{path}: data.pkl: missing, expected a file of torch.save")

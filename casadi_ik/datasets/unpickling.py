@@ -21,6 +21,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.npz import refuse_giants
 
 MOST = 2**29
 """Bytes of a file."""
@@ -178,8 +179,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     """
     try:
         size = path.stat().st_size
-        if size > MOST:
-            raise DescriptionError(f"{path}: found {size} bytes, expected {MOST} at most")
+        refuse_giants(str(path), size, MOST)
         yield
     except OSError as error:
         raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
