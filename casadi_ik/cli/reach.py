@@ -22,7 +22,6 @@ from casadi_ik.cli.question import (
 from casadi_ik.cli.report import fields, files, headline
 from casadi_ik.errors import MissingExtraError
 from casadi_ik.motion.motion import Motion
-from casadi_ik.motion.rates import own_velocities
 from casadi_ik.motion.reaching import PARTS, Reach
 
 
@@ -67,14 +66,14 @@ def _report(name: str, found: Reach, motion: Motion) -> list[RenderableType]:
     ends = [float(times[np.flatnonzero(part == one)[-1]]) for one in PARTS if (part == one).any()]
     spent = [end - begin for begin, end in zip([0.0, *ends], ends, strict=False)]
     named = [one for one in PARTS if (part == one).any()]
-    share = np.abs(motion.velocity) / own_velocities(motion.robot)
     room = "not checked" if found.clearance is None else f"{1e3 * found.clearance:.1f} mm"
     pairs = {
         "time": f"{times[-1]:.2f} s: "
         + ", ".join(f"{one} {length:.2f} s" for one, length in zip(named, spent, strict=True)),
         "way there": found.reason.removeprefix("way there: "),
         "clearance": room,
-        "fastest motor": f"{100 * share.max():.0f} % of its velocity limit",
+        "motors": f"up to {100 * found.velocity_share:.0f} % of their velocity limits, "
+        f"{100 * found.acceleration_share:.0f} % of their acceleration limits (by the samples)",
         "solutions tried": str(found.tried),
     }
     return [headline(True, "REACHED", f"{name}: {motion.robot.name}"), fields(pairs)]

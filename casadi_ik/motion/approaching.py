@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.motion.clear_between import between
+from casadi_ik.motion.clear_between import least_clearance
 from casadi_ik.motion.closing import Closer, LastPart
 from casadi_ik.motion.plan import FollowPlan
 from casadi_ik.problem.clearance import Surroundings
@@ -100,6 +100,7 @@ class Tried:
         last: The last part of the way; None if it cannot be gone.
         reason: Why not, "" if it can.
         open_handed: What is not to be touched before the hand closes; None: nothing is checked.
+        holding: What is not to be touched while it closes; likewise.
     """
 
     number: int
@@ -107,6 +108,7 @@ class Tried:
     last: LastPart | None
     reason: str
     open_handed: Surroundings | None
+    holding: Surroundings | None
 
 
 def approaches(asked: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Tried]:
@@ -116,7 +118,7 @@ def approaches(asked: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Trie
     for number, q in enumerate(solutions, start=1):
         last = closer.find(asked.problem, q, asked.opening, asked.distance)
         reason = _blocked(last, holding, open_handed)
-        yield Tried(number, q, None if reason else last, reason, open_handed)
+        yield Tried(number, q, None if reason else last, reason, open_handed, holding)
 
 
 def approach(asked: ApproachPlan, solutions: Sequence[Array]) -> Approach:
@@ -136,7 +138,7 @@ def approach(asked: ApproachPlan, solutions: Sequence[Array]) -> Approach:
             continue
         clearance = None
         if one.open_handed is not None:
-            clearance = float(one.open_handed.check(one.last.coming).distance.min())
+            clearance, _ = least_clearance(one.open_handed, one.last.coming)
         return Approach(
             ReachStatus.REACHED, "", one.q, one.last.coming, one.last.closing, clearance, one.number
         )
@@ -168,9 +170,7 @@ def _blocked(
     ):
         if around is None or len(postures) < 2:
             continue
-        ways = between(around, postures)
-        if not ways.free.all():
-            pair = around.check(ways.worst[[int(np.argmin(ways.room))]]).pair(0)
-            assert pair is not None
-            return f"{name} is not free: {pair[0]} and {pair[1]} touch"
+        _, touching = least_clearance(around, postures)
+        if touching:
+            return f"{name} is not free: {touching}"
     return ""

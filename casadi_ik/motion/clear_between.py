@@ -116,12 +116,14 @@ class _Looking:
         return self.at((one.q + other.q) / 2, _half_way(one.poses, other.poses))
 
 
-def between(around: Surroundings, q: Array) -> Between:
+def between(around: Surroundings, q: Array, least: bool = False) -> Between:
     """What is on the straight ways from each of k postures to the next.
 
     Args:
         around: What must not be touched, the same for all, or at each posture.
         q: (k, n).
+        least: Whether the least room of all is looked for, too: where all is free it is nowhere
+            less than the smallest of `Between.room` by more than `RESOLUTION`.
     """
     count, n = max(len(q) - 1, 0), q.shape[1]
     poses = around.poses
@@ -147,7 +149,9 @@ def between(around: Surroundings, q: Array) -> Between:
     seen(other, way)
     while len(way):
         motion = looking.motion(one, other)
-        kept = (one.room + other.room < motion) & (motion > 2 * RESOLUTION) & free[way]
+        floor = max(float(room.min()) - RESOLUTION, 0.0) if least else 0.0
+        near = one.room + other.room < motion + 2 * floor
+        kept = near & (motion > 2 * RESOLUTION) & free[way]
         rows = np.flatnonzero(kept)
         if not len(rows):
             break
@@ -157,6 +161,21 @@ def between(around: Surroundings, q: Array) -> Between:
         one, other = _Postures.joined(one, middle), _Postures.joined(middle, other)
         way = np.concatenate([way, way])
     return Between(free, worst, room)
+
+
+def least_clearance(around: Surroundings, q: Array) -> tuple[float, str]:
+    """The least clearance on the straight ways from each of k postures (k, n) to the next.
+
+    Returns:
+        The clearance [m]: it is nowhere less by more than `RESOLUTION`, if all is free; and what
+        touches, "": nothing does.
+    """
+    ways = between(around, q, least=True)
+    found = around.check(np.concatenate([q, ways.worst]))
+    if found.free.all():
+        return float(found.distance.min()), ""
+    pair = found.pair(int(found.room.argmin())) or ()
+    return float(found.distance.min()), f"{' and '.join(pair)} touch"
 
 
 def _half_way(one: Array, other: Array) -> Array:

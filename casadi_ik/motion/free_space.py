@@ -2,38 +2,27 @@
 
 from __future__ import annotations
 
-import math
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.motion.clear_between import between
 from casadi_ik.problem.clearance import Surroundings
 
-STRIDE = 0.02
-"""Longest step of a motor between two postures that are looked at [rad, or part of its range]."""
+STRIDES = (0.02, 0.005, 0.002)
+"""Longest steps of a motor between postures that a planner looks at [rad, or part of its range]:
+finer ones where a way turns out not to be free between them."""
 
 SECONDS = 5.0
 """Time that a planner has."""
-
-
-def between_postures(start: Array, end: Array, units: Array) -> Array:
-    """(k, n) postures on the straight way, close to one another; both ends are among them."""
-    count = max(2, math.ceil(float(np.max(np.abs(end - start) / units)) / STRIDE) + 1)
-    return start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
 
 
 def motor_units(robot: ArmHand) -> Array:
     """(n,) what counts as a unit of each motor: 1 rad, or the range of a slider."""
     slides = np.array([actuator.unit == "m" for actuator in robot.description.actuators])
     return np.where(slides, robot.upper - robot.lower, 1.0)
-
-
-def dense(corners: Array, units: Array) -> Array:
-    """Straight ways from corner to corner (k, n), looked at closely."""
-    return np.concatenate([between_postures(*pair, units) for pair in pairwise(corners)])
 
 
 def free_way(
@@ -52,11 +41,12 @@ def free_way(
         The corners, None if no way was found; and how it was found, or why not.
     """
     units, straight = motor_units(robot), np.stack([start, end])
-    if around is None or around.free(dense(straight, units)).all():
+    if around is None or between(around, straight).free.all():
         return straight, "straight"
     for posture, name in ((start, "start"), (end, "pre-grasp")):
-        if not around.free(posture[None])[0]:
-            return None, f"the {name} is not free"
+        found = around.check(posture[None])
+        if not found.free[0]:
+            return None, f"the {name} is not free: {' and '.join(found.pair(0) or ())} touch"
     try:
         from ompl import base, geometric, util
     except ImportError:
@@ -82,18 +72,20 @@ def free_way(
         states.append(state)
     setup.setStartAndGoalStates(*states)
     information = setup.getSpaceInformation()
-    information.setStateValidityCheckingResolution(STRIDE / space.getMaximumExtent())
-    setup.setPlanner(geometric.RRTConnect(information))
-    setup.solve(SECONDS)
-    if not setup.haveExactSolutionPath():
-        return None, f"the straight way is not free, and OMPL found no other in {SECONDS:g} s"
-    setup.simplifySolution(SECONDS / 5)
-    found = setup.getSolutionPath().getStates()
-    corners = units * np.array([_numbers(state, n) for state in found])
-    corners[0], corners[-1] = start, end
-    if not around.free(dense(corners, units)).all():
-        return None, "the way that OMPL found is not free between the postures it looked at"
-    return corners, "OMPL, RRT-Connect"
+    for stride in STRIDES:
+        setup.clear()
+        information.setStateValidityCheckingResolution(stride / space.getMaximumExtent())
+        setup.setPlanner(geometric.RRTConnect(information))
+        setup.solve(SECONDS)
+        if not setup.haveExactSolutionPath():
+            return None, f"the straight way is not free, and OMPL found no other in {SECONDS:g} s"
+        setup.simplifySolution(SECONDS / 5)
+        found_way = setup.getSolutionPath().getStates()
+        corners = units * np.array([_numbers(state, n) for state in found_way])
+        corners[0], corners[-1] = start, end
+        if between(around, corners).free.all():
+            return corners, "OMPL, RRT-Connect"
+    return None, "the ways that OMPL found are not free between the postures it looked at"
 
 
 def _numbers(state: Any, n: int) -> Array:

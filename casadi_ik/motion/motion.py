@@ -15,6 +15,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs.mcap.cdr import JOINT_STATE, JOINT_TRAJECTORY, STRING, cdr_message
+from casadi_ik.motion.rates import differences
 
 SUFFIXES = (".npz", ".csv", ".mcap")
 """Kinds of files."""
@@ -64,6 +65,24 @@ class Motion:
         """
         velocity = np.diff(q, axis=0, prepend=q[:1]) / period
         acceleration = np.diff(velocity, axis=0, prepend=velocity[:1]) / period
+        times = period * np.arange(len(q), dtype=float)
+        return cls(robot, times, q, velocity, acceleration, notes)
+
+    @classmethod
+    def of_samples(
+        cls, robot: ArmHand, period: float, q: Array, notes: dict[str, np.ndarray]
+    ) -> Motion:
+        """A motion from rest to rest, by samples: rates are their central differences.
+
+        Args:
+            robot: The robot.
+            period: Time from sample to sample [s].
+            q: (k, n) where the motors are.
+            notes: (k, ...) by name.
+        """
+        steps, acceleration = differences(q, period)
+        velocity = np.zeros_like(q)
+        velocity[1:-1] = (steps[1:] + steps[:-1]) / 2
         times = period * np.arange(len(q), dtype=float)
         return cls(robot, times, q, velocity, acceleration, notes)
 

@@ -63,6 +63,37 @@ def rates_of(robot: ArmHand, velocity: Any, acceleration: Any) -> Rates:
     return Rates(fastest, each(robot, "acceleration", acceleration))
 
 
+def shares(q: Array, period: float, rates: Rates) -> tuple[float, float]:
+    """The largest parts of the limits that samples take, at rest before and after.
+
+    Args:
+        q: (m, n) where the motors are, one period after the other.
+        period: [s].
+        rates: The limits.
+
+    Returns:
+        Of the velocity, by first differences; of the acceleration, by second differences.
+    """
+    velocity, acceleration = differences(q, period)
+    return (
+        float((np.abs(velocity) / rates.velocity).max(initial=0.0)),
+        float((np.abs(acceleration) / rates.acceleration).max(initial=0.0)),
+    )
+
+
+def differences(q: Array, period: float) -> tuple[Array, Array]:
+    """First (m - 1, n) and second (m, n) differences of samples over time.
+
+    Before the first sample and after the last the motors move mirrored: the velocity there is zero,
+    and the second difference twice the step over the time squared.
+    """
+    steps = np.diff(q, axis=0)
+    if not len(steps):
+        return steps, np.zeros_like(q)
+    around = np.concatenate([-steps[:1], steps, -steps[-1:]])
+    return steps / period, np.diff(around, axis=0) / period**2
+
+
 def each(robot: ArmHand, name: str, value: Any) -> Array:
     """One positive number per motor.
 

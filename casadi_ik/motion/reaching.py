@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.motion.approaching import ApproachPlan, ReachStatus, approaches
-from casadi_ik.motion.closing import LastPart
+from casadi_ik.motion.clear_between import least_clearance
 from casadi_ik.motion.free_space import free_way
 from casadi_ik.motion.motion import Motion
-from casadi_ik.motion.rates import Rates
+from casadi_ik.motion.rates import Rates, shares
 from casadi_ik.motion.timing import timed
 
 PARTS = ("going", "coming", "closing")
@@ -29,8 +30,12 @@ class Reach:
         motion: From q0 at rest to the grasp at rest; its note "part" says which of `PARTS` each
             time belongs to. None if there is none.
         q: (n,) the solution of the grasp that it ends with; None likewise.
-        clearance: Smallest distance on the way before the hand closes [m]; None without a scene.
+        clearance: Smallest distance on the way before the hand closes [m], as `Clearances` counts
+            it, between samples too: it is nowhere less by more than 0.1 mm. None without a scene.
         tried: Solutions of the grasp that were looked at.
+        velocity_share: Largest part of a motor's velocity limit that the samples take, by their
+            first differences; 0 without a motion.
+        acceleration_share: Likewise of the acceleration, by second differences.
 
     Example:
         >>> found = solver.reach(grasp)
@@ -44,6 +49,8 @@ class Reach:
     q: Array | None
     clearance: float | None
     tried: int
+    velocity_share: float = 0.0
+    acceleration_share: float = 0.0
 
     @property
     def success(self) -> bool:
@@ -90,42 +97,39 @@ def reach(asked: ReachPlan, q0: Array, solutions: Sequence[Array]) -> Reach:
         if corners is None:
             reasons.append((ReachStatus.NO_WAY, how))
             continue
-        motion = _motion(asked, corners, last)
+        going = [(PARTS[0], np.stack(ends)) for ends in pairwise(corners)]
+        motion = _in_time(asked, [*going, (PARTS[1], last.coming), (PARTS[2], last.closing)])
         part = motion.notes["part"]
-        before = motion.q[part != PARTS[2]]
-        if open_handed is not None and not open_handed.free(before).all():
-            reasons.append((ReachStatus.NO_WAY, "the timed motion is not free between its points"))
+        open_part, closing = motion.q[part != PARTS[2]], motion.q[part == PARTS[2]]
+        clearance, reason = None, ""
+        if open_handed is not None and one.holding is not None:
+            clearance, reason = least_clearance(open_handed, open_part)
+            shut = np.concatenate([open_part[-1:], closing])
+            reason = reason or least_clearance(one.holding, shut)[1]
+        if reason:
+            reasons.append((ReachStatus.NO_WAY, f"the timed motion is not free: {reason}"))
             continue
-        clearance = None
-        if open_handed is not None:
-            clearance = float(open_handed.check(before).distance.min())
-        return Reach(ReachStatus.REACHED, f"way there: {how}", motion, one.q, clearance, one.number)
+        return Reach(
+            ReachStatus.REACHED,
+            f"way there: {how}",
+            motion,
+            one.q,
+            clearance,
+            one.number,
+            *shares(motion.q, asked.period, asked.rates),
+        )
     # That which came farthest says most.
     status, reason = max(reasons, key=lambda one: one[0] is ReachStatus.NO_WAY)
     return Reach(status, reason, None, None, None, len(solutions))
 
 
-def _motion(asked: ReachPlan, corners: Array, last: LastPart) -> Motion:
-    """All parts in time, at rest between them."""
-    robot = asked.approach.plan.robot
-    straight = [corners[i : i + 2] for i in range(len(corners) - 1)]
-    parts = [(PARTS[0], way) for way in straight] + [(PARTS[1], last.coming)]
-    parts.append((PARTS[2], last.closing))
-    done = [(name, timed(way, asked.rates, asked.period)) for name, way in parts]
-    names, times, end = [PARTS[0]], [np.zeros(1)], 0.0
-    for name, one in done:
-        times.append(end + one.times[1:])
-        end += float(one.times[-1])
-        names += [name] * (len(one.times) - 1)
-    still = np.zeros_like(corners[:1])
-    return Motion(
-        robot,
-        np.concatenate(times),
-        np.clip(
-            np.concatenate([corners[:1], *(one.q[1:] for _, one in done)]),
-            *asked.approach.plan.bounds,
-        ),
-        np.concatenate([still, *(one.velocity[1:] for _, one in done)]),
-        np.concatenate([still, *(one.acceleration[1:] for _, one in done)]),
-        {"part": np.array(names)},
-    )
+def _in_time(asked: ReachPlan, ways: Sequence[tuple[str, Array]]) -> Motion:
+    """Ways (k, n), each from where the last one ends, in time, at rest between them."""
+    plan = asked.approach.plan
+    q, names = [ways[0][1][:1]], [ways[0][0]]
+    for name, way in ways:
+        samples = timed(way, asked.rates, asked.period)[1:]
+        q.append(samples)
+        names += [name] * len(samples)
+    every = np.concatenate(q)
+    return Motion.of_samples(plan.robot, asked.period, every, {"part": np.array(names)})

@@ -10,7 +10,13 @@ from numpy.typing import ArrayLike
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.hand_motors import hand_motors
+
+DETERMINED = 0.15
+"""Contacts that move by less than this when their palm moves by 1 (turned [rad], or shifted by
+`LENGTH`) do not say where it is. Those of all shipped hands with three fingers or more move by 0.17
+at least."""
 
 ROUNDING = 1e-6
 """A posture may be so far beyond a limit [rad or m]; it is then at the limit."""
@@ -98,7 +104,7 @@ def hand_postures(robot: ArmHand, postures: Mapping[str, ArrayLike], count: int)
     )
 
 
-def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array]:
+def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array, dict[str, Array]]:
     """Where fingertips are if hands of given postures have their palms at poses.
 
     Args:
@@ -107,14 +113,35 @@ def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array
         postures: (k, n) as `hand_posture` gives them.
 
     Returns:
-        Contact points (k, f, 3) [m] and normals (k, f, 3), base frame.
+        Contact points (k, f, 3) [m] and normals (k, f, 3), base frame; and "tangents" (k, f, 3)
+        where points and normals leave the palm free, as those of two opposed fingers do: NaN where
+        they do not, no entry if they never do.
     """
     q = np.where(np.isnan(postures), robot.home, postures)
     points, normals = robot.contacts(q)
     here = robot.palm(q)
     turn = palms[:, :3, :3] @ np.swapaxes(here[:, :3, :3], 1, 2)
-    points = (points - here[:, None, :3, 3]) @ np.swapaxes(turn, 1, 2) + palms[:, None, :3, 3]
-    return points, normals @ np.swapaxes(turn, 1, 2)
+    back = np.swapaxes(turn, 1, 2)
+    points = (points - here[:, None, :3, 3]) @ back + palms[:, None, :3, 3]
+    normals = normals @ back
+    free = _stiffness(points, normals) < DETERMINED
+    if not free.any():
+        return points, normals, {}
+    tangents = robot.contact_frames(q)[..., :3, 1] @ back
+    return points, normals, {"tangents": np.where(free[:, None, None], tangents, np.nan)}
+
+
+def _stiffness(points: Array, normals: Array) -> Array:
+    """(k,) how much contacts move at least, lengths by `LENGTH`, per unit motion of the palm."""
+    off = (points - points.mean(axis=1, keepdims=True)) / LENGTH
+    f = points.shape[1]
+    moved = np.zeros((len(points), 6, 2 * f, 3))
+    for i, axis in enumerate(np.eye(3)):
+        moved[:, i, :f] = axis
+        moved[:, 3 + i, :f] = np.cross(axis, off)
+        moved[:, 3 + i, f:] = np.cross(axis, normals)
+    values = np.linalg.svd(moved.reshape(len(points), 6, -1), compute_uv=False)
+    return np.asarray(values[:, -1], dtype=np.float64)
 
 
 def held_too(postures: Array, fixed: Array | None, actuators: Sequence[str]) -> Array:

@@ -160,7 +160,7 @@ class Questions:
             InputError: No rigid motions, or a motor of the hand among the held ones.
         """
         poses = checked_pose(palms, "palms")
-        points, normals = touched(self.robot, poses, postures)
+        points, normals, more = touched(self.robot, poses, postures)
         held = held_too(postures, self.held(fixed) if fixed else None, self.robot.actuators)
         return Problems(
             points,
@@ -168,6 +168,7 @@ class Questions:
             self._usual,
             self.enforce_limits,
             fixed=held,
+            more=more,
             prefer=prefer,
             palms=poses,
         )

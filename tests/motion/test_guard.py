@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from dense_ways import dense
 from moving_study.paths import smooth_path
 
 import casadi_ik as ik
 from casadi_ik.motion.clear_between import RESOLUTION, between
-from casadi_ik.motion.free_space import dense, motor_units
+from casadi_ik.motion.free_space import motor_units
 
 PERIOD = 0.004
 

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
+from dense_ways import dense
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError
-from casadi_ik.motion.free_space import dense, free_way, motor_units
-from casadi_ik.motion.rates import rates_of
+from casadi_ik.motion.free_space import free_way, motor_units
+from casadi_ik.motion.rates import rates_of, shares
+from casadi_ik.motion.timing import timed
 
 
 @pytest.fixture(scope="module")
 def grasp() -> ik.Grasp:
     return ik.load_grasp("cup")
+
+
+def sent(motion):
+    """Largest first and second differences (n,) of what is sent, at rest before and after."""
+    (period,) = set(np.diff(motion.times).round(12))
+    q = np.concatenate([motion.q[:1], motion.q, motion.q[-1:]])
+    return (
+        np.abs(np.diff(q, axis=0)).max(axis=0) / period,
+        np.abs(np.diff(q, n=2, axis=0)).max(axis=0) / period**2,
+    )
 
 
 def check_motion(robot, grasp, found, q0):
@@ -56,6 +70,58 @@ def test_straight_there_then_straight_on_then_closing(robot, grasp):
     assert np.linalg.norm(tips - points, axis=1).max() == pytest.approx(0.025, abs=0.003)
 
 
+@pytest.mark.parametrize(
+    ("name", "period"),
+    [("tennis_ball", 0.01), ("apple", 0.004), ("tomato_soup_can", 0.02), ("cup", 0.05)],
+)
+def test_what_is_sent_keeps_to_the_limits(robot, name, period):
+    """Closing passes corners, where joints come to limits; the figures are measured."""
+    found = ik.Solver(robot).reach(ik.load_grasp(name), period=period)
+    velocity, acceleration = sent(found.motion)
+    rates = rates_of(robot, None, None)
+    assert (velocity <= rates.velocity * (1 + 1e-9)).all()
+    assert (acceleration <= rates.acceleration * (1 + 1e-9)).all()
+    assert found.velocity_share == pytest.approx((velocity / rates.velocity).max())
+    assert (acceleration / rates.acceleration).max() <= found.acceleration_share <= 1
+
+
+def test_short_and_kinked_paths_are_timed(robot):
+    """Steps of a ten-millionth and of a third, of all motors or one; ways to and fro."""
+    rng, rates = np.random.default_rng(0), rates_of(robot, None, None)
+    for size in (1e-7, 1e-4, 1e-2, 0.3):
+        for moving in (1, 14):
+            steps = size * rng.standard_normal((int(rng.integers(1, 12)), 14))
+            steps[:, moving:] = 0.0
+            path = robot.home + np.cumsum(np.concatenate([np.zeros((1, 14)), steps]), axis=0)
+            q = timed(path, rates, 0.01)
+            np.testing.assert_array_equal(q[[0, -1]], path[[0, -1]])
+            assert max(shares(q, 0.01, rates)) <= 1
+            assert ((q >= path.min(axis=0)) & (q <= path.max(axis=0))).all()
+
+
+def test_a_clearance_is_that_between_samples_too(robot):
+    """A ball beside the way, passed between two samples that are far apart."""
+    grasp = ik.Grasp(ik.load_grasp("cup").contacts)
+    way = ik.Solver(robot).reach(grasp).motion
+    going = way.q[way.notes["part"] == "going"]
+    place = robot.palm(going[len(going) // 2])[:3, 3] - np.array([0.0, 0.0, 0.3])
+    itself = [
+        {"links": pair, "reason": "not of interest"}
+        for pair in combinations(robot.links(way.q[0]), 2)
+    ]
+    ball = {"ball": {"kind": "sphere", "radius": 0.08, "xyz": place.tolist()}}
+    solver = ik.Solver(robot, scene=ik.Scene(ball, touching=itself))
+    found = solver.reach(grasp, period=0.08)
+    before = found.motion.q[found.motion.notes["part"] != "closing"]
+    fine = dense(before, 0.1 * motor_units(robot))
+    there = solver.check(fine, grasp).distance.min()
+    assert solver.check(before, grasp).distance.min() > there + 1e-3
+    assert found.clearance == pytest.approx(there, abs=1e-4)
+    last = solver.approach(grasp)
+    there = solver.check(dense(last.coming, 0.1 * motor_units(robot)), grasp).distance.min()
+    assert last.clearance == pytest.approx(there, abs=1e-4)
+
+
 def test_around_what_is_in_the_way(robot):
     """A ball where the straight way leads: OMPL goes around it."""
     start = robot.home + 1.6 * (np.arange(14) == 0)
@@ -71,7 +137,7 @@ def test_around_what_is_in_the_way(robot):
     np.testing.assert_array_equal(corners[[0, -1]], ways)
     assert around.free(dense(corners, motor_units(robot))).all()
     inside, why = free_way(robot, ways.mean(axis=0), ways[1], around, seed=0)
-    assert (inside, why) == (None, "the start is not free")
+    assert (inside, why) == (None, "the start is not free: bh_base and ball touch")
 
 
 def test_all_of_it_is_free(robot, grasp):

@@ -236,7 +236,9 @@ class Prover:
         asked = np.stack([fingers, faced], axis=2).astype(float)
         tolerance = np.stack([problems.position_tolerance, problems.angle_tolerance], axis=1)
         finest = max(TINY, PART * float(problems.position_tolerance.min()))
-        limits = joint_limits(self._robot, problems)
+        # A kernel's column is a vector: of a hand with one motor there is no second dimension.
+        size, ends = self._test.input_shapes[0], self._test.input_shapes[2]
+        limits = [np.reshape(end, ends) for end in joint_limits(self._robot, problems)]
         arm = np.zeros(2), np.full(2, NONE)
         if self._arm is not None:
             cosines = arm[1] if self._cones is None else self._cones.cosines(problems)
@@ -251,10 +253,11 @@ class Prover:
             target, lower, upper = target[wanted], lower[wanted], upper[wanted]
             boxes += np.bincount(target, minlength=count)
             refuted, scores = self._test(
-                *(lower, upper, *limits, points[target], normals[target]),
+                *(end.reshape(-1, *size) for end in (lower, upper)),
+                *(*limits, points[target], normals[target]),
                 *(tolerance, asked[target], *arm),
             )
-            refuted = refuted > 0
+            refuted, scores = refuted > 0, scores.reshape(lower.shape)
             reach[target[refuted[:, 1] & ~refuted[:, 0]]] = True
             widest = scores.argmax(axis=1)
             rows = np.arange(len(target))

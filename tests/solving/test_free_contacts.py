@@ -1,0 +1,57 @@
+"""Contacts that leave the palm free: two fingers that face each other, a finger alone."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+
+
+@cache
+def robot_of(name: str) -> ik.ArmHand:
+    return ik.load_robot(name)
+
+
+@cache
+def solver_of(name: str) -> ik.Solver:
+    return ik.Solver(robot_of(name))
+
+
+@pytest.mark.parametrize("name", ["panda+panda_hand", "ur5e+robotiq_2f85"])
+def test_a_palm_is_where_it_was_asked_for_though_its_contacts_leave_it_free(name):
+    robot, solver = robot_of(name), solver_of(name)
+    q = robot.random(np.random.default_rng(3), 60)
+    hand = {robot.actuators[i]: q[:, i] for i in robot.description.hand_actuators}
+    batch = solver.solve_palms(robot.palm(q), hand)
+    assert batch.success.all()
+    np.testing.assert_allclose(robot.palm(batch.q), robot.palm(q), atol=1e-6)
+    posture = {motor: float(values[0]) for motor, values in hand.items()}
+    one = ik.Grasp(palm=robot.palm(q[0]), posture=posture)
+    assert solver.solve(one).palm.ok
+    assert solver.choose([one], limit=2).answered == 1
+
+
+def test_a_palm_out_of_reach_is_diagnosed_as_one():
+    robot, solver = robot_of("panda+panda_hand"), solver_of("panda+panda_hand")
+    far = robot.palm(robot.home)
+    far[0, 3] += 2.0
+    solution = solver.solve(ik.Grasp(palm=far, posture={"panda_finger_1": 0.02}))
+    assert solution.status is ik.Status.UNREACHABLE
+    assert solution.diagnosis.palm is not None
+
+
+@pytest.mark.parametrize("name", ["panda+panda_hand", "ur5e+robotiq_2f85"])
+def test_what_a_hand_of_one_motor_misses_is_diagnosed(name):
+    robot, solver = robot_of(name), solver_of(name)
+    rng = np.random.default_rng(0)
+    points, normals = robot.contacts(robot.random(rng, 20))
+    points = points + 0.1 * rng.normal(size=(20, 1, 3))
+    askew = normals + 0.05 * rng.normal(size=normals.shape)
+    batch = solver.solve_batch(points, askew, diagnose=True)
+    assert batch.success.any()
+    assert not batch.success.all()
+    for solved, why in zip(batch.success, batch.diagnoses, strict=True):
+        assert solved == (why is None)
