@@ -101,7 +101,7 @@ def refused(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ca
 
     def call(command: str, subject: object, *words: object) -> str:
         before = sorted(tmp_path.rglob("*"))
-        outputs = ("--out", tmp_path / "new.out", "--log", tmp_path / "new.mcap")
+        outputs = ("--out", tmp_path / "new.npz", "--log", tmp_path / "new.mcap")
         error = run(command, subject, *outputs, *words).error
         assert sorted(tmp_path.rglob("*")) == before
         return error
