@@ -7,11 +7,16 @@ import casadi as ca
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.so3 import quaternion_to_matrix
 
+SEVERAL = 0.55
+"""Squared length of the powers' matrix, of trace one, below which its dominant eigenvalue counts as
+another's as well: 1 if it is one vector's alone, 1/2 if it is that of two. So it is of two fingers
+that face each other, nearly enough; not of three in shipped hands."""
+
 SQUARINGS = 7
 """Repeated squarings of the 4 x 4 matrix: a power iteration of 128 steps."""
 
 
-def align(correlation: Expr) -> Expr:
+def align(correlation: Expr, free: Expr | None = None) -> Expr:
     """Rotation R (3, 3) that maximises trace(R B') for B = sum of weighted outer products b a'.
 
     The best R takes the vectors a to the vectors b in the least-squares sense. The dominant
@@ -19,7 +24,9 @@ def align(correlation: Expr) -> Expr:
     vectors (B of rank two or one) are as good as many.
 
     Args:
-        correlation: B (3, 3), any scale but zero.
+        correlation: B (3, 3), any scale; zero if `free` is given only.
+        free: Unit quaternion (4, 1), scalar first. Where several R are as good (one vector turns
+            about itself), the one nearest to it; None: any of them.
     """
     B = correlation / ca.fmax(ca.norm_fro(correlation), 1e-300)
     trace = B[0, 0] + B[1, 1] + B[2, 2]
@@ -34,4 +41,7 @@ def align(correlation: Expr) -> Expr:
     for j in range(1, 4):
         better = ca.sumsqr(M[:, j]) > ca.sumsqr(column)
         column = ca.if_else(better, M[:, j], column)
+    if free is not None:
+        # M is the projection onto the best quaternions, by how many dimensions they have.
+        column = ca.if_else(ca.sumsqr(M) < SEVERAL, M @ free, column)
     return quaternion_to_matrix(column / ca.fmax(ca.norm_2(column), 1e-300))

@@ -43,6 +43,22 @@ def test_a_palm_out_of_reach_is_diagnosed_as_one():
     assert solution.diagnosis.palm is not None
 
 
+@pytest.mark.parametrize(
+    ("name", "fingers", "count"),
+    [("ur5e+robotiq_2f85", 2, 160), ("jaco2+panda_hand", 2, 480), ("puma560+jaco_3f", 1, 220)],
+)
+def test_what_contacts_leave_free_is_searched(name, fingers, count):
+    """Of these reachable targets 1, 5 and 6 were missed."""
+    robot, solver = robot_of(name), solver_of(name)
+    points, normals = robot.contacts(robot.random(np.random.default_rng(11), count))
+    if fingers == 1:
+        others = np.arange(len(robot.fingers)) != np.arange(count)[:, None] % len(robot.fingers)
+        points[others] = normals[others] = np.nan
+    assert solver.solve_batch(points, normals).success.all()
+    alone = ik.Solver(robot, compiled=False)
+    assert alone.solve_batch(points[-10:], normals[-10:]).success.all()
+
+
 @pytest.mark.parametrize("name", ["panda+panda_hand", "ur5e+robotiq_2f85"])
 def test_what_a_hand_of_one_motor_misses_is_diagnosed(name):
     robot, solver = robot_of(name), solver_of(name)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
+from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.problem.contacts.conditions import LENGTH, Rates, Vectors
 from casadi_ik.problem.contacts.rows import ContactRows, tip_rates, tip_vectors
 from casadi_ik.robots.description import RobotDescription
@@ -55,10 +57,19 @@ def hand_contacts(robot: RobotDescription, hand: Expr, columns: tuple[int, ...])
     return HandContacts(tips, rates)
 
 
-def best_palm(contacts: HandContacts, rows: ContactRows, p: dict[str, Expr]) -> tuple[Expr, Expr]:
+def best_palm(
+    contacts: HandContacts, rows: ContactRows, p: dict[str, Expr], number: Expr | None = None
+) -> tuple[Expr, Expr]:
     """The palm pose that brings a given posture closest to the contacts.
 
     A line or a plane is taken for the point it goes through.
+
+    Args:
+        contacts: Of the posture.
+        rows: What is asked.
+        p: Parameters with the target.
+        number: Where contacts leave the palm's rotation free (two fingers that face each other, one
+            finger), another one for every number from 0, evenly spread; None: always the same.
 
     Returns:
         rotation (3, 3) and origin (3, 1) [m], base frame.
@@ -79,5 +90,16 @@ def best_palm(contacts: HandContacts, rows: ContactRows, p: dict[str, Expr]) -> 
         for axis in ("normal", "tangent"):
             if axis in goal:
                 B = B + weights[i, 1] * goal[axis] @ tip[axis].T
-    rotation = align(B)
+    rotation = align(B, None if number is None else even_turn(number))
     return rotation, target_centre - rotation @ hand_centre
+
+
+def even_turn(number: Expr) -> Expr:
+    """Unit quaternion (4, 1) of a number from 0, evenly spread over all rotations (Shoemake)."""
+    first, *steps = (float(step) for step in even_steps(3))
+    share = ca.fmod(0.5 + first * number, 1.0)
+    one, other = (2 * np.pi * ca.fmod(0.5 + step * number, 1.0) for step in steps)
+    short, long = ca.sqrt(1 - share), ca.sqrt(share)
+    return ca.vertcat(
+        short * ca.sin(one), short * ca.cos(one), long * ca.sin(other), long * ca.cos(other)
+    )

@@ -162,7 +162,8 @@ class HandFirstStep:
         exhausted = s["candidate"] >= count
         q = self._with_hand(p["start"], hand)
         contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
-        rotation, origin = best_palm(contacts, layouts.contacts, p)
+        number = ca.fmax(s["candidate"] + s["earlier"], 0.0)
+        rotation, origin = best_palm(contacts, layouts.contacts, p, number)
         after = layouts.state.pack(
             self.layouts.counted(s, Phase.CANDIDATE)
             | {
