@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.solids import Kind, Solid
+from casadi_ik.collision.solids import GROUP, Kind, Solid
 from casadi_ik.collision.table import Table
 
 CUTS = 40
@@ -21,6 +21,9 @@ CLOSE = 1e-7
 """Where tangents and function agree to this [m], the least is found."""
 
 TINY = 1e-30
+
+AT_ONCE = 256
+"""Segments that are held against a cloud together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,7 @@ def nearest(where: Array, poses: Array, table: Table) -> Nearest:
         rows = np.flatnonzero(other == s + number)
         if len(rows):
             parts = _from_solid(solid, placed[:, one[rows]], places[:, number])
-            wide = solid.size[0] if solid.kind is Kind.CAPSULE else 0.0
+            wide = solid.size[0] if solid.kind in (Kind.CAPSULE, Kind.CLOUD) else 0.0
             _put(found, rows, parts, radius[rows] + wide)
     return found
 
@@ -109,9 +112,46 @@ def _from_solid(solid: Solid, a: Array, pose: Array) -> tuple[Array, Array, Arra
         return _segments(a, np.broadcast_to(both, a.shape))
     c = np.einsum("kji,kpj->kpi", rotation, a[..., :3] - origin[:, None])
     h = np.einsum("kji,kpj->kpi", rotation, a[..., 3:])
-    t, value, way = _lowest(solid, c, h)
+    t, value, way = (_from_points if solid.kind is Kind.CLOUD else _lowest)(solid, c, h)
     turned = np.einsum("kij,kpj->kpi", rotation, way)
     return value, t, np.zeros_like(t), turned
+
+
+def _from_points(solid: Solid, c: Array, h: Array) -> tuple[Array, Array, Array]:
+    """Where on segments a cloud's points are nearest, how far that is, and the way out."""
+    groups = solid.planes.reshape(-1, GROUP + 1, 4)
+    middles, wide = groups[:, 0, :3], groups[:, 0, 3]
+    parts = _parts_of(c.reshape(-1, 3)), _parts_of(h.reshape(-1, 3))
+    found = [_nearest_points(groups, middles, wide, a, b) for a, b in zip(*parts, strict=True)]
+    t, length, way = (np.concatenate(some) for some in zip(*found, strict=True))
+    shape = c.shape[:-1]
+    return t.reshape(shape), length.reshape(shape), way.reshape(*shape, 3)
+
+
+def _parts_of(rows: Array) -> list[Array]:
+    return [rows[i : i + AT_ONCE] for i in range(0, max(len(rows), 1), AT_ONCE)]
+
+
+def _nearest_points(
+    groups: Array, middles: Array, wide: Array, c: Array, h: Array
+) -> tuple[Array, Array, Array]:
+    def apart(points: Array, c: Array, h: Array) -> tuple[Array, Array]:
+        away, along = points - c, np.maximum((h * h).sum(axis=-1), TINY)
+        t = np.clip((away * h).sum(axis=-1) / along, -1, 1)
+        return t, t[..., None] * h - away
+
+    far = np.linalg.norm(apart(middles, c[:, None], h[:, None])[1], axis=-1)
+    near = far - wide <= (far + wide).min(axis=1)[:, None] + CLOSE
+    row, group = np.nonzero(near)
+    t, way = apart(groups[group, 1:, :3], c[row, None], h[row, None])
+    length = np.linalg.norm(way, axis=-1)
+    best = length.argmin(axis=1)
+    each = np.arange(len(row))
+    t, length, way = t[each, best], length[each, best], way[each, best]
+    # Rows ascend; of each the first of its groups in order of distance.
+    order = np.lexsort((length, row))
+    first = order[np.append(True, np.diff(row[order]) > 0)]
+    return t[first], length[first], way[first] / np.maximum(length[first], TINY)[:, None]
 
 
 def _lowest(solid: Solid, c: Array, h: Array) -> tuple[Array, Array, Array]:
@@ -157,6 +197,9 @@ def signed(solid: Solid, p: Array) -> tuple[Array, Array]:
         foot[..., 2] = np.clip(p[..., 2], -solid.size[1], solid.size[1])
         off = np.linalg.norm(p - foot, axis=-1)
         return off - solid.size[0], (p - foot) / np.maximum(off, TINY)[..., None]
+    if solid.kind is Kind.CLOUD:
+        _, off, way = _from_points(solid, p, np.zeros_like(p))
+        return off - solid.size[0], way
     if solid.kind is Kind.HALF_SPACE:
         return p[..., 2], np.broadcast_to([0.0, 0.0, 1.0], p.shape)
     if solid.kind is Kind.CONVEX:

@@ -33,13 +33,21 @@ def gaps(item: Item, others: Sequence[Item], shifts: Array) -> Array:
     """
     least = np.full(len(shifts), np.inf)
     for solid, pose in _placed([item]):
-        mine = surface(solid) @ pose[:3, :3].T + pose[:3, 3]
+        mine, wide = _skin(solid, pose)
         for other, place in _placed(others):
-            least = np.minimum(least, _apart(mine, other, place, shifts))
+            if other.kind is not Kind.CLOUD:  # of a cloud the points tell all
+                least = np.minimum(least, _apart(mine, other, place, shifts) - wide)
             if other.kind is not Kind.HALF_SPACE:
-                theirs = surface(other) @ place[:3, :3].T + place[:3, 3]
-                least = np.minimum(least, _apart(theirs, solid, pose, -shifts))
+                theirs, thick = _skin(other, place)
+                least = np.minimum(least, _apart(theirs, solid, pose, -shifts) - thick)
     return least
+
+
+def _skin(solid: Solid, pose: Array) -> tuple[Array, float]:
+    """(k, 3) points that tell where a solid at a pose is, and how far it reaches beyond them."""
+    whole = solid.kind is Kind.CLOUD
+    points = solid.points if whole else surface(solid)
+    return points @ pose[:3, :3].T + pose[:3, 3], float(solid.size[0]) if whole else 0.0
 
 
 def surface(solid: Solid) -> Array:

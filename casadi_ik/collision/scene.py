@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
 from casadi_ik.collision.hulls import hull
+from casadi_ik.collision.point_files import finite_points, read_points
 from casadi_ik.collision.scene_file import (
     BoxEntry,
     CapsuleEntry,
@@ -21,11 +23,21 @@ from casadi_ik.collision.scene_file import (
     HalfSpaceEntry,
     MeshEntry,
     ObjectEntry,
+    PointCloudEntry,
     SceneFile,
     SolidEntry,
     SphereEntry,
 )
-from casadi_ik.collision.solids import Solid, box, capsule, cylinder, half_space, of_object
+from casadi_ik.collision.solids import (
+    Solid,
+    box,
+    capsule,
+    cloud,
+    cylinder,
+    half_space,
+    of_object,
+    thinned,
+)
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.mesh_file import read_mesh
 from casadi_ik.files.reading import (
@@ -39,8 +51,17 @@ from casadi_ik.files.reading import (
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import in_si
 from casadi_ik.grasps.objects import load_object
-from casadi_ik.grasps.pose import checked_pose
+from casadi_ik.grasps.pose import checked_pose, one_pose, rotations_of
 from casadi_ik.robots.collision import Touching
+
+TURNS = ("rpy", "quaternion_wxyz", "quaternion_xyzw", "pose")
+"""How a solid may be turned."""
+
+UNIT = 0.01
+"""What a quaternion's length may be off one: it is rounded where it is written down."""
+
+MOST_BALLS = 100_000
+"""Of a point cloud."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +123,18 @@ class Scene:
         Raises:
             DescriptionError: One line that names the key, what was found and what was expected.
         """
+        clouds: dict[str, np.ndarray] = {}
+        plain: dict[str, Any] = {}
+        for key, value in (solids or {}).items():
+            plain[key] = value
+            if isinstance(value, Mapping) and value.get("kind") == "point-cloud":
+                # Arrays of so many numbers, some of them NaN, are looked at as arrays.
+                points = value.get("points")
+                if isinstance(points, np.ndarray):
+                    clouds[key] = points
+                    plain[key] = {**value, "points": []}
         data = {
-            "solids": {key: _plain(value) for key, value in (solids or {}).items()},
+            "solids": {key: _plain(value) for key, value in plain.items()},
             "margin": margin,
             "grasped": grasped,
             "touching": [_plain(one) for one in touching],
@@ -112,7 +143,7 @@ class Scene:
         where = Path(name)
         raw = in_si(data)
         refuse_non_finite(raw, where)
-        self._take(convert(raw, SceneFile, where), where)
+        self._take(convert(raw, SceneFile, where), where, clouds)
         self.name = name
 
     @classmethod
@@ -124,7 +155,9 @@ class Scene:
         scene.name = entry.name or path.stem
         return scene
 
-    def _take(self, entry: SceneFile, path: Path) -> None:
+    def _take(
+        self, entry: SceneFile, path: Path, clouds: Mapping[str, np.ndarray] = MappingProxyType({})
+    ) -> None:
         if not entry.margin >= 0:
             raise DescriptionError(f"{path}: margin: found {entry.margin:g}, expected >= 0 m")
         self.margin = entry.margin
@@ -133,9 +166,8 @@ class Scene:
             where = f"{path}: solids.{name}"
             if solid.margin is not None and not solid.margin >= 0:
                 raise DescriptionError(f"{where}.margin: found {solid.margin:g}, expected >= 0 m")
-            parts = tuple(_parts(solid, where, path))
-            pose = frame_matrix(Frame(solid.xyz, solid.rpy))
-            self.items[name] = Item(name, parts, pose, solid.margin)
+            parts = tuple(_parts(solid, where, path, clouds.get(name)))
+            self.items[name] = Item(name, parts, _pose(solid, where), solid.margin)
         self.grasped = entry.grasped
         if entry.grasped is not None and entry.grasped not in self.items:
             known = ", ".join(self.items) or "none"
@@ -233,7 +265,32 @@ def grasped_in(scene: Scene | None) -> str:
     return scene.grasped
 
 
-def _parts(entry: SolidEntry, where: str, path: Path) -> list[tuple[Solid, Array]]:
+def _pose(entry: SolidEntry, where: str) -> Array:
+    """(4, 4) of a solid; how it is turned may be said in one of four ways."""
+    turns = [key for key in TURNS if getattr(entry, key) is not None]
+    if entry.pose is not None and entry.xyz is not None:
+        turns.append("xyz")
+    if len(turns) > 1:
+        raise DescriptionError(f"{where}: found {' and '.join(turns)}, expected one of them")
+    if entry.pose is not None:
+        try:
+            return one_pose(entry.pose, f"{where}.pose")
+        except InputError as error:
+            raise DescriptionError(str(error)) from error
+    pose = frame_matrix(Frame(entry.xyz or (0.0, 0.0, 0.0), entry.rpy or (0.0, 0.0, 0.0)))
+    for key, shift in (("quaternion_wxyz", 0), ("quaternion_xyzw", 1)):
+        given = getattr(entry, key)
+        if given is not None:
+            length = math.hypot(*given)
+            if abs(length - 1) > UNIT:
+                raise DescriptionError(f"{where}.{key}: found length {length:g}, expected 1")
+            pose[:3, :3] = rotations_of(np.roll(given, shift)[None])[0]
+    return pose
+
+
+def _parts(
+    entry: SolidEntry, where: str, path: Path, points: np.ndarray | None
+) -> list[tuple[Solid, Array]]:
     here = np.eye(4)
     for key in ("size", "radius", "length", "scale"):
         value = getattr(entry, key, 1.0)
@@ -256,15 +313,43 @@ def _parts(entry: SolidEntry, where: str, path: Path) -> list[tuple[Solid, Array
         case ConvexEntry():
             return [(hull(np.array(entry.points, dtype=float), f"{where}.points"), here)]
         case MeshEntry():
-            file = Path(entry.file).expanduser()
-            file = file if file.is_absolute() else path.parent / file
-            points, _ = read_mesh(file, f"{where}.file")
-            return [(hull(entry.scale * points, f"{where}.file"), here)]
+            corners, _ = read_mesh(_beside(path, entry.file), f"{where}.file")
+            return [(hull(entry.scale * corners, f"{where}.file"), here)]
+        case PointCloudEntry():
+            return _cloud(entry, where, path, points)
         case ObjectEntry():
             try:
                 return of_object(load_object(entry.object).shape)
             except (UnknownNameError, DescriptionError) as error:
                 raise DescriptionError(f"{where}.object: {error}") from error
+
+
+def _beside(path: Path, file: str) -> Path:
+    found = Path(file).expanduser()
+    return found if found.is_absolute() else path.parent / found
+
+
+def _cloud(
+    entry: PointCloudEntry, where: str, path: Path, points: np.ndarray | None
+) -> list[tuple[Solid, Array]]:
+    given = points is not None or bool(entry.points)
+    if given == bool(entry.file):
+        raise DescriptionError(f"{where}: expected a point cloud's file or its points")
+    if entry.file:
+        found = entry.scale * read_points(_beside(path, entry.file), f"{where}.file")
+    else:
+        array = np.array(entry.points, dtype=float) if points is None else points
+        found = finite_points(array, f"{where}.points")
+    if not 0 <= entry.voxel < math.inf:
+        raise DescriptionError(f"{where}.voxel: found {entry.voxel:g}, expected >= 0 m")
+    wider = 0.0
+    if entry.voxel > 0:
+        found, wider = thinned(found, entry.voxel)
+    if len(found) > MOST_BALLS:
+        raise DescriptionError(
+            f"{where}: found {len(found)} points, expected at most {MOST_BALLS} (see 'voxel')"
+        )
+    return cloud(found, entry.radius + wider)
 
 
 def _plain(value: Any) -> Any:

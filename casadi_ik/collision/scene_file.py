@@ -5,8 +5,11 @@ from __future__ import annotations
 import msgspec
 
 from casadi_ik.files.reading import Angles, Point, Struct
-from casadi_ik.files.units import Length
+from casadi_ik.files.units import Length, Pure
 from casadi_ik.robots.collision_entries import TouchingEntry
+
+Quaternion = tuple[Pure, Pure, Pure, Pure]
+PoseRow = tuple[Pure, Pure, Pure, Length]
 
 
 class _Entry(
@@ -16,12 +19,18 @@ class _Entry(
 
     Attributes:
         xyz: Its origin in the robot's base frame [m].
-        rpy: Angles about the base's fixed axes x, y, z [rad].
+        rpy: Angles about the base's fixed axes x, y, z [rad]; or how it is turned as
+        quaternion_wxyz: a unit quaternion, scalar first, or
+        quaternion_xyzw: scalar last (as ROS has it).
+        pose: (4, 4) rows of its pose, instead of all these; translation in [m].
         margin: Distance to keep from it [m]; left out: the scene's.
     """
 
-    xyz: Point = (0.0, 0.0, 0.0)
-    rpy: Angles = (0.0, 0.0, 0.0)
+    xyz: Point | None = None
+    rpy: Angles | None = None
+    quaternion_wxyz: Quaternion | None = None
+    quaternion_xyzw: Quaternion | None = None
+    pose: tuple[PoseRow, PoseRow, PoseRow, PoseRow] | None = None
     margin: Length | None = None
 
 
@@ -95,6 +104,25 @@ class ConvexEntry(_Entry, frozen=True, tag="convex", kw_only=True):
     points: list[Point]
 
 
+class PointCloudEntry(_Entry, frozen=True, tag="point-cloud", kw_only=True):
+    """Balls about points, as a camera or a scanner sees them.
+
+    Attributes:
+        radius: Of every ball [m].
+        file: npy, npz, PLY, PCD or a table of x, y, z; a path, counted from the scene's file.
+        points: The points themselves, instead of a file [m].
+        voxel: Edge of the cubes of a grid in each of which the points become one [m]; its ball is
+            wider by how far they are from it. 0: all are kept.
+        scale: Factor of a file's coordinates.
+    """
+
+    radius: Length
+    file: str = ""
+    points: list[Point] = msgspec.field(default_factory=list)
+    voxel: Length = 0.0
+    scale: float = 1.0
+
+
 class ObjectEntry(_Entry, frozen=True, tag="object", kw_only=True):
     """An object.
 
@@ -113,6 +141,7 @@ SolidEntry = (
     | HalfSpaceEntry
     | MeshEntry
     | ConvexEntry
+    | PointCloudEntry
     | ObjectEntry
 )
 

@@ -3,13 +3,13 @@
 A solid lies in its own frame. A half-space is all below z = 0; a box, a cylinder (along z) and a
 capsule (along z) are about the origin; a convex body is all that is below its planes. Of what is
 round but no ball nor cylinder the planes touch it from outside, so that the body of the planes
-holds it: distances are never larger than the true ones.
+holds it: distances are never larger than the true ones. A cloud is balls about points.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
@@ -26,6 +26,12 @@ stands out by at most 2 % of the distance from it."""
 STRIDE = 197
 """Places along their spiral from one of them to the next; has no factor in common with them."""
 
+GROUP = 32
+"""Points of a cloud that are looked at together; as in the driver."""
+
+PART = 1024
+"""Points of a cloud that are one solid: far ones are passed over by one look each."""
+
 LINKS = 5
 """Capsules that a bent one is made of."""
 
@@ -38,6 +44,7 @@ class Kind(IntEnum):
     BOX = 2
     CYLINDER = 3
     CONVEX = 4
+    CLOUD = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +54,21 @@ class Solid:
     Attributes:
         kind: Which.
         size: (3,) [m]: of a box half its edges; of a cylinder radius and half its length; of a
-            capsule radius and half its segment; else nothing.
+            capsule radius and half its segment; of a cloud the radius of its balls; else nothing.
         reach: Radius of the ball about the origin that holds it [m]; infinite for a half-space.
-        planes: (m, 4) outward unit normals and offsets [m] of a convex body.
+        planes: (m, 4) outward unit normals and offsets [m] of a convex body; of a cloud, for every
+            group of its points, middle and radius of what holds them, then the points and 0 [m].
     """
 
     kind: Kind
     size: Array
     reach: float
     planes: Array
+
+    @property
+    def points(self) -> Array:
+        """(k, 3) points of a cloud; the last ones of a group may be there several times."""
+        return self.planes.reshape(-1, GROUP + 1, 4)[:, 1:, :3].reshape(-1, 3)
 
 
 NO_PLANES = np.zeros((0, 4))
@@ -87,6 +100,56 @@ def convex(points: Array, normals: Array) -> Solid:
     """The convex hull of points (k, 3) whose faces have these normals (m, 3)."""
     planes = _planes(normals, lambda ways: (ways @ points.T).max(axis=1))
     return Solid(Kind.CONVEX, np.zeros(3), float(np.linalg.norm(points, axis=1).max()), planes)
+
+
+def cloud(points: Array, radius: float) -> list[tuple[Solid, Array]]:
+    """Balls of a radius about points (k, 3), as solids of some of them with their (4, 4) poses."""
+    found = []
+    for part in _gathered(points, PART):
+        pose = np.eye(4)
+        pose[:3, 3] = (part.min(axis=0) + part.max(axis=0)) / 2
+        about, rows = part - pose[:3, 3], []
+        for group in _gathered(about, GROUP):
+            middle = (group.min(axis=0) + group.max(axis=0)) / 2
+            # A hair more than it is, so that rounding leaves none of its points out.
+            around = float(np.linalg.norm(group - middle, axis=1).max()) * (1 + 1e-9) + 1e-12
+            filled = np.concatenate([group, np.repeat(group[-1:], GROUP - len(group), axis=0)])
+            rows += [[*middle, around], *np.column_stack([filled, np.zeros(GROUP)])]
+        reach = float(np.linalg.norm(about, axis=1).max()) + radius
+        size = np.array([radius, 0.0, 0.0])
+        found.append((Solid(Kind.CLOUD, size, reach, np.array(rows)), pose))
+    return found
+
+
+def _gathered(points: Array, most: int) -> Iterator[Array]:
+    """Points in parts that lie together, halved across where they reach farthest."""
+    if len(points) <= most:
+        yield points
+        return
+    # All parts but the last one are full.
+    half = most * (math.ceil(len(points) / most) // 2)
+    order = np.argpartition(points[:, np.ptp(points, axis=0).argmax()], half)
+    yield from _gathered(points[order[:half]], most)
+    yield from _gathered(points[order[half:]], most)
+
+
+def thinned(points: Array, edge: float) -> tuple[Array, float]:
+    """One point for those in each cube of a grid, and how far one of them is from it at most.
+
+    Args:
+        points: (k, 3) [m].
+        edge: Of a cube [m].
+
+    Returns:
+        (m, 3) the middle of what lies in each cube, and [m].
+    """
+    cells = np.floor((points - points.min(axis=0)) / edge)
+    order = np.lexsort(cells.T)
+    ordered, cells = points[order], cells[order]
+    first = np.flatnonzero(np.append(True, (np.diff(cells, axis=0) != 0).any(axis=1)))
+    middles = (np.minimum.reduceat(ordered, first) + np.maximum.reduceat(ordered, first)) / 2
+    of = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(points))))
+    return middles, float(np.linalg.norm(ordered - middles[of], axis=1).max())
 
 
 def of_object(shape: Shape) -> list[tuple[Solid, Array]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Item
-from casadi_ik.collision.solids import Kind, Solid
+from casadi_ik.collision.solids import Solid
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,5 +132,4 @@ def driver_rows(solids: Sequence[Solid]) -> tuple[NDArray[np.void], Array]:
         row["kind"], row["size"], row["reach"] = int(solid.kind), solid.size, solid.reach
         row["first"], row["planes"] = first, len(solid.planes)
         first += len(solid.planes)
-    planes = [solid.planes for solid in solids if solid.kind is Kind.CONVEX]
-    return rows, np.concatenate([np.zeros((0, 4)), *planes])
+    return rows, np.concatenate([np.zeros((0, 4)), *(solid.planes for solid in solids)])

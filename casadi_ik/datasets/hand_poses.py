@@ -197,18 +197,6 @@ class HandPoses:
         return poses
 
 
-def of_quaternions(quaternions: Array) -> Array:
-    """(k, 3, 3) rotations of quaternions (k, 4) w x y z of any length; NaN of a zero one."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
-
-
 def of_fixed_axes(angles: Array) -> Array:
     """(k, 3, 3) rotations about fixed axes by (k, 3) roll, pitch, yaw [rad], as URDF has them."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(angles).T, np.cos(angles).T

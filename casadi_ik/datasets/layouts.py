@@ -13,14 +13,13 @@ from casadi_ik.arrays import Array
 from casadi_ik.datasets.hand_poses import (
     HandPoses,
     of_fixed_axes,
-    of_quaternions,
     of_two_columns,
 )
 from casadi_ik.datasets.torch_files import read_torch
 from casadi_ik.datasets.unpickling import MOST, Packed, read_npy
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.npz import refuse_giants
-from casadi_ik.grasps.pose import inverse
+from casadi_ik.grasps.pose import inverse, rotations_of
 
 STAGES = ("pregrasp", "grasp", "squeeze")
 """Of a grasp, in this order."""
@@ -230,7 +229,7 @@ def _object_pose(where: str, found: Mapping[str, Any]) -> Array:
     if row.shape != (7,):
         raise DescriptionError(f"{where}: obj_pose: found {row.size} numbers, expected 7")
     held = HandPoses(
-        f"{where}: obj_pose", row[None, :3], of_quaternions(row[None, 3:]), np.zeros((1, 0))
+        f"{where}: obj_pose", row[None, :3], rotations_of(row[None, 3:]), np.zeros((1, 0))
     )
     if held.faults:
         raise DescriptionError(f"{where}: obj_pose: {held.faults[0]}")
@@ -245,7 +244,7 @@ def _of_stages(where: str, found: Mapping[str, Any], stages: Mapping[str, Array]
     for name, rows in stages.items():
         if rows.shape != shape:
             raise DescriptionError(f"{where}: {name}: found shape {rows.shape}, expected {shape}")
-        given = HandPoses(where, rows[:, :3], of_quaternions(rows[:, 3:7]), rows[:, 7:])
+        given = HandPoses(where, rows[:, :3], rotations_of(rows[:, 3:7]), rows[:, 7:])
         poses = back @ given.poses
         made[name] = replace(given, position=poses[:, :3, 3], rotation=poses[:, :3, :3])
     scales = _scales(where, found, len(stages["grasp"]))

@@ -10,9 +10,10 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.batches.target_table import polars_module
-from casadi_ik.datasets.hand_poses import HandPoses, of_fixed_axes, of_quaternions
+from casadi_ik.datasets.hand_poses import HandPoses, of_fixed_axes
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.npz import read_npz, refuse_giants
+from casadi_ik.grasps.pose import rotations_of
 
 PLACE = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -52,7 +53,7 @@ def read_table(path: Path) -> HandPoses:
     def block(of: tuple[str, ...]) -> Array:
         return np.stack([columns[name] for name in of], axis=1) if of else np.zeros((count, 0))
 
-    rotate = of_quaternions if turned is QUATERNION else of_fixed_axes
+    rotate = rotations_of if turned is QUATERNION else of_fixed_axes
     return HandPoses(str(path), block(PLACE), rotate(block(turned)), block(names), names)
 
 

@@ -46,6 +46,18 @@ def one_pose(pose: ArrayLike, name: str = "pose") -> Array:
     return array
 
 
+def rotations_of(quaternions: Array) -> Array:
+    """(k, 3, 3) rotations of quaternions (k, 4) w x y z of any length; NaN of a zero one."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+
+
 def inverse(pose: Array) -> Array:
     """Of a pose (4, 4)."""
     back = np.eye(4)

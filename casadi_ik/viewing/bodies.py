@@ -15,6 +15,14 @@ PLATE = 0.75
 MOST_SEEN = 3000
 """Triangles of a mesh that are drawn: finer ones would be slow to send and to turn."""
 
+MOST_POINTS = 10_000
+"""Of a point cloud that are drawn."""
+
+OCTAHEDRON = np.array(
+    [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+)
+"""Triangles between the ends of x, y, z, -x, -y, -z."""
+
 SHARP = np.cos(np.deg2rad(35.0))
 """Faces that meet at a larger angle meet at an edge."""
 
@@ -72,6 +80,11 @@ def body_of(solid: Solid, about: Array) -> Surface:
             return sharp(
                 Surface(plate.points + np.array([about[0], about[1], -0.001]), plate.triangles)
             )
+        case Kind.CLOUD:
+            points = solid.points[:: 1 + len(solid.points) // MOST_POINTS]
+            corners = (points[:, None] + x * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
+            first = 6 * np.arange(len(points))[:, None, None]
+            return Surface(corners, (first + OCTAHEDRON).reshape(-1, 3))
         case Kind.CONVEX:
             ways = round_shape(1.0, 0.0, "Sphere")
             slopes = ways.points @ solid.planes[:, :3].T

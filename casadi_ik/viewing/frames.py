@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
+from casadi_ik.grasps.pose import rotations_of
 
 MOST = 1e6
 """Of a number that a browser sends [m, deg or mm]."""
@@ -56,18 +57,11 @@ def pose_of(position: Array, wxyz: Array) -> Array:
     Raises:
         ValueError: They are not of these sizes, or not finite.
     """
-    turn = usable(wxyz, 4)
-    length = float(np.linalg.norm(turn))
-    if length == 0:
-        raise ValueError("found a quaternion of no length")
-    w, x, y, z = turn / length
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    pose[:3, :3] = rotations_of(usable(wxyz, 4)[None])[0]
     pose[:3, 3] = usable(position, 3)
+    if not np.isfinite(pose).all():
+        raise ValueError("found a quaternion of no length")
     return pose
 
 

@@ -98,6 +98,11 @@ def _mesh(solid: CollisionSolid, pose: Array, about: Array) -> pv.PolyData:
             local = pose[:3, :3].T @ (about - pose[:3, 3])
             center = (local[0], local[1], -SKIN)
             mesh = pv.Cube(center, 2 * PLATE, 2 * PLATE, 2 * SKIN)
+        case Kind.CLOUD:
+            ball = pv.Sphere(radius=x, theta_resolution=8, phi_resolution=6)
+            balls = pv.PolyData(solid.points).glyph(scale=False, orient=False, geom=ball)
+            assert isinstance(balls, pv.PolyData)
+            mesh = _triangles(balls)
         case Kind.CONVEX:
             hull = pv.PolyData(surface(solid)).delaunay_3d().extract_surface(algorithm=None)
             mesh = with_edges(_triangles(hull))

@@ -5,14 +5,18 @@
  * Of two capsules the distance is exact. Of a capsule and a solid it is that of its segment's point
  * nearest to the solid (deepest inside it), never more than the true one: the signed distance from
  * a convex solid is convex along the segment, and what is given is where two of its tangents meet.
+ * From the balls of a cloud it is exact.
  *
  * Expects the macros N_Q, N_CAPSULES and N_OWN (solids of the robot).
  */
-enum { HALF_SPACE, CAPSULE, BOX, CYLINDER, CONVEX };
+enum { HALF_SPACE, CAPSULE, BOX, CYLINDER, CONVEX, CLOUD };
 enum { MOST_CUTS = 40 };
 
 /* So many planes of a convex solid, which are spread all around, tell whether it is far away. */
 enum { FEW = 64 };
+
+/* So many points of a cloud have a ball that holds them, in the row before theirs. */
+enum { GROUP = 32 };
 
 /* Where tangents and function agree to this [m], the least is found. */
 #define CLOSE 1e-7
@@ -179,6 +183,30 @@ static LANES_TARGET lanes lowest(const solid *one, vector c, vector h, envelope 
   return lanes_select(inner, found, ends);
 }
 
+/* Square of the distance of a point from a segment about c; over: one by the square of its half. */
+LANES_INLINE lanes off_point(const double *point, vector c, vector h, double over) {
+  const vector r = {point[0] - c.x, point[1] - c.y, point[2] - c.z};
+  const lanes t = within(dot(r, h) * over);
+  const vector off = minus(r, (vector) {t * h.x, t * h.y, t * h.z});
+  return dot(off, off);
+}
+
+/* Distance of a segment from the points of a cloud that are nearer than `near`; else anything above
+ * it. What lies in groups that are farther in every lane is not looked at. */
+static LANES_TARGET lanes off_cloud(const double *row, int64_t count, vector c, vector h,
+                                    double half, lanes near) {
+  const double *end = row + 4 * count, over = half > 0 ? 1 / (half * half) : 0;
+  lanes best = SPREAD(INFINITY);
+  int k;
+  for (; row < end; row += 4 * (GROUP + 1)) {
+    const lanes far = near + row[3];
+    if (lanes_all((off_point(row, c, h, over) >= far * far) | (far < SPREAD(0.0)))) continue;
+    for (k = 1; k <= GROUP; ++k) best = smaller(best, off_point(row + 4 * k, c, h, over));
+    near = smaller(near, lanes_sqrt(best));
+  }
+  return lanes_sqrt(best);
+}
+
 /* Distance of a capsule's segment from a solid, less `radius`; where the least distances are below
  * what this can be at all, anything above them. */
 static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, const lanes *pose,
@@ -207,6 +235,11 @@ static LANES_TARGET lanes off_solid(const clearance_job *job, const solid *one, 
   way.x = x.x * h.x + y.x * h.y + z.x * h.z;
   way.y = x.y * h.x + y.y * h.y + z.y * h.z;
   way.z = x.z * h.x + y.z * h.y + z.z * h.z;
+  if (one->kind == CLOUD) {
+    const double wide = radius + one->size[0];
+    return off_cloud(job->planes + 4 * one->first, one->planes, place, way, half, least + wide)
+           - wide;
+  }
   if (one->kind == CONVEX) {
     const double *plane = job->planes + 4 * one->first;
     const int64_t some = planes.count < FEW ? planes.count : FEW;
@@ -237,7 +270,9 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
   double limit;
   int lane, outcome;
   for (k = 0; k < N_OWN + job->n_solids; ++k) {
-    if (job->solids[k].planes > most) most = job->solids[k].planes;
+    if (job->solids[k].kind == CONVEX && job->solids[k].planes > most) {
+      most = job->solids[k].planes;
+    }
   }
   outcome = set_up(&space, N_Q + places + 2 * (size_t) most);
   if (outcome != DONE) return outcome;

@@ -4,7 +4,7 @@ typedef struct {
   int64_t kind;
   double size[3];
   double reach;                /* of the ball about its origin that holds it */
-  int64_t first, planes;       /* rows of the table of planes */
+  int64_t first, planes;       /* rows of the table of planes, or points */
 } solid;
 
 enum { RECENT = 8 };

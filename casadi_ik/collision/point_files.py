@@ -1,0 +1,215 @@
+"""Point clouds as they come in files: npy, npz, PLY, PCD and tables of numbers."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import DescriptionError
+from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.npz import UNREADABLE, read_npz
+
+MOST = 10_000_000
+"""Points of a file."""
+
+MOST_BYTES = 2**30
+"""Of a file."""
+
+LONGEST_HEAD = 200
+"""Lines of the head of a PLY or PCD file."""
+
+PLY_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+
+
+@dataclass
+class _Head:
+    """What the head of a PLY or PCD file says.
+
+    Attributes:
+        fields: Name, type and number of values of each field of a point.
+        count: How many points there are.
+        form: "ascii", or how the bytes lie: "<" or ">".
+    """
+
+    fields: list[tuple[str, str, int]]
+    count: int
+    form: str
+
+
+def read_points(path: Path, where: str) -> Array:
+    """(k, 3) points of a file [as it has them]; those of no distance (NaN) are left out.
+
+    Args:
+        path: ``.npy``, ``.npz`` (an array alone, or called ``points``), ``.ply`` and ``.pcd`` (text
+            or bytes), ``.xyz``, ``.txt``, ``.csv`` (x, y and z in the first three columns).
+        where: File and key, for the message.
+
+    Raises:
+        DescriptionError: There is no such file, it is damaged, or no file of points.
+    """
+    readers: dict[str, Callable[[Path], Array]] = {
+        ".npy": _npy,
+        ".npz": _npz,
+        ".ply": lambda file: _headed(file, _ply_head),
+        ".pcd": lambda file: _headed(file, _pcd_head),
+        **dict.fromkeys((".xyz", ".txt", ".csv"), _table),
+    }
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        known = ", ".join(readers)
+        raise DescriptionError(f"{where}: found {path.name!r}, expected a name ending in {known}")
+    if not path.is_file():
+        raise DescriptionError(f"{where}: no such file {str(path)!r}")
+    try:
+        if path.stat().st_size > limit(MOST_BYTES):
+            raise ValueError(f"found more than {limit(MOST_BYTES)} bytes {RAISED}")
+        found = reader(path)
+    except DescriptionError as error:
+        raise DescriptionError(f"{where}: {error}") from error
+    except OSError as error:
+        raise DescriptionError(f"{where}: {path.name}: {error.strerror or error}") from error
+    except (*UNREADABLE, TypeError, LookupError, StopIteration) as error:
+        reason = " ".join(str(error).split())
+        raise DescriptionError(f"{where}: {path.name} cannot be read: {reason}") from error
+    return finite_points(found, f"{where}: {path.name}")
+
+
+def finite_points(points: np.ndarray, where: str) -> Array:
+    """Points (k, 3) that are numbers; a camera's rows without a distance are left out.
+
+    Raises:
+        DescriptionError: Another shape, no numbers, or none is left.
+    """
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        found = f"{points.dtype} of shape {points.shape}"
+        raise DescriptionError(f"{where}: found {found}, expected numbers (k, 3)")
+    kept = np.asarray(points[np.isfinite(points).all(axis=1)], dtype=np.float64)
+    if not len(kept):
+        raise DescriptionError(f"{where}: found no points, expected at least one")
+    return kept
+
+
+def _at_most(count: int) -> int:
+    if not 0 <= count <= limit(MOST):
+        raise ValueError(f"found {count} points, expected at most {limit(MOST)} {RAISED}")
+    return count
+
+
+def _npy(path: Path) -> Array:
+    array = np.lib.format.open_memmap(path, mode="r")  # reserves nothing, unpickles nothing
+    _at_most(array.size // 3)
+    return np.asarray(array)
+
+
+def _npz(path: Path) -> Array:
+    arrays = read_npz(path, 24 * MOST)
+    if len(arrays) > 1 and "points" not in arrays:
+        raise ValueError(f"found {', '.join(arrays)}, expected one array, or one called points")
+    return arrays["points"] if "points" in arrays else next(iter(arrays.values()))
+
+
+def _table(path: Path) -> Array:
+    with path.open("rb") as stream:
+        return _numbers(stream, [0, 1, 2], None)
+
+
+def _numbers(stream: IO[bytes], columns: list[int], count: int | None) -> Array:
+    """Columns of a table with blanks or commas between its numbers."""
+    rows, most = (line.replace(b",", b" ") for line in stream), limit(MOST) + 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # nothing in it: told by the caller
+        found = np.loadtxt(rows, comments=["#", "//"], usecols=columns, max_rows=most, ndmin=2)
+    _at_most(len(found))
+    if count is not None and len(found) < count:
+        raise ValueError(f"found {len(found)} points, expected {count}")
+    return found[:count].reshape(-1, 3)
+
+
+def _headed(path: Path, read_head: Callable[[IO[bytes]], _Head]) -> Array:
+    with path.open("rb") as stream:
+        head = read_head(stream)
+        names = [name for name, _, _ in head.fields]
+        places = [names.index(axis) if axis in names else -1 for axis in "xyz"]
+        if min(places) < 0:
+            raise ValueError(f"found {' '.join(names)}, expected x, y and z")
+        if head.form == "ascii":
+            before = np.cumsum([0, *(count for _, _, count in head.fields)])
+            return _numbers(stream, before[places].tolist(), head.count)
+        row = np.dtype(
+            [
+                (f"f{i}", f"{head.form}{kind}", count)
+                for i, (_, kind, count) in enumerate(head.fields)
+            ]
+        )
+        data = stream.read(row.itemsize * head.count)
+        if len(data) < row.itemsize * head.count:
+            raise ValueError(f"ends after {len(data) // row.itemsize} of {head.count} points")
+        rows = np.frombuffer(data, row)
+        return np.stack([rows[f"f{i}"].reshape(-1).astype(np.float64) for i in places], axis=1)
+
+
+def _lines(stream: IO[bytes]) -> list[str]:
+    return stream.readline(1000).decode("ascii").split()
+
+
+def _ply_head(stream: IO[bytes]) -> _Head:
+    if _lines(stream) != ["ply"]:
+        raise ValueError("no PLY file")
+    forms = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
+    head, elements = _Head([], 0, ""), 0
+    for _ in range(LONGEST_HEAD):
+        match _lines(stream):
+            case ["format", form, _]:
+                head.form = forms[form]
+            case ["element", name, count]:
+                elements += 1
+                if elements == 1 and name != "vertex":
+                    raise ValueError(f"begins with {name}, expected vertex first")
+                head.count = _at_most(int(count)) if elements == 1 else head.count
+            case ["property", "list", *_] if elements == 1:
+                raise ValueError("a vertex has lists, expected numbers")
+            case ["property", kind, name] if elements == 1:
+                head.fields.append((name, PLY_TYPES[kind], 1))
+            case ["end_header"]:
+                return head
+            case _:
+                pass
+    raise ValueError("its head has no end")
+
+
+def _pcd_head(stream: IO[bytes]) -> _Head:
+    said: dict[str, list[str]] = {}
+    for _ in range(LONGEST_HEAD):
+        words = _lines(stream)
+        if words and not words[0].startswith("#"):
+            said[words[0].upper()] = words[1:]
+        if "DATA" in said:
+            break
+    else:
+        raise ValueError("no PCD file")
+    form = said["DATA"][0]
+    if form not in ("ascii", "binary"):
+        raise ValueError(f"its data are {form}, expected ascii or binary")
+    names = said["FIELDS"]
+    counts = [int(one) for one in said.get("COUNT", ["1"] * len(names))]
+    if not all(0 < one <= 1000 for one in counts):
+        raise ValueError(f"COUNT: found {counts}")
+    kinds = [f"{kind.lower()}{size}" for kind, size in zip(said["TYPE"], said["SIZE"], strict=True)]
+    count = int(said["POINTS"][0]) if "POINTS" in said else int(said["WIDTH"][0])
+    fields = list(zip(names, kinds, counts, strict=True))
+    return _Head(fields, _at_most(count), "<" if form == "binary" else form)

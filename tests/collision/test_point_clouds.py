@@ -1,0 +1,299 @@
+"""Point clouds about a robot: as far as so many balls, whatever file they come from."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capsule_arm import write_robot
+from coal_oracle import described, distance
+
+import casadi_ik as ik
+from casadi_ik.arrays import Array
+from casadi_ik.errors import DescriptionError
+from casadi_ik.problem.clearance import SceneCheck
+
+RADIUS = 0.01
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
+    return ik.load_robot(write_robot(tmp_path_factory.mktemp("three")))
+
+
+def surfaces(rng: np.random.Generator, count: int) -> Array:
+    """Points (count, 3) of a floor, a wall and a ball, as a camera sees them."""
+    flat = rng.uniform([-0.8, -0.8, -0.21], [0.8, 0.8, -0.2], (count, 3))
+    wall = rng.uniform([0.55, -0.5, -0.2], [0.56, 0.5, 0.8], (count, 3))
+    way = rng.normal(size=(count, 3))
+    ball = [0.3, 0.35, 0.4] + 0.1 * way / np.linalg.norm(way, axis=1)[:, None]
+    return np.concatenate([flat[: count // 3], wall[: count // 3], ball])[:count]
+
+
+def cloud(points: Array, **more: object) -> ik.Scene:
+    return ik.Scene({"seen": {"kind": "point-cloud", "points": points, "radius": RADIUS, **more}})
+
+
+def clearances(robot: ik.ArmHand, scene: ik.Scene, q: Array) -> Array:
+    """(k,) with everything that is checked [m]."""
+    points, normals = robot.contacts(robot.home)
+    contacts = zip(robot.fingers, points, normals, strict=True)
+    grasp = ik.Grasp({name: ik.Contact(*contact) for name, *contact in contacts})
+    found = ik.Solver(robot, scene=scene).check(q, grasp)
+    assert found is not None
+    return found.distance
+
+
+def by_hand(robot: ik.ArmHand, points: Array, q: Array) -> Array:
+    """(k,) least distance of the robot's capsules from balls about points [m]."""
+    links, found = robot.links(q), np.full(len(q), np.inf)
+    for one in robot.description.shapes.capsules:
+        if one.link == "base":
+            continue
+        pose = links[one.link]
+        middle = pose[:, :3, :3] @ one.center + pose[:, :3, 3]
+        half = pose[:, :3, :3] @ one.half
+        away = points - middle[:, None]
+        long = max(float(one.half @ one.half), 1e-30)
+        t = np.clip(np.einsum("kmi,ki->km", away, half) / long, -1, 1)
+        apart = np.linalg.norm(away - t[..., None] * half[:, None], axis=2).min(axis=1)
+        found = np.minimum(found, apart - one.radius - RADIUS)
+    return found
+
+
+def test_thousands_of_points_are_as_far_as_by_hand(robot, rng):
+    points = surfaces(rng, 5000)
+    q = robot.random(rng, 150)
+    itself = clearances(robot, ik.Scene(), q)
+    expected = np.minimum(itself, by_hand(robot, points, q))
+    assert (expected < itself).sum() > 10
+    np.testing.assert_allclose(clearances(robot, cloud(points), q), expected, atol=1e-9)
+
+
+def test_a_cloud_is_its_balls_one_by_one(robot, rng):
+    points = surfaces(rng, 70)
+    balls = {
+        str(i): {"kind": "sphere", "radius": RADIUS, "xyz": point} for i, point in enumerate(points)
+    }
+    q = robot.random(rng, 60)
+    one, other = clearances(robot, cloud(points), q), clearances(robot, ik.Scene(balls), q)
+    np.testing.assert_allclose(one, other, atol=1e-12)
+    # The robot's capsules alone, which coal knows as they are: it never sees less room.
+    import coal
+
+    shapes = [one for one in described(robot) if isinstance(one[1], coal.Capsule)]
+    ball, links = coal.Sphere(RADIUS), robot.links(q)
+    for row in range(0, len(q), 6):
+        for link, shape, pose in shapes:
+            if link == "base":
+                continue
+            for point in points:
+                there = np.eye(4)
+                there[:3, 3] = point
+                assert one[row] <= distance(shape, links[link][row] @ pose, ball, there) + 1e-6
+
+
+def test_numpy_and_the_gradient_say_the_same(robot, rng):
+    scene = cloud(surfaces(rng, 2500), xyz=[0, 0, 0.05], rpy=[0.1, 0.2, 0.3])
+    q = robot.random(rng, 40)
+    compiled, plain = (SceneCheck(robot, scene, one) for one in (True, False))
+    points, normals = robot.contacts(robot.home)
+    asked = ik.Solver(robot)._questions.of_arrays(points[None], normals[None], None)
+    one, other = compiled.around(asked).scene_alone, plain.around(asked).scene_alone
+    room = one.check(q).room
+    np.testing.assert_allclose(room, other.check(q).room, atol=1e-9)
+    np.testing.assert_array_equal(one.free(q), room >= 0)
+    found, slope = one.gradient(q)
+    np.testing.assert_allclose(found, room, atol=1e-6)
+    step = 1e-6 * rng.normal(size=q.shape)
+    ahead, behind = one.check(q + step).room, one.check(q - step).room
+    smooth = np.abs(ahead - behind) > 0
+    np.testing.assert_allclose(
+        (ahead - behind)[smooth] / 2, np.einsum("kn,kn->k", slope, step)[smooth], atol=2e-8
+    )
+
+
+def test_what_is_thinned_is_never_farther(robot, rng):
+    points = surfaces(rng, 4000)
+    q = robot.random(rng, 80)
+    full, thin = (clearances(robot, cloud(points, voxel=edge), q) for edge in (0.0, 0.03))
+    assert (thin <= full + 1e-12).all()
+    assert (full - thin).max() < 2 * 0.03
+    parts = cloud(points, voxel=0.03).items["seen"].parts
+    assert sum(len(np.unique(solid.points, axis=0)) for solid, _ in parts) < 2500
+
+
+def written(folder: Path, points: Array) -> list[Path]:
+    """The points in all kinds of files."""
+    rows = [" ".join(f"{value:.17g}" for value in row) for row in points]
+    np.save(folder / "a.npy", points)
+    np.savez(folder / "b.npz", points=points, colors=points)
+    np.savez_compressed(folder / "c.npz", points)
+    (folder / "d.xyz").write_text("# x y z\n" + "\n".join(rows))
+    (folder / "e.csv").write_text("\n".join(row.replace(" ", ", ") + ", 255" for row in rows))
+    head = "ply\nformat {}\ncomment made up\nelement vertex {}\nproperty uchar red\n"
+    head += "".join(f"property double {axis}\n" for axis in "zxy")
+    head += "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    turned = points[:, [2, 0, 1]]
+    lines = "\n".join("7 " + " ".join(f"{v:.17g}" for v in row) for row in turned)
+    (folder / "f.ply").write_text(head.format("ascii 1.0", len(points)) + lines + "\n")
+    for name, form in (("g.ply", "<"), ("h.ply", ">")):
+        word = {"<": "little", ">": "big"}[form]
+        data = np.zeros(len(points), [("red", "u1"), ("p", f"{form}f8", 3)])
+        data["p"] = turned
+        said = head.format(f"binary_{word}_endian 1.0", len(points))
+        (folder / name).write_bytes(said.encode() + data.tobytes())
+    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z normal rgb\nSIZE 8 8 8 4 4\nTYPE F F F F U\n"
+    head += f"COUNT 1 1 1 2 1\nWIDTH {len(points)}\nHEIGHT 1\nPOINTS {len(points)}\nDATA "
+    (folder / "i.pcd").write_text(head + "ascii\n" + "\n".join(f"{row} 0 0 9" for row in rows))
+    data = np.zeros(len(points), [("p", "<f8", 3), ("n", "<f4", 2), ("c", "<u4")])
+    data["p"] = points
+    (folder / "j.pcd").write_bytes(head.encode() + b"binary\n" + data.tobytes())
+    return sorted(folder.iterdir())
+
+
+def test_every_file_gives_the_same_points(robot, rng, tmp_path):
+    points = surfaces(rng, 100)
+    holed = np.insert(points, 3, np.nan, axis=0)  # as cameras write what they do not see
+    q = robot.random(rng, 20)
+    expected = clearances(robot, cloud(points), q)
+    np.testing.assert_array_equal(clearances(robot, cloud(holed), q), expected)
+    (tmp_path / "files").mkdir()
+    files = written(tmp_path / "files", holed)
+    assert len(files) == 10
+    for file in files:
+        path = tmp_path / "scene.yaml"
+        path.write_text(
+            f"solids: {{seen: {{kind: point-cloud, file: files/{file.name}, radius: 10 mm}}}}\n"
+        )
+        found = clearances(robot, ik.load_scene(path), q)
+        np.testing.assert_allclose(found, expected, atol=1e-12, err_msg=file.name)
+
+
+HEAD = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 9\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("a.npy", b"", "cannot be read"),
+        ("a.npy", b"\x93NUMPY\x01\x00v\x00{'descr': '|O', 'fortran_order': False, ", "cannot be"),
+        ("a.ply", b"solid", "no PLY file"),
+        ("a.ply", b"ply\nelement vertex 9\nproperty float x\nend_header\n", "x, y"),
+        ("a.ply", b"ply\nformat what 1.0\n", "cannot be read"),
+        ("a.ply", b"ply\nelement vertex 99999999999\nend_header\n", "at most 10000000"),
+        ("a.pcd", b"VERSION 0.7\nDATA ascii\n", "cannot be read"),
+        ("a.pcd", HEAD + b"DATA binary_compressed\n", "are binary_compressed"),
+        ("a.pcd", HEAD + b"DATA binary\nabc", "after 0 of 9"),
+        ("a.pcd", HEAD + b"TYPE Q F F\nDATA binary\n", "cannot be"),
+        ("a.xyz", b"1 2\n3 4\n", "cannot be read"),
+        ("a.xyz", b"", "found no points"),
+        ("a.xyz", b"nan nan nan\n", "found no points"),
+        ("a.npz", b"PK", "not an npz file"),
+        ("a.las", b"", "expected a name ending in .npy, .npz, .ply, .pcd, .xyz, .txt, .csv"),
+    ],
+)  # fmt: skip
+def test_files_that_are_none_are_one_line(tmp_path, name, data, message):
+    (tmp_path / name).write_bytes(data)
+    entry = {"kind": "point-cloud", "radius": 0.01, "file": str(tmp_path / name)}
+    with pytest.raises(DescriptionError, match=message) as caught:
+        ik.Scene({"seen": entry})
+    assert "\n" not in str(caught.value)
+    assert "solids.seen" in str(caught.value)
+
+
+def test_arrays_and_keys_that_do_not_fit(tmp_path):
+    with (
+        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("points.npy", "w", force_zip64=True) as stream,
+    ):
+        np.lib.format.write_array(stream, np.zeros((11_000_000, 3)))
+    points = np.zeros((2, 3))
+    for more, message in (
+        (
+            {"points": np.zeros((2, 2))},
+            r"found float64 of shape \(2, 2\), expected numbers",
+        ),
+        ({"points": np.full((2, 3), "a")}, "expected numbers"),
+        ({"points": np.full((2, 3), np.nan)}, "found no points"),
+        ({}, "expected a point cloud's file or its points"),
+        ({"points": points, "file": "a.npy"}, "expected a point cloud's file or its points"),
+        ({"points": points, "voxel": -1}, "voxel: found -1, expected >= 0 m"),
+        ({"points": points, "radius": 0}, "radius: found 0.0, expected > 0"),
+        ({"file": str(tmp_path / "no.npy")}, "no such file"),
+        ({"file": str(tmp_path / "bomb.npz")}, "unpacks to 264000[0-9]* bytes, ex"),
+        ({"points": np.random.default_rng(0).normal(size=(100_001, 3))}, "found 100001 points"),
+    ):
+        with pytest.raises(DescriptionError, match=message) as caught:
+            ik.Scene({"seen": {"kind": "point-cloud", "radius": 0.01, **more}})
+        assert str(caught.value).startswith("scene: solids.seen")
+
+
+def test_answers_keep_off_a_cloud(rng):
+    """A grasp in a scene that is a cloud alone: free, and why it is not where there is no way."""
+    robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
+    bare = ik.Solver(robot, scene=ik.Scene()).solve(grasp)
+    assert bare.success
+    # Points about the elbow of the answer that nothing stands in the way of.
+    elbow = robot.links(bare.q)["lwr_link_4"][:3, 3]
+    scene = cloud(elbow + rng.uniform(-0.05, 0.05, (2000, 3)))
+    solver = ik.Solver(robot, scene=scene)
+    touched = solver.check(bare.q, grasp)
+    assert touched is not None
+    assert touched.distance.min() < 0
+    found = solver.solve(grasp)
+    assert found.success
+    assert found.clearance is not None
+    assert found.clearance >= -1e-9
+    tips = np.array([contact.point for contact in grasp.contacts.values()])
+    closed = cloud(tips.mean(axis=0) + rng.uniform(-0.3, 0.3, (2000, 3)))
+    blocked = ik.Solver(robot, scene=closed).solve(grasp)
+    assert blocked.status is ik.Status.COLLISION
+    assert blocked.closest is not None
+    assert "seen" in blocked.closest
+
+
+def test_poses_are_said_in_four_ways(robot, rng, tmp_path):
+    rpy = [0.4, -0.3, 1.1]
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a / 2), np.sin(a / 2)) for a in rpy)
+    w = cr * cp * cy + sr * sp * sy
+    x, y, z = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    box = {"kind": "box", "size": [0.3, 0.1, 0.2]}
+    xyz, q = [0.4, 0.1, 0.3], robot.random(rng, 40)
+    first = ik.Scene({"a": {**box, "xyz": xyz, "rpy": rpy}})
+    expected = clearances(robot, first, q)
+    pose = first.items["a"].pose
+    for more in (
+        {"xyz": xyz, "quaternion_wxyz": [w, x, y, z]},
+        {"xyz": xyz, "quaternion_xyzw": np.round([-x, -y, -z, -w], 4)},
+        {"pose": pose},
+        {"pose": pose.tolist()},
+    ):
+        found = clearances(robot, ik.Scene({"a": {**box, **more}}), q)
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        "solids:\n  a:\n    kind: box\n    size: [300 mm, 100 mm, 200 mm]\n    pose:\n"
+        + "".join(f"      - {row}\n" for row in pose.tolist())
+    )
+    np.testing.assert_allclose(clearances(robot, ik.load_scene(path), q), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"rpy": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}, "found rpy and quaternion_wxyz, ex"),
+        ({"pose": np.eye(4), "xyz": [0, 0, 0]}, "found pose and xyz, expected one of them"),
+        ({"quaternion_wxyz": [0, 0, 0, 0]}, "quaternion_wxyz: found length 0, expected 1"),
+        ({"quaternion_xyzw": [1, 1, 0, 0]}, "quaternion_xyzw: found length 1.41421, expected 1"),
+        ({"quaternion_wxyz": [1, 0, 0]}, "quaternion_wxyz: expected `array` of length 4, got 3"),
+        ({"pose": 2 * np.eye(4)}, "pose: its first three columns are no rotation"),
+        ({"pose": np.eye(3)}, "pose"),
+    ],
+)
+def test_poses_that_are_none(more, message):
+    with pytest.raises(DescriptionError, match=message) as caught:
+        ik.Scene({"a": {"kind": "box", "size": [1, 1, 1], **more}})
+    assert str(caught.value).startswith("scene: solids.a")
