@@ -45,10 +45,16 @@ def backend(
     """
     check_installed(dask)
     import joblib
+    from joblib.externals.loky import get_reusable_executor
 
     if dask is None:
         with joblib.parallel_config(backend="loky", n_jobs=jobs):
-            yield None
+            try:
+                yield None
+            except (KeyboardInterrupt, GeneratorExit):
+                # By themselves they would finish what they have and wait for more.
+                get_reusable_executor().shutdown(wait=False, kill_workers=True)
+                raise
         return
     with _quiet(), _client(dask) as client:
         _check(client, dask, packages)

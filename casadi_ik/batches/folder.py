@@ -97,12 +97,27 @@ class BatchFolder:
         with written_whole(self.part(solved.number)) as part:
             part.write_bytes(solved.answers)
 
-    def answers(self, number: int) -> dict[str, np.ndarray]:
+    def answers(self, number: int, first_row: int, count: int) -> dict[str, np.ndarray]:
         """The arrays of a part.
 
+        Args:
+            number: Of the part.
+            first_row: Number of its first target among all.
+            count: Targets of it.
+
         Raises:
-            InputError: Its file is damaged.
+            InputError: Its file is damaged, or has the answers to other targets.
         """
+        arrays = self._arrays(number)
+        found = int(arrays.pop("first_row", -1)), len(arrays.get("status", ()))
+        if found != (first_row, count):
+            raise InputError(
+                f"{self.part(number)}: found {found[1]} rows from {found[0]} on, expected {count} "
+                f"from {first_row} on; remove it and go on"
+            )
+        return arrays
+
+    def _arrays(self, number: int) -> dict[str, np.ndarray]:
         path = self.part(number)
         try:
             with np.load(path, allow_pickle=False) as arrays:

@@ -44,7 +44,7 @@ class SolvedPart:
     Attributes:
         number: Of the part.
         count: Targets of it.
-        answers: An npz of the arrays of `columns`.
+        answers: An npz of the arrays of `columns`, and `first_row`, the number of the first target.
         log: An MCAP log, if one was asked for; solves are numbered as among all targets.
         faults: What is wrong with a target, by its number among all.
     """
@@ -78,7 +78,7 @@ def solve_part(solver: bytes, asked: Asked, part: Part) -> SolvedPart:
         )
         log = None if path is None else path.read_bytes()
     answers = io.BytesIO()
-    np.savez(answers, allow_pickle=False, **columns(block.solution))
+    np.savez(answers, allow_pickle=False, first_row=part.first_row, **columns(block.solution))
     count = len(block.solution)
     return SolvedPart(part.number, count, answers.getvalue(), log, dict(block.faults))
 

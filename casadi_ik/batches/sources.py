@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import Protocol
 
@@ -85,6 +86,11 @@ class Source:
             for count in self.counts
             for start in range(0, count, self.size)
         )
+
+    @cached_property
+    def first_rows(self) -> tuple[int, ...]:
+        """Number of each part's first target among all."""
+        return (0, *accumulate(self.sizes))[:-1]
 
     def without(self, done: Container[int]) -> Iterator[Part]:
         """The parts that are not done yet, read as they are asked for.

@@ -21,6 +21,8 @@ class Exit(IntEnum):
     """One line on stderr says where, what was found and what was expected."""
     INTERRUPTED = 130
     """Ctrl-C (128 + SIGINT, as shells count)."""
+    TERMINATED = 143
+    """SIGTERM (128 + 15): what is finished is kept as after Ctrl-C."""
     BROKEN_PIPE = 141
     """Whoever read the report went away (128 + SIGPIPE)."""
 

@@ -29,14 +29,12 @@ from casadi_ik.grasps.pose import moved
 BLOCK = 4096
 """Targets in memory at once, at most."""
 
-FIRST_BLOCK = 64
-
 BRIEF, LONG = 1.0, 4.0
 """Seconds from which on the next block is not larger, or smaller: what Ctrl-C may cost."""
 
 
 class Pace:
-    """How large blocks are: a few seconds each, whatever a target takes.
+    """How large blocks are: a few seconds each, whatever a target takes; the first a target a job.
 
     Attributes:
         size: Of the next block.
@@ -44,7 +42,7 @@ class Pace:
 
     def __init__(self, jobs: int) -> None:
         self._least = min(jobs, BLOCK)
-        self.size = min(max(FIRST_BLOCK, jobs), BLOCK)
+        self.size = self._least
         self._began = time.monotonic()
 
     def begin(self) -> int:

@@ -22,7 +22,6 @@ from casadi_ik.cli.question import the_fixed, the_object_pose, the_robot, the_so
 from casadi_ik.cli.report import batch_report
 from casadi_ik.cli.say import say
 from casadi_ik.cli.solution_file import growing_npz
-from casadi_ik.errors import InputError
 from casadi_ik.files.shipped import resolve
 from casadi_ik.logs.write.provenance import plain
 
@@ -67,6 +66,8 @@ def batch_in_parts(arguments: argparse.Namespace) -> Answer:
     with writing(folder.path, "--out"):
         folder.claim(_question(arguments, solver, source, asked), arguments.resume)
     done = folder.done()
+    for number in done.intersection(range(len(source.sizes))):
+        _answers(folder, source, number)  # before hours are spent on the rest
     faults: dict[int, str] = {}
     before = sum(source.sizes[number] for number in done)
     with progress(count, before) as show, writing(folder.path, "--out"):
@@ -98,31 +99,23 @@ def _totals(
     source: Source, folder: BatchFolder, faults: dict[int, str], out: Path | None
 ) -> BatchTotals:
     """Totals over all parts in order; they become one file if one is asked for."""
-    totals, first_row = BatchTotals(), 0
+    totals = BatchTotals()
     totals.note_faults(faults)
     if out is None:
-        for number, size in enumerate(source.sizes):
-            totals.add(_whole(folder, number, size), first_row)
-            first_row += size
+        for number, first_row in enumerate(source.first_rows):
+            totals.add(_answers(folder, source, number), first_row)
         return totals
     with growing_npz(out, "--out") as npz:
-        for number, size in enumerate(source.sizes):
-            arrays = _whole(folder, number, size)
+        for number, first_row in enumerate(source.first_rows):
+            arrays = _answers(folder, source, number)
             npz.append(arrays)
             totals.add(arrays, first_row)
-            first_row += size
     folder.remove()
     return totals
 
 
-def _whole(folder: BatchFolder, number: int, size: int) -> dict[str, Any]:
-    arrays = folder.answers(number)
-    if len(arrays["status"]) != size:
-        raise InputError(
-            f"{folder.part(number)}: found {len(arrays['status'])} rows, expected {size}; remove "
-            "it and go on"
-        )
-    return arrays
+def _answers(folder: BatchFolder, source: Source, number: int) -> dict[str, Any]:
+    return folder.answers(number, source.first_rows[number], source.sizes[number])
 
 
 def _question(

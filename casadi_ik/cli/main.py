@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -29,21 +31,50 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         0 done or solved, 1 a valid problem not solved, 2 bad input (one line on stderr),
-        130 interrupted, 141 the reader of stdout went away. What no one foresaw is raised.
+        130 interrupted, 143 terminated, 141 the reader of stdout went away. What no one foresaw is
+        raised.
     """
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _terminated_like_interrupted():
         warnings.showwarning = _show_warning
         try:
             return _run(argv)
         except CasadiIKError as error:
             say("error", str(error))
             return Exit.BAD_INPUT
+        except Terminated:
+            say("error", "terminated")
+            return Exit.TERMINATED
         except KeyboardInterrupt:
             say("error", "interrupted")
             return Exit.INTERRUPTED
         except BrokenPipeError:
             _abandon_stdout()
             return Exit.BROKEN_PIPE
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came: what handles Ctrl-C keeps or removes files as it does there."""
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """Raise `Terminated` on SIGTERM inside the block, unless the program around us handles it."""
+
+    def terminate(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough
+        raise Terminated
+
+    ours = (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    )
+    if ours:
+        signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _run(argv: Sequence[str] | None) -> Exit:

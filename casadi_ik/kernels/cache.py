@@ -15,11 +15,13 @@ import os
 import platform
 import re
 from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 
 import casadi as ca
 
 from casadi_ik.files.leftovers import tidy
+from casadi_ik.kernels.cancellation import interrupt_afterwards
 from casadi_ik.kernels.codegen import library_source
 from casadi_ik.kernels.compiler import (
     Compiler,
@@ -81,26 +83,31 @@ def load_library(
         return None
     short = name[:NAME]
     with _lock:
-        directory = trusted_cache()
+        places = _places()
         brief = (
             library_key(f"{ca.CasadiMeta.version()} {recipe} {driver}", compiler) if recipe else ""
         )
         note = f"{short}-{brief}.key"
-        library = _recognised(directory, short, note, symbol) if directory and brief else None
-        if library is not None or at_hand:
-            return library
-        source = write(build(), driver)
+        for directory in places if brief else ():
+            library = _recognised(directory, short, note, symbol)
+            if library is not None:
+                return library
+        if at_hand:
+            return None
+        with interrupt_afterwards():
+            source = write(build(), driver)
         key = library_key(source, compiler)
         library = _loaded.get(key)
         if library is None:
             stem = f"{short}-{key}"
-            library = _find(directory, stem, symbol) if directory else None
+            found = (_find(directory, stem, symbol) for directory in places)
+            library = next(filter(None, found), None)
             if library is None:
-                library = _built(directory, stem, source, compiler, symbol)
+                library = _built(places, stem, source, compiler, symbol)
             if library is None:
                 return None
             _loaded[key] = library
-        if directory and brief:
+        for directory in places if brief else ():
             _note(directory / note, key)
         return library
 
@@ -169,14 +176,33 @@ def _content_hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
+def _places() -> list[Path]:
+    """Folders to look into: the cache, and a temporary one where that cannot be written."""
+    directory = trusted_cache()
+    places = [] if directory is None else [directory]
+    writable = directory is not None and os.access(directory, os.W_OK)
+    return places if writable else [*places, *_temporary(places)]
+
+
+def _temporary(others: list[Path]) -> Iterator[Path]:
+    """The temporary folder, if it can be used and is not among others."""
+    try:
+        directory = private_directory()
+    except OSError as error:
+        warn_once("a temporary folder", f"cannot be used: {reason(error)}")
+        return
+    if directory not in others:
+        yield directory
+
+
 def _built(
-    directory: Path | None, stem: str, source: str, compiler: Compiler, symbol: str
+    places: list[Path], stem: str, source: str, compiler: Compiler, symbol: str
 ) -> ctypes.CDLL | None:
-    """Compile into the cache, else into a directory of this process; None if neither has room."""
+    """Compile into the first place that has room, else a temporary one; None if none has."""
     problems: dict[Path, OSError | UnloadableError] = {}
     library = None
     announce(stem.rpartition("-")[0], len(source))
-    for place in _places(directory):
+    for place in chain(places, _temporary(places)):
         try:
             tidy(place, "build-*", 1)
             tidy(place, ".*.part", -2)
@@ -191,15 +217,6 @@ def _built(
     if library is None:
         warn_no_compiler("there is no room for what it makes")
     return library
-
-
-def _places(directory: Path | None) -> Iterator[Path]:
-    if directory is not None:
-        yield directory
-    try:
-        yield private_directory()
-    except OSError as error:
-        warn_once("a temporary folder", f"cannot be used: {reason(error)}")
 
 
 def _compiled(

@@ -1,7 +1,8 @@
-"""How work in a thread is told to stop: Ctrl-C reaches the main thread only."""
+"""How work is told to stop: Ctrl-C and SIGTERM reach the main thread, which tells the others."""
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,3 +42,31 @@ def stop_if_cancelled() -> None:
     """
     if is_cancelled():
         raise CancelledError
+
+
+@contextmanager
+def interrupt_afterwards() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM wait for the end of the block, which calls CasADi.
+
+    CasADi swallows a KeyboardInterrupt while it converts arguments, and inside an evaluation for
+    Ipopt it takes one for a number that could not be computed.
+
+    Raises:
+        KeyboardInterrupt: After the block, if Ctrl-C was pressed in it; or what else a handler
+            raises.
+    """
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if threading.current_thread() is not threading.main_thread():
+        handlers = {}
+    came: list[int] = []
+    for number, handler in handlers.items():
+        if callable(handler):
+            signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            if callable(handler):
+                signal.signal(number, handler)
+    for number in came[:1]:
+        signal.raise_signal(number)

@@ -10,7 +10,6 @@ profile, and nothing is checked there.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import errno
 import os
@@ -29,19 +28,17 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT) if hasattr(errno, "EDQUOT") else (errno.E
 
 
 class CacheWarning(RuntimeWarning):
-    """Compiled kernels cannot be kept: what was compiled now will be compiled again."""
+    """The folder for compiled kernels cannot be used: they are kept in a temporary one."""
 
 
 _warned: set[str] = set()
-_private: dict[int, Path] = {}
 
 
 def cache_directory() -> Path:
     """Where libraries are kept, whether it can be used or not.
 
     `CASADI_IK_CACHE`, else `casadi_ik` in `XDG_CACHE_HOME`, else in the platform's directory for
-    caches (`~/.cache`, `~/Library/Caches`, `%LOCALAPPDATA%`); the process's own if there is no
-    home.
+    caches (`~/.cache`, `~/Library/Caches`, `%LOCALAPPDATA%`); a temporary one if there is no home.
 
     Raises:
         OSError: A relative path, and the working folder is gone; or there is no temporary folder.
@@ -83,34 +80,27 @@ def trusted_cache() -> Path | None:
 
 
 def private_directory() -> Path:
-    """A directory of this process alone, which takes it away in the end.
+    """The user's own folder among temporary files, for what the cache cannot keep.
 
     Raises:
-        OSError: It cannot be made, or others could replace it.
+        OSError: It cannot be made, or others could write into it.
     """
-    if os.getpid() not in _private:
-        made = Path(os.path.realpath(tempfile.mkdtemp(prefix="casadi_ik-")))
-        if problem := distrust(made):
-            shutil.rmtree(made, ignore_errors=True)
-            raise PermissionError(errno.EPERM, problem, str(made))
-        _private[os.getpid()] = made
-        atexit.register(_remove, made, os.getpid())
-    return _private[os.getpid()]
-
-
-def _remove(directory: Path, process: int) -> None:
-    """Not at the end of a fork of the process that made it."""
-    if os.getpid() == process:
-        shutil.rmtree(directory, ignore_errors=True)
+    user = f"-{os.getuid()}" if _has_owners() else ""
+    directory = Path(tempfile.gettempdir(), f"casadi_ik{user}")
+    _make(directory)
+    real = Path(os.path.realpath(directory, strict=True))
+    if problem := distrust(real):
+        raise PermissionError(errno.EPERM, problem, str(real))
+    return real
 
 
 def warn_once(place: str, problem: str) -> None:
-    """Say once per process that what is compiled cannot be kept there."""
+    """Say once per process that what is compiled cannot be kept in a place."""
     if place in _warned:
         return
     _warned.add(place)
     warnings.warn(
-        f"{place[:200]}: {problem}; kernels are compiled for this process alone "
+        f"{place[:200]}: {problem}; kernels are kept among temporary files "
         "(CASADI_IK_CACHE names another folder)",
         CacheWarning,
         stacklevel=2,

@@ -106,6 +106,31 @@ def test_killed_and_taken_up_again(targets: Path, whole: dict[str, np.ndarray], 
     assert len(log.solves()) == COUNT - 1
 
 
+def test_terminated(targets: Path, tmp_path: Path):
+    """SIGTERM to the client alone: the finished parts stay, its workers do not."""
+    out = tmp_path / "out"
+    process = begun(targets, *ROBOT, *PARTS, "--resume", "--jobs", "2", "--out", out)
+    wait_for_parts(out, 3, process)
+    process.terminate()
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 143
+    assert error.splitlines()[-1] == "casadi-ik: error: terminated"
+    assert len(list(out.glob("part-*.npz"))) >= 3
+    end = time.monotonic() + 60
+    while alive(process.pid) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not alive(process.pid)
+
+
+def alive(group: int) -> bool:
+    """Whether any process of a group is left."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
 @pytest.fixture
 def cluster() -> Iterator[tuple[str, subprocess.Popen[str], list[subprocess.Popen[str]]]]:
     """A scheduler and two workers."""
@@ -173,6 +198,10 @@ Change = Callable[[Path], list[str]]
         (lambda _: [], "holds parts of this batch, expected --resume"),
         (lambda _: ["--resume", "--seed", "7"], "seed: these parts were made with 0, this batch"),
         (lambda out: _damage(out), "damaged"),
+        (
+            lambda out: _copy(out),
+            "part-000001.npz: found 10 rows from 0 on, expected 10 from 10 on",
+        ),
     ],
 )
 def test_what_is_there_must_belong(
@@ -193,6 +222,11 @@ def test_what_is_there_must_belong(
 def _damage(out: Path) -> list[str]:
     path = out / "part-000001.npz"
     path.write_bytes(path.read_bytes()[:100])
+    return ["--resume"]
+
+
+def _copy(out: Path) -> list[str]:
+    (out / "part-000001.npz").write_bytes((out / "part-000000.npz").read_bytes())
     return ["--resume"]
 
 

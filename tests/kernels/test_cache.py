@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
+import signal
 import subprocess
 import sys
+import tempfile
 import textwrap
 import warnings
 from dataclasses import replace
@@ -26,6 +29,7 @@ from casadi_ik.kernels import (
     compiler,
 )
 from casadi_ik.kernels.codegen import library_source
+from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.recipe import recipe as recipe_of
 
 from .graphs import counting_step, needs_compiler
@@ -70,6 +74,41 @@ def test_second_use_builds_nothing(directory: Path, monkeypatch: pytest.MonkeyPa
     assert FunctionKernel(function())(3)[0] == 6
     forget(monkeypatch)
     assert FunctionKernel(function())(3)[0] == 6
+
+
+class Pressed:
+    """Presses Ctrl-C while CasADi converts it, which takes that for a number of the wrong type."""
+
+    def __SX__(self) -> ca.SX:
+        signal.raise_signal(signal.SIGINT)
+        return ca.SX(1)
+
+
+@needs_compiler
+@pytest.mark.usefixtures("directory")
+def test_ctrl_c_while_a_graph_is_built() -> None:
+    def build() -> ca.Function:
+        with contextlib.suppress(TypeError):
+            _ = ca.SX.sym("x") * Pressed()  # type: ignore[operator]
+        return function()
+
+    with pytest.raises(KeyboardInterrupt):
+        FunctionKernel(FunctionGraph("scaled", build, {"x": (1, 1)}, ((1, 1),)))
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_written(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A read-only home: what one process compiles the next finds."""
+    directory.write_text("a file is in the way")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert FunctionKernel(function())(3)[0] == 6
+        monkeypatch.setattr(compiler.Compiler, "build", refuse_to_build)
+        forget(monkeypatch)
+        assert FunctionKernel(function())(3)[0] == 6
 
 
 @needs_compiler

@@ -423,26 +423,6 @@ def works_or_dies() -> None:
 
 
 @needs_compiler
-def test_a_fork_leaves_its_parents_folder_alone(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("CASADI_IK_CACHE", str(directory / "file" / "x"))
-    directory.mkdir()
-    (directory / "file").write_text("")
-    with pytest.warns(CacheWarning):
-        assert works()
-    private = folders.private_directory()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        process = os.fork()
-    if process == 0:
-        folders._remove(private, os.getppid())
-        os._exit(0)
-    assert os.waitpid(process, 0)[1] == 0
-    assert private.is_dir()
-
-
-@needs_compiler
 def test_a_working_folder_that_is_gone(tmp_path: Path) -> None:
     """A relative place cannot be found then; one line, and the answer is right all the same."""
     script = """

@@ -30,11 +30,10 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.kernels.cancellation import interrupt_afterwards, stop_if_cancelled
 from casadi_ik.kernels.forks import ForkSafeLock
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.methods.ipopt.contacts import NlpContacts
-from casadi_ik.methods.ipopt.interrupts import interrupt_afterwards
 from casadi_ik.methods.ipopt.parameters import IpoptParameters
 from casadi_ik.methods.ipopt.watch import EXACT, JOINT_SLACK, Watch, within
 from casadi_ik.problem.contacts.kinds import Kinds
