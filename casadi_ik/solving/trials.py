@@ -107,7 +107,7 @@ class Trials:
             start: (k, n).
             postures: (k, hand).
         """
-        states, parameters = self.method.rows(problems, start, postures[:, None])
+        states, parameters = self.method.rows(problems, start, postures[:, None], begun=True)
         states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
         return states, parameters
 

@@ -24,9 +24,10 @@ __attribute__((visibility("default")))
 int casadi_ik_rounds_on(rounds *job) {
   job->under_way = 0;
   job->iterations = 0;
+  job->again = 0;
   job->status = RUNNING;
   while (job->round < job->rounds && !is_hopeful(job, job->round)) ++job->round;
-  if (job->round >= job->rounds) return UNHELPED;
+  if (job->round >= job->rounds && !search_again(job)) return UNHELPED;
   job->paused = 1;
   return casadi_ik_rounds(job);
 }

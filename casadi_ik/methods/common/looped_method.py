@@ -7,6 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -92,8 +93,16 @@ class LoopedMethod(ABC):
             problems: k targets.
             q0: (k, n) configurations to start from.
             number: Of the round, from 0.
-            last: (k, ns) states in which the round before ended; None in the first.
+            last: (k, ns) states in which the round before ended; None in the first of all. Of a
+                later search (see `searches`) round 0 has them too.
         """
+
+    def searches(self, problems: Problems) -> tuple[Problems, ...]:
+        """What is asked one after the other of targets that are not solved before: all rounds each.
+
+        A preference orders answers; whether there is one it does not decide.
+        """
+        return (problems,)
 
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
         """(k,) whether failed solves take part in a round after the first.
@@ -118,6 +127,8 @@ class LoopedMethod(ABC):
         self, problems: Problems, q0: Array, last: LoopResult, number: int, rounds: int
     ) -> LoopResult | None:
         """All rounds from one on for targets that are not solved, if there is a shorter way.
+
+        Searches that follow are made, too.
 
         Args:
             problems: k targets.
@@ -183,18 +194,19 @@ class LoopedMethod(ABC):
     def stepper(self, problems: Problems, q0: Array) -> Stepper:
         """One target, one iteration at a time; see `Method.stepper`."""
         self._check(problems)
-        rounds = iter(range(1, self.rounds))
+        rounds = product(self.searches(problems), range(self.rounds))
+        first, _ = next(rounds)
 
         def next_round(status: int, state: Array) -> Start | None:
             if status == Status.SOLVED:
                 return None
-            number = next((n for n in rounds if self.hopeful(state[None], n)[0]), None)
-            if number is None:
-                return None
-            states, parameters = self.begin(problems, q0[None], number, state[None])
-            return states[0], parameters[0]
+            for asked, number in rounds:
+                if self.hopeful(state[None], number)[0]:
+                    states, parameters = self.begin(asked, q0[None], number, state[None])
+                    return states[0], parameters[0]
+            return None
 
-        states, parameters = self.begin(problems, q0[None])
+        states, parameters = self.begin(first, q0[None])
         return Stepper(self.graph, states[0], parameters[0], next_round)
 
     def run(
@@ -202,7 +214,7 @@ class LoopedMethod(ABC):
     ) -> Outcome:
         """Solve a batch; see `Method.run`. No random numbers are drawn.
 
-        `rounds` are so many at most instead of all.
+        `rounds` are so many of each search at most instead of all.
         """
         del seed
         self._check(problems)
@@ -213,15 +225,15 @@ class LoopedMethod(ABC):
         status = np.empty(count, dtype=np.int64)
         left, some, here, last = np.arange(count), problems, q0, None
         every = self.rounds if rounds is None else rounds
-        for number in range(every):
-            if number:
+        for place, (asked, number) in enumerate(product(self.searches(problems), range(every))):
+            if place:
                 left = np.flatnonzero(status != Status.SOLVED)
                 if not len(left):
                     break
-                if not trace:
+                if number and not trace:
                     codes = status[left].astype(np.int32)
                     before = LoopResult(states[left], iterations[left], codes, seconds[left])
-                    ends = self.finish(problems.rows(left), q0[left], before, number, every)
+                    ends = self.finish(asked.rows(left), q0[left], before, number, every)
                     if ends is not None:
                         states[left], status[left] = ends.states, ends.status
                         iterations[left] += ends.iterations
@@ -230,7 +242,7 @@ class LoopedMethod(ABC):
                 left = left[self.hopeful(states[left], number)]
                 if not len(left):
                     continue
-                some, here, last = problems.rows(left), q0[left], states[left]
+                some, here, last = asked.rows(left), q0[left], states[left]
             begun = time.perf_counter()
             first, parameters = self.begin(some, here, number, last)
             result = self.kernel.run(first, parameters, self.max_iterations, trace)

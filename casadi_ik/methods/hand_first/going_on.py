@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+COUNTED = ("counts",)
+"""What a search leaves to the next one, which else begins anew."""
+
 CARRIED = (
     *("passed", "near", "balanced", "least", "returns"),
-    *("best_cost", "best_q", "counts"),
+    *("best_cost", "best_q", *COUNTED),
 )
 """What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
 were balanced in vain, and what was found."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -20,6 +21,7 @@ from casadi_ik.methods.hand_first import one_by_one
 from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.going_on import (
     CARRIED,
+    COUNTED,
     NEAR_SHRINKS,
     SURE,
     TINY,
@@ -117,14 +119,21 @@ class HandFirstMethod(LoopedMethod):
         self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
     ) -> Start:
         """Start with the hand postures of the round; what was found before is kept."""
-        states, parameters = self._round(problems, q0, number, last)
+        states, parameters = self._round(problems, q0, number, last if number else None)
         if last is not None:
             layout = self.step.layouts.state
-            for name in CARRIED:
+            for name in CARRIED if number else COUNTED:
                 states[:, layout.slice(name)] = last[:, layout.slice(name)]
+        if last is not None and number:
             earlier = layout.slice("earlier")
             states[:, earlier] = last[:, earlier] + self.options.candidates
         return states, parameters
+
+    def searches(self, problems: Problems) -> tuple[Problems, ...]:
+        """Near where the robot is, if that is wanted; then anywhere."""
+        if problems.prefer != NEAREST:
+            return (problems,)
+        return problems, replace(problems, prefer="limits")
 
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
         """Whether a round may still help: see `most_returns` and `rugged`."""

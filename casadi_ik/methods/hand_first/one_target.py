@@ -72,7 +72,7 @@ class OneTarget:
         self._run: Any = library[SYMBOL]
         self._run_on: Any = library[f"{SYMBOL}_on"]
         self._job = job = _structure(sizes)()
-        job.rounds = plan.rounds if whole else 1
+        job.rounds = plan.rounds if whole else 0
         self._kept = hands.tables(plan.enforce_limits) if whole else (hands.table,)
         for i, table in enumerate(self._kept):
             job.tiles[i] = memory(table.lookup.tiles)
@@ -114,6 +114,8 @@ class OneTarget:
 
     def go_on(self, number: int, rounds: int) -> int | None:
         """Make later rounds for what stands in the arrays, after others that ended in `state`.
+
+        The search without preference follows where what is near was wanted.
 
         Args:
             number: The first of them.
@@ -201,6 +203,7 @@ def _structure(sizes: dict[str, int]) -> type[ctypes.Structure]:
         *_arrays(here=n, terms=sizes["N_TERMS"], q=n, position_error=f, angle_error=f),
         ("beyond", ctypes.c_double),
         *_whole("iterations", "restarts", "status", "round", "under_way", "in_round", "rounds"),
+        *_whole("again"),
         *_arrays(state=state, last=state, parameters=sizes["N_PARAMETERS"], mark=state),
         *_arrays(postures=sizes["N_CANDIDATES"] * h, near=pool * h),
         *_arrays(mended=sizes["N_MENDED"] * h, left=sizes["N_MENDED"]),

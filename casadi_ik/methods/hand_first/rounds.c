@@ -320,7 +320,13 @@ static int begin_round(rounds *job, int64_t number) {
   outputs[0] = job->state;
   outputs[1] = job->parameters;
   code = BEGIN(&map);
-  if (code != DONE || !number) return code;
+  if (code != DONE) return code;
+  if (!number) {
+    for (i = 0; job->again && i < N_COUNTS; ++i) {
+      job->state[STATE_COUNTS + i] = job->last[STATE_COUNTS + i];
+    }
+    return DONE;
+  }
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = 0.0;
   if (later >= VALLEYS) {
@@ -354,6 +360,7 @@ static int finish(rounds *job) {
   double *outputs[3];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   int code, i, met = 1;
+  if (job->again) job->terms[TERMS_NEAREST] = 1.0;
   memcpy(job->q, job->state + STATE_Q, sizeof job->q);
   job->restarts = (int64_t) job->state[STATE_EARLIER]
                 + (int64_t) clipped((double) (int64_t) tried, 0.0, N_CANDIDATES - 1);
@@ -420,8 +427,19 @@ static int rounds_begin(rounds *job) {
   job->under_way = 0;
   job->iterations = 0;
   job->restarts = 0;
+  job->again = 0;
   job->status = RUNNING;
   return sound && asked;
+}
+
+/* A preference orders answers: where none was found near `here`, all rounds follow without it. 0 if
+ * they have been made, and if a first round alone is wanted. */
+static int search_again(rounds *job) {
+  if (!job->rounds || !(job->terms[TERMS_NEAREST] > 0)) return 0;
+  job->terms[TERMS_NEAREST] = 0.0;
+  job->again = 1;
+  job->round = 0;
+  return 1;
 }
 
 /* Goes on for so many iterations, and begins one round at most; `status` says whether it is over.
@@ -465,7 +483,7 @@ static int rounds_run(rounds *job, int64_t most) {
     }
     do ++job->round;
     while (job->round < job->rounds && !is_hopeful(job, job->round));
-    if (job->round < job->rounds) continue;
+    if (job->round < job->rounds || search_again(job)) continue;
     job->status = status == RUNNING ? LIMIT_STATUS
                 : status == REPEATED ? STALLED_STATUS
                 : status < 0 ? INVALID_STATUS : status;

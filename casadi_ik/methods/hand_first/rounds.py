@@ -22,7 +22,7 @@ from casadi_ik.methods.hand_first.beginning import terms
 from casadi_ik.methods.hand_first.each_finger import mends
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.restarts import Restarts
-from casadi_ik.methods.hand_first.state import HandFirstLayouts
+from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
@@ -33,7 +33,7 @@ DIMENSIONS = (
 )
 """Of the arrays in `rounds`."""
 
-STATE = ("q", "phase", "candidate", "earlier", "returns", "best_cost", "best_q")
+STATE = ("q", "phase", "candidate", "earlier", "returns", "best_cost", "best_q", "counts")
 """What rounds.c reads and writes of a state."""
 
 
@@ -134,6 +134,7 @@ class RoundsPlan:
             "REFINEMENT_PHASE": int(Phase.REFINEMENT),
             "N_CARRIED": len(self._carried),
             "N_FRESH": len(fresh_fit()),
+            "N_COUNTS": len(STAGES),
             **places,
         }
 

@@ -12,7 +12,8 @@ typedef struct {
   int64_t status;
   /* On its way. */
   int64_t round, under_way, in_round;
-  int64_t rounds;               /* how many may be made */
+  int64_t rounds;               /* of a search, at most; 0: its first alone, no other */
+  int64_t again;                /* 1 = near `here` there was none: the search without preference */
   double state[N_STATE], last[N_STATE], parameters[N_PARAMETERS], mark[N_STATE];
   double postures[N_CANDIDATES * N_HAND];
   double near[N_POOL * N_HAND], mended[N_MENDED * N_HAND], left[N_MENDED];

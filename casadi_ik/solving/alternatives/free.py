@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +16,9 @@ from casadi_ik.solving.alternatives.swings import ArmSwings, Preference
 
 TOGETHER = 128
 """Targets that are worked on at once."""
+
+USUAL = "limits"
+"""What is preferred where nothing is said."""
 
 
 class FreeFinder:
@@ -63,6 +67,33 @@ class FreeFinder:
             reasons: Whether to find out if those without one would have one without the scene, or
                 if the robot could pass through itself.
         """
+        found = self._look(problems, around, q, starts, seed, every, reasons)
+        home = np.tile(self.robot.home, (len(q), 1))
+        biased = problems.prefer != USUAL or not np.array_equal(starts, home)
+        left = np.flatnonzero(~found.free)
+        if not biased or not len(left):
+            return found
+        # A preference orders answers; whether there is one it does not decide.
+        some = replace(problems.rows(left), prefer=USUAL)
+        ends = self.trials.method.run(some, home[left], seed, False).q
+        met = self.trials.solved(some, ends, some.enforce_limits)
+        left, some, ends = left[met], some.rows(np.flatnonzero(met)), ends[met]
+        again = self._look(some, around.rows(left), ends, home[left], seed)
+        return found.with_free(left, again)
+
+    def _look(
+        self,
+        problems: Problems,
+        around: Surroundings,
+        q: Array,
+        starts: Array,
+        seed: int,
+        every: bool = False,
+        reasons: bool = False,
+    ) -> FreeAnswers:
+        """One search, see `find`."""
+        if not len(q):
+            return FreeAnswers(q, np.zeros(0, dtype=bool), ())
         parts = []
         for first in range(0, len(q), TOGETHER):
             rows = np.arange(first, min(first + TOGETHER, len(q)))

@@ -73,6 +73,15 @@ class FreeAnswers:
     free: NDArray[np.bool_]
     reports: tuple[CollisionReport | None, ...]
 
+    def with_free(self, rows: NDArray[np.intp], others: FreeAnswers) -> FreeAnswers:
+        """With the free answers that others are to some of the targets."""
+        taken = rows[others.free]
+        q, free, reports = self.q.copy(), self.free.copy(), list(self.reports)
+        q[taken], free[taken] = others.q[others.free], True
+        for row in taken.tolist():
+            reports[row] = None
+        return FreeAnswers(q, free, tuple(reports))
+
 
 class FreeSearch:
     """The search for some targets.
