@@ -50,7 +50,15 @@ def choose(arguments: argparse.Namespace) -> Answer:
     check_outputs([("--out", out)], inputs=[path])
     solver = Solver(robot, tolerance=the_tolerance(arguments), scene=the_scene(arguments))
     with located(str(path)):
-        ranking = solver.choose(grasps, pose, q0, arguments.limit, arguments.prefer, arguments.seed)
+        ranking = solver.choose(
+            grasps,
+            pose,
+            q0,
+            arguments.limit,
+            arguments.prefer,
+            arguments.seed,
+            per_candidate=arguments.per_candidate,
+        )
     text = json.dumps(_ranked(ranking, grasps), indent=2, allow_nan=False) + "\n"
     write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
     report = _report(path.name, solver, ranking, grasps, out)

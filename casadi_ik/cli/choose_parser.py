@@ -124,6 +124,13 @@ def add_choose(commands: Any) -> None:
         "--limit", metavar="N", type=whole(1), default=10, help="answers at most (default: 10)"
     )
     parser.add_argument(
+        "--per-candidate",
+        metavar="N",
+        type=whole(1),
+        default=1,
+        help="answers of one candidate at most (default: 1)",
+    )
+    parser.add_argument(
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"
     )
     add_tolerances(parser)

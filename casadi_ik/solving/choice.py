@@ -18,13 +18,12 @@ from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import inverse, moved, one_pose
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.preference import preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.ranking import Choice, Ranking
 from casadi_ik.problem.solution import Solution
 from casadi_ik.problem.status import Status
-from casadi_ik.solving.alternatives.choosing import Answers, answers_of
+from casadi_ik.solving.alternatives.choosing import Answers, Look, answers_of
 from casadi_ik.solving.alternatives.distinct import checked_distance
 from casadi_ik.solving.alternatives.finder import APART
 from casadi_ik.solving.alternatives.swings import Preference
@@ -46,6 +45,7 @@ def choose(
     seed: int = 0,
     fixed: Mapping[str, float] | None = None,
     apart: float = APART,
+    per_candidate: int | None = 1,
 ) -> Ranking:
     """Rank answers to many grasps, see `Solver.choose`.
 
@@ -54,39 +54,47 @@ def choose(
         UnsupportedError: The method is not hand-first.
     """
     begin = time.perf_counter()
-    if not isinstance(limit, (int, np.integer)) or limit < 1:
-        raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
+    limit = _count(limit, "limit")
+    most = None if per_candidate is None else _count(per_candidate, "per_candidate")
     apart, start = checked_distance(apart), questions.start(q0)
     word = "own" if callable(prefer) else engine.preference(prefer, q0 is not None)
-    usual = preference(None, q0 is not None)
     pose = None if object_pose is None else one_pose(object_pose, "object_pose")
-    asked = list(_asked(questions, grasps, pose, fixed, usual))
+    asked = list(_asked(questions, grasps, pose, fixed))
     wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
     parts: list[tuple[NDArray[np.intp], Answers]] = []
-    answers, entries = None, list[Choice]()
-    for thorough in (False, True):
+
+    def look(candidates: NDArray[np.bool_], which: Look, near: bool = False) -> Answers:
+        """What all looks so far have come to, after one more at some candidates."""
         for rows, some in asked:
-            left = rows if answers is None else rows[answers.reasons[rows] != ""]
+            left = rows[candidates[rows]]
             if not len(left):
                 continue
             mine = some.rows(np.searchsorted(rows, left))
+            mine = replace(mine, picked=left, prefer="q0" if near else "limits")
             found = answers_of(
                 engine.kinds_of(mine).freer,
                 mine,
                 engine.around(mine),
+                start if near else engine.robot.home,
                 start,
                 wanted,
-                int(limit),
+                limit,
                 seed,
-                thorough,
+                which,
             )
+            if near:
+                found = replace(found, reasons=np.full(len(left), "", dtype=object))
             parts.append((left, found))
-        answers = Answers.joined(parts, len(grasps))
-        entries = _Ranked(engine, asked, answers, apart).best(int(limit))
-        if len(entries) >= limit:
-            break
+        return Answers.joined(parts, len(grasps))
+
+    # Neither what is preferred nor where the robot is decides which candidates have an answer.
+    answers = look(np.ones(len(grasps), dtype=bool), Look.QUICK)
+    if answers.answered.sum() < min(limit, len(grasps)):
+        answers = look(~answers.answered, Look.THOROUGH)
+    if q0 is not None:
+        answers = look(answers.answered, Look.OWN, near=True)
+    entries = _Ranked(engine, asked, answers, apart).best(limit, most)
     seconds = (time.perf_counter() - begin) / len(grasps)
-    assert answers is not None
     reasons = [reason for reason in answers.reasons.tolist() if reason]
     return Ranking(
         entries=tuple(
@@ -97,6 +105,17 @@ def choose(
         failures=dict(Counter(reasons).most_common()),
         prefer=word,
     )
+
+
+def _count(value: int, name: str) -> int:
+    """A number of answers.
+
+    Raises:
+        InputError: It is none.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise InputError(f"{name}: found {value!r}, expected an integer >= 1")
+    return int(value)
 
 
 def _own(prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand) -> Callable[[Array], Array]:
@@ -118,7 +137,6 @@ def _asked(
     grasps: Sequence[Grasp],
     pose: Array | None,
     fixed: Mapping[str, float] | None,
-    prefer: str,
 ) -> Iterator[tuple[NDArray[np.intp], Problems]]:
     """Candidates with the same fingers, tolerances, kinds and object, in the base frame."""
     if not len(grasps):
@@ -133,7 +151,7 @@ def _asked(
     for numbers in groups.values():
         some = [grasps[number] for number in numbers]
         rows = np.array(numbers, dtype=np.intp)
-        problems = _placed(questions.of_grasps(some, fixed, prefer), some, pose)
+        problems = _placed(questions.of_grasps(some, fixed), some, pose)
         for _, of_kinds, alike in by_kinds(problems):
             yield (rows if of_kinds is None else rows[of_kinds]), alike
 
@@ -173,26 +191,35 @@ class _Ranked:
     ) -> None:
         self.engine, self.asked, self.answers, self.apart = engine, asked, answers, apart
 
-    def best(self, limit: int) -> list[Choice]:
-        """The best that differ from each other."""
+    def best(self, limit: int, most: int | None) -> list[Choice]:
+        """The best that differ from each other, at most so many of a candidate."""
         answers, robot = self.answers, self.engine.robot
         # Of equals that whose arm is farther from its limits, then the first candidate.
         left = np.lexsort((answers.owner, -answers.margin, -answers.score))
         parts = answers.q / (robot.upper - robot.lower)
+        places = np.full(len(answers.reasons), limit if most is None else most)
         found: list[Choice] = []
+
+        def others(rows: NDArray[np.intp], row: int, places: NDArray[np.intp]) -> NDArray[np.intp]:
+            off = np.abs(parts[rows] - parts[row]).max(axis=1)
+            room = places[answers.owner[rows]] > 0
+            return rows[(off >= self.apart) & (off > 0) & room]
+
         while len(left) and len(found) < limit:
-            chosen: list[int] = []
-            while len(left) and len(found) + len(chosen) < limit:
-                row = int(left[0])
+            chosen, rest, free = list[int](), left, places.copy()
+            while len(rest) and len(found) + len(chosen) < limit:
+                row = int(rest[0])
                 chosen.append(row)
-                off = np.abs(parts[left] - parts[row]).max(axis=1)
-                left = left[(off >= self.apart) & (off > 0)]
+                free[answers.owner[row]] -= 1
+                rest = others(rest, row, free)
             solutions = self._judged(np.array(chosen))
-            found += [
-                Choice(int(answers.owner[row]), solutions[row], float(answers.score[row]))
-                for row in chosen
-                if solutions[row].success
-            ]
+            left = left[~np.isin(left, chosen)]
+            for row in chosen:
+                if solutions[row].success:
+                    owner = int(answers.owner[row])
+                    found.append(Choice(owner, solutions[row], float(answers.score[row])))
+                    places[owner] -= 1
+                    left = others(left, row, places)
         return found
 
     def _judged(self, rows: NDArray[np.intp]) -> dict[int, Solution]:

@@ -126,11 +126,13 @@ class ChoosingSolver:
         seed: int = 0,
         fixed: Mapping[str, float] | None = None,
         apart: float = APART,
+        per_candidate: int | None = 1,
     ) -> Ranking:
         """Of many grasps find those that are best to take, and how.
 
         Of every candidate the different hands that meet its contacts are looked at, with every
         branch of the arm all around its swivel; free of collision where the solver has a scene.
+        Which candidates have an answer depends neither on `q0` nor on `prefer`: they order.
 
         Args:
             grasps: The candidates.
@@ -140,11 +142,13 @@ class ChoosingSolver:
             limit: How many answers at most.
             prefer: What comes first: "q0", "limits", "manipulability", "clearance" as for `solve`,
                 or a function of the robot and configurations (m, n) that gives their scores (m,),
-                higher is better, -inf for never. None: "q0" if q0 is given, else "limits".
+                higher is better, -inf for never. None: "q0" if q0 is given, else "limits". What is
+                given (a palm's hand, `fixed`) is no part of "limits".
             seed: As for `solve`.
             fixed: As for `solve`.
             apart: How different answers are, of one candidate or several: of any two at least one
                 actuator differs by this part of its range, 0 to 1. 0: all that are not the same.
+            per_candidate: How many answers of one candidate at most; None: any number.
 
         Returns:
             The answers, best first, and why candidates have none.
@@ -155,9 +159,9 @@ class ChoosingSolver:
             UnsupportedError: The method is not hand-first.
 
         Example:
-            >>> ranked = solver.choose([grasp, ik.load_grasp("apple")], limit=3, prefer="limits")
+            >>> ranked = solver.choose([grasp, ik.load_grasp("apple")], prefer="limits")
             >>> len(ranked), ranked.answered, ranked[0].score >= ranked[1].score
-            (3, 2, True)
+            (2, 2, True)
         """
         return choose(
             self._engine,
@@ -170,4 +174,5 @@ class ChoosingSolver:
             seed,
             fixed,
             apart,
+            per_candidate,
         )

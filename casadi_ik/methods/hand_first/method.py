@@ -120,11 +120,12 @@ class HandFirstMethod(LoopedMethod):
     ) -> Start:
         """Start with the hand postures of the round; what was found before is kept."""
         states, parameters = self._round(problems, q0, number, last if number else None)
-        if last is not None:
-            layout = self.step.layouts.state
-            for name in CARRIED if number else COUNTED:
-                states[:, layout.slice(name)] = last[:, layout.slice(name)]
-        if last is not None and number:
+        if last is None:
+            return states, parameters
+        layout = self.step.layouts.state
+        for name in CARRIED if number else COUNTED:
+            states[:, layout.slice(name)] = last[:, layout.slice(name)]
+        if number:
             earlier = layout.slice("earlier")
             states[:, earlier] = last[:, earlier] + self.options.candidates
         return states, parameters

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,20 @@ CLOSER = 8
 """So many times as many answers as are wanted are looked at closer."""
 
 
+class Look(Enum):
+    """Which hands of a candidate are looked at.
+
+    Attributes:
+        QUICK: Those that one round leads to.
+        THOROUGH: All that a single grasp would get, after `ROUNDS` of rounds.
+        OWN: The one that a solve comes to.
+    """
+
+    QUICK = auto()
+    THOROUGH = auto()
+    OWN = auto()
+
+
 @dataclass(frozen=True, eq=False)
 class Answers:
     """Answers to some of k candidates.
@@ -44,6 +59,11 @@ class Answers:
     score: Array
     margin: Array
     reasons: NDArray[np.object_]
+
+    @property
+    def answered(self) -> Bools:
+        """(k,) which candidates have one."""
+        return np.asarray(self.reasons == "", dtype=bool)
 
     @classmethod
     def joined(cls, parts: list[tuple[NDArray[np.intp], Answers]], count: int) -> Answers:
@@ -69,11 +89,12 @@ def answers_of(
     finder: FreeFinder,
     problems: Problems,
     around: Surroundings | None,
+    begin: Array,
     start: Array,
     prefer: Preference,
     limit: int,
     seed: int,
-    thorough: bool,
+    look: Look,
 ) -> Answers:
     """Answers to k candidates.
 
@@ -81,18 +102,19 @@ def answers_of(
         finder: Of the robot, for the kinds of their contacts.
         problems: The candidates.
         around: What answers must not touch; None: nothing is checked.
-        start: (n,) where the robot is.
+        begin: (n,) where hands are looked for from.
+        start: (n,) where the robot is; with `prefer` it says which arms are better.
         prefer: What is preferred.
         limit: How many answers are wanted.
         seed: Of random arms.
-        thorough: Whether to look at `ROUNDS` of hands, instead of at the first.
+        look: Which hands are looked at.
     """
     parts = []
     for first in range(0, len(problems), TOGETHER):
         rows = np.arange(first, min(first + TOGETHER, len(problems)))
         nearby = None if around is None else around.rows(rows)
-        part = _Part(finder, problems.rows(rows), nearby, start, prefer, limit)
-        parts.append((rows, part.run(seed, thorough)))
+        part = _Part(finder, problems.rows(rows), nearby, begin, start, prefer, limit)
+        parts.append((rows, part.run(seed, look)))
     return Answers.joined(parts, len(problems))
 
 
@@ -104,24 +126,29 @@ class _Part:
         finder: FreeFinder,
         problems: Problems,
         around: Surroundings | None,
+        begin: Array,
         start: Array,
         prefer: Preference,
         limit: int,
     ) -> None:
         self.finder, self.problems, self.around = finder, problems, around
         self.prefer, self.limit, self.trials = prefer, limit, finder.trials
-        self.starts = np.tile(start, (len(problems), 1))
+        self.begin, self.starts = (np.tile(q, (len(problems), 1)) for q in (begin, start))
         self.limits = self.trials.limits(problems)
+        fixed = np.full(len(begin), np.nan) if problems.fixed is None else problems.fixed
+        # What is given has no part in what is better.
+        self.columns = np.flatnonzero(np.isnan(np.atleast_2d(fixed)).any(axis=0)).tolist()
 
-    def run(self, seed: int, thorough: bool) -> Answers:
+    def run(self, seed: int, look: Look) -> Answers:
         """Their answers."""
         method = self.trials.method
-        rounds = ROUNDS if thorough else 1
-        outcome = method.run(self.problems, self.starts, seed, False, rounds)
+        rounds = ROUNDS if look is Look.THOROUGH else 1
+        outcome = method.run(self.problems, self.begin, seed, False, rounds)
         good = self.trials.solved(self.problems, outcome.q, self.problems.enforce_limits)
         rows = np.flatnonzero(good)
-        q, owner, pairs = self._answers(*self._hands(outcome.q, rows))
-        if thorough and self.around is not None:
+        hands = outcome.q[rows], rows
+        q, owner, pairs = self._answers(*(hands if look is Look.OWN else self._hands(*hands)))
+        if look is Look.THOROUGH and self.around is not None:
             left = rows[~np.isin(rows, owner)]
             more, whose = self._further(outcome.q, left, seed)
             q, owner = np.concatenate([q, more]), np.concatenate([owner, whose])
@@ -137,21 +164,21 @@ class _Part:
         """Different hands that meet the contacts of candidates, with an arm for each.
 
         Args:
-            q: (k, n) first answers.
-            rows: Candidates that have one.
+            q: (m, n) first answers.
+            rows: (m,) the candidates that have them.
         """
         if not len(rows) or self.problems.palms is not None:
-            return q[rows], rows  # a hand that is given has no other posture
+            return q, rows  # a hand that is given has no other posture
         some = self.problems.rows(rows)
         postures = self.trials.method.postures(some, 0)
         count, n = postures.shape[1], q.shape[1]
         owner = np.repeat(rows, count)
         asked = self.problems.rows(owner)
-        starts = self.limits.of(owner).clip(self.starts[owner])
+        starts = self.limits.of(owner).clip(self.begin[owner])
         flat = postures.reshape(-1, postures.shape[2])
         ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat))
         ends[~self.trials.solved(asked, ends, asked.enforce_limits)] = np.nan
-        every = np.concatenate([q[rows][:, None], ends.reshape(len(rows), count, n)], axis=1)
+        every = np.concatenate([q[:, None], ends.reshape(len(rows), count, n)], axis=1)
         hand = self.finder.hand
         robot = self.finder.robot
         parts = every[:, :, hand] / (robot.upper - robot.lower)[hand]
@@ -222,7 +249,7 @@ class _Part:
             return q[rows], rows
         around = self.around.rows(rows)
         some = self.problems.rows(rows)
-        found = self.finder.find(some, around, q[rows], self.starts[rows], seed)
+        found = self.finder.find(some, around, q[rows], self.begin[rows], seed)
         return found.q[found.free], rows[found.free]
 
     def _score(self, q: Array, owner: NDArray[np.intp]) -> Array:
@@ -231,4 +258,4 @@ class _Part:
         room = np.zeros(len(q))
         if self.prefer == CLEARANCE and self.around is not None:
             room = self.around.rows(owner).check(q).room
-        return self.finder.score(q, self.starts[owner], self.prefer, room)
+        return self.finder.score(q, self.starts[owner], self.prefer, room, self.columns)

@@ -135,6 +135,21 @@ class FreeFinder:
         """(m,) smallest distance of the arm from its limits, as a part of half its range."""
         return self._finder.arm_margins(q)
 
-    def score(self, q: Array, starts: Array, prefer: Preference, room: Array) -> Array:
-        """(m,) what is preferred, higher is better; `room` (m,) for "clearance"."""
-        return score_of(self._finder, q, starts, prefer, room)
+    def score(
+        self,
+        q: Array,
+        starts: Array,
+        prefer: Preference,
+        room: Array,
+        columns: list[int] | None = None,
+    ) -> Array:
+        """(m,) what is preferred, higher is better.
+
+        Args:
+            q: (m, n) configurations.
+            starts: (m, n) where the robot is.
+            prefer: What is preferred.
+            room: (m,) for "clearance".
+            columns: Motors whose distance from the limits counts; None: all.
+        """
+        return score_of(self._finder, q, starts, prefer, room, columns)

@@ -324,11 +324,16 @@ def _shifted(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -
 
 
 def score_of(
-    finder: AlternativeFinder, q: Array, starts: Array, prefer: Preference, room: Array
+    finder: AlternativeFinder,
+    q: Array,
+    starts: Array,
+    prefer: Preference,
+    room: Array,
+    columns: list[int] | None = None,
 ) -> Array:
-    """(m,) what is preferred of configurations, higher is better; `room` (m,) for "clearance"."""
+    """(m,) what is preferred of configurations, see `FreeFinder.score`."""
     if callable(prefer):
         return np.asarray(prefer(q), dtype=float)
     if prefer == CLEARANCE:
         return room
-    return finder.score(q, starts, prefer)
+    return finder.score(q, starts, prefer, columns)

@@ -1,0 +1,126 @@
+"""A preference, and where the robot is, order answers: they never decide whether there is one."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import casadi_ik as ik
+
+ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+robotiq_3f")
+SCENES = {"none": None, "itself": ik.Scene(), "table": ik.load_scene("table")}
+COUNT = 8
+
+
+@cache
+def solver_of(robot: str, scene: str) -> ik.Solver:
+    return ik.Solver(ik.load_robot(robot), scene=SCENES[scene])
+
+
+def preferences(solver):
+    known = (None, "q0", "limits", "manipulability")
+    return known if solver.scene is None else (*known, "clearance")
+
+
+def starts(robot, rng):
+    return {
+        "none": None,
+        "home": robot.home,
+        "random": robot.random(rng, 1)[0],
+        "extreme": np.where(rng.random(len(robot.lower)) < 0.5, robot.lower, robot.upper),
+    }
+
+
+def grasps_of(robot, points, normals):
+    return [
+        ik.Grasp({name: ik.Contact(p[i], n[i]) for i, name in enumerate(robot.fingers)})
+        for p, n in zip(points, normals, strict=True)
+    ]
+
+
+def targets(solver, rng):
+    """Of random postures, whether they are free or not, some of them out of reach; the postures."""
+    robot = solver.robot
+    q = robot.random(rng, COUNT)
+    points, normals = robot.contacts(q)
+    points[-2:] += rng.normal(0, 0.2, (2, 1, 3))
+    return points, normals, q
+
+
+some = settings(max_examples=6, derandomize=True, deadline=None)
+asked = given(
+    seed=st.integers(0, 2**32 - 1), robot=st.sampled_from(ROBOTS), scene=st.sampled_from([*SCENES])
+)
+
+
+@some
+@asked
+def test_solved_is_the_same_whatever_is_preferred(seed, robot, scene):
+    solver, rng = solver_of(robot, scene), np.random.default_rng(seed)
+    points, normals, truth = targets(solver, rng)
+    every = starts(solver.robot, rng)
+    usual = solver.solve_batch(points, normals)
+    grasps = grasps_of(solver.robot, points, normals)
+    for prefer, (name, q0) in product(preferences(solver), every.items()):
+        batch = solver.solve_batch(points, normals, q0=q0, prefer=prefer)
+        assert batch.success.tolist() == usual.success.tolist(), (prefer, name)
+        side = solver.solve_batch(points, normals, q0=q0, prefer=prefer, jobs=2)
+        assert side.success.tolist() == usual.success.tolist(), (prefer, name)
+    for prefer, row in product(preferences(solver), range(0, COUNT, 3)):
+        q0 = every["random"]
+        alone = solver.solve(grasps[row], q0=q0, prefer=prefer, diagnose=False)
+        assert alone.success == usual.success[row], prefer
+    # A start that is an answer says more than the target does: it may add, and never costs one.
+    told = solver.solve_batch(points, normals, q0=truth)
+    assert not (usual.success & ~told.success).any()
+    assert told.success[:-2].sum() >= usual.success[:-2].sum()
+
+
+@some
+@asked
+def test_choose_answers_as_many_candidates(seed, robot, scene):
+    solver, rng = solver_of(robot, scene), np.random.default_rng(seed)
+    points, normals, _ = targets(solver, rng)
+    grasps = grasps_of(solver.robot, points, normals)
+    for limit in (3, COUNT):
+        usual = solver.choose(grasps, limit=limit)
+        for prefer, q0 in product(preferences(solver), starts(solver.robot, rng).values()):
+            ranked = solver.choose(grasps, q0=q0, prefer=prefer, limit=limit)
+            assert ranked.answered == usual.answered, (prefer, q0)
+            assert ranked.failures == usual.failures, (prefer, q0)
+            assert len({one.candidate for one in ranked}) == len(ranked)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_what_cannot_be_reached_near_q0_is_looked_for_elsewhere(robot):
+    """Near what the tolerances allow other starts end elsewhere: some of these were lost."""
+    solver, rng = solver_of(robot, "none"), np.random.default_rng(7)
+    points, normals = solver.robot.contacts(solver.robot.random(rng, 400))
+    points += rng.normal(0, 0.004, points.shape)
+    normals += rng.normal(0, 0.04, normals.shape)
+    usual = solver.solve_batch(points, normals).success
+    assert 50 < usual.sum() < 400
+    fast = solver.fast()
+    for q0 in starts(solver.robot, rng).values():
+        near = solver.solve_batch(points, normals, q0=q0)
+        assert not (usual & ~near.success).any()
+        for row in np.flatnonzero(~usual)[:20]:
+            q, status = fast(points[row], normals[row], q0)
+            assert status == near.status[row]
+            np.testing.assert_array_equal(q, near.q[row])
+
+
+@pytest.mark.parametrize("grasp", ["shadow_cup", "leap_mustard_bottle"])
+@pytest.mark.parametrize("prefer", ["q0", "limits", "manipulability", "clearance"])
+def test_a_shipped_grasp_on_the_table(grasp, prefer):
+    """With "q0" it was COLLISION: one hand was looked at, again and again."""
+    asked = ik.load_grasp(grasp)
+    solution = solver_of(asked.robot, "table").solve(asked, prefer=prefer)
+    assert solution.success, solution.collision
+    assert solution.clearance is not None
+    assert solution.clearance >= 0
