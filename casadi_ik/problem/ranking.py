@@ -18,8 +18,9 @@ class Choice:
         solution: How to take it.
         score: What it was ranked by, higher is better: smallest distance of an actuator that is
             not given from its limits as a part of half its range ("limits"); minus the distance
-            from q0, every actuator as a part of its range ("q0"); of the arm [m^3] ("manipulability"); room
-            beyond the margins of the scene [m] ("clearance"); or what the given function says.
+            from q0, every actuator as a part of its range ("q0"); of the arm [m^3]
+            ("manipulability"); room beyond the margins of the scene [m] ("clearance"); or what the
+            given function says.
 
     Example:
         >>> best = solver.choose([grasp], prefer="limits")[0]

@@ -172,7 +172,9 @@ def test_of_a_given_hand_the_arm_alone_is_ranked(solver, robot, rng):
     q = robot.random(rng, 30)
     q[:, hand] = np.where(rng.random(q[:, hand].shape) < 0.3, robot.upper[hand], q[:, hand])
     grasps = [
-        ik.Grasp(palm=robot.palm(one), posture=dict(zip(robot.actuators[hand], one[hand])))
+        ik.Grasp(
+            palm=robot.palm(one), posture=dict(zip(robot.actuators[hand], one[hand], strict=True))
+        )
         for one in q
     ]
     ranked = solver.choose(grasps, prefer="limits", limit=5)
