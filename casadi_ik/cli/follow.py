@@ -23,10 +23,12 @@ from casadi_ik.files.limits import RAISED, limit
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.following import FollowStatus
 from casadi_ik.motion.motion import Motion
-from casadi_ik.motion.retarget import Retarget, Retargeter, load_retarget, usual_retarget
+from casadi_ik.motion.retarget import Retargeter, load_retarget, usual_retarget
 
 FRAMES_AT_ONCE = 1024
 """Cycles whose targets are in memory at once."""
+
+WORLD_LANDMARKS = "stays: the keypoints' origin is in the hand (MediaPipe's world landmarks)"
 
 MOST_CYCLES = 4_000_000
 """Of a motion: an hour at a kilohertz."""
@@ -62,10 +64,9 @@ def follow(arguments: argparse.Namespace) -> Answer:
     error = np.full((len(q), len(robot.fingers)), np.nan)
     where = "--retarget" if arguments.retarget is None else str(arguments.retarget)
     with located(where):
-        config = config or usual_retarget(robot)
-        retargeter = Retargeter(config, robot, start)
+        retargeter = Retargeter(config or usual_retarget(robot), robot, start)
     begin = time.perf_counter()
-    for i, answer in enumerate(_followed(follower, frames, times, config, retargeter), start=1):
+    for i, answer in enumerate(_followed(path, follower, frames, times, retargeter), start=1):
         state = follower.state
         q[i], status[i], error[i] = answer, state.status.value, state.position_error
     seconds = (time.perf_counter() - begin) / max(len(times), 1)
@@ -73,7 +74,8 @@ def follow(arguments: argparse.Namespace) -> Answer:
     motion = Motion.of_cycles(robot, arguments.period, q, notes)
     write_output(out, "--out", motion.write_to)
     followed = int((status[1:] == FollowStatus.FOLLOWING.value).sum())
-    report = _report(path, out, follower, motion, status[1:], error[1:], seconds)
+    stays = retargeter.in_hand and retargeter.config.travel is None
+    report = _report(path, out, follower, motion, status[1:], error[1:], seconds, stays)
     return Answer(report, Exit.DONE if followed == len(times) else Exit.NOT_SOLVED)
 
 
@@ -88,10 +90,10 @@ def _start(solver: Solver, frames: Frames) -> Array:
 
 
 def _followed(
-    follower: Follower, frames: Frames, times: Array, config: Retarget, retargeter: Retargeter
+    path: Path, follower: Follower, frames: Frames, times: Array, retargeter: Retargeter
 ) -> Iterator[Array]:
     """Where the motors are at the end of each cycle."""
-    weight = config.wrist_weight, config.wrist_weight
+    weight = (retargeter.config.wrist_weight,) * 2
     for first in range(0, len(times), FRAMES_AT_ONCE):
         now = times[first : first + FRAMES_AT_ONCE]
         if frames.keypoints is None:
@@ -99,7 +101,8 @@ def _followed(
             yield from (follower(*target) for target in zip(*both, strict=True))
             continue
         for keypoints in frames.at(now, frames.keypoints):
-            wanted = retargeter(keypoints)
+            with located(f"{path}"):
+                wanted = retargeter(keypoints, follower.period)
             palm = wanted.palm if follower.moves_palm else None
             yield follower(wanted.points, palm=palm, palm_weight=weight)
 
@@ -112,11 +115,13 @@ def _report(
     status: np.ndarray,
     error: Array,
     seconds: float,
+    in_hand: bool,
 ) -> Group:
     counts = {one.value: int((status == one.value).sum()) for one in FollowStatus}
     step = np.abs(motion.velocity) / follower.velocity
     pairs = {
         "robot": motion.robot.name,
+        "wrist": WORLD_LANDMARKS if in_hand else "",
         "cycles": f"{len(status)} of {1e3 * follower.period:g} ms, {1e6 * seconds:.0f} us each",
         "how they went": ", ".join(f"{name} {count}" for name, count in counts.items() if count),
         "fastest motor": f"{100 * step.max():.0f} % of its velocity limit",

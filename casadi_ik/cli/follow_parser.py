@@ -16,7 +16,8 @@ example:
   casadi-ik follow keypoints.npz --robot panda+allegro_right --out motion.mcap
 
 KEYPOINTS.npz holds, for k frames, either
-  keypoints (k, 21, 3) of a person's hand [m], in any frame that stays the same
+  keypoints (k, 21, 3) of a person's hand [m], in any frame that stays the same; of those whose
+            origin is in the hand (MediaPipe's world landmarks) the robot's wrist stays
 or, for the f fingers in the robot's order (`casadi-ik robots`),
   points    (k, f, 3) contact points [m], robot's base frame; NaN marks a free finger
   normals   (k, f, 3) if wanted: outward pad normals; NaN marks a free one

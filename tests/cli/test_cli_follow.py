@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import POSTURE, Command
+from made_up_hand import hand
 from mcap_ros2.reader import read_ros2_messages
 
 import casadi_ik as ik
@@ -83,6 +84,36 @@ def test_keypoints_and_a_bad_frame(run: Command, tmp_path: Path) -> None:
     assert "holding" in done.out
     q = np.load(out)["q"]
     assert np.isfinite(q).all()
+
+
+def test_world_landmarks_are_said_and_the_period_is_not_smoothed(
+    run: Command, tmp_path: Path, robot: ik.ArmHand
+) -> None:
+    frame = hand(0.5, np.zeros(3))
+    way = np.linspace(0.5, 0.9, 31)
+    seen = np.stack([hand(bend, np.zeros(3)) - frame.mean(axis=0) for bend in way])
+    slow = RETARGET.replace("0.5", "0.05")
+    (tmp_path / "hand.yaml").write_text("robot: kuka_lwr_barrett\n" + slow)
+    ends = []
+    for period in (0.002, 0.02):
+        frames, out = write(tmp_path, keypoints=seen), tmp_path / "motion.npz"
+        words = ("--retarget", tmp_path / "hand.yaml", "--period", period, "--out", out)
+        done = run("follow", frames, *words)
+        assert done.err == ""
+        assert "MediaPipe's world landmarks" in " ".join(done.out.split())
+        found = np.load(out)
+        ends.append(robot.contacts(found["q"][np.searchsorted(found["times"], 0.9)])[0])
+    # As smooth at a fast cycle as at a slow one.
+    assert np.linalg.norm(ends[0] - ends[1], axis=1).max() < 2e-3
+
+
+def test_image_landmarks_are_one_line(run: Command, tmp_path: Path) -> None:
+    seen = np.tile(3.0 * hand(0.5, np.zeros(3)) + [0.3, 0.5, 1e-7], (3, 1, 1))
+    frames, out = write(tmp_path, keypoints=seen), tmp_path / "motion.mcap"
+    done = run("follow", frames, "--robot", "kuka_lwr_barrett", "--out", out)
+    assert "frames.npz: keypoints: found places in a picture" in done.error
+    assert "take its world landmarks" in done.error
+    assert sorted(tmp_path.iterdir()) == [frames]
 
 
 @pytest.mark.parametrize(

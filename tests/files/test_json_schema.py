@@ -72,7 +72,7 @@ EXAMPLES: dict[str, Any] = {
         "grasped": "cup",
         "margins": [{"links": ["a", "b"], "margin": "5 mm"}],
     },
-    "retarget": {"fingers": {"t": 4}, "rpy": [0, 0, "90 deg"], "low_pass": 0.3},
+    "retarget": {"fingers": {"t": 4}, "rpy": [0, 0, "90 deg"], "low_pass": 0.3, "mirror": True},
 }
 
 

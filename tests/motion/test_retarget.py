@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from made_up_hand import hand, like_robot
+from msgspec.structs import replace
 
 import casadi_ik as ik
 from casadi_ik.errors import DescriptionError, InputError
@@ -77,7 +78,7 @@ def test_motions_are_scaled_and_turned(robot):
     assert np.arccos((np.trace(relative) - 1) / 2) == pytest.approx(0.3)
 
 
-def test_without_a_frame_and_a_size_the_first_frame_tells_them(robot):
+def test_without_a_frame_the_first_one_tells_it(robot):
     """Fingertips of a person who holds the hand as the robot does are the robot's own."""
     points, _ = robot.contacts(robot.home)
     palm = robot.palm(robot.home)
@@ -85,8 +86,119 @@ def test_without_a_frame_and_a_size_the_first_frame_tells_them(robot):
     turn, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
     frame[[4, 8, 12]] = (points - palm[:3, 3]) @ turn / 1.7 + frame[0]
-    wanted = Retargeter(usual_retarget(robot), robot)(frame)
+    config = replace(usual_retarget(robot), scaling=1.7)
+    wanted = Retargeter(config, robot)(frame)
     np.testing.assert_allclose(wanted.points, points, atol=1e-9)
+
+
+def spans(frame, wanted, robot, config):
+    """Thumb to index finger of a person and of a robot [m]."""
+    thumb, index = (name for name, key in config.fingers.items() if key in (4, 8))
+    tips = wanted.points[[robot.fingers.index(thumb), robot.fingers.index(index)]]
+    return np.linalg.norm(frame[4] - frame[8]), np.linalg.norm(tips[0] - tips[1])
+
+
+@pytest.mark.parametrize("name", ["panda+allegro_right", "kuka_lwr_barrett", "ur5e+robotiq_3f"])
+def test_sizes_are_those_of_open_hands(name):
+    """Neither the robot's posture nor the person's first one counts: a pinch is a pinch."""
+    robot = ik.load_robot(name)
+    config, place = usual_retarget(robot), np.array([0.3, 0.1, 0.6])
+    pinch = hand(0.9, place)
+    pinch[4] = pinch[8] + [0.0, 0.0, -0.02]
+    ratios = []
+    for bend in (0.0, 0.4, 0.9):
+        retargeter = Retargeter(config, robot)
+        retargeter(hand(bend, place))
+        person, own = spans(pinch, retargeter(pinch), robot, config)
+        ratios.append(own / person)
+    assert person == pytest.approx(0.02)
+    assert 0.85 < ratios[0] < 1.15
+    np.testing.assert_allclose(ratios, ratios[0], rtol=1e-9)
+    # Where the joints between are not seen, the first frame's fingers are taken to be straight.
+    half_seen = hand(0.0, place)
+    half_seen[[2, 6, 10, 14, 18]] = np.nan
+    retargeter = Retargeter(config, robot)
+    retargeter(half_seen)
+    person, own = spans(pinch, retargeter(pinch), robot, config)
+    assert own / person == pytest.approx(ratios[0], rel=0.25)
+
+
+def seen_by_mediapipe(bend, wrist):
+    """World landmarks of a hand: metres about its own middle."""
+    frame = hand(bend, wrist)
+    return frame - frame.mean(axis=0) + [0.004, -0.006, 0.002]
+
+
+def test_of_world_landmarks_the_wrist_stays(robot):
+    config = usual_retarget(robot)
+    home = robot.palm(robot.home)[:3, 3]
+    ways = [(bend, np.array([0.2 * bend, 0.1, 0.5])) for bend in (0.1, 0.5, 0.9)]
+    retargeter = Retargeter(config, robot)
+    for bend, place in ways:
+        wanted = retargeter(seen_by_mediapipe(bend, place))
+        np.testing.assert_allclose(wanted.palm[:3, 3], home, atol=1e-12)
+    assert retargeter.in_hand
+    metric = Retargeter(config, robot)
+    for bend, place in ways:
+        goes = metric(hand(bend, place))
+    # The fingers are where they are of a hand whose wrist goes.
+    offsets = [one.points - one.palm[:3, 3] for one in (wanted, goes)]
+    np.testing.assert_allclose(*offsets, atol=1e-9)
+    assert np.linalg.norm(goes.palm[:3, 3] - home) > 0.1
+    assert not metric.in_hand
+    # Who says how far the wrist goes is believed.
+    told = Retargeter(replace(config, travel=1.0), robot)
+    moved = [told(seen_by_mediapipe(*way)).palm[:3, 3] for way in ways]
+    assert np.linalg.norm(moved[-1] - moved[0]) > 0.005
+
+
+@pytest.mark.parametrize("size", [0.35, 0.1])
+def test_image_landmarks_are_refused_in_words(robot, size):
+    """Parts of the picture's width and height, depths from the wrist; fingers may be beyond it."""
+    frame = hand(0.3, np.zeros(3)) * size / 0.09 + [0.4, 0.5, 3e-7]
+    with pytest.raises(InputError, match=r"image landmarks.*expected metres: take its world landm"):
+        Retargeter(usual_retarget(robot), robot)(frame)
+    pixels = 1800 * (hand(0.3, np.zeros(3)) + 0.2)
+    with pytest.raises(InputError, match=r"a palm 163 m long, expected metres \(pixels, or mm\?\)"):
+        Retargeter(usual_retarget(robot), robot)(pixels)
+
+
+def test_a_left_hand_moves_a_right_robot_hand(robot):
+    """Its fingers come out as a right hand's, its wrist goes and turns as it does."""
+    config = replace(usual_retarget(robot), rpy=(0.0, 0.0, 0.0))
+    right, left = Retargeter(config, robot), Retargeter(replace(config, mirror=True), robot)
+    plain = Retargeter(config, robot)
+    for i, bend in enumerate((0.5, 0.3, 0.7)):
+        place, turn = np.array([0.3, 0.1 * i, 0.5 + 0.05 * i]), 0.3 * i
+        c, s = np.cos(turn), np.sin(turn)
+        other = hand(bend, np.zeros(3)) * [1.0, -1.0, 1.0]
+        seen = other @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + place
+        expected, wanted = right(hand(bend, place, turn)), left(seen)
+        np.testing.assert_allclose(wanted.palm, expected.palm, atol=1e-9)
+        tips, own = (one.points - one.palm[:3, 3] for one in (expected, wanted))
+        np.testing.assert_allclose(own @ own.T, tips @ tips.T, atol=1e-9)
+        # Which way round thumb, index and middle finger stand.
+        assert np.linalg.det(own) == pytest.approx(np.linalg.det(tips))
+        flipped = plain(seen)
+        flat = flipped.points - flipped.palm[:3, 3]
+        assert np.linalg.det(flat) == pytest.approx(-np.linalg.det(tips))
+
+
+def test_smoothing_does_not_depend_on_how_often_it_is_called(robot):
+    """A frame at 30 Hz, looked at once or in every cycle of a follower at a kilohertz or two."""
+    config = replace(usual_retarget(robot), scaling=1.0, low_pass=0.3)
+    frames = [hand(0.4, np.array([0.05 * i, 0.0, 0.4])) for i in range(5)]
+    found = []
+    for cycles in (1, 33, 66):
+        retargeter = Retargeter(config, robot)
+        for frame in frames:
+            for _ in range(cycles):
+                wanted = retargeter(frame, elapsed=1 / 30 / cycles)
+        found.append(wanted.palm)
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-12)
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match=r"elapsed: found .*, expected seconds above 0"):
+            retargeter(frames[0], elapsed=bad)
 
 
 def test_low_pass(robot):
@@ -115,7 +227,8 @@ def test_arm_and_hand_follow_a_person(robot):
     """Who moves as the robot can is followed by fingertips and wrist, whatever the scale."""
     way = 0.15 * np.sin(np.linspace(0, np.pi, 120))[:, None] * np.sin(np.arange(14))
     path = robot.home + way
-    config = Retarget(fingers={"thumb": 4, "finger_2": 8, "finger_3": 12}, travel=1.7)
+    fingers = {"thumb": 4, "finger_2": 8, "finger_3": 12}
+    config = Retarget(fingers=fingers, scaling=1.7, travel=1.7)
     retargeter = Retargeter(config, robot)
     follower = ik.Solver(robot).follow(robot.home, 1 / 30)
     points, _ = robot.contacts(path)
