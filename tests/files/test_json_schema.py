@@ -178,7 +178,9 @@ def test_schema_and_reader_agree(kind: str) -> None:
     """Every key left out, misspelt, or with another value: both take it, or neither does."""
     some = [EXAMPLES[kind]] if kind in EXAMPLES else []
     if kind in FOLDERS:
-        smallest = min(shipped(kind), key=lambda path: path.stat().st_size)
+        # In which unit a sliding joint's limits are is a matter of its type.
+        turning = [path for path in shipped(kind) if "prismatic" not in path.read_text()]
+        smallest = min(turning, key=lambda path: path.stat().st_size)
         some.append(small(loaded(smallest)))
     taken = refused = 0
     for data in some:
