@@ -24,6 +24,7 @@ from casadi_ik.cli.question import (
 from casadi_ik.cli.report import clearance, duration, files, headline, table
 from casadi_ik.cli.solve import as_json
 from casadi_ik.datasets import Candidates, load_candidates
+from casadi_ik.grasps.load import grasp_data
 from casadi_ik.problem.ranking import Ranking
 
 
@@ -76,9 +77,12 @@ def _ranked(ranking: Ranking, grasps: Candidates) -> dict[str, Any]:
                 "candidate": one.candidate,
                 "name": grasps[one.candidate].name,
                 "score": one.score,
+                "grasp": grasp_data(one.grasp),
+                **({} if before is None else {"pregrasp": grasp_data(before)}),
                 "solution": as_json(one.solution),
             }
             for one in ranking
+            for before in (one.grasp.pregrasp,)
         ],
     }
 

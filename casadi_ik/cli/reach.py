@@ -19,8 +19,10 @@ from casadi_ik.cli.question import (
     the_start,
     the_tolerance,
 )
+from casadi_ik.cli.ranked_file import ChosenPosture, chosen_posture
 from casadi_ik.cli.report import fields, files, headline
-from casadi_ik.errors import MissingExtraError
+from casadi_ik.errors import InputError, MissingExtraError
+from casadi_ik.grasps import Grasp
 from casadi_ik.motion.motion import Motion
 from casadi_ik.motion.reaching import PARTS, Reach
 
@@ -31,8 +33,13 @@ def reach(arguments: argparse.Namespace) -> Answer:
     Raises:
         CasadiIKError: Bad input, or an output that cannot be written.
     """
-    path, grasp = the_grasp(arguments)
-    robot = the_robot(arguments.robot, path, grasp)
+    path, asked = _asked(arguments)
+    grasp = asked if isinstance(asked, Grasp) else asked.grasp
+    if isinstance(asked, Grasp):
+        robot = the_robot(arguments.robot, path, grasp)
+    else:
+        with located(f"{path}: solution.robot"):
+            robot = the_robot(arguments.robot or asked.robot)
     q0, out, animation = the_start(arguments, robot), arguments.out, arguments.animation
     outputs: list[tuple[str, Path | None]] = [("--out", out), ("--animation", animation)]
     check_outputs(outputs, inputs=[path])
@@ -43,12 +50,15 @@ def reach(arguments: argparse.Namespace) -> Answer:
     solver = Solver(robot, tolerance=the_tolerance(arguments), scene=the_scene(arguments))
     with located(str(path)):
         found = solver.reach(
-            grasp,
+            asked,
             q0,
             arguments.opening,
             arguments.distance,
             period=arguments.period,
             seed=arguments.seed,
+            direction=_direction(arguments),
+            lift=arguments.lift,
+            retreat=arguments.retreat,
         )
     name, motion = grasp.name or str(path), found.motion
     if motion is None:
@@ -59,6 +69,31 @@ def reach(arguments: argparse.Namespace) -> Answer:
         draw(motion, grasp, animation, solver.scene)
     written = [(option.lstrip("-"), file) for option, file in outputs if file is not None]
     return Answer(Group(*_report(name, found, motion), *files(written)), Exit.DONE)
+
+
+def _asked(arguments: argparse.Namespace) -> tuple[Path, Grasp | ChosenPosture]:
+    """What is to be reached, and its file.
+
+    Raises:
+        CasadiIKError: See `the_grasp` and `chosen_posture`, or an option that does not fit.
+    """
+    path = Path(arguments.grasp)
+    if path.suffix.lower() != ".json":
+        if arguments.rank is not None:
+            raise InputError("--rank: expected it with what `casadi-ik choose` writes (.json)")
+        return the_grasp(arguments)
+    if arguments.object_pose is not None:
+        raise InputError(f"--object-pose: {path} says where its objects are")
+    return path, chosen_posture(path, arguments.rank or 1)
+
+
+def _direction(arguments: argparse.Namespace) -> list[float] | None:
+    if arguments.direction is None:
+        return None
+    values = [value for group in arguments.direction for value in group]
+    if len(values) != 3 or not any(values):
+        raise InputError(f"--direction: found {values}, expected three numbers, not all zero")
+    return values
 
 
 def _report(name: str, found: Reach, motion: Motion) -> list[RenderableType]:

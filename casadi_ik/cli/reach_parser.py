@@ -15,9 +15,11 @@ _EXAMPLES = """\
 examples:
   casadi-ik reach cup --scene table --out motion.mcap --animation way.gif
   casadi-ik reach GRASP --robot panda+allegro_right --object-pose 0.5 0 0.1 0 0 1.57 --out way.csv
+  casadi-ik reach ranked.json --scene table --rank 2 --lift 0.1 --out motion.mcap
 
 The robot goes from --q0 to a pre-grasp with open fingers, comes straight on, and closes: from rest
-to rest, within the motors' velocities and accelerations; with --scene all of it is free.
+to rest, within the motors' velocities and accelerations; with --scene all of it is free. Of
+what `casadi-ik choose` wrote it goes to the very posture that was chosen.
 MOTION.mcap holds it as trajectory_msgs/JointTrajectory, and as joint states for viewers; a name
 that ends in .npz or .csv gives arrays or a table.
 
@@ -33,7 +35,15 @@ def add_reach(commands: Any) -> None:
         description="Go from where the robot is to a grasp.",
         epilog=_EXAMPLES,
     )
-    parser.add_argument("grasp", metavar="GRASP", help="a shipped name or a YAML file")
+    parser.add_argument(
+        "grasp", metavar="GRASP", help="a shipped name, a YAML file, or RANKED.json"
+    )
+    parser.add_argument(
+        "--rank",
+        metavar="N",
+        type=whole(1),
+        help="which of the answers of RANKED.json (default: 1, the best)",
+    )
     parser.add_argument("--robot", metavar="R", help="a shipped name or a YAML file")
     add_motion(parser)
     parser.add_argument(
@@ -57,6 +67,28 @@ def add_reach(commands: Any) -> None:
         type=positive,
         default=0.08,
         help="how far the hand comes straight (default: 0.08)",
+    )
+    parser.add_argument(
+        "--direction",
+        metavar="X",
+        type=numbers,
+        nargs="+",
+        help="the way the hand comes: x y z in the base frame, 0 0 -1 from above (default: from "
+        "where the grasp has its palm before it, if it says, else from the palm to the contacts)",
+    )
+    parser.add_argument(
+        "--lift",
+        metavar="M",
+        type=positive,
+        default=0.0,
+        help="how far the hand then goes up, with what it holds (default: 0)",
+    )
+    parser.add_argument(
+        "--retreat",
+        metavar="M",
+        type=positive,
+        default=0.0,
+        help="how far it goes back after that, against the way it came (default: 0)",
     )
     parser.add_argument(
         "--period",

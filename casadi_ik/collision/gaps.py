@@ -10,6 +10,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import signed
 from casadi_ik.collision.scene import Item
 from casadi_ik.collision.solids import Kind, Solid, spread
+from casadi_ik.grasps.pose import inverse
 
 POINTS = 256
 """Of a surface, besides its edges."""
@@ -21,33 +22,34 @@ HALVINGS = 50
 """By which a surface is found along a ray."""
 
 
-def gaps(item: Item, others: Sequence[Item], shifts: Array) -> Array:
-    """Distances (k,) [m] of a thing moved by shifts (k, 3) from others; negative: they overlap.
+def gaps(item: Item, others: Sequence[Item], poses: Array) -> Array:
+    """Distances (k,) [m] of a thing at poses (k, 4, 4) from others; negative: they overlap.
 
     Points of either's surface against the other: exact to a few millimetres.
 
     Args:
         item: What is moved.
         others: The rest.
-        shifts: [m], base frame.
+        poses: Of the item, base frame.
     """
-    least = np.full(len(shifts), np.inf)
-    for solid, pose in _placed([item]):
-        mine, wide = _skin(solid, pose)
+    least = np.full(len(poses), np.inf)
+    for solid, part in item.parts:
+        mine, wide = _skin(solid)
         for other, place in _placed(others):
-            if other.kind is not Kind.CLOUD:  # of a cloud the points tell all
-                least = np.minimum(least, _apart(mine, other, place, shifts) - wide)
-            if other.kind is not Kind.HALF_SPACE:
-                theirs, thick = _skin(other, place)
-                least = np.minimum(least, _apart(theirs, solid, pose, -shifts) - thick)
+            theirs, thick = _skin(other)
+            points = mine[: 0 if other.kind is Kind.CLOUD else None]  # its own points tell all
+            for row, pose in enumerate(poses @ part):
+                seen = inverse(place) @ pose
+                here = _apart(points, seen, other) - wide
+                least[row] = min(least[row], here, _apart(theirs, inverse(seen), solid) - thick)
     return least
 
 
-def _skin(solid: Solid, pose: Array) -> tuple[Array, float]:
-    """(k, 3) points that tell where a solid at a pose is, and how far it reaches beyond them."""
-    whole = solid.kind is Kind.CLOUD
-    points = solid.points if whole else surface(solid)
-    return points @ pose[:3, :3].T + pose[:3, 3], float(solid.size[0]) if whole else 0.0
+def _skin(solid: Solid) -> tuple[Array, float]:
+    """(k, 3) points that tell where a solid is, in its frame, and how far it reaches beyond them."""
+    if solid.kind is Kind.CLOUD:
+        return solid.points, float(solid.size[0])
+    return surface(solid), 0.0
 
 
 def surface(solid: Solid) -> Array:
@@ -92,9 +94,6 @@ def _placed(items: Iterable[Item]) -> Iterator[tuple[Solid, Array]]:
             yield solid, item.pose @ place
 
 
-def _apart(points: Array, solid: Solid, pose: Array, shifts: Array) -> Array:
-    """(k,) least distances of points (m, 3), moved by shifts, from a solid at a pose."""
-    if not len(points):
-        return np.full(len(shifts), np.inf)
-    local = (points + shifts[:, None] - pose[:3, 3]) @ pose[:3, :3]
-    return signed(solid, local)[0].min(axis=1)
+def _apart(points: Array, pose: Array, solid: Solid) -> float:
+    """Least distance of points (m, 3), which are at a pose in the frame of a solid, from it."""
+    return float(signed(solid, points @ pose[:3, :3].T + pose[:3, 3])[0].min(initial=np.inf))

@@ -14,13 +14,16 @@ from casadi_ik.collision.table import Table
 from casadi_ik.errors import DescriptionError
 
 
-def pair_table(model: CollisionModel, scene: Scene, touched_by: Sequence[str]) -> Table:
+def pair_table(
+    model: CollisionModel, scene: Scene, touched_by: Sequence[str], carried: bool = False
+) -> Table:
     """The pairs of a robot and a scene.
 
     Args:
         model: The robot's shapes.
         scene: What stands about it.
         touched_by: Links that may touch what is grasped.
+        carried: Whether what is grasped moves with the hand: then links that cannot move count.
 
     Raises:
         DescriptionError: The scene speaks of a link or a solid that is not there, or of one that
@@ -48,7 +51,7 @@ def pair_table(model: CollisionModel, scene: Scene, touched_by: Sequence[str]) -
             for i, link in enumerate(links):
                 may = frozenset((link, name)) in stated
                 # What cannot move is where it was put: no answer could change that.
-                fixed = model.is_fixed(link)
+                fixed = model.is_fixed(link) and not (carried and name == scene.grasped)
                 if may or fixed or (name == scene.grasped and link in touched_by):
                     continue
                 pairs.append((i, count + len(solids)))

@@ -5,15 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, InputError
-from casadi_ik.files.reading import Frame, Point, Struct, Vector, frame_matrix, read
+from casadi_ik.files.reading import (
+    Frame,
+    Point,
+    Struct,
+    Vector,
+    frame_matrix,
+    read,
+    roll_pitch_yaw,
+)
 from casadi_ik.files.shipped import resolve, shipped_names
 from casadi_ik.files.units import AnyValue, Length, Turn
 from casadi_ik.grasps.grasp import Contact, Grasp
 from casadi_ik.grasps.tolerance import Tolerance
+from casadi_ik.grasps.vectors import MORE
 
 
 class ToleranceEntry(Struct, frozen=True):
@@ -149,6 +161,40 @@ def _contact(entry: ContactEntry) -> Contact:
         plane=entry.plane,
         direction=entry.direction,
     )
+
+
+def grasp_data(grasp: Grasp) -> dict[str, Any]:
+    """A grasp as a file has it, to the last digit; what comes before and after it is left out."""
+    contacts: dict[str, dict[str, Any]] = {}
+    for finger, contact in grasp.contacts.items():
+        given = {key: getattr(contact, key) for key in ("point", "normal", *MORE)}
+        if np.isnan(contact.point).any():
+            given = {"direction": contact.normal}
+        entry: dict[str, Any] = {
+            key: _numbers(value) for key, value in given.items() if value is not None
+        }
+        if contact.tolerance is not None:
+            position, angle = contact.tolerance.position, contact.tolerance.angle
+            entry["tolerance"] = {"position": float(position), "angle": float(angle)}
+        contacts[finger] = entry
+    data: dict[str, Any] = {"robot": grasp.robot} if grasp.robot else {}
+    if grasp.object:
+        pose = grasp.object_pose
+        data["object"] = {"name": grasp.object} | ({} if pose is None else {"pose": _frame(pose)})
+    data |= {"contacts": contacts} if contacts else {}
+    if grasp.palm is not None:
+        data["palm"] = _frame(grasp.palm)
+    if grasp.posture:
+        data["posture"] = {name: float(value) for name, value in grasp.posture.items()}
+    return data
+
+
+def _frame(pose: Array) -> dict[str, list[float]]:
+    return {"xyz": _numbers(pose[:3, 3]), "rpy": _numbers(roll_pitch_yaw(pose[:3, :3]))}
+
+
+def _numbers(values: Array) -> list[float]:
+    return [float(value) + 0.0 for value in values]
 
 
 def shipped_grasps(robot: str) -> tuple[str, ...]:

@@ -15,6 +15,9 @@ from casadi_ik.motion.plan import FollowPlan
 from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.problems import Problems
 
+SHORT = 5e-3
+"""A palm that is nearer to its grasp before it [m] does not say from where it comes."""
+
 
 class ReachStatus(Enum):
     """How it went.
@@ -30,8 +33,10 @@ class ReachStatus(Enum):
     """The grasp has no solution (`Solver.solve` says why)."""
     NO_APPROACH = "no approach"
     """From no solution the open hand can go straight back without touching anything."""
+    NO_RETREAT = "no retreat"
+    """With what it holds the hand cannot be lifted, or go back, as it was asked."""
     NO_WAY = "no way"
-    """No way to a pre-grasp was found."""
+    """No way to a pre-grasp, or to a posture, was found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +87,23 @@ class ApproachPlan:
         problem: The grasp.
         opening: Of the hand before it closes [m].
         distance: Of the straight approach [m].
+        direction: (3,) the way the hand comes, base frame; None: as the grasp has it.
+        pregrasp: (3,) where the grasp has the palm before it, base frame [m]; None: not said.
     """
 
     plan: FollowPlan
     problem: Problems
     opening: float
     distance: float
+    direction: Array | None = None
+    pregrasp: Array | None = None
+
+    def along(self, q: Array) -> Array | None:
+        """(3,) the way the hand comes to a solution (n,); None: from the palm to the contacts."""
+        if self.direction is not None or self.pregrasp is None:
+            return self.direction
+        way = self.plan.robot.palm(q)[:3, 3] - self.pregrasp
+        return way if np.linalg.norm(way) > SHORT else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +111,7 @@ class Tried:
     """What became of one solution of a grasp.
 
     Attributes:
+        closer: Finds straight ways.
         number: Of the solution, from 1.
         q: (n,) the solution.
         last: The last part of the way; None if it cannot be gone.
@@ -103,6 +120,7 @@ class Tried:
         holding: What is not to be touched while it closes; likewise.
     """
 
+    closer: Closer
     number: int
     q: Array
     last: LastPart | None
@@ -116,21 +134,21 @@ def approaches(asked: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Trie
     closer = Closer(asked.plan)
     holding, open_handed = _surroundings(asked)
     for number, q in enumerate(solutions, start=1):
-        last = closer.find(asked.problem, q, asked.opening, asked.distance)
+        last = closer.find(asked.problem, q, asked.opening, asked.distance, asked.along(q))
         reason = _blocked(last, holding, open_handed)
-        yield Tried(number, q, None if reason else last, reason, open_handed, holding)
+        yield Tried(closer, number, q, None if reason else last, reason, open_handed, holding)
 
 
-def approach(asked: ApproachPlan, solutions: Sequence[Array]) -> Approach:
+def approach(asked: ApproachPlan, solutions: Sequence[Array], why: str) -> Approach:
     """The last part of the way to the first of some solutions for which there is one.
 
     Args:
         asked: What to keep to.
         solutions: (n,) each, of the grasp, best first.
+        why: Why there are none.
     """
     if not solutions:
-        reason = "the grasp has no solution"
-        return Approach(ReachStatus.NOT_SOLVED, reason, None, None, None, None, 0)
+        return Approach(ReachStatus.NOT_SOLVED, why, None, None, None, None, 0)
     reason = ""
     for one in approaches(asked, solutions):
         if one.last is None:

@@ -32,11 +32,15 @@ class Between:
         worst: (k - 1, n) the posture with least room that was looked at on each.
         room: (k - 1,) its room [m]; no posture on a free way has less by more than what it moves
             to the next that was looked at.
+        distance: (k - 1,) its clearance, see `Clearances` [m].
+        pairs: (k - 1,) number of its pair, see `Clearances`.
     """
 
     free: Bools
     worst: Array
     room: Array
+    distance: Array
+    pairs: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +51,20 @@ class _Postures:
         q: (m, n).
         poses: (m, s, 12) of the solids.
         places: (m, p) where shapes are, see `ClearanceKernel.placed`.
-        room: (m,).
+        found: (m, 3) room, clearance and number of its pair.
     """
 
     q: Array
     poses: Array
     places: Array
-    room: Array
+    found: Array
+
+    @property
+    def room(self) -> Array:
+        return self.found[:, 0]
 
     def rows(self, rows: NDArray[np.intp] | slice) -> _Postures:
-        return _Postures(self.q[rows], self.poses[rows], self.places[rows], self.room[rows])
+        return _Postures(self.q[rows], self.poses[rows], self.places[rows], self.found[rows])
 
     @classmethod
     def joined(cls, one: _Postures, other: _Postures) -> _Postures:
@@ -64,7 +72,7 @@ class _Postures:
             (one.q, other.q),
             (one.poses, other.poses),
             (one.places, other.places),
-            (one.room, other.room),
+            (one.found, other.found),
         )
         return cls(*(np.concatenate(pair) for pair in pairs))
 
@@ -83,12 +91,13 @@ class _Looking:
     def at(self, q: Array, poses: Array) -> _Postures:
         """Postures (m, n) with solids at (m, s, 12)."""
         parts = [slice(i, i + TOGETHER) for i in range(0, len(q), TOGETHER)]
-        around, room, places = self._around, list[Array](), list[Array]()
+        around, found, places = self._around, list[Array](), list[Array]()
         for part in parts:
             here = Surroundings(around.kernel, around.table, poses[part], around.margin)
-            room.append(here.check(q[part]).room)
+            seen = here.check(q[part])
+            found.append(np.stack([seen.room, seen.distance, seen.pairs.astype(float)], axis=1))
             places.append(around.kernel.placed(q[part])[0])
-        return _Postures(q, poses, np.concatenate(places), np.concatenate(room))
+        return _Postures(q, poses, np.concatenate(places), np.concatenate(found))
 
     def motion(self, one: _Postures, other: _Postures) -> Array:
         """(m,) how much nearer two shapes may come on the way [m], twice the largest motion."""
@@ -132,8 +141,9 @@ def between(around: Surroundings, q: Array, least: bool = False) -> Between:
             poses.reshape(-1, *poses.shape[-2:])[:1], (len(q), *poses.shape[-2:])
         )
     looking = _Looking(around)
-    free, room = np.ones(count, dtype=bool), np.full(count, np.inf)
-    worst = np.empty((count, n))
+    free, found = np.ones(count, dtype=bool), np.full((count, 3), np.inf)
+    found[:, 2] = -1
+    room, worst = found[:, 0], np.empty((count, n))
     every = looking.at(q, np.ascontiguousarray(poses))
     way = np.arange(count)
     one, other = every.rows(slice(0, count)), every.rows(slice(1, count + 1))
@@ -142,7 +152,7 @@ def between(around: Surroundings, q: Array, least: bool = False) -> Between:
         order = np.argsort(-some.room, kind="stable")
         less = order[some.room[order] < room[whose[order]]]
         # Behind each other the least comes last, and is what stays.
-        room[whose[less]], worst[whose[less]] = some.room[less], some.q[less]
+        found[whose[less]], worst[whose[less]] = some.found[less], some.q[less]
         free[whose[~(some.room >= -ROUNDING)]] = False
 
     seen(one, way)
@@ -160,22 +170,28 @@ def between(around: Surroundings, q: Array, least: bool = False) -> Between:
         seen(middle, way)
         one, other = _Postures.joined(one, middle), _Postures.joined(middle, other)
         way = np.concatenate([way, way])
-    return Between(free, worst, room)
+    return Between(free, worst, room, found[:, 1], found[:, 2].astype(np.int64))
 
 
 def least_clearance(around: Surroundings, q: Array) -> tuple[float, str]:
-    """The least clearance on the straight ways from each of k postures (k, n) to the next.
+    """The least clearance on the straight ways from each of k postures to the next.
+
+    Args:
+        around: As for `between`.
+        q: (k, n).
 
     Returns:
         The clearance [m]: it is nowhere less by more than `RESOLUTION`, if all is free; and what
         touches, "": nothing does.
     """
+    if len(q) < 2:
+        q = np.concatenate([q, q])
     ways = between(around, q, least=True)
-    found = around.check(np.concatenate([q, ways.worst]))
-    if found.free.all():
-        return float(found.distance.min()), ""
-    pair = found.pair(int(found.room.argmin())) or ()
-    return float(found.distance.min()), f"{' and '.join(pair)} touch"
+    clearance = float(ways.distance.min())
+    if ways.free.all():
+        return clearance, ""
+    pair = around.table.names[ways.pairs[int(ways.room.argmin())]]
+    return clearance, f"{pair[0]} and {pair[1]} touch"
 
 
 def _half_way(one: Array, other: Array) -> Array:

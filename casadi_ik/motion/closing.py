@@ -43,7 +43,14 @@ class Closer:
         self._robot = plan.robot
         self._asked = Asked(plan, usual(len(plan.robot.fingers)), 0)
 
-    def find(self, problem: Problems, q: Array, opening: float, distance: float) -> LastPart | None:
+    def find(
+        self,
+        problem: Problems,
+        q: Array,
+        opening: float,
+        distance: float,
+        direction: Array | None = None,
+    ) -> LastPart | None:
         """The last part of the way to a solution; None if there is none.
 
         Args:
@@ -51,6 +58,7 @@ class Closer:
             q: (n,) its solution.
             opening: How far the fingertips are from their contacts while the hand is open [m].
             distance: How far it comes straight [m].
+            direction: (3,) the way it comes, base frame; None: from the palm to the contacts.
         """
         robot = self._robot
         palm, (points, normals) = robot.palm(q), robot.contacts(q)
@@ -61,16 +69,22 @@ class Closer:
         there = opening_way[-1]
         if not self._asked.cycle.palm:
             return LastPart(there[None], opening_way[::-1])
-        tips = robot.contacts(there)[0]
-        middle = tips[given].mean(axis=0) - palm[:3, 3]
-        back = -distance * middle / max(float(np.linalg.norm(middle)), 1e-9)
-        palms = np.repeat(robot.palm(there)[None], POSTURES, axis=0)
-        palms[:, :3, 3] += share[:, 0] * back
-        coming = self._walk(there, tips + share * back, palms, np.ones_like(given))
-        off = np.linalg.norm(robot.palm(coming)[:, :3, 3] - palms[:, :3, 3], axis=1)
-        if off.max() > STRAY:
-            return None
-        return LastPart(coming[::-1], opening_way[::-1])
+        here: Array = robot.contacts(there)[0][given].mean(axis=0) - palm[:3, 3]
+        way = here if direction is None else direction
+        back = -distance * way / max(float(np.linalg.norm(way)), 1e-9)
+        coming = self.straight(there, back)
+        return None if coming is None else LastPart(coming[::-1], opening_way[::-1])
+
+    def straight(self, q: Array, shift: Array) -> Array | None:
+        """(k, n) postures from q on with palm and fingertips moved by (3,) [m]; None: it strays."""
+        robot, share = self._robot, np.linspace(0.0, 1.0, POSTURES)[:, None]
+        tips = robot.contacts(q)[0]
+        palms = np.repeat(robot.palm(q)[None], POSTURES, axis=0)
+        palms[:, :3, 3] += share * shift
+        every = np.ones(len(tips), dtype=bool)
+        found = self._walk(q, tips + share[:, None] * shift, palms, every)
+        off = np.linalg.norm(robot.palm(found)[:, :3, 3] - palms[:, :3, 3], axis=1)
+        return None if off.max() > STRAY else found
 
     def _walk(self, q: Array, tips: Array, palms: Array, given: Array) -> Array:
         """(k, n) postures from q on with fingertips (k, f, 3) and palm (k, 4, 4) there."""

@@ -12,19 +12,21 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.methods.hand_first.method import UNBOUNDED
 from casadi_ik.motion.approaching import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.plan import FollowPlan
-from casadi_ik.motion.rates import Rates, length, rates_of, seconds, unbounded
-from casadi_ik.motion.reaching import Reach, ReachPlan, reach
+from casadi_ik.motion.rates import Rates, a_direction, length, rates_of, seconds, unbounded
+from casadi_ik.motion.reaching import Pace, Reach, ReachPlan, move, reach
 from casadi_ik.motion.tracking import Track, track
 from casadi_ik.motion.walker import Walker
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.ranking import Chosen
+from casadi_ik.problem.verdict import LIMIT_SLACK, judge
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 
@@ -151,7 +153,7 @@ class MovingSolver:
 
     def reach(
         self,
-        grasp: Grasp,
+        grasp: Grasp | Chosen,
         q0: ArrayLike | None = None,
         opening: float = 0.02,
         distance: float = 0.08,
@@ -160,16 +162,21 @@ class MovingSolver:
         period: float = 0.01,
         seed: int = 0,
         limit: int = 8,
+        direction: ArrayLike | None = None,
+        lift: float = 0.0,
+        retreat: float = 0.0,
     ) -> Reach:
         """The way from where the robot is to a grasp, in time.
 
-        It goes to a pre-grasp, where the hand is open; comes straight along the line from the palm
-        to the contacts; and closes. Solutions of the grasp are tried, nearest first, until there
-        is a way to one. With a scene all of it is checked, between its points too: the straight
-        way there if it is free, else one by OMPL; fingers touch the object only while they close.
+        It goes to a pre-grasp, where the hand is open; comes straight; and closes. Of a grasp
+        solutions are tried, nearest first, until there is a way to one; of what `choose` answers
+        (``ranked[0]``) it is that very posture or none. With a scene all of it is checked, between
+        its points too: the straight way there if it is free, else one by OMPL; fingers touch the
+        object only while they close. With `lift` or `retreat` it goes on: the object moves with
+        the palm then, and is compared with the scene by points of its surface.
 
         Args:
-            grasp: A contact per finger.
+            grasp: A contact per finger, or an answer of `choose`.
             q0: (n,) where the robot is, at rest [rad or m]; None: at home.
             opening: How far the fingertips are from their contacts before they close [m].
             distance: How far the hand comes straight [m].
@@ -178,37 +185,103 @@ class MovingSolver:
             period: Time between two samples of the motion [s].
             seed: Of starts and of a planner.
             limit: Solutions that are tried at most.
+            direction: (3,) the way the hand comes, base frame: ``[0, 0, -1]`` from above. None:
+                from where the grasp has its palm before it, if it says (`Grasp.pregrasp`), else
+                along the line from the palm to the contacts.
+            lift: How far the hand goes straight up, along z of the base, after it closed [m].
+            retreat: How far it goes back then, against the way it came [m].
 
         Raises:
             InputError: Bad numbers, or a grasp the robot cannot take.
             MissingExtraError: toppra is not installed (extra `motion`).
-            UnsupportedError: The method is not hand-first.
+            UnsupportedError: The method is not hand-first, or a hand that no arm moves is to be
+                lifted.
 
         Example:
             >>> found = solver.reach(grasp, q0=robot.home)
             >>> found.status.name, bool(found.motion.times[-1] > 0)
             ('REACHED', True)
+            >>> best = solver.choose([grasp])[0]
+            >>> found = solver.reach(best, lift=0.05)
+            >>> bool((found.motion.q == best.solution.q).all(axis=1).any())
+            True
         """
         start = self._questions.start(q0)
-        last, solutions = self._solutions(grasp, start, opening, distance, seed, limit)
-        rates = rates_of(self.robot, velocity, acceleration)
-        asked = ReachPlan(last, rates, seconds("period", period), seed)
-        return reach(asked, np.clip(start, *last.plan.bounds), solutions)
+        onward = length("lift", lift), length("retreat", retreat)
+        if any(onward) and not self.robot.description.arm_actuators:
+            raise UnsupportedError(f"lift: {self.robot.name!r} has no arm that moves its palm")
+        pace = Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
+        last = self._last_part(grasp, start, opening, distance, direction)
+        solutions, why = self._solutions(grasp, last.problem, start, seed, limit)
+        asked = ReachPlan(last, pace, seed, *onward)
+        return reach(asked, np.clip(start, *last.plan.bounds), solutions, why)
+
+    def move(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+        period: float = 0.01,
+        seed: int = 0,
+    ) -> Reach:
+        """The way from one posture to another, in time: straight, or around what is in the way.
+
+        From rest to rest. With a scene it is free, between its points too; no finger may touch
+        what the scene calls grasped. Where the straight way (in motors) is not free, OMPL looks
+        for another.
+
+        Args:
+            q0: (n,) where the robot is [rad or m].
+            q1: (n,) where it is to be.
+            velocity: As for `follow`.
+            acceleration: As for `follow`.
+            period: Time between two samples of the motion [s].
+            seed: Of a planner.
+
+        Returns:
+            A `Reach` of one part, "going"; NO_WAY if none was found.
+
+        Raises:
+            InputError: Bad numbers, or a posture beyond limits.
+            MissingExtraError: toppra is not installed (extra `motion`).
+
+        Example:
+            >>> found = solver.move(robot.home, solution.q)
+            >>> found.success, bool((found.motion.q[-1] == solution.q).all())
+            (True, True)
+        """
+        ends = self._questions.start(q0), self._questions.start(q1, "q1")
+        lower, upper = self._bounds(None)
+        for name, q in zip(("q0", "q1"), ends, strict=True):
+            off = np.maximum(lower - q, q - upper)
+            i = int(off.argmax())
+            if not off[i] <= LIMIT_SLACK:
+                raise InputError(
+                    f"{name}: found {self.robot.actuators[i]} at {q[i]:g}, expected a number from "
+                    f"{lower[i]:g} to {upper[i]:g}"
+                )
+        pace = Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
+        around, check = None, self._engine.check
+        if check is not None:
+            around = check.around(self._anything(np.nan)).rows(np.zeros(1, dtype=np.intp))
+        return move(self.robot, ends, around, pace, seed)
 
     def approach(
         self,
-        grasp: Grasp,
+        grasp: Grasp | Chosen,
         distance: float = 0.08,
         opening: float = 0.02,
         q0: ArrayLike | None = None,
         seed: int = 0,
         limit: int = 8,
+        direction: ArrayLike | None = None,
     ) -> Approach:
         """The last part of the way to a grasp: a pre-grasp, straight on, closing.
 
-        The hand is open at the pre-grasp and comes straight along the line from the palm to the
-        contacts. Solutions of the grasp are tried, nearest to q0 first. With a scene all of it is
-        checked, between its points too; fingers touch the object only while they close.
+        The hand is open at the pre-grasp and comes straight. Solutions of the grasp are tried,
+        nearest to q0 first; of what `choose` answers it is that very posture. With a scene all of
+        it is checked, between its points too; fingers touch the object only while they close.
 
         Args:
             grasp: As for `reach`.
@@ -217,6 +290,7 @@ class MovingSolver:
             q0: (n,) where the robot is [rad or m]; None: at home.
             seed: Of starts.
             limit: Solutions that are tried at most.
+            direction: As for `reach`.
 
         Raises:
             InputError: Bad numbers, or a grasp the robot cannot take.
@@ -228,27 +302,51 @@ class MovingSolver:
             (True, (14,))
         """
         start = self._questions.start(q0)
-        return approach(*self._solutions(grasp, start, opening, distance, seed, limit))
+        last = self._last_part(grasp, start, opening, distance, direction)
+        return approach(last, *self._solutions(grasp, last.problem, start, seed, limit))
 
-    def _solutions(
-        self, grasp: Grasp, start: Array, opening: float, distance: float, seed: int, limit: int
-    ) -> tuple[ApproachPlan, list[Array]]:
-        """What the last part of the way to a grasp keeps to, and solutions (n,), nearest first."""
-        problem = self._questions.of_grasps([grasp], None)
-        bounds, free = self._bounds(None), unbounded(self.robot)
-        asked = ApproachPlan(
-            self._plan(start, bounds, 1.0, free, start, math.inf, PATH_PULL),
+    def _last_part(
+        self,
+        grasp: Grasp | Chosen,
+        start: Array,
+        opening: float,
+        distance: float,
+        direction: ArrayLike | None,
+    ) -> ApproachPlan:
+        """What the last part of the way to a grasp keeps to."""
+        asked: Any = grasp if isinstance(grasp, Grasp) else getattr(grasp, "grasp", grasp)
+        problem = self._questions.of_grasps([asked], None)
+        before = asked.pregrasp and asked.pregrasp.palm
+        return ApproachPlan(
+            self._plan(
+                start, self._bounds(None), 1.0, unbounded(self.robot), start, math.inf, PATH_PULL
+            ),
             problem,
             length("opening", opening),
             length("distance", distance),
+            None if direction is None else a_direction("direction", direction),
+            None if before is None else before[:3, 3],
         )
+
+    def _solutions(
+        self, grasp: Grasp | Chosen, problem: Problems, start: Array, seed: int, limit: int
+    ) -> tuple[list[Array], str]:
+        """Solutions (n,) of a grasp, nearest first, or that which was chosen; why there is none."""
+        if not isinstance(grasp, Grasp):
+            q = self._questions.start(grasp.q, "q")
+            verdict = judge(self.robot, problem, q[None])
+            if verdict.solved(problem.enforce_limits)[0]:
+                return [q], ""
+            off = f"{1e3 * np.nanmax(verdict.position_error):.3g} mm"
+            return [], f"the posture that was chosen does not take its grasp ({off} off, or limits)"
         engine = self._engine.kinds_of(problem)
         found = engine.finder.find(
             problem, start, seed, limit, "q0", apart=0.05, around=engine.around(problem)
         )
         # A solve looks further for an answer that is free than a list of all does.
         best = engine.solve(replace(problem, prefer="q0"), Run(start, seed))
-        return asked, [*best.q[best.success], *(one.q for one in found)][:limit]
+        every = [*best.q[best.success], *(one.q for one in found)][:limit]
+        return every, "" if every else "the grasp has no solution"
 
     def _plan(
         self,
@@ -277,7 +375,11 @@ class MovingSolver:
     def _bounds(self, problems: Problems | None) -> tuple[Array, Array]:
         """(n,) lower and upper."""
         if problems is None:
-            f = len(self.robot.fingers)
-            anywhere: Any = np.zeros((1, f, 3))
-            problems = self._questions.of_arrays(anywhere, anywhere + 1.0, None)
+            problems = self._anything(0.0)
         return problems.bounds(self.robot.description, UNBOUNDED)
+
+    def _anything(self, place: float) -> Problems:
+        """A target with all contacts at a place, or none if that is NaN."""
+        anywhere = np.zeros((1, len(self.robot.fingers), 3))
+        found = self._questions.of_arrays(anywhere, anywhere + 1.0, None)
+        return replace(found, points=anywhere + place)

@@ -142,6 +142,21 @@ def length(name: str, value: Any) -> float:
     return number
 
 
+def a_direction(name: str, value: Any) -> Array:
+    """(3,) a direction.
+
+    Raises:
+        InputError: Something else.
+    """
+    try:
+        way = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        way = np.zeros(0)
+    if way.shape != (3,) or not np.isfinite(way).all() or not way.any():
+        raise InputError(f"{name}: found {value!r}, expected three numbers, not all zero")
+    return way
+
+
 def unbounded(robot: ArmHand) -> Rates:
     """No limits, for cycles of one second."""
     anything = UNBOUNDED * np.maximum(robot.upper - robot.lower, 1.0)

@@ -215,7 +215,7 @@ class SceneCheck:
         self.kernel = ClearanceKernel(robot.description, compiled)
         self.model = self._as_it_stands(collision_model(robot.description))
         self._held: dict[str, Scene] = {}
-        self._tables: dict[tuple[str, frozenset[str]], tuple[Table, dict[str, Item]]] = {}
+        self._tables: dict[tuple[str, frozenset[str], bool], tuple[Table, dict[str, Item]]] = {}
         (placed,) = self.kernel.placed(robot.home)
         check_base(self.model, scene, placed)
         self._table(scene, frozenset())
@@ -272,8 +272,12 @@ class SceneCheck:
             for finger in self.robot.description.fingers
         }
 
-    def around(self, problems: Problems) -> Surroundings:
+    def around(self, problems: Problems, carried: bool = False) -> Surroundings:
         """What targets are checked against.
+
+        Args:
+            problems: The targets.
+            carried: Whether the hand carries what it grasps.
 
         Raises:
             UnknownNameError: They grasp an object that there is not.
@@ -289,7 +293,7 @@ class SceneCheck:
             name for name, on in zip(self.robot.fingers, np.atleast_1d(fingers), strict=True) if on
         ]
         touched = frozenset().union(*(self.bodies_of_fingers[name] for name in named))
-        table, items = self._table(scene, touched)
+        table, items = self._table(scene, touched, carried)
         moved = name if pose is not None else None
         return Surroundings(self.kernel, table, table.poses(items, moved, pose), scene.margin)
 
@@ -299,10 +303,12 @@ class SceneCheck:
             self._held[name] = self.scene.holding(name, pose)
         return self._held[name]
 
-    def _table(self, scene: Scene, touched: frozenset[str]) -> tuple[Table, dict[str, Item]]:
-        key = scene.grasped or "", touched
+    def _table(
+        self, scene: Scene, touched: frozenset[str], carried: bool = False
+    ) -> tuple[Table, dict[str, Item]]:
+        key = scene.grasped or "", touched, carried
         if key not in self._tables:
-            table = pair_table(self.model, scene, sorted(touched))
+            table = pair_table(self.model, scene, sorted(touched), carried)
             self._tables[key] = table, scene.items
         return self._tables[key]
 

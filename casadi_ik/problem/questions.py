@@ -182,15 +182,15 @@ class Questions:
         robot = self.robot
         return fixed_array(fixed or {}, robot.actuators, robot.lower, robot.upper)
 
-    def start(self, q0: ArrayLike | None) -> Array:
+    def start(self, q0: ArrayLike | None, name: str = "q0") -> Array:
         """One configuration (n,) to start from; None is the robot's home.
 
         Raises:
-            InputError: Not one configuration.
+            InputError: Not one configuration; the message has its name.
         """
-        start = self.robot.configuration(q0, "q0")
+        start = self.robot.configuration(q0, name)
         if start.ndim != 1:
-            raise InputError(f"q0: found shape {start.shape}, expected ({len(start[0])},)")
+            raise InputError(f"{name}: found shape {start.shape}, expected ({len(start[0])},)")
         return start
 
 

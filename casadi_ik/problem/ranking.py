@@ -4,9 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import Protocol, overload
 
+from casadi_ik.arrays import Array
+from casadi_ik.grasps import Grasp
 from casadi_ik.problem.solution import Solution
+
+
+class Chosen(Protocol):
+    """A posture that takes a grasp."""
+
+    @property
+    def grasp(self) -> Grasp:
+        """In the base frame."""
+        ...
+
+    @property
+    def q(self) -> Array:
+        """(n,) the posture [rad or m]."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +37,7 @@ class Choice:
             from q0, every actuator as a part of its range ("q0"); of the arm [m^3]
             ("manipulability"); room beyond the margins of the scene [m] ("clearance"); or what the
             given function says.
+        grasp: The grasp, where the object is (base frame).
 
     Example:
         >>> best = solver.choose([grasp], prefer="limits")[0]
@@ -31,6 +48,12 @@ class Choice:
     candidate: int
     solution: Solution
     score: float
+    grasp: Grasp
+
+    @property
+    def q(self) -> Array:
+        """(n,) the posture: what `Solver.reach` goes to."""
+        return self.solution.q
 
 
 @dataclass(frozen=True, eq=False)

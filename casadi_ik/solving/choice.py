@@ -59,6 +59,11 @@ def choose(
     apart, start = checked_distance(apart), questions.start(q0)
     word = "own" if callable(prefer) else engine.preference(prefer, q0 is not None)
     pose = None if object_pose is None else one_pose(object_pose, "object_pose")
+
+    def placed(number: int) -> Grasp:
+        grasp = grasps[number]
+        return grasp if pose is None else grasp.in_object_frame().at(pose)
+
     asked = list(_asked(questions, grasps, pose, fixed))
     wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
     parts: list[tuple[NDArray[np.intp], Answers]] = []
@@ -93,7 +98,7 @@ def choose(
         answers = look(~answers.answered, Look.THOROUGH)
     if q0 is not None:
         answers = look(answers.answered, Look.OWN, near=True)
-    entries = _Ranked(engine, asked, answers, apart).best(limit, most)
+    entries = _Ranked(engine, asked, answers, apart, placed).best(limit, most)
     seconds = (time.perf_counter() - begin) / len(grasps)
     reasons = [reason for reason in answers.reasons.tolist() if reason]
     return Ranking(
@@ -188,8 +193,10 @@ class _Ranked:
         asked: Sequence[tuple[NDArray[np.intp], Problems]],
         answers: Answers,
         apart: float,
+        placed: Callable[[int], Grasp],
     ) -> None:
         self.engine, self.asked, self.answers, self.apart = engine, asked, answers, apart
+        self.placed = placed
 
     def best(self, limit: int, most: int | None) -> list[Choice]:
         """The best that differ from each other, at most so many of a candidate."""
@@ -217,7 +224,8 @@ class _Ranked:
             for row in chosen:
                 if solutions[row].success:
                     owner = int(answers.owner[row])
-                    found.append(Choice(owner, solutions[row], float(answers.score[row])))
+                    score, grasp = float(answers.score[row]), self.placed(owner)
+                    found.append(Choice(owner, solutions[row], score, grasp))
                     places[owner] -= 1
                     left = others(left, row, places)
         return found

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
-import numpy as np
-
-from casadi_ik.arrays import Array
-from casadi_ik.files.reading import roll_pitch_yaw
-from casadi_ik.grasps import Contact, Grasp
+from casadi_ik.grasps import Grasp
+from casadi_ik.grasps.load import grasp_data
 
 
 def grasp_text(grasp: Grasp, comment: str = "") -> str:
@@ -19,36 +17,22 @@ def grasp_text(grasp: Grasp, comment: str = "") -> str:
         comment: A line before it.
     """
     lines = [f"# {comment}"] if comment else []
-    if grasp.robot:
-        lines.append(f"robot: {json.dumps(grasp.robot, ensure_ascii=False)}")
-    if grasp.object:
-        lines += ["object:", f"  name: {json.dumps(grasp.object, ensure_ascii=False)}"]
-        if grasp.object_pose is not None:
-            turn = roll_pitch_yaw(grasp.object_pose[:3, :3])
-            xyz = _vector(grasp.object_pose[:3, 3])
-            lines.append(f"  pose: {{xyz: {xyz}, rpy: {_vector(turn)}}}")
-    lines.append("contacts:  # points [m] and outward normals of the pads, robot's base frame")
-    for finger, contact in grasp.contacts.items():
-        lines.append(f"  {json.dumps(finger, ensure_ascii=False)}:")
-        lines += [f"    {line}" for line in _contact(contact)]
+    for key, value in grasp_data(grasp).items():
+        if key == "contacts":
+            lines.append("contacts:  # points [m] and outward normals of the pads, base frame")
+            for finger, contact in value.items():
+                lines += [f"  {_flow(finger)}:", *_lines(contact, "    ")]
+        elif isinstance(value, dict):
+            lines += [f"{key}:", *_lines(value, "  ")]
+        else:
+            lines.append(f"{key}: {_flow(value)}")
     return "\n".join(lines) + "\n"
 
 
-def _contact(contact: Contact) -> list[str]:
-    if np.isnan(contact.point).any():
-        assert contact.normal is not None
-        lines = [f"direction: {_vector(contact.normal)}"]
-    else:
-        lines = [f"point: {_vector(contact.point)}"]
-        for name in ("normal", "tangent", "line", "plane"):
-            vector = getattr(contact, name)
-            if vector is not None:
-                lines.append(f"{name}: {_vector(vector)}")
-    if contact.tolerance is not None:
-        position, angle = contact.tolerance.position, contact.tolerance.angle
-        lines.append(f"tolerance: {{position: {float(position)!r}, angle: {float(angle)!r}}}")
-    return lines
+def _lines(data: dict[str, Any], indent: str) -> list[str]:
+    keys = {key: key if key.isidentifier() else _flow(key) for key in data}
+    return [f"{indent}{keys[key]}: {_flow(value)}" for key, value in data.items()]
 
 
-def _vector(values: Array) -> str:
-    return f"[{', '.join(repr(float(value) + 0.0) for value in values)}]"
+def _flow(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from dense_ways import dense
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.motion.free_space import free_way, motor_units
 from casadi_ik.motion.rates import rates_of, shares
 from casadi_ik.motion.timing import timed
@@ -209,3 +210,117 @@ def test_a_palm_that_is_given_is_reached(robot, grasp):
         np.abs(found.motion.q[found.motion.notes["part"] == "coming"] - solution.q)[:, 7:].max()
         > 0.02
     )
+
+
+@pytest.fixture(scope="module")
+def on_table(robot, grasp):
+    solver = ik.Solver(robot, scene=ik.load_scene("table"))
+    return solver, solver.choose([grasp], limit=3, prefer="limits")
+
+
+def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
+    solver, ranked = on_table
+    for one in ranked:
+        found = solver.reach(one)
+        assert found.success, found.reason
+        np.testing.assert_array_equal(found.motion.q[-1], one.solution.q)
+        np.testing.assert_array_equal(found.q, one.q)
+        np.testing.assert_array_equal(solver.approach(one).closing[-1], one.q)
+    away = np.eye(4)
+    away[0, 3] = 0.1
+    moved = replace(ranked[0], grasp=grasp.at(away))
+    missed = solver.reach(moved)
+    assert missed.status is ik.ReachStatus.NOT_SOLVED
+    assert "does not take its grasp" in missed.reason
+    assert solver.approach(moved).reason == missed.reason
+    with pytest.raises(InputError, match="grasp: found int, expected a Grasp"):
+        solver.reach(3)
+
+
+def test_candidates_of_choose_are_where_the_object_is(robot, grasp):
+    """The grasps come in the object's frame, the answers in the base frame."""
+    pose = grasp.object_pose
+    (one,) = ik.Solver(robot).choose([grasp.in_object_frame()], object_pose=pose, limit=1)
+    for finger, contact in grasp.contacts.items():
+        np.testing.assert_allclose(one.grasp.contacts[finger].point, contact.point, atol=1e-12)
+    np.testing.assert_allclose(one.grasp.object_pose, pose, atol=1e-12)
+
+
+def test_a_direction_that_is_given_or_known(robot, grasp):
+    solver, down = ik.Solver(robot), np.array([0.0, 0.0, -1.0])
+    (one,) = solver.choose([grasp], limit=1)
+
+    def comes(asked, **more):
+        found = solver.reach(asked, distance=0.1, **more)
+        coming = robot.palm(found.motion.q[found.motion.notes["part"] == "coming"])[:, :3, 3]
+        way = coming[-1] - coming[0]
+        return way / np.linalg.norm(way)
+
+    assert comes(one, direction=3 * down) @ down > 0.999
+    assert comes(grasp, direction=down) @ down > 0.999
+    assert comes(one) @ down < 0.9
+    motors = dict(zip(robot.actuators[7:], one.q[7:].tolist(), strict=True))
+    above = robot.palm(one.q) - np.array([[0, 0, 0, 0]] * 2 + [[0, 0, 0, -0.05]] + [[0, 0, 0, 0]])
+    before = ik.Grasp(palm=above, posture=motors)
+    assert comes(replace(one, grasp=replace(grasp, pregrasp=before))) @ down > 0.999
+    with pytest.raises(InputError, match=r"direction: found .*, expected three numbers"):
+        solver.reach(grasp, direction=[0, 0, 0])
+
+
+def test_the_object_goes_along(robot, grasp, on_table):
+    solver, ranked = on_table
+    found = solver.reach(ranked[0], lift=0.1, retreat=0.08)
+    motion, part = found.motion, found.motion.notes["part"]
+    assert list(dict.fromkeys(part)) == ["going", "coming", "closing", "lifting", "retreating"]
+    ends = [motion.q[np.flatnonzero(part == name)[-1]] for name in dict.fromkeys(part)]
+    np.testing.assert_array_equal(ends[2], ranked[0].q)
+    palms = robot.palm(np.array(ends))[:, :3, 3]
+    np.testing.assert_allclose(palms[3] - palms[2], [0, 0, 0.1], atol=1e-3)
+    came = palms[1] - palms[0]
+    back = palms[4] - palms[3]
+    np.testing.assert_allclose(back, -0.08 * came / np.linalg.norm(came), atol=2e-3)
+    assert max(found.velocity_share, found.acceleration_share) <= 1
+    # The cup's brim is 30 mm above its middle: a ball that no finger comes near.
+    for height, lift, free in ((0.09, 0.1, False), (0.09, 0.04, True), (0.09, 0.0, True)):
+        place = (grasp.object_pose[:3, 3] + np.array([0.0, 0.0, height])).tolist()
+        ball = {"ball": {"kind": "sphere", "radius": 0.01, "xyz": place}}
+        other = ik.Solver(robot, scene=ik.Scene(ball)).reach(ranked[0], lift=lift)
+        assert other.success is free
+        assert free or other.status is ik.ReachStatus.NO_RETREAT
+        assert free or other.reason == "lifting is not free: cup and ball touch"
+    hand = ik.Solver(ik.load_robot("ar10"))
+    with pytest.raises(UnsupportedError, match="no arm that moves its palm"):
+        hand.reach(ik.load_grasp("ar10_cup"), lift=0.1)
+
+
+def test_what_stands_on_something_may_be_lifted_from_it(robot, grasp, on_table):
+    """The object touches what it stands on."""
+    _, ranked = on_table
+    below = (grasp.object_pose[:3, 3] - np.array([0.0, 0.0, 0.03 + 0.005])).tolist()
+    post = {"kind": "cylinder", "radius": 0.01, "length": 0.01, "xyz": below}
+    solver = ik.Solver(robot, scene=ik.Scene({"post": post}))
+    assert solver.reach(ranked[0], lift=0.05).success
+
+
+def test_from_posture_to_posture(robot, grasp, on_table):
+    solver, ranked = on_table
+    found = solver.move(robot.home, ranked[0].q)
+    assert (found.status, found.reason) == (ik.ReachStatus.REACHED, "straight")
+    np.testing.assert_array_equal(found.motion.q[[0, -1]], [robot.home, ranked[0].q])
+    assert set(found.motion.notes["part"]) == {"going"}
+    assert max(found.velocity_share, found.acceleration_share) <= 1
+    start = robot.home + 1.6 * (np.arange(14) == 0)
+    place = robot.palm((start + robot.home) / 2)[:3, 3]
+    ball = {"ball": {"kind": "sphere", "radius": 0.05, "xyz": place.tolist()}}
+    around = ik.Solver(robot, scene=ik.Scene(ball))
+    found = around.move(start, robot.home)
+    assert found.reason == "OMPL, RRT-Connect"
+    nothing_held = ik.Grasp(grasp.contacts)
+    there = around.check(dense(found.motion.q, 0.2 * motor_units(robot)), nothing_held).distance
+    assert there.min() >= -1e-4
+    assert found.clearance <= there.min() + 1e-4
+    inside = around.move((start + robot.home) / 2, robot.home)
+    assert (inside.status, inside.motion) == (ik.ReachStatus.NO_WAY, None)
+    assert inside.reason == "the start is not free: bh_base and ball touch"
+    with pytest.raises(InputError, match=r"q1: found lwr_joint_1 at 9, expected a number from"):
+        solver.move(robot.home, [9.0, *robot.home[1:]])

@@ -99,7 +99,9 @@ def _standing(check: SceneCheck, problems: Problems) -> Callable[[Array], NDArra
     def stands(shifts: Array) -> NDArray[np.bool_]:
         if item is None or not others:
             return np.ones(len(shifts), dtype=bool)
-        every = gaps(item, others, np.concatenate([np.zeros((1, 3)), shifts]))
+        poses = np.repeat(item.pose[None], 1 + len(shifts), axis=0)
+        poses[1:, :3, 3] += shifts
+        every = gaps(item, others, poses)
         return every[1:] >= min(float(every[0]), 0.0) - ROUNDING
 
     return stands
