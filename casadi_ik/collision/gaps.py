@@ -46,7 +46,7 @@ def gaps(item: Item, others: Sequence[Item], poses: Array) -> Array:
 
 
 def _skin(solid: Solid) -> tuple[Array, float]:
-    """(k, 3) points that tell where a solid is, in its frame, and how far it reaches beyond them."""
+    """(k, 3) points that tell where a solid is, in its frame; how far it reaches beyond them."""
     if solid.kind is Kind.CLOUD:
         return solid.points, float(solid.size[0])
     return surface(solid), 0.0
@@ -96,4 +96,6 @@ def _placed(items: Iterable[Item]) -> Iterator[tuple[Solid, Array]]:
 
 def _apart(points: Array, pose: Array, solid: Solid) -> float:
     """Least distance of points (m, 3), which are at a pose in the frame of a solid, from it."""
-    return float(signed(solid, points @ pose[:3, :3].T + pose[:3, 3])[0].min(initial=np.inf))
+    if not len(points):
+        return np.inf
+    return float(signed(solid, points @ pose[:3, :3].T + pose[:3, 3])[0].min())

@@ -49,8 +49,11 @@ def test_an_object_is_not_moved_into_the_table() -> None:
     )
     others = [item for name, item in scene.items.items() if name != "cup"]
     shifts = np.array([[0, 0, 0.02], [0, 0, -0.02], [0, 0.17, 0.02], [0.06, 0, 0.05]])
-    found = gaps(scene.items["cup"], others, shifts)
-    np.testing.assert_allclose(found, [0.02, -0.02, -0.01, -0.01], atol=2e-3)
+    poses = np.repeat(scene.items["cup"].pose[None], 5, axis=0)
+    poses[:4, :3, 3] += shifts
+    poses[4, :3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # it lies on the air, 40 mm thick below
+    found = gaps(scene.items["cup"], others, poses)
+    np.testing.assert_allclose(found, [0.02, -0.02, -0.01, -0.01, 0.01], atol=2e-3)
 
 
 def test_margins_of_single_pairs(robot) -> None:
