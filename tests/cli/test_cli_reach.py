@@ -87,7 +87,7 @@ def ranked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = {"candidates": [grasp_data(ik.load_grasp("cup"))]}
     (folder / "candidates.yaml").write_text(yaml.safe_dump(data))
     words = ["choose", folder / "candidates.yaml", "--robot", "kuka_lwr_barrett", "--scene"]
-    words += ["table", "--limit", "3", "--out", folder / "ranked.json"]
+    words += ["table", "--limit", "3", "--per-candidate", "3", "--out", folder / "ranked.json"]
     assert main([str(word) for word in words]) == 0
     return folder / "ranked.json"
 

@@ -215,7 +215,7 @@ def test_a_palm_that_is_given_is_reached(robot, grasp):
 @pytest.fixture(scope="module")
 def on_table(robot, grasp):
     solver = ik.Solver(robot, scene=ik.load_scene("table"))
-    return solver, solver.choose([grasp], limit=3, prefer="limits")
+    return solver, solver.choose([grasp], limit=3, prefer="limits", per_candidate=None)
 
 
 def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
