@@ -82,8 +82,8 @@ def add_choose(commands: Any) -> None:
     parser.add_argument(
         "--object",
         metavar="NAME",
-        help="what a data set or table grasps: a shipped name or a YAML file; of --take contacts "
-        "only the pads that touch it count",
+        help="what a data set or table grasps: a shipped name, a YAML file or a mesh (in convex "
+        "pieces; as large as the data say); of --take contacts only the pads that touch it count",
     )
     parser.add_argument(
         "--of",

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.solids import Solid, convex
+from casadi_ik.collision.solids import Solid, convex, of_object
 from casadi_ik.errors import DescriptionError, MissingExtraError
+from casadi_ik.grasps.mesh_shape import MeshShape
+from casadi_ik.grasps.objects import load_object
 
 THIN = 1e-9
 """A hull of less volume [m^3] than this is none."""
@@ -52,6 +54,37 @@ def hull(points: Array, where: str) -> Solid:
     if float(np.abs(outward).sum()) < THIN:
         raise DescriptionError(f"{where}: encloses no volume, expected a body")
     return convex(points, normals)
+
+
+def hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
+    """The convex hulls of the pieces of a mesh, each with its (4, 4) pose in the mesh's frame.
+
+    Raises:
+        DescriptionError: A piece is flat.
+        MissingExtraError: coal is not installed.
+    """
+    found: list[tuple[Solid, Array]] = []
+    for number, (points, _) in enumerate(shape.pieces):
+        pose = np.eye(4)
+        pose[:3, 3] = points.mean(axis=0)
+        named = f"{where}: piece {number} of {len(shape.pieces)}"
+        found.append((hull(points - pose[:3, 3], named), pose))
+    return found
+
+
+def object_solids(name: str) -> list[tuple[Solid, Array]]:
+    """The solids that an object consists of, each with its (4, 4) pose in its frame.
+
+    Args:
+        name: As `load_object` takes it.
+
+    Raises:
+        UnknownNameError: No shipped object has that name.
+        DescriptionError: Its file is missing or malformed.
+        MissingExtraError: It is a mesh, and coal is not installed.
+    """
+    shape = load_object(name).shape
+    return hulls(shape, name) if isinstance(shape, MeshShape) else of_object(shape)
 
 
 def _coal(where: str) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.hulls import hull
+from casadi_ik.collision.hulls import hull, hulls, object_solids
 from casadi_ik.collision.point_files import finite_points, read_points
 from casadi_ik.collision.scene_file import (
     BoxEntry,
@@ -35,7 +35,6 @@ from casadi_ik.collision.solids import (
     cloud,
     cylinder,
     half_space,
-    of_object,
     thinned,
 )
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
@@ -50,7 +49,7 @@ from casadi_ik.files.reading import (
 )
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import in_si
-from casadi_ik.grasps.objects import load_object
+from casadi_ik.grasps.mesh_shape import load_mesh_shape
 from casadi_ik.grasps.pose import checked_pose, one_pose, rotations_of
 from casadi_ik.robots.collision import Touching
 
@@ -210,7 +209,8 @@ class Scene:
         """The scene with an object that is grasped at a (4, 4) pose.
 
         Args:
-            name: Of an item of the scene, or of a shipped object.
+            name: Of an item of the scene, of a shipped object, or the path of an object's file or
+                mesh, as in ``Grasp.object``.
             pose: Of its frame in the base frame.
 
         Raises:
@@ -224,7 +224,7 @@ class Scene:
         """
         place = checked_pose(pose, f"pose of {name!r}")
         known = self.items.get(name)
-        parts = known.parts if known else tuple(of_object(load_object(name).shape))
+        parts = known.parts if known else tuple(object_solids(name))
         scene = self._with(Item(name, parts, place, known.margin if known else None))
         scene.grasped = name
         return scene
@@ -313,15 +313,24 @@ def _parts(
         case ConvexEntry():
             return [(hull(np.array(entry.points, dtype=float), f"{where}.points"), here)]
         case MeshEntry():
-            corners, _ = read_mesh(_beside(path, entry.file), f"{where}.file")
-            return [(hull(entry.scale * corners, f"{where}.file"), here)]
+            return _meshes(entry, f"{where}.file", path)
         case PointCloudEntry():
             return _cloud(entry, where, path, points)
         case ObjectEntry():
             try:
-                return of_object(load_object(entry.object).shape)
+                return object_solids(entry.object)
             except (UnknownNameError, DescriptionError) as error:
                 raise DescriptionError(f"{where}.object: {error}") from error
+
+
+def _meshes(entry: MeshEntry, where: str, path: Path) -> list[tuple[Solid, Array]]:
+    names = [entry.file] if isinstance(entry.file, str) else entry.file
+    if not names:
+        raise DescriptionError(f"{where}: found none, expected at least one")
+    files = [_beside(path, name) for name in names]
+    if entry.parts:
+        return hulls(load_mesh_shape(files, entry.scale, where), where)
+    return [(hull(entry.scale * read_mesh(file, where)[0], where), np.eye(4)) for file in files]
 
 
 def _beside(path: Path, file: str) -> Path:

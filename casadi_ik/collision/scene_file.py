@@ -83,15 +83,17 @@ class HalfSpaceEntry(_Entry, frozen=True, tag="half-space", kw_only=True):
 
 
 class MeshEntry(_Entry, frozen=True, tag="mesh", kw_only=True):
-    """The convex hull of a mesh.
+    """The convex hull of a mesh, or of several that are one thing.
 
     Attributes:
-        file: A path, counted from the scene's file.
+        file: A path, counted from the scene's file, or several.
         scale: Factor of its coordinates.
+        parts: What hangs together in a mesh is a convex part by itself.
     """
 
-    file: str
+    file: str | list[str]
     scale: float = 1.0
+    parts: bool = False
 
 
 class ConvexEntry(_Entry, frozen=True, tag="convex", kw_only=True):
@@ -127,7 +129,7 @@ class ObjectEntry(_Entry, frozen=True, tag="object", kw_only=True):
     """An object.
 
     Attributes:
-        object: A shipped object, or the path of an object file.
+        object: A shipped object, or the path of an object file or of a mesh.
     """
 
     object: str

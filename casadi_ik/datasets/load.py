@@ -24,6 +24,7 @@ from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.limits import RAISED, limit
 from casadi_ik.grasps import Contact, Grasp, GraspObject, load_object
 from casadi_ik.grasps.candidates import load_grasp_files
+from casadi_ik.grasps.objects import is_mesh
 from casadi_ik.problem.contacts.arrays import NAMES
 from casadi_ik.problem.hand_motors import finger_joints, hand_motors
 from casadi_ik.problem.problems import DIRECTIONS
@@ -53,7 +54,7 @@ def load_candidates(
     hand: str | Path | None = None,
     object_pose: ArrayLike | None = None,
     take: Take = "palm",
-    grasped: str | GraspObject | None = None,
+    grasped: str | Path | Sequence[str | Path] | GraspObject | None = None,
     of: str | None = None,
     scale: float | None = None,
     invalid: Invalid = "error",
@@ -76,8 +77,10 @@ def load_candidates(
         object_pose: (4, 4) where the object is in the base frame; None: grasps stay in its frame.
         take: What a palm and a posture are taken for. "palm": the palm is given and the hand too,
             only the arm is looked for. "contacts": the fingertips are asked for, where they are.
-        grasped: The object, or its shipped name: of "contacts" only pads nearer to its surface
-            than 10 mm count, and they are where the surface is; collisions know it by its name.
+        grasped: The object, its shipped name, or the path of its file or mesh (several meshes are
+            one body): of "contacts" only pads nearer to its surface than 10 mm count, and they are
+            where the surface is; `Grasp.object` names it for collisions. Where the file says by
+            what `scale` the object is larger than its mesh, a mesh is.
         of: Whose grasps, by the file's own name, where a file has those of several objects.
         scale: Which size of the object, where a file has grasps of several.
         invalid: What becomes of a row of a data set or table with a joint beyond its limits, with
@@ -114,8 +117,11 @@ def load_candidates(
         raise InputError(f"invalid: found {invalid!r}, expected one of {', '.join(INVALIDS)}")
     if not file.exists():
         raise DescriptionError(f"{file}: no such file or folder, expected candidates")
-    thing = load_object(grasped) if isinstance(grasped, str) else grasped
-    found = _loaded(file, held, layout, hand, take, thing, of, scale, invalid)
+    if isinstance(grasped, Path):
+        grasped = str(grasped)
+    elif not (grasped is None or isinstance(grasped, (str, GraspObject))):
+        grasped = ",".join(map(str, grasped))
+    found = _loaded(file, held, layout, hand, take, grasped, of, scale, invalid)
     _refuse_other_units(file, found)
     if object_pose is None:
         return found
@@ -128,7 +134,7 @@ def _loaded(
     layout: str | None,
     hand: str | Path | None,
     take: Take,
-    thing: GraspObject | None,
+    grasped: str | GraspObject | None,
     of: str | None,
     scale: float | None,
     invalid: Invalid,
@@ -137,7 +143,7 @@ def _loaded(
     if kind in READERS and layout != TABLE:
         given, found = read_layout(path, layout)
         one = given.of(of).of_scale(scale)
-        return _of_hand(one, robot, convention_for(robot, found, hand), take, thing, invalid)
+        return _of_hand(one, robot, convention_for(robot, found, hand), take, grasped, invalid)
     if scale is not None:
         raise InputError(f"scale: found {scale:g}, but {path.name} says of no size")
     if of is not None:
@@ -147,7 +153,7 @@ def _loaded(
         known = (*robot.description.joint_names, *robot.actuators)
         names = tuple(name for name in given.names if name in known)
         own = _own(robot, names) if hand is None else convention_for(robot, TABLE, hand)
-        return _of_hand(given, robot, own, take, thing, invalid)
+        return _of_hand(given, robot, own, take, grasped, invalid)
     if layout is not None:
         expected = ", ".join(READERS if layout != TABLE else SUFFIXES)
         raise DescriptionError(f"{path}: found no {expected} file, expected one of {layout}")
@@ -194,10 +200,11 @@ def _of_hand(
     robot: ArmHand,
     convention: Convention,
     take: Take,
-    thing: GraspObject | None,
+    grasped: str | GraspObject | None,
     invalid: Invalid,
 ) -> Candidates:
     """Grasps of hands whose poses and joints are given in the object's frame."""
+    thing, name = _thing(grasped, given.scales)
     _refuse_too_many(given.where, len(given.rows))
     joints = convention.positions(given)
     hands = None
@@ -219,7 +226,7 @@ def _of_hand(
         for name, stage in (("pregrasp", given.pregrasp), ("squeeze", given.squeeze))
         if stage is not None
     }
-    stem, name = Path(given.where).stem, "" if thing is None else thing.name
+    stem = Path(given.where).stem
     grasps = []
     for place, i in enumerate(kept):
         asked: dict[str, Any]
@@ -235,6 +242,18 @@ def _of_hand(
         hands.shift[kept] if take == "palm" and hands is not None else np.zeros(len(kept)),
         given.scales[0] if given.scales else None,
     )
+
+
+def _thing(
+    grasped: str | GraspObject | None, scales: tuple[float, ...]
+) -> tuple[GraspObject | None, str]:
+    """What is grasped, and the name by which it is found again; a mesh as large as it is said."""
+    if not isinstance(grasped, str):
+        return grasped, "" if grasped is None else grasped.name
+    if scales and is_mesh(grasped) and "@" not in grasped:
+        grasped = f"{grasped}@{scales[0]:.6g}"
+    thing = load_object(grasped)
+    return thing, grasped
 
 
 def _refuse_too_many(where: str, count: int) -> None:
@@ -264,12 +283,12 @@ def _contacts(
     if thing is None:
         rows = zip(robot.fingers, points, normals, strict=True)
         return {finger: Contact(point, normal) for finger, point, normal in rows}
-    off, outward = thing.signed_distance(points), thing.normal(points)
-    surface = points - off[:, None] * outward
+    off = thing.signed_distance(points)
+    near = np.flatnonzero(np.abs(off) <= TOUCHING)
+    outward = thing.normal(points[near])
+    surface = points[near] - off[near, None] * outward
     found = {
-        finger: Contact(surface[i], -outward[i])
-        for i, finger in enumerate(robot.fingers)
-        if abs(off[i]) <= TOUCHING
+        robot.fingers[finger]: Contact(surface[i], -outward[i]) for i, finger in enumerate(near)
     }
     if not found:
         raise DescriptionError(

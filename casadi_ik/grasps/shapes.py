@@ -232,7 +232,7 @@ class BentCapsule(Primitive, frozen=True, tag="bent-capsule", kw_only=True):
 
 
 Shape = Sphere | Cylinder | EllipticCylinder | Box | BentCapsule
-"""What an object may look like."""
+"""What an object may look like, beside a mesh."""
 
 
 def _rows(points: ArrayLike) -> tuple[Array, tuple[int, ...]]:
