@@ -24,7 +24,7 @@ controllers without a unit for doubles, all of it is in single precision: an ans
 precision, too, if another than here. An earlier export in DIR
 is replaced; any other folder that is not empty is refused. With --scene, being solved includes
 that nothing touches; where the answer does, the other ways are looked at in which the arm can hold
-the hand (other hands are not).
+the hand, and then other hands.
 
 exit codes: 0 written, 2 bad input (nothing is written)
 """

@@ -67,7 +67,7 @@ def pair_table(
         if frozenset(both) not in stated:
             margin = scene.margins.get(frozenset(both), scene.margin)
             pairs.append((i, j))
-            offsets.append(offset + margin - scene.margin)
+            offsets.append(offset + (margin - scene.margin))
             margins.append(margin)
             names.append(both)
     return Table(

@@ -23,9 +23,12 @@ from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.kernels.swing_kernel import ArmPlaces
 from casadi_ik.methods.common.arm_branches import arms_graph
+from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import ROUNDING, SceneCheck
 from casadi_ik.solving.alternatives.arm_places import arm_places
+from casadi_ik.solving.alternatives.free_search import ALIKE, LEAST_RANGE, ROUNDS
+from casadi_ik.solving.alternatives.idle_fingers import CLOSER, NEAR, PARTS, PLACES
 
 MOST = 1000
 """The largest capacity: each solid costs kilobytes."""
@@ -79,7 +82,7 @@ class SceneSources:
     @cached_property
     def places(self) -> ArmPlaces | None:
         """Where arms are looked at; None where they have no closed form."""
-        arm = self.method.step.arm
+        arm = self.method.step.placed
         return None if arm is None else arm_places(self.robot, arm)
 
     @property
@@ -93,7 +96,7 @@ class SceneSources:
     @property
     def arms(self) -> FunctionGraph | None:
         """All arms of a palm; None where they have no closed form."""
-        arm = self.method.step.arm
+        arm = self.method.step.placed
         return None if arm is None else arms_graph(arm, "all_arms", "")
 
     @property
@@ -152,6 +155,7 @@ class SceneSources:
 
     def substitutes(self) -> dict[str, str]:
         """What stands for the marks that a scene brings."""
+        candidates = self.method.options.candidates
         marks = {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
@@ -162,9 +166,12 @@ class SceneSources:
             "OWN_SOLIDS": str(self._own),
             "LINKS": str(len(self.links)),
             "ROUNDING": number(self.rounding),
+            "N_HAND": str(len(self.robot.description.hand_actuators)),
+            "N_CANDIDATES": str(candidates),
+            "TRIED": str(self._rounds * candidates),
+            "N_LOOKED": str(self._rounds * candidates + 1),
+            "LOOK_CONSTANTS": self._look_constants(),
             "MOST_PAIRS": str(max(self._most_pairs, 1)),
-            "SCENE_CONSTANTS": self._constants(),
-            "SWINGS": "" if self.places is None else driver_text("swings"),
             "LINK_NAMES": ", ".join(json.dumps(link, ensure_ascii=False) for link in self.links),
             "SHAPES_JSON": json.dumps(self.shapes()),
         }
@@ -183,6 +190,7 @@ class SceneSources:
             "SCENE_ROOM": f"  {room} room[{self.room}];\n",
             "SCENE_LOOK": filled("scene_look.c", marks),
             "SCENE_INIT": f"  {self.prefix}_scene_init(solver);\n",
+            "SCENE_BEGIN": "  solver->scene.looking = solver->scene.again = 0;\n",
             "SCENE_WASM": wasm,
             "SCENE_JS": js,
             "SCENE_DTS": types,
@@ -223,7 +231,9 @@ class SceneSources:
             f"int {self.prefix}_place_kernel(const double *q, double *places, "
             f"{self.prefix}_memory *memory);\n"
             f"void {self.prefix}_scene_init({self.prefix}_solver *solver);\n"
-            f"int {self.prefix}_free({self.prefix}_solver *solver, const double *lower, "
+            f"int {self.prefix}_hand_is_free({self.prefix}_solver *solver, const double *lower, "
+            "const double *upper, double *q);\n"
+            f"int {self.prefix}_arm_is_free({self.prefix}_solver *solver, const double *lower, "
             "const double *upper, int near, double *q);\n"
         )
 
@@ -240,6 +250,47 @@ class SceneSources:
                 for one in shapes.solids
             ],
         }
+
+    @property
+    def _rounds(self) -> int:
+        """Rounds of other hands that are looked at."""
+        return min(ROUNDS, self.method.options.rounds)
+
+    def _look_constants(self) -> str:
+        """What the search for hands that are free knows."""
+        closed = int(self.places is not None)
+        ranges = np.maximum(self.robot.upper - self.robot.lower, LEAST_RANGE)
+        return (
+            define({"LOOK_ROUNDS": self._rounds, "HAS_CLOSED_ARM": closed})
+            + f"#define LOOK_ALIKE {number(ALIKE)}\n"
+            + define_arrays({"LOOK_RANGES": ranges})
+        )
+
+    def _idle_constants(self) -> str:
+        """What is known of fingers that touch nothing."""
+        robot, about = self.robot, self.robot.description
+        hand = list(about.hand_actuators)
+        fingers = [about.finger_actuators(name) for name in robot.fingers]
+        moved = [about.links_moved([motor]) for motor in hand]
+        whole = {"N_HAND": len(hand), "N_PARTS": len(PARTS)}
+        whole |= {"N_IDLE": PLACES, "N_IDLE_CLOSER": CLOSER}
+        return (
+            define(whole)
+            + f"#define IDLE_NEAR {number(NEAR)}\n"
+            + define_arrays(
+                {
+                    "HAND": np.array(hand),
+                    "HAND_LOWER": robot.lower[hand],
+                    "HAND_RANGE": (robot.upper - robot.lower)[hand],
+                    "HAND_SPREAD": even_steps(len(robot.lower))[hand],
+                    "IDLE_PARTS": np.array(PARTS),
+                    "FINGER_MOVED": np.array([[int(m in some) for m in hand] for some in fingers]),
+                    "LINK_MOVED": np.array(
+                        [[int(link in some) for some in moved] for link in self.links]
+                    ),
+                }
+            )
+        )
 
     def _constants(self) -> str:
         model, robot = self.model, self.robot
@@ -292,11 +343,12 @@ class SceneSources:
                 "ARM_LOW": p.low,
                 "ARM_RANGE": p.high - p.low,
             }
-        return define(whole) + text + define_arrays(arrays)
+        return define(whole) + text + define_arrays(arrays) + self._idle_constants()
 
 
 WITHOUT = (
     *("SCENE_TYPES", "SCENE_CALLS", "SCENE_FIELDS", "SCENE_ROOM", "SCENE_INIT", "SCENE_WASM"),
+    "SCENE_BEGIN",
     *("SCENE_JS", "SCENE_DTS", "SCENE_SHAPES_JS", "SCENE_SHAPES_DTS", "SCENE_STATUS_JS"),
     *("SCENE_STATUS_TYPE", "SCENE_STATUS_DTS", "SCENE_ANSWER_JS", "SCENE_ANSWER_DTS"),
 )
@@ -305,4 +357,4 @@ WITHOUT = (
 
 def without_scene() -> dict[str, str]:
     """What stands for the marks where an export knows no scene."""
-    return dict.fromkeys(WITHOUT, "") | {"SCENE_LOOK": "#define look_about(solver) ((void) 0)\n"}
+    return dict.fromkeys(WITHOUT, "") | {"SCENE_LOOK": "#define run_on rounds_run\n"}

@@ -87,7 +87,12 @@ def freed(
 
 
 def freed_at_once(
-    engine: Freeing, problems: Problems, around: Surroundings, q: Array, start: Array
+    engine: Freeing,
+    problems: Problems,
+    around: Surroundings,
+    q: Array,
+    start: Array,
+    others: bool = False,
 ) -> tuple[Array, SolvedVerdict, Clearances] | None:
     """Another arm for the hand of one answer that touches something, judged; None: look further.
 
@@ -99,9 +104,10 @@ def freed_at_once(
         around: What it is checked against.
         q: (n,) the answer.
         start: (n,) where the robot is.
+        others: Whether to look at the hands of further rounds, too, as an exported solver does.
     """
     finder = engine.freer
-    found = finder.beside(problems, around, q[None], start[None])
+    found = finder.beside(problems, around, q[None], start[None], others)
     verdict = None if found is None else judge_one(finder.robot, problems, found)
     if found is None or verdict is None:
         return None

@@ -1,4 +1,4 @@
-/* What stands about the robot: how far it is, and another arm for the hand where one touches. */
+/* What stands about the robot: how far it is, and another arm for a hand where one touches. */
 #include "@PREFIX@_parts.h"
 
 #define FREESTANDING
@@ -16,11 +16,11 @@ enum { DONE = 0, SLICE_OVER = 1, NO_MEMORY = -1 };
 static double length3(const double *v) { return sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
 
 void @PREFIX@_scene_init(@PREFIX@_solver *solver) {
-  int i;
+  int i, k;
   for (i = 0; i < N_OWN; ++i) {
     @PREFIX@_solid *own = solver->scene.solids + i;
     own->kind = OWN_KIND[i];
-    memcpy(own->size, OWN_SIZE[i], sizeof own->size);
+    for (k = 0; k < 3; ++k) own->size[k] = OWN_SIZE[i][k];
     own->reach = OWN_REACH[i];
   }
   for (i = 0; i < @GUARD@_SCENE; ++i) solver->scene.solids[N_OWN + i].kind = @GUARD@_NOTHING;
@@ -63,14 +63,38 @@ static void add_pair(@PREFIX@_solver *solver, int i, int j, double offset) {
   solver->scene.offsets[k] = offset;
 }
 
-/* Pairs that hand and palm decide, or those that the arm has a part in. */
-static void add_pairs(@PREFIX@_solver *solver, int of_arm) {
+/* Of which pairs the distance is decided by what: hand and palm, without or with the fingers that
+ * touch nothing, or the arm, too. */
+enum { OF_HAND, OF_IDLE, OF_ARM };
+
+static int link_of(int number) {
+  if (number < N_CAPSULES) return LINK[number];
+  number -= N_CAPSULES;
+  return number < N_OWN ? OWN_LINK[number] : N_OWN - 1 - number;
+}
+
+/* Motors of the hand that move no finger with a contact, and the links that they move. */
+static void find_idle(@PREFIX@_solver *solver, const double *lower, const double *upper,
+                      int *motors, int *links) {
+  int k, f, i;
+  memset(links, 0, @GUARD@_LINKS * sizeof *links);
+  for (k = 0; k < N_HAND; ++k) {
+    motors[k] = lower[HAND[k]] < upper[HAND[k]];
+    for (f = 0; f < @GUARD@_FINGERS; ++f) {
+      motors[k] &= !FINGER_MOVED[f][k] || solver->points[3 * f] != solver->points[3 * f];
+    }
+    for (i = 0; motors[k] && i < @GUARD@_LINKS; ++i) links[i] |= LINK_MOVED[i][k];
+  }
+}
+
+/* Pairs of one part; idle: links of idle fingers, a null pointer: there are none. */
+static void add_pairs(@PREFIX@_solver *solver, const int *idle, int part) {
   int i, k, f;
   for (k = 0; k < @GUARD@_SCENE; ++k) {
     if (solver->scene.solids[N_OWN + k].kind == @GUARD@_NOTHING) continue;
     for (i = 0; i < N_CAPSULES; ++i) {
       int may = 0;
-      if (FIXED[i] || MOVING[i] != of_arm) continue;
+      if (FIXED[i] || (MOVING[i] ? OF_ARM : idle && idle[LINK[i]]) != part) continue;
       /* A finger may touch what it grasps with the link of its pad. */
       for (f = 0; f < @GUARD@_FINGERS; ++f) {
         may |= TOUCHES[f][i] && solver->points[3 * f] == solver->points[3 * f];
@@ -79,17 +103,22 @@ static void add_pairs(@PREFIX@_solver *solver, int of_arm) {
     }
   }
   for (k = 0; k < N_PAIRS; ++k) {
-    if (PAIR_MOVING[k] == of_arm) add_pair(solver, PAIRS[k][0], PAIRS[k][1], OFFSETS[k]);
+    const int first = link_of(PAIRS[k][0]), other = link_of(PAIRS[k][1]);
+    if ((PAIR_MOVING[k] ? OF_ARM : idle && (idle[first] || idle[other])) == part) {
+      add_pair(solver, PAIRS[k][0], PAIRS[k][1], OFFSETS[k]);
+    }
   }
 }
 
-static clearance_job about(@PREFIX@_solver *solver) {
+static clearance_job about(@PREFIX@_solver *solver, const int *idle) {
   clearance_job job = {0};
   int i;
   solver->scene.n_pairs = 0;
-  add_pairs(solver, 0);
+  add_pairs(solver, idle, OF_HAND);
+  solver->scene.n_busy = solver->scene.n_pairs;
+  add_pairs(solver, idle, OF_IDLE);
   solver->scene.n_held = solver->scene.n_pairs;
-  add_pairs(solver, 1);
+  add_pairs(solver, idle, OF_ARM);
   job.poses = solver->scene.poses;
   job.n_solids = @GUARD@_SCENE;
   job.solids = solver->scene.solids;
@@ -117,14 +146,8 @@ static double room_at(@PREFIX@_solver *solver, clearance_job *job, const double 
   return least - solver->scene.margin;
 }
 
-static int link_of(int number) {
-  if (number < N_CAPSULES) return LINK[number];
-  number -= N_CAPSULES;
-  return number < N_OWN ? OWN_LINK[number] : N_OWN - 1 - number;
-}
-
 double @PREFIX@_clearance(@PREFIX@_solver *solver, const double *q) {
-  clearance_job job = about(solver);
+  clearance_job job = about(solver, 0);
   int64_t closest;
   const double room = room_at(solver, &job, q, &closest);
   if (closest >= 0) {
@@ -136,8 +159,9 @@ double @PREFIX@_clearance(@PREFIX@_solver *solver, const double *q) {
 
 #if HAS_CLOSED_ARM
 /* The preferred arm that touches nothing, for the hand of an answer; 0 if there is none. */
-static int swing_arm(@PREFIX@_solver *solver, clearance_job *clear, const double *lower,
-                     const double *upper, int near, double *q) {
+static int swing_arm(@PREFIX@_solver *solver, const double *lower, const double *upper, int near,
+                     double *q) {
+  clearance_job clear = about(solver, 0);
   static const int64_t columns[] = ARM_COLUMNS;
   swings_job job = {0};
   map_job map = {0};
@@ -158,12 +182,12 @@ static int swing_arm(@PREFIX@_solver *solver, clearance_job *clear, const double
     low[i] = lower[columns[i]];
     high[i] = upper[columns[i]];
   }
-  clear->pairs += 2 * solver->scene.n_held;
-  clear->offsets += solver->scene.n_held;
-  clear->n_pairs -= solver->scene.n_held;
+  clear.pairs += 2 * solver->scene.n_held;
+  clear.offsets += solver->scene.n_held;
+  clear.n_pairs -= solver->scene.n_held;
   job.arms = @PREFIX@_arms_kernel;
   job.check = @PREFIX@_near_kernel;
-  job.clear = clear;
+  job.clear = &clear;
   job.lanes = 1;
   job.order = near ? NEAR_START : FAR_FROM_LIMITS;
   job.n_q = @GUARD@_MOTORS;
@@ -200,20 +224,63 @@ static int swing_arm(@PREFIX@_solver *solver, clearance_job *clear, const double
 }
 #endif
 
-int @PREFIX@_free(@PREFIX@_solver *solver, const double *lower, const double *upper, int near,
-                  double *q) {
-  int found = @PREFIX@_clearance(solver, q) - solver->scene.margin >= -ROUNDING;
-#if HAS_CLOSED_ARM
-  if (!found) {
-    clearance_job job = about(solver);
-    int64_t closest;
-    job.n_pairs = solver->scene.n_held;
-    if (room_at(solver, &job, q, &closest) < -ROUNDING) return 0;
-    job = about(solver);
-    found = swing_arm(solver, &job, lower, upper, near, q);
+/* Puts idle fingers where they have most room, if the hand touches something by them alone; the room
+ * that hand and palm have [m]. */
+static double put_aside(@PREFIX@_solver *solver, const double *lower, const double *upper,
+                        double *q) {
+  int motors[N_HAND], links[@GUARD@_LINKS], k, closer;
+  double most, part = 0, tried[@GUARD@_MOTORS], best[@GUARD@_MOTORS];
+  int64_t closest, place;
+  clearance_job job;
+  find_idle(solver, lower, upper, motors, links);
+  job = about(solver, links);
+  job.n_pairs = solver->scene.n_busy;
+  most = room_at(solver, &job, q, &closest);
+  job.pairs += 2 * solver->scene.n_busy;
+  job.offsets += solver->scene.n_busy;
+  job.n_pairs = solver->scene.n_held - solver->scene.n_busy;
+  if (most < -ROUNDING || !job.n_pairs) return most;
+  most = room_at(solver, &job, q, &closest);
+  memcpy(best, q, sizeof best);
+  /* All over their range first, then ever closer about the best. */
+  for (closer = 0; closer <= N_PARTS && most < -ROUNDING; ++closer) {
+    if (closer && !(most > -IDLE_NEAR)) break;
+    if (closer) part = IDLE_PARTS[closer - 1];
+    for (place = 0; place < (closer ? N_IDLE_CLOSER : N_IDLE); ++place) {
+      double room;
+      memcpy(tried, q, sizeof tried);
+      for (k = 0; k < N_HAND; ++k) {
+        const int column = HAND[k];
+        const double x = 0.5 + (double) place * HAND_SPREAD[k], step = x - (double) (int64_t) x;
+        double to = HAND_LOWER[k] + step * HAND_RANGE[k];
+        if (!motors[k]) continue;
+        if (closer) to = q[column] + part * ((step - 0.5) * HAND_RANGE[k]);
+        to = to > lower[column] ? to : lower[column];
+        tried[column] = to < upper[column] ? to : upper[column];
+      }
+      room = room_at(solver, &job, tried, &closest);
+      if (!(room > most)) continue;
+      most = room;
+      memcpy(best, tried, sizeof best);
+    }
+    memcpy(q, best, sizeof best);
   }
+  job = about(solver, links);
+  job.n_pairs = solver->scene.n_held;
+  return room_at(solver, &job, q, &closest);
+}
+
+int @PREFIX@_hand_is_free(@PREFIX@_solver *solver, const double *lower, const double *upper,
+                          double *q) {
+  return put_aside(solver, lower, upper, q) >= -ROUNDING;
+}
+
+int @PREFIX@_arm_is_free(@PREFIX@_solver *solver, const double *lower, const double *upper, int near,
+                         double *q) {
+#if HAS_CLOSED_ARM
+  return swing_arm(solver, lower, upper, near, q);
 #else
   (void) lower, (void) upper, (void) near;
+  return @PREFIX@_clearance(solver, q) - solver->scene.margin >= -ROUNDING;
 #endif
-  return found;
 }

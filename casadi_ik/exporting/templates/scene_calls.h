@@ -2,8 +2,9 @@
 /* Puts solid `number` of @GUARD@_SCENE into the scene, or takes it out (@GUARD@_NOTHING). pose: rotation row by
  * row, then the origin (12 numbers). grasped: links whose pads are in contact may touch it. Being
  * solved includes that nothing touches: the robot itself neither, also with nothing about it. Where
- * the answer touches, the arm's other ways to hold the hand are looked at, which may take as long as
- * so many solves; if none is free the status is @GUARD@_COLLISION. */
+ * the answer touches, the arm's other ways to hold the hand are looked at, then up to @TRIED@ other hands
+ * with theirs, which may take as long as so many solves; if none is free the status is
+ * @GUARD@_COLLISION, and q the answer of largest clearance. */
 int @PREFIX@_set_solid(@PREFIX@_solver *solver, int number, int kind, const double *size,
                        const double *pose, int grasped);
 

@@ -26,5 +26,10 @@ typedef struct {
   double poses[12 * @GUARD@_SCENE];
   int32_t grasped[@GUARD@_SCENE], pairs[2 * @MOST_PAIRS@];
   double offsets[@MOST_PAIRS@];
-  int64_t n_held, n_pairs;
+  int64_t n_busy, n_held, n_pairs;
+  /* The search for a hand that is free, where the answer touches something. */
+  int64_t looking, again, round, fit, n_met, next, iterations, restarts, fresh, n_known, n_swung;
+  double q[@GUARD@_MOTORS], room; /* the answer of largest clearance */
+  double met[@N_CANDIDATES@ * @GUARD@_MOTORS], rated[@N_CANDIDATES@];
+  double known[@N_LOOKED@ * @N_HAND@], swung[@N_LOOKED@ * @N_HAND@];
 } @PREFIX@_scene;

@@ -43,14 +43,14 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const double *points, const double *
   memcpy(solver->normals, normals, sizeof solver->normals);
   memcpy(solver->here, q0 ? q0 : HOME, sizeof solver->here);
   solver->terms[TERMS_NEAREST] = q0 ? 1.0 : 0.0;
-  if (!rounds_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
+@SCENE_BEGIN@  if (!rounds_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
   return (int) solver->status;
 }
 
 int @PREFIX@_run(@PREFIX@_solver *solver, int64_t iterations) {
-  const int under_way = solver->status == @GUARD@_RUNNING;
-  if (rounds_run(solver, iterations) != DONE) solver->status = @GUARD@_INVALID;
-  if (under_way && solver->status == @GUARD@_SOLVED) look_about(solver);
+  if (solver->status == @GUARD@_RUNNING && run_on(solver, iterations) != DONE) {
+    solver->status = @GUARD@_INVALID;
+  }
   return (int) solver->status;
 }
 

@@ -11,7 +11,7 @@ function differs(answer, target) {
     answer.status !== target.status ||
     answer.iterations !== target.iterations ||
     answer.restarts !== target.restarts ||
-@SCENE_TEST_SAME@    target.q.some((value, i) => !Object.is(value, answer.q[i]))
+@SCENE_TEST_SAME@    @SCENE_TEST_OR@target.q.some((value, i) => !Object.is(value, answer.q[i]))
   );
 }
 

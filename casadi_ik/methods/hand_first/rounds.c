@@ -442,6 +442,26 @@ static int search_again(rounds *job) {
   return 1;
 }
 
+/* Goes on with what is under way for at most so many iterations. */
+static int iterate(rounds *job, int64_t most, int32_t *status) {
+  const int64_t before = job->in_round;
+  double seconds = 0;
+  loop_job loop = {0};
+  int code;
+  loop.states = job->state;
+  loop.parameters = job->parameters;
+  loop.iterations = &job->in_round;
+  loop.status = status;
+  loop.seconds = &seconds;
+  loop.mark = job->mark;
+  loop.count = 1;
+  loop.max_iterations = before + most < BUDGET ? before + most : BUDGET;
+  loop.slice = SLICE;
+  code = SOLVE(&loop);
+  job->iterations += job->in_round - before;
+  return code;
+}
+
 /* Goes on for so many iterations, and begins one round at most; `status` says whether it is over.
  *
  * Returns DONE, SLICE_OVER if it has to be called again, or what went wrong.
@@ -449,10 +469,8 @@ static int search_again(rounds *job) {
 static int rounds_run(rounds *job, int64_t most) {
   int begun = 0, code;
   while (job->status == RUNNING) {
+    const int64_t before = job->iterations;
     int32_t status = RUNNING;
-    int64_t spent;
-    double seconds = 0;
-    loop_job loop = {0};
     if (!job->under_way) {
       if (begun++ || most <= 0) return DONE;
       code = begin_round(job, job->round);
@@ -460,20 +478,8 @@ static int rounds_run(rounds *job, int64_t most) {
       job->under_way = 1;
       job->in_round = 0;
     }
-    spent = job->in_round;
-    loop.states = job->state;
-    loop.parameters = job->parameters;
-    loop.iterations = &job->in_round;
-    loop.status = &status;
-    loop.seconds = &seconds;
-    loop.mark = job->mark;
-    loop.count = 1;
-    loop.max_iterations = spent + most < BUDGET ? spent + most : BUDGET;
-    loop.slice = SLICE;
-    code = SOLVE(&loop);
-    spent = job->in_round - spent;
-    job->iterations += spent;
-    most -= spent;
+    code = iterate(job, most, &status);
+    most -= job->iterations - before;
     if (code != DONE) return code;
     if (status == RUNNING && job->in_round < BUDGET) return DONE;
     job->under_way = 0;

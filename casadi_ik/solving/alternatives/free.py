@@ -117,7 +117,12 @@ class FreeFinder:
         )
 
     def beside(
-        self, problems: Problems, around: Surroundings, q: Array, starts: Array
+        self,
+        problems: Problems,
+        around: Surroundings,
+        q: Array,
+        starts: Array,
+        others: bool = False,
     ) -> Array | None:
         """The first that `find` looks at for one target: another arm (n,) for the same hand.
 
@@ -126,9 +131,13 @@ class FreeFinder:
             around: What it is checked against.
             q: (1, n) an answer that is not free.
             starts: (1, n) where the robot is.
+            others: Whether to look at what comes next, too: the hands of further rounds.
         """
         search = FreeSearch(self._finder, self.swings, problems, around, starts, 0)
         search.swing(q, np.zeros(1, dtype=np.intp))
+        if others:
+            for hands, owner in search.of_rounds():
+                search.swing(hands, owner)
         return search.best[0] if search.free[0] else None
 
     def arm_margins(self, q: Array) -> Array:

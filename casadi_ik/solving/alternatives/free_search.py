@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,9 @@ ALIKE = 0.02
 
 ROUNDS = 3
 """Rounds of hand postures."""
+
+LEAST_RANGE = 1e-9
+"""What stands for the range of a motor that has none [rad or m]."""
 
 ESCAPES = 4
 """Steps away from what is nearest."""
@@ -113,7 +117,7 @@ class FreeSearch:
         self.hands: list[tuple[Array, NDArray[np.intp], Array]] = []
         robot, hand = finder.robot, finder.hand
         self._idle = IdleFingers(robot, problems)
-        self._ranges = np.maximum(robot.upper - robot.lower, 1e-9)
+        self._ranges = np.maximum(robot.upper - robot.lower, LEAST_RANGE)
         self._known, self._swung = (Different(count, len(hand), ALIKE) for _ in range(2))
         self._fresh = np.ones(count, dtype=bool)
 
@@ -124,7 +128,7 @@ class FreeSearch:
     def run(self, q: Array, every: bool = False) -> None:
         """Look until all are free; or first, if asked, at the hands of a round whether or not."""
         self.swing(q, np.arange(len(q)))
-        for hands, owner in self._others(every):
+        for hands, owner in chain(self.of_rounds(every), self._from_anywhere()):
             self.swing(hands, owner)
         blocked = np.flatnonzero(~self.free)
         if len(blocked):
@@ -156,6 +160,7 @@ class FreeSearch:
             self.take(q, owner)
             self.hands.append((q, owner, np.zeros(len(q))))
             np.add.at(self.tried, owner, 1)
+            self._fresh[owner] = True
             return
         room = self.around.rows(owner).held.check(q).room
         parts = (q / self._ranges)[:, self.finder.hand]
@@ -201,9 +206,9 @@ class FreeSearch:
         )
         return *self._solved(swung.q, owner[swung.owner]), swung.tried
 
-    def _others(self, every: bool) -> Iterator[tuple[Array, NDArray[np.intp]]]:
-        """Answers with other hands and arms, of the targets that are not free."""
-        method, hand = self.trials.method, self.finder.hand
+    def of_rounds(self, every: bool = False) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+        """Answers with other hands, of the targets that are not free, round by round."""
+        method = self.trials.method
         for number in range(min(ROUNDS, method.options.rounds)):
             # Where a round has brought no other hand, the next will not either.
             rows = np.flatnonzero((~self.free | (every and not number)) & self._fresh)
@@ -219,10 +224,12 @@ class FreeSearch:
             asked = self.problems.rows(owner)
             ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat))
             yield self._solved(ends, owner)
-        rows = np.flatnonzero(~self.free)
+
+    def _from_anywhere(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+        """Answers with other hands and arms, of the targets that are not free."""
+        rows, robot, hand = np.flatnonzero(~self.free), self.finder.robot, self.finder.hand
         if not len(rows):
             return
-        robot = self.finder.robot
         count = STARTS if self.swings is None else HANDS
         owner = np.repeat(rows, count)
         numbers = np.array([self.problems.number(int(row)) for row in rows])
