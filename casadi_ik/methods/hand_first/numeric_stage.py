@@ -6,14 +6,18 @@ import casadi as ca
 
 from casadi_ik.methods.common.contact_fit import EXACT, judge
 from casadi_ik.methods.common.numeric_arm import (
+    NEAR,
+    SIX,
     STARTS,
     nearest_start,
     other_side,
     pose_step,
 )
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
+from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
 
 
@@ -38,6 +42,17 @@ def numeric_stage(layouts: HandFirstLayouts) -> ca.Function:
     return ca.Function("placement", [state, parameters], list(outputs))
 
 
+def _is_near(s: dict[str, Expr], p: dict[str, Expr], rows: list[int], cost: Expr) -> Expr:
+    """Whether an arm of too few free motors is as near a palm as can be asked in the first round.
+
+    What is left is for arm and hand together.
+    """
+    few = ca.sum1(p["lower"][rows] < p["upper"][rows]) < SIX
+    allowed = ca.mmax(p["position_tolerance"] / LENGTH) ** 2 + ca.mmax(p["angle_tolerance"]) ** 2
+    near = ca.logic_and(few, cost < NEAR * allowed)
+    return ca.logic_and(near, s["earlier"] < 1)
+
+
 def _pose_step(layouts: HandFirstLayouts) -> ca.Function:
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
@@ -57,7 +72,8 @@ def _pose_step(layouts: HandFirstLayouts) -> ca.Function:
     again = ca.logic_and(judged.settled, ca.logic_and(s["earlier"] > 0, turned > 0))
     starts = s["starts"] + ca.logic_and(judged.settled, ca.logic_not(again))
     turned = ca.if_else(judged.settled, ca.if_else(again, turned, 0), s["turned"])
-    leave = ca.logic_or(exact, starts >= STARTS)
+    near = ca.logic_and(judged.settled, _is_near(s, p, rows, judged.cost))
+    leave = ca.logic_or(ca.logic_or(exact, near), starts >= STARTS)
     q = with_rows(s["q"], rows, ca.if_else(leave, best, ca.if_else(again, ca.vertcat(*sent), now)))
     after = layouts.state.pack(
         layouts.counted(s, Phase.ARM_PLACEMENT)
