@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
@@ -73,3 +75,66 @@ def test_a_joint_of_an_arm_with_two_spheres_may_be_held_in_another_turn(tmp_path
             joint["limits"] = ["-360 deg", "360 deg"]
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(arm))
     assert all_solved(ik.load_robot(path), {"lwr_joint_1": 4.2, "lwr_joint_7": -5.1}, prefer)
+
+
+FIXED = ("fr3_joint_3", "fr3_joint_4", "trifinger_finger_2_0")
+OTHERS_FIXED = ("fr3_joint_1", "fr3_joint_4", "trifinger_finger_1_0")
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize(
+    ("names", "q"),
+    [
+        (
+            FIXED,
+            [
+                *(1.223134, -0.000228, -0.383794, -2.444648, 2.592195, 2.932624, -2.377022),
+                *(0.83858, 0.882637, -1.144192, 0.043121, 0.387828, -1.526174),
+                *(-0.254952, 1.144506, -1.033636),
+            ],
+        ),
+        (
+            OTHERS_FIXED,
+            [
+                *(-2.230327, -0.323357, 2.518197, -0.977686, 1.282477, 1.782027, 2.46734),
+                *(0.658108, 1.06685, -1.471483, 0.719918, 0.597569, -1.089626),
+                *(0.223291, 0.098716, -0.228548),
+            ],
+        ),
+    ],
+)
+def test_motors_of_arm_and_hand_held_together(names, q, compiled):
+    """No table holds the hand's postures: some targets need more rounds than usual."""
+    robot = ik.load_robot("fr3+trifinger")
+    points, normals = robot.contacts(np.array([q]))
+    fixed = {name: q[robot.actuators.index(name)] for name in names}
+    batch = ik.Solver(robot, compiled=compiled).solve_batch(points, normals, fixed=fixed)
+    assert batch.success.all()
+
+
+@pytest.mark.parametrize("joints", [5, 3])
+def test_short_arms_and_wrists_are_placed_at_once(tmp_path, joints):
+    """They bring a palm where it is asked for by chance only: what is near is good enough."""
+    robot = short_arm(tmp_path, joints)
+    q = robot.random(np.random.default_rng(6), 25)
+    for prefer in ("limits", "q0"):
+        solver = ik.Solver(robot, compiled=False)
+        batch = solver.solve_batch(*robot.contacts(q), q0=robot.home, prefer=prefer)
+        assert batch.success.all()
+        assert np.median(batch.phases["arm-placement"]) < 50
+
+
+def short_arm(folder: Path, joints: int) -> ik.ArmHand:
+    """The shipped arm-hand with the first joints of its arm."""
+    path = copy_shipped_robot(folder)
+    arm = yaml.safe_load((folder / "arm.yaml").read_text())
+    arm["joints"] = arm["joints"][:joints]
+    names = [joint["name"] for joint in arm["joints"]]
+    arm["tip"] = {**arm["tip"], "link": arm["joints"][-1]["child"]}
+    arm["home"] = {name: value for name, value in arm.get("home", {}).items() if name in names}
+    del arm["collision"]
+    (folder / "arm.yaml").write_text(yaml.safe_dump(arm))
+    whole = yaml.safe_load(path.read_text())
+    whole["home"] = {n: v for n, v in whole["home"].items() if n in names or n.startswith("bh")}
+    path.write_text(yaml.safe_dump(whole))
+    return ik.load_robot(path)

@@ -91,6 +91,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             **t,
         }
     )
+    still = ca.sum1(t["lower"][hand] >= t["upper"][hand])
     zero = {item.name: ca.SX.zeros(item.size) for item in layouts.state}
     state = layouts.state.pack(
         zero
@@ -99,6 +100,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "best_q": here,
             "best_cost": sys.float_info.max,
             "least": sys.float_info.max,
+            "part_held": ca.logic_and(still > 0, still < len(hand)),
             "phase": ca.if_else(t["nearest"], float(Phase.REFINEMENT), float(Phase.CANDIDATE)),
             "candidate": -t["nearest"],
         }

@@ -22,7 +22,9 @@ from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.going_on import (
     CARRIED,
     COUNTED,
+    NEAR_OF_MANY,
     NEAR_SHRINKS,
+    RETURNS_OF_MANY,
     SURE,
     TINY,
     VARIED,
@@ -139,14 +141,17 @@ class HandFirstMethod(LoopedMethod):
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
         """Whether a round may still help: see `most_returns` and `rugged`."""
         layout = self.step.layouts.state
-        returns, cost = (states[:, layout.slice(name).start] for name in ("returns", "best_cost"))
+        returns, cost, part_held = (
+            states[:, layout.slice(name).start] for name in ("returns", "best_cost", "part_held")
+        )
+        most = np.where(part_held > 0, RETURNS_OF_MANY, self._returns)
         further = number - self._rugged
         if further >= 0:
-            near = min(self._near, NEAR_SHRINKS / (further + 1))
-            return (returns < self._returns) & (cost < near)
+            near = np.where(part_held > 0, NEAR_OF_MANY, self._near)
+            return (returns < most) & (cost < np.minimum(near, NEAR_SHRINKS / (further + 1)))
         # No more hands of tables if their fits come back to a minimum that just misses.
         tables = VARIED <= number < self.options.rounds
-        return (returns < self._returns) | (cost < SURE) | (not tables)
+        return (returns < most) | (cost < SURE) | (not tables)
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """The step counts them."""

@@ -33,7 +33,10 @@ DIMENSIONS = (
 )
 """Of the arrays in `rounds`."""
 
-STATE = ("q", "phase", "candidate", "earlier", "returns", "best_cost", "best_q", "counts")
+STATE = (
+    *("q", "phase", "candidate", "earlier", "part_held", "returns"),
+    *("best_cost", "best_q", "counts"),
+)
 """What rounds.c reads and writes of a state."""
 
 
@@ -119,6 +122,7 @@ class RoundsPlan:
             "RUGGED": going_on.rugged(len(layouts.robot.hand_actuators)),
             "VARIED": going_on.VARIED,
             "RETURNS": going_on.most_returns(len(layouts.robot.hand_actuators)),
+            "RETURNS_OF_HELD": going_on.RETURNS_OF_MANY,
             "POOL": restarts.MENDED if self.mends else restarts.POOL,
             "MENDS": int(self.mends),
             "SPREAD": restarts.SPREAD,
@@ -143,6 +147,7 @@ class RoundsPlan:
         return {
             "SURE": going_on.SURE,
             "NEAR_COST": going_on.near_cost(hand),
+            "NEAR_OF_HELD": going_on.NEAR_OF_MANY,
             "NEAR_SHRINKS": going_on.NEAR_SHRINKS,
             "AT_END": restarts.AT_END,
             "HELD": restarts.HELD,
