@@ -9,7 +9,10 @@ from casadi_ik.importing.posture import moved
 from casadi_ik.robots.description import Joint, RobotDescription
 
 SAMPLES = 300
-"""Postures of the arm that are compared."""
+"""Postures of the arm that are compared, if it has no more joints than `USUAL`."""
+
+USUAL = 12
+"""Joints of an arm."""
 
 TURN = np.pi / 2
 """A joint is not turned further than this from the middle of its range, however wide it is."""
@@ -28,7 +31,8 @@ def guess_home(robot: RobotDescription) -> Array:
     rng = np.random.default_rng(0)
     half = np.minimum((robot.upper - robot.lower)[arm] / 4, TURN)
     best, found = -1.0, middle
-    for i in range(SAMPLES):
+    # What a posture takes grows with the square of the joints.
+    for i in range(max(1, int(SAMPLES * min(1.0, (USUAL / len(arm)) ** 2)))):
         q = middle.copy()
         if i:
             q[arm] += half * rng.uniform(-1, 1, len(arm))

@@ -157,3 +157,98 @@ def test_what_robots_are_written_with_is_expanded(
     found = ik.load_robot(out)
     assert found.links(found.home)["left_1"][2, 3] == pytest.approx(0.1)
     assert "more" in found.links(found.home)
+
+
+def test_robots_larger_than_any(run: Command, tmp_path: Path) -> None:
+    path, out = robot(tmp_path / "x.urdf"), tmp_path / "mine.yaml"
+    plain, end = path.read_text().removesuffix("</robot>"), tmp_path / "other.yaml"
+    ends = '<joint name="j{0}" type="{1}"><parent link="palm"/><child link="x{0}"/>'
+    more = f'<link name="x{{0}}"/>{ends}<limit lower="0" upper="1" velocity="1"/></joint>'
+    fixed, fingers = (
+        "".join(more.format(i, kind) for i in range(1200)) for kind in ("fixed", "revolute")
+    )
+    for added, says in ((fixed, "1205 links"), (fingers[: fingers.index("x300")], "304 moving jo")):
+        text = added[: added.rindex("<link")] if added is not fixed else added
+        path.write_text(f"{plain}{text}</robot>")
+        assert f"x.urdf: found {says}" in run("import", path, "--out", out).error
+    path.write_text(f"{plain}{fixed}</robot>")
+    assert run("import", path, "--size-limits", "2", "--out", end).exit == 0
+
+
+TAG, AXIS, PLACE, LIMIT = (
+    *('<robot name="hand"', '<axis xyz="1 0 0"/>', 'xyz="0 0.04 0.1"', 'lower="0" upper="1.5"'),
+)
+
+NUMBERS = {
+    "encoding": (TAG, f'<?xml version="1.0" encoding="utf-7"?>{TAG}', ""),
+    "unknown encoding": (TAG, f'<?xml version="1.0" encoding="x"?>{TAG}', ""),
+    "limits without end": (LIMIT, 'lower="-1e308" upper="1e308"', ""),
+    "no axis": (AXIS, "<axis/>", ""),
+    "axis": (AXIS, '<axis xyz="1e308 0 0"/>', "axis: xyz: found '1e308 0 0'"),
+    "place": (PLACE, 'xyz="0 0 1e308"', "origin: xyz: found '0 0 1e308'"),
+    "NaN": (LIMIT, 'lower="0" upper="nan"', "limit: upper: found 'nan'"),
+}
+
+
+@pytest.mark.parametrize("case", NUMBERS)
+def test_numbers_and_encodings_of_urdf(run: Command, tmp_path: Path, case: str) -> None:
+    path = robot(tmp_path / "x.urdf")
+    old, new, says = NUMBERS[case]
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    done = run("import", path, "--out", tmp_path / "mine.yaml", "--check")
+    if says:
+        assert f"x.urdf: joint 'a': {says}" in done.error
+    else:
+        assert (done.exit, done.err) == (0, ""), done
+
+
+MJCF = """<mujoco><compiler angle="radian"/>{assets}<worldbody><body name="palm">{bodies}
+<body name="l1" pos="0 0.04 0.1"><joint name="a" axis="{axis}" range="{range}" limited="true"/>
+<geom size="0.01"/><body name="l2" pos="0 0 {place}"><joint name="b" axis="1 0 0" range="0 1"
+limited="true"/><geom size="0.01"/></body></body>
+<body name="r1" pos="0 -0.04 0.1"><joint name="c" axis="-1 0 0" range="0 1" limited="true"/>
+<geom size="0.01"/></body></body></worldbody>
+<tendon><fixed name="t"><joint joint="a" coef="{pull}"/><joint joint="b" coef="{pull}"/></fixed>
+</tendon><actuator><position tendon="t"/></actuator></mujoco>"""
+
+PLAIN = {"assets": "", "bodies": "", "axis": "1 0 0", "range": "0 1", "place": "0.05", "pull": "1"}
+
+GIANTS = "takes more than 2 s of computing or 307 MiB (CASADI_IK_LIMITS=4 in the environment allows"
+
+MODELS = {
+    "plain": ({}, ""),
+    "field": (
+        {"assets": '<asset><hfield name="h" nrow="38000" ncol="38000" size="1 1 1 1"/></asset>'},
+        GIANTS,
+    ),
+    "replicated": (
+        {"bodies": '<replicate count="1000000"><body><geom size="0.1"/></body></replicate>'},
+        GIANTS,
+    ),
+    "axis is NaN": ({"axis": "nan 0 0"}, "jnt_axis: expected finite numbers"),
+    "axis is infinite": ({"axis": "inf 0 0"}, "jnt_axis: expected finite numbers"),
+    "axis overflows": ({"axis": "1e308 0 0"}, "jnt_axis: one is no direction"),
+    "place is NaN": ({"place": "nan"}, "body_pos: expected finite numbers"),
+    "place is far": ({"place": "1e308"}, "body_pos: expected finite numbers"),
+    "range is NaN": ({"range": "nan 1"}, "jnt_range: holds NaN"),
+    "range is infinite": ({"range": "-inf inf"}, ""),
+    "range is wide": ({"range": "-1e308 1e308"}, ""),
+    "tendon that pulls nothing": ({"pull": "0"}, ""),
+}
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_numbers_and_giants_of_mjcf(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    changes, says = MODELS[case]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CASADI_IK_LIMITS", "0.1" if says == GIANTS else "1")
+    Path("x.xml").write_text(MJCF.format(**PLAIN | changes))
+    done = run("import", "x.xml", "--palm", "palm", "--out", "mine.yaml", "--check")
+    if says:
+        assert f"x.xml: mujoco cannot read it: {says}" in done.error
+    else:
+        assert (done.exit, done.err) == (0, ""), done
+    assert {path.name for path in tmp_path.iterdir()} <= {"x.xml", "mine.yaml"}

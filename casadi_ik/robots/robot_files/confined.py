@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -45,18 +46,21 @@ def confined(what: str, path: Path) -> bytes:
     seconds, doing = limit(SECONDS), "expand" if what == MACROS else "read"
     limits = (seconds, limit(MEMORY), limit(OUTPUT))
     # Not the script's folder, whose modules are called as some of others are.
-    command = [sys.executable, "-P", foreign.__file__, what, str(path), *map(str, limits)]
-    known = os.pathsep.join(one or str(Path.cwd()) for one in sys.path)
+    script, place = Path(foreign.__file__).resolve(), path.resolve()
+    command = [sys.executable, "-P", str(script), what, str(place), *map(str, limits)]
+    known = os.pathsep.join(str(Path(one).resolve()) for one in sys.path)
     try:
-        done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": known},
-            timeout=PATIENCE * seconds,
-            check=False,
-        )
+        with tempfile.TemporaryDirectory() as folder:  # MuJoCo keeps a log where it runs
+            done = subprocess.run(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                cwd=folder,
+                env=os.environ | {"PYTHONPATH": known},
+                timeout=PATIENCE * seconds,
+                check=False,
+            )
     except subprocess.TimeoutExpired:
         code, said = 1, b""
     except (OSError, ValueError) as error:

@@ -14,6 +14,7 @@ from casadi_ik.robots.couplings import Coupling, Linear, Polynomial
 from casadi_ik.robots.robot_files.confined import MODEL, confined
 from casadi_ik.robots.robot_files.file_shapes import mjcf_shapes
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, fixed, turned
+from casadi_ik.robots.robot_files.xml_text import FURTHEST, check_size
 
 WORLD = "world"
 """MuJoCo's name of what does not move."""
@@ -50,6 +51,7 @@ def read_mjcf(path: Path) -> RobotTree:
         MissingExtraError: MuJoCo is not installed.
     """
     mujoco, model = mujoco_model(path)
+    check_size(model.nbody, model.njnt, path)
     couplings = _equalities(mujoco, model, path)
     motors = _tendons(mujoco, model, couplings)
     names = [model.body(i).name or f"body_{i}" for i in range(model.nbody)]
@@ -94,7 +96,7 @@ def _of_body(
         anchor[:3, 3] = model.jnt_pos[joint]
         child = names[body] if last else f"{names[body]}:{name}"
         limits = None
-        if model.jnt_limited[joint]:
+        if model.jnt_limited[joint] and np.abs(model.jnt_range[joint]).max() <= FURTHEST:
             limits = (float(model.jnt_range[joint, 0]), float(model.jnt_range[joint, 1]))
         elif kind == "revolute":
             kind = "continuous"
@@ -157,19 +159,26 @@ def _tendons(
         if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON
     }
     motors: dict[str, tuple[float, float]] = {}
+    named = {joint_name(model, joint) for joint in range(model.njnt)}
     for tendon in sorted(pulled):
         first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
         wraps = range(first, first + count)
         if any(model.wrap_type[i] != mujoco.mjtWrap.mjWRAP_JOINT for i in wraps):
             continue  # one that runs through space
-        joints = [int(model.wrap_objid[i]) for i in wraps]
-        ratios = [float(model.wrap_prm[i]) for i in wraps]
+        pulls = [(int(model.wrap_objid[i]), float(model.wrap_prm[i])) for i in wraps]
+        joints = [joint for joint, ratio in pulls if ratio]
+        ratios = [ratio for _, ratio in pulls if ratio]
         ranges = [model.jnt_range[joint] for joint in joints]
-        limited = all(model.jnt_limited[joint] for joint in joints)
+        limited = all(
+            model.jnt_limited[joint] and -FURTHEST <= low < high <= FURTHEST
+            for joint, (low, high) in zip(joints, ranges, strict=True)
+        )
         taken = any(joint_name(model, joint) in couplings for joint in joints)
         if not limited or taken or len(joints) < 2:
             continue
         name = model.tendon(tendon).name or f"tendon_{tendon}"
+        while name in named:
+            name = f"{name}_tendon"
         # From where all joints are slack to where all are pulled.
         slack = [float(r[0] if c > 0 else r[1]) for c, r in zip(ratios, ranges, strict=True)]
         taut = [float(r[1] if c > 0 else r[0]) for c, r in zip(ratios, ranges, strict=True)]

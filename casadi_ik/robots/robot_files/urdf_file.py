@@ -11,6 +11,7 @@ import math
 import os
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,10 @@ from casadi_ik.robots.couplings import Coupling, Linear
 from casadi_ik.robots.robot_files.file_shapes import urdf_shapes
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, parents_first
 from casadi_ik.robots.robot_files.xml_text import (
+    FURTHEST,
     Element,
     attribute,
+    check_size,
     check_vector,
     number,
 )
@@ -48,13 +51,14 @@ def read_urdf(element: Element, path: Path) -> RobotTree:
         MissingExtraError: pinocchio is not installed.
     """
     links = [attribute(link, "name", f"{path}: a link") for link in element.findall("link")]
-    joints = {}
+    elements = element.findall("joint")
+    check_size(len(links), sum(one.get("type") != "fixed" for one in elements), path)
+    names = [attribute(joint, "name", f"{path}: a joint") for joint in elements]
     _once(links, "link", path)
-    for joint in element.findall("joint"):
-        name = attribute(joint, "name", f"{path}: a joint")
-        _once([*joints, name], "joint", path)
+    _once(names, "joint", path)
+    joints = dict(zip(names, elements, strict=True))
+    for name, joint in joints.items():
         _check(joint, links, f"{path}: joint {name!r}")
-        joints[name] = joint
     root = _root(links, joints, path)
     model = _model(element, links, joints, path)
     found = {joint.name: joint for joint in _from_model(model, joints, path)}
@@ -71,6 +75,8 @@ def bare(element: Element) -> Element:
         copy = ElementTree.SubElement(plain, "joint", dict(joint.attrib))
         for kind in KINEMATIC:
             for part in joint.findall(kind)[:1]:
+                if kind == "axis" and not part.get("xyz"):  # as if it were not there
+                    continue
                 if kind == "limit":  # what URDF demands beside the range
                     part = Element("limit", {"effort": "0", "velocity": "0"} | part.attrib)
                 copy.append(part)
@@ -96,8 +102,8 @@ def pinocchio() -> Any:
 
 
 def _once(names: list[str], noun: str, path: Path) -> None:
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise DescriptionError(f"{path}: {noun} {name!r} appears twice")
 
 
@@ -119,8 +125,8 @@ def _check(joint: Element, links: list[str], where: str) -> None:
         if not np.linalg.norm(direction) > 1e-9:
             raise DescriptionError(f"{where}: axis: is zero, expected a direction")
     limit = joint.find("limit")
-    ends = [number(limit, name, f"{where}: limit") for name in ("lower", "upper")]
-    number(limit, "velocity", f"{where}: limit")
+    ends = _ends(limit, where)
+    number(limit, "velocity", f"{where}: limit", math.inf)
     low, high = (end or 0.0 for end in ends)
     if low > high:
         raise DescriptionError(f"{where}: limit: lower {low:.6g} is above upper {high:.6g}")
@@ -189,7 +195,7 @@ def _from_model(model: Any, elements: dict[str, Element], path: Path) -> Iterato
             placement = parent.placement.inverse() * frame.placement
         limit = element.find("limit")
         where = f"{path}: joint {frame.name!r}"
-        velocity = number(limit, "velocity", f"{where}: limit") or math.inf
+        velocity = number(limit, "velocity", f"{where}: limit", math.inf) or math.inf
         yield TreeJoint(
             frame.name,
             parent.name,
@@ -213,10 +219,14 @@ def _axis(joint: Any, model: Any) -> Array:
 
 def _limits(limit: Element | None, where: str) -> tuple[float, float] | None:
     """The range that is stated; an end that is left out is zero in URDF if the other is there."""
-    ends = [number(limit, name, f"{where}: limit") for name in ("lower", "upper")]
-    if ends == [None, None]:
+    ends = _ends(limit, where)
+    if ends == [None, None] or max(abs(end or 0.0) for end in ends) > FURTHEST:
         return None
     return ends[0] or 0.0, ends[1] or 0.0
+
+
+def _ends(limit: Element | None, where: str) -> list[float | None]:
+    return [number(limit, name, f"{where}: limit", math.inf) for name in ("lower", "upper")]
 
 
 def _mimic(element: Element, where: str) -> Coupling | None:
