@@ -20,7 +20,7 @@ from casadi_ik.files.shipped import resolve
 from casadi_ik.importing.capsules import LEAST_SAVING
 from casadi_ik.importing.fitted import MOST, fitted, worst
 from casadi_ik.importing.posture import Postures
-from casadi_ik.importing.surfaces import together
+from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.importing.touching import may_touch
 from casadi_ik.robots.described_parts import arm_part, hand_part
 from casadi_ik.robots.schema import ArmFile, HandFile
@@ -39,13 +39,24 @@ def main() -> None:
         "--apart", nargs="*", default=[], help="our links that hold several of the file: each alone"
     )
     parser.add_argument("--without", nargs="*", default=[], help="links of the file to leave out")
+    parser.add_argument(
+        "--shapes",
+        nargs="+",
+        choices=("collision", "seen"),
+        default=["collision"],
+        help="which of the file's shapes to hold; collision: of a link without any what is seen",
+    )
     given = parser.parse_args()
     path = resolve(given.name, given.kind)
     if given.kind == "arms":
         part: Any = arm_part(read(path, ArmFile)[0], path)
     else:
         part = hand_part(read(path, HandFile)[0], path)
-    parts = in_our_links(part, given.file, set(given.without))
+    parts: dict[str, list[Surface]] = {}
+    for wanted in given.shapes:
+        found = in_our_links(part, given.file, set(given.without), seen=wanted == "seen")
+        for link, some in found.items():
+            parts.setdefault(link, []).extend(some)
     surfaces = {link: whole for link, some in parts.items() if (whole := together(some))}
     flat = {part.root} if given.kind == "hands" else set()
     shapes = fitted(surfaces, flat, most=given.most, saving=given.saving)

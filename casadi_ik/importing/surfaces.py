@@ -91,12 +91,15 @@ def together(surfaces: list[Surface]) -> Surface | None:
     return Surface(np.concatenate([one.points for one in surfaces]), np.concatenate(triangles))
 
 
-def link_surfaces(tree: RobotTree, links: Collection[str]) -> tuple[dict[str, Surface], list[str]]:
+def link_surfaces(
+    tree: RobotTree, links: Collection[str], seen: bool = False
+) -> tuple[dict[str, Surface], list[str]]:
     """Shapes of a file's links: those for collisions, else those that are seen.
 
     Args:
         tree: The file.
         links: Those that are wanted: fine meshes take a second each.
+        seen: Whether those that are seen are wanted instead (URDF).
 
     Returns:
         By link its shape in its frame; and what is not there, a line each.
@@ -106,7 +109,7 @@ def link_surfaces(tree: RobotTree, links: Collection[str]) -> tuple[dict[str, Su
         return {link: found[link] for link in links if link in found}, []
     assert tree.element is not None
     missing = Missing(tree.path)
-    found = _of_urdf(tree.element, "collision", links, missing)
+    found = {} if seen else _of_urdf(tree.element, "collision", links, missing)
     rest = [link for link in links if link not in found]
     found |= _of_urdf(tree.element, "visual", rest, missing)
     return found, missing.lines()

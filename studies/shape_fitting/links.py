@@ -29,8 +29,10 @@ class Axis:
     way: Array
 
 
-def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, list[Surface]]:
-    """The shapes of the file's links by our link, in its frame."""
+def in_our_links(
+    part: Part, file: Path, without: set[str], seen: bool = False
+) -> dict[str, list[Surface]]:
+    """The shapes of the file's links by our link, in its frame; `seen` as for `link_surfaces`."""
     tree = read_tree(file)
     theirs = tree_poses(tree)
     ours = Postures(part).poses({})
@@ -71,7 +73,7 @@ def in_our_links(part: Part, file: Path, without: set[str]) -> dict[str, list[Su
             ):
                 holder[joint.child] = holder[joint.parent]
                 changed = True
-    found, missing = link_surfaces(tree, list(holder))
+    found, missing = link_surfaces(tree, list(holder), seen)
     for line in missing:
         print("  ", line)
     parts: dict[str, list[Surface]] = {}
