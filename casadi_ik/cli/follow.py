@@ -93,7 +93,8 @@ def _followed(
     path: Path, follower: Follower, frames: Frames, times: Array, retargeter: Retargeter
 ) -> Iterator[Array]:
     """Where the motors are at the end of each cycle."""
-    weight = (retargeter.config.wrist_weight,) * 2
+    counts = retargeter.config.wrist_weight
+    weight = counts, counts
     for first in range(0, len(times), FRAMES_AT_ONCE):
         now = times[first : first + FRAMES_AT_ONCE]
         if frames.keypoints is None:

@@ -20,6 +20,7 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
 
+import msgspec.msgpack
 import viser
 from websockets.asyncio import server as websocket_server
 from websockets.asyncio.server import ServerConnection
@@ -134,6 +135,27 @@ def _quiet(handler: Handler) -> Handler:
         if found != wanted:
             await connection.close(1002, f"Version mismatch. Client: {found}, Server: {wanted}")
             return
+        receive = connection.recv
+
+        async def checked(*how: Any, **more: Any) -> Any:
+            message = await receive(*how, **more)
+            refuse_other_updates(message)
+            return message
+
+        connection.recv = checked  # type: ignore[method-assign]
         await handler(connection)
 
     return handle
+
+
+def refuse_other_updates(message: str | bytes) -> None:
+    """Refuse what sets more of a control than its value, as no browser does: viser would.
+
+    Raises:
+        ValueError: It does, or it is no message.
+    """
+    if not isinstance(message, bytes):
+        raise ValueError("found a text")
+    found = msgspec.msgpack.decode(message)
+    if found.get("type") == "GuiUpdateMessage" and set(found["updates"]) != {"value"}:
+        raise ValueError(f"found updates of {set(found['updates'])}, expected the value")

@@ -69,9 +69,12 @@ def usable(numbers: ArrayLike, count: int) -> Array:
     """Numbers (count,) that a browser has sent.
 
     Raises:
-        ValueError: They are not so many, not finite, or too large to be drawn.
+        ValueError: They are none, not so many, not finite, or too large to be drawn.
     """
-    found = np.asarray(numbers, dtype=float)
+    try:
+        found = np.asarray(numbers, dtype=float)
+    except TypeError as error:
+        raise ValueError(str(error)) from error
     if found.shape != (count,) or not (np.abs(found) <= MOST).all():
         raise ValueError(f"found {found}, expected {count} numbers up to {MOST:g}")
     return found

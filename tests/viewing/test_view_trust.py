@@ -212,6 +212,8 @@ def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path:
         CAMERA | {"fov": "wide"},
         CAMERA | {"wxyz": [1]},
         values | {"updates": {"nothing": 1}},
+        values | {"updates": {"update_cb": "x"}},
+        values | {"updates": {"value": "finger_2"}},
         values | {"updates": {"value": {"a": 1}}},
         values | {"updates": {"value": "no such finger"}},
         values | {"uuid": slider, "updates": {"value": "x"}},
@@ -219,6 +221,7 @@ def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path:
         drag | {"wxyz": [1, 0, 0, 0], "position": [nan, nan, nan]},
         drag | {"wxyz": [0, 0, 0, 0], "position": [0, 0, 0]},
         drag | {"wxyz": [1, 0], "position": [0.1]},
+        drag | {"wxyz": [1, 0, 0, 0], "position": {"a": 1}},
         drag | {"wxyz": [1, 0, 0, 0], "position": [1e300, 0, 0]},
     ]
     with socket.create_connection((str(urlsplit(url).hostname), urlsplit(url).port or 0)) as raw:
