@@ -37,6 +37,12 @@ SEARCHED = (
 SHAPELESS = "  the files have no shapes of links: a scene needs `collision:` in the description"
 """Said where there is nothing to be fitted."""
 
+GUESSED = (
+    "  pads, thumb, palm and home are guesses (delete the line of a finger that is none): see the "
+    "lines marked GUESS"
+)
+"""Last words of the report."""
+
 SAME = 1e-9
 """Poses that differ by no more [m, or in their axes] are the same."""
 
@@ -177,6 +183,9 @@ def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> l
             pairs["limits"] = f"assumed, since {Path(line.file).name} states none: " + ", ".join(
                 line.limits
             )
+    if lines.hand.spinning:
+        still = ", ".join(sorted(lines.hand.spinning))
+        pairs["locked"] = f"{still}: turns without end, so it is no finger and stands still"
     for name, value in differences.items():
         verdict = "as its own library has it" if value <= SAME else "NOT as its own library has it"
         pairs[f"check {name}"] = f"{verdict}: poses differ by at most {value:.1e}"
@@ -197,5 +206,5 @@ def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> l
         notes.append(Text(SEARCHED, "yellow"))
     if not lines.shapes:
         notes.append(Text(SHAPELESS, "yellow"))
-    guessed = Text("  pads, thumb, palm and home are guesses: see the lines marked GUESS", "yellow")
+    guessed = Text(GUESSED, "yellow")
     return [headline(True, "IMPORTED", what), fields(pairs), rows, *notes, guessed]

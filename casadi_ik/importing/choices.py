@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from casadi_ik.errors import InputError
-from casadi_ik.importing.fingers import holds_arms, palms
+from casadi_ik.importing.fingers import holds_arms, moving_below, palms
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
 
 FLANGES = (
@@ -29,7 +29,7 @@ def the_tip(tree: RobotTree) -> tuple[str, str]:
     """
     last = None
     link = tree.root
-    while len(movers := _movers(tree, link)) == 1:
+    while len(movers := moving_below(tree, link)) == 1:
         last = movers[0]
         link = last.child
     if last is None or (len(movers) > 1 and holds_arms(tree, link)):
@@ -90,6 +90,22 @@ def assumed_locks(joints: list[TreeJoint]) -> dict[str, float]:
     return {joint.name: 0.0 for joint in joints if joint.type not in single}
 
 
+def spinners(tree: RobotTree, palm: str) -> dict[str, float]:
+    """Joints below a palm that turn without end by themselves: propellers, no fingers.
+
+    They stand still, at zero, if there are other chains that may be fingers.
+    """
+    first = moving_below(tree, palm)
+    found = [
+        joint
+        for joint in first
+        if joint.type == "continuous" and not joint.coupling and not moving_below(tree, joint.child)
+    ]
+    leaders = {joint.coupling.of for joint in tree.joints if joint.coupling is not None}
+    alone = [joint for joint in found if joint.name not in leaders]
+    return {joint.name: 0.0 for joint in alone} if len(alone) < len(first) else {}
+
+
 def file_text(path: Path, out: Path) -> str:
     """A file as a description names it: relative to that, if it is not far from it."""
     here, there = out.resolve().parent, path.resolve()
@@ -97,14 +113,6 @@ def file_text(path: Path, out: Path) -> str:
         return there.relative_to(here).as_posix()
     except ValueError:
         return there.as_posix()
-
-
-def _movers(tree: RobotTree, link: str) -> list[TreeJoint]:
-    found: list[TreeJoint] = []
-    for joint in tree.joints:
-        if joint.parent == link:
-            found += [joint] if joint.type != "fixed" else _movers(tree, joint.child)
-    return found
 
 
 def _rigid(tree: RobotTree, link: str) -> list[str]:

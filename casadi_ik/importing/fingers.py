@@ -43,20 +43,20 @@ class Branch:
 
 def palms(tree: RobotTree) -> list[str]:
     """Links from which two or more chains that move go out, from the root down."""
-    return [link for link in tree.links if len(_movers(tree, link)) >= 2]
+    return [link for link in tree.links if len(moving_below(tree, link)) >= 2]
 
 
 def holds_arms(tree: RobotTree, palm: str) -> bool:
     """Whether what hangs on a link is rather arms than fingers."""
-    return any(_depth(tree, joint.child) + 1 >= LONG_CHAIN for joint in _movers(tree, palm))
+    return any(_depth(tree, joint.child) + 1 >= LONG_CHAIN for joint in moving_below(tree, palm))
 
 
-def _movers(tree: RobotTree, link: str) -> list[TreeJoint]:
+def moving_below(tree: RobotTree, link: str) -> list[TreeJoint]:
     """The first moving joints below a link, those behind fixed ones included."""
     found: list[TreeJoint] = []
     for joint in tree.joints:
         if joint.parent == link:
-            found += [joint] if joint.type != "fixed" else _movers(tree, joint.child)
+            found += [joint] if joint.type != "fixed" else moving_below(tree, joint.child)
     return found
 
 

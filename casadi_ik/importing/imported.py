@@ -15,6 +15,7 @@ from casadi_ik.importing.choices import (
     assumed_locks,
     file_text,
     kept_joints,
+    spinners,
     the_palm,
     the_tip,
 )
@@ -124,6 +125,7 @@ def import_robot(
     moved = sum(joint.type != "fixed" for joint in tree.chain(tree.root, palm_link, str(hand)))
     key = "robot" if arm is None and moved else "hand"
     limits, locked = assumed_limits(joints), assumed_locks(joints)
+    locked |= (spinning := spinners(tree, palm_link))
     told = xacro and hand.suffix != ".xacro"
     entry = HandFromFile(str(hand.resolve()), palm_link, None, locked, limits, told)
     part = hand_from_file(entry, {}, key, out)
@@ -152,7 +154,11 @@ def import_robot(
         command=command,
         name=out.stem,
         arm=arm_line,
-        hand=FileLine(file_text(hand, out), palm_link, palm_how, limits, locked, entry.xacro),
+        hand=FileLine(
+            *(file_text(hand, out), palm_link, palm_how, limits, locked),
+            xacro=told,
+            spinning=frozenset(spinning),
+        ),
         key=key,
         mount=None if arm is None else list(mount or [0.0] * 6),
         mount_how="--mount" if mount else "GUESS: the hand's base on the arm's tip",

@@ -32,6 +32,7 @@ class FileLine:
         limits: What is assumed of joints without limits.
         locked: Joints that stand still.
         xacro: Whether its macros are expanded although it is not called so.
+        spinning: Those of them that turn without end, and so were taken for no fingers.
     """
 
     file: str
@@ -40,6 +41,7 @@ class FileLine:
     limits: Mapping[str, tuple[float, float]]
     locked: Mapping[str, float]
     xacro: bool = False
+    spinning: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +89,9 @@ class Written:
             f"# Made by: {self.command}",
             "# What no file of a robot says was guessed: look at the lines marked GUESS, correct",
             "# them here. To see them: casadi-ik import THIS.yaml --picture FILE.png; to drag pads",
-            "# to where they belong: casadi-ik view THIS.yaml --pads",
+            "# to where they belong: casadi-ik view THIS.yaml --pads. Of a finger that is none",
+            "# delete its line under `fingers`, and the line `thumb` if that names it. `home` and",
+            "# `collision` may be deleted as well.",
             *(f"# {one_line(note)}" for note in self.notes),
             f"name: {scalar(self.name)}",
         ]
@@ -134,8 +138,10 @@ def _file_lines(key: str, line: FileLine, end: str, ends: Iterable[str]) -> list
             for name, (low, high) in line.limits.items()
         ]
     if line.locked:
-        found.append("  locked:  # these joints have no single axis")
-        found += [f"    {scalar(name)}: {value:.6g}" for name, value in line.locked.items()]
+        found.append("  locked:  # GUESS: these joints stand still; delete a line to let one move")
+        for name, value in line.locked.items():
+            why = "turns without end: no finger" if name in line.spinning else "has no single axis"
+            found.append(f"    {scalar(name)}: {value:.6g}  # {why}")
     return found
 
 

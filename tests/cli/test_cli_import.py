@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from command_line import Command
 
@@ -21,7 +22,7 @@ def link(name: str, inside: str = "") -> str:
 
 def joint(name: str, parent: str, child: str, xyz: str, axis: str, limits: str, **more: str) -> str:
     ends = f'<parent link="{parent}"/><child link="{child}"/>'
-    low, high = limits.split()
+    low, high = limits.split() if limits else ("", "")
     limit = f'<limit lower="{low}" upper="{high}" velocity="0" effort="1"/>'
     origin = f'<origin xyz="{xyz}" rpy="{more.get("rpy", "0 0 0")}"/>'
     kind = more.get("kind", "revolute")
@@ -215,3 +216,65 @@ def test_picture(run: Command, tmp_path: Path) -> None:
         "mine.png",
         "mine.yaml",
     ]
+
+
+def gripper(folder: Path) -> Path:
+    """An arm whose gripper has a propeller, which turns without end, beside two jaws on a motor."""
+    path = arm(folder)
+    text = path.read_text().replace("</robot>", "")
+    body = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
+    text += link("bar") + link("propeller", body.format("package://jaws/meshes/none.stl"))
+    text += joint("bar", "tool_flange", "bar", "0.04 0 0", "0 0 1", "0 0", kind="fixed")
+    text += joint("gripper", "tool_flange", "propeller", "0.02 0 0", "1 0 0", "", kind="continuous")
+    mimic = '<mimic joint="left" multiplier="-1"/></joint>'
+    for side, mesh in (("left", "meshes/jaw.stl"), ("right", "package://jaws/meshes/jaw.stl")):
+        text += link(f"{side}_jaw", body.format(mesh))
+        ends = "0.015 0.037" if side == "left" else "-0.037 -0.015"
+        jaw = joint(side, "bar", f"{side}_jaw", "0 0 0", "0 1 0", ends)
+        jaw = jaw.replace("revolute", "prismatic")
+        text += jaw if side == "left" else jaw.replace("</joint>", mimic)
+    path.write_text(text + "</robot>")
+    return path
+
+
+def test_a_relative_file_finds_its_meshes_and_a_propeller_is_no_thumb(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "jaws" / "meshes").mkdir(parents=True)
+    trimesh.creation.box((0.05, 0.01, 0.02)).export(tmp_path / "jaws" / "meshes" / "jaw.stl")
+    gripper(tmp_path / "jaws").rename(tmp_path / "jaws" / "robot.urdf")
+    monkeypatch.chdir(tmp_path)
+    done = run(
+        "import", "jaws/robot.urdf", "--palm", "tool_flange", "--out", "mine.yaml", "--check"
+    )
+    assert (done.exit, done.err) == (0, ""), done
+    said = " ".join(done.out.split())
+    assert "there is no such file (mesh 'package://jaws/meshes/none.stl')" in said
+    assert "gripper: turns without end, so it is no finger and stands still" in said
+    robot, text = ik.load_robot("mine.yaml"), Path("mine.yaml").read_text()
+    assert len(robot.fingers) == 2
+    assert robot.actuators == ("j0", "j1", "j2", "j3", "j4", "j5", "left")
+    assert "    gripper: 0  # turns without end: no finger\n" in text
+    points, _ = robot.contacts(robot.home)  # on the jaws' inner sides, which meshes tell
+    assert np.linalg.norm(points[0] - points[1]) == pytest.approx(2 * (robot.home[-1] - 0.005))
+    # What the comment says may be deleted may be deleted.
+    assert "Of a finger that is none" in text
+    lines = text.splitlines(keepends=True)
+    kept = [x for x in lines if not x.startswith(("thumb:", f"  {robot.thumb}: {{link"))]
+    assert len(kept) == len(lines) - 2
+    Path("mine.yaml").write_text("".join(kept))
+    assert ik.load_robot("mine.yaml").fingers == robot.fingers[1:]
+
+
+def test_a_missing_package_is_said_once(run: Command, tmp_path: Path) -> None:
+    path, text = hand(tmp_path), hand(tmp_path).read_text()
+    for name in ("ff_1", "mf_1", "opposed_1"):
+        mesh = f'<mesh filename="package://shapes_of_it/meshes/{name}.stl"/>'
+        shape = f"<collision><geometry>{mesh}</geometry></collision>"
+        text = text.replace(f'<link name="{name}">', f'<link name="{name}">{shape}')
+    path.write_text(text)
+    done = run("import", path, "--out", tmp_path / "mine.yaml")
+    assert done.out.count("package 'shapes_of_it' is not found") == 1
+    said = " ".join(done.out.split())
+    assert "(3 meshes, one is 'package://shapes_of_it/meshes/ff_1.stl')" in said
+    assert "ROS_PACKAGE_PATH=FOLDER casadi-ik import" in said
