@@ -41,9 +41,9 @@ def export(arguments: argparse.Namespace) -> Answer:
     robot = load_robot(arguments.robot)
     prefix = checked_prefix(arguments.prefix, robot.name)
     if arguments.target == "wasm":
-        files = wasm_project(robot, prefix, arguments.scene)
+        files = wasm_project(robot, prefix, arguments.scene, arguments.follow)
     else:
-        files = c_project(robot, prefix, arguments.scene, arguments.single)
+        files = c_project(robot, prefix, arguments.scene, arguments.single, arguments.follow)
     write_folder(arguments.out, files)
     size = sum(len(content) for content in files.values())
     pairs = {

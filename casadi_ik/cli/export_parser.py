@@ -15,6 +15,7 @@ _EXPORT = """\
 examples:
   casadi-ik export kuka_lwr_barrett --out solver && make -C solver test
   casadi-ik export kuka_lwr_barrett --out solver --single && make -C solver test
+  casadi-ik export kuka_lwr_barrett --out solver --follow && make -C solver test
   casadi-ik export my_robot.yaml --out page --target wasm
 
 DIR becomes a project that needs nothing but a C compiler (--target wasm: a browser or node):
@@ -84,6 +85,11 @@ def add_export(commands: Any) -> None:
         "--single",
         action="store_true",
         help="in single precision, for controllers that have no other (--target c)",
+    )
+    parser.add_argument(
+        "--follow",
+        action="store_true",
+        help="with a follower of moving contacts that keeps velocities and accelerations",
     )
     parser.set_defaults(run=_export)
     parser = commands.add_parser(

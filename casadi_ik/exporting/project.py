@@ -12,6 +12,7 @@ from pathlib import Path
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.exporting.follow import FollowSources
 from casadi_ik.exporting.scene import SceneSources
 from casadi_ik.exporting.scene_targets import IN_TEST_C, IN_TEST_SINGLE, SceneTargets
 from casadi_ik.exporting.single import SinglePrecision, in_single_precision
@@ -98,7 +99,11 @@ class Exported:
 
 
 def exported(
-    robot: ArmHand, prefix: str, capacity: int | None = None, single: bool = False
+    robot: ArmHand,
+    prefix: str,
+    capacity: int | None = None,
+    single: bool = False,
+    follow: bool = False,
 ) -> Exported:
     """The solver of a robot as source code.
 
@@ -107,10 +112,13 @@ def exported(
         prefix: What every name begins with.
         capacity: How many solids may stand about; None: collisions are not looked at.
         single: Whether it is in single precision.
+        follow: Whether a follower goes with it, in double precision.
 
     Raises:
         UnsupportedError: It cannot be exported.
     """
+    if single and follow:
+        raise UnsupportedError("--follow: computes in double precision, expected no --single")
     method, solver = hand_first(robot), Solver(robot)
     if not method.kernel.compiled:
         raise UnsupportedError(
@@ -131,7 +139,11 @@ def exported(
         "TARGETS": str(COUNT),
         "ROUNDS_COUNT": str(sources.plan.rounds),
     }
-    files = {
+    more: dict[str, str] = {}
+    if follow:
+        more, about_it = FollowSources(robot, prefix, tolerance).files()
+        marks |= about_it
+    files = more | {
         f"include/{prefix}.h": filled("solver.h", marks),
         f"src/{prefix}_parts.h": filled("parts.h", marks),
         f"src/{prefix}_solver.c": filled("solver.c", marks),
@@ -153,7 +165,11 @@ def tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
 
 
 def c_project(
-    robot: ArmHand, prefix: str, capacity: int | None = None, single: bool = False
+    robot: ArmHand,
+    prefix: str,
+    capacity: int | None = None,
+    single: bool = False,
+    follow: bool = False,
 ) -> dict[str, str | bytes]:
     """The files of a project in C, by path.
 
@@ -162,11 +178,12 @@ def c_project(
         prefix: What every name begins with.
         capacity: How many solids may stand about; None: collisions are not looked at.
         single: Whether it is in single precision.
+        follow: Whether a follower goes with it.
 
     Raises:
         UnsupportedError: The robot's solver cannot be exported.
     """
-    project = exported(robot, prefix, capacity, single)
+    project = exported(robot, prefix, capacity, single, follow)
     files = {
         "example/main.c": "main.c",
         "test/test.c": "test_single.c" if single else "test.c",

@@ -12,7 +12,9 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.exporting.follow import NO_FOLLOWER
 from casadi_ik.exporting.generated import standing_alone
+from casadi_ik.exporting.palms import palm_marks
 from casadi_ik.exporting.precision import IN_DOUBLE, in_single
 from casadi_ik.exporting.scene import SceneSources, without_scene
 from casadi_ik.exporting.single import SinglePrecision, in_single_precision
@@ -160,6 +162,7 @@ class SolverSources:
             for p in self.parts
         )
         about = without_scene() if self.scene is None else self.scene.substitutes()
+        about |= NO_FOLLOWER | palm_marks(robot, self.prefix)
         about |= IN_DOUBLE if self.single is None else in_single(self.single)
         lower, upper = self._bounds
         single = self.single

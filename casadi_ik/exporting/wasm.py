@@ -24,7 +24,7 @@ COMMAND = (
 
 
 def wasm_project(
-    robot: ArmHand, prefix: str, capacity: int | None = None
+    robot: ArmHand, prefix: str, capacity: int | None = None, follow: bool = False
 ) -> dict[str, str | bytes]:
     """The files of a module with its wrapper, by path.
 
@@ -35,7 +35,7 @@ def wasm_project(
     """
     if importlib.util.find_spec("ziglang") is None:
         raise MissingExtraError("--target wasm needs ziglang: pip install 'casadi-ik[compiler]'")
-    project = exported(robot, prefix, capacity)
+    project = exported(robot, prefix, capacity, follow=follow)
     marks = (
         project.marks
         | tested(project, IN_TEST_MJS)

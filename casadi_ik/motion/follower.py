@@ -20,6 +20,9 @@ from casadi_ik.problem.verdict import TOLERANCE_SLACK
 
 NO_FRAME = "no frame yet"
 
+PALM_WEIGHT = 0.1
+"""How much a palm's place and its axes count unless said, a contact counting 1."""
+
 
 class Follower:
     """Follows contacts from cycle to cycle; what it returns is safe to be sent to the motors.
@@ -131,7 +134,7 @@ class Follower:
         target: Grasp | ArrayLike,
         normals: ArrayLike | None = None,
         palm: ArrayLike | None = None,
-        palm_weight: tuple[float, float] = (0.1, 0.1),
+        palm_weight: tuple[float, float] = (PALM_WEIGHT, PALM_WEIGHT),
     ) -> Array:
         """One cycle.
 

@@ -19,6 +19,7 @@ const char *const @PREFIX@_motor_names[] = {@MOTOR_NAMES@};
 void @PREFIX@_init(@PREFIX@_solver *solver) {
   memset(solver, 0, sizeof *solver);
   memcpy(solver->terms, TERMS, sizeof TERMS);
+  memcpy(solver->ranges, TERMS + TERMS_LOWER, sizeof solver->ranges);
   solver->rounds = ROUNDS;
   solver->status = @GUARD@_BAD_INPUT;
 @SCENE_INIT@}
@@ -33,8 +34,8 @@ void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, double position
 }
 
 void @PREFIX@_set_range(@PREFIX@_solver *solver, int motor, double lower, double upper) {
-  solver->terms[TERMS_LOWER + motor] = lower;
-  solver->terms[TERMS_UPPER + motor] = upper;
+  solver->ranges[motor] = lower;
+  solver->ranges[N_MOTORS + motor] = upper;
 }
 
 int @PREFIX@_begin(@PREFIX@_solver *solver, const double *points, const double *normals,
@@ -42,6 +43,7 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const double *points, const double *
   memcpy(solver->points, points, sizeof solver->points);
   memcpy(solver->normals, normals, sizeof solver->normals);
   memcpy(solver->here, q0 ? q0 : HOME, sizeof solver->here);
+  memcpy(solver->terms + TERMS_LOWER, solver->ranges, sizeof solver->ranges);
   solver->terms[TERMS_NEAREST] = q0 ? 1.0 : 0.0;
 @SCENE_BEGIN@  if (!rounds_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
   return (int) solver->status;
@@ -70,3 +72,4 @@ void @PREFIX@_contacts(@PREFIX@_solver *solver, const double *q, double *points,
   outputs[1] = normals;
   (void) @PREFIX@_contacts_kernel(&map, &solver->memory);
 }
+@PALM@

@@ -22,7 +22,7 @@ export const Status: {
   /** The budget of iterations is used up. */
   readonly ITERATION_LIMIT: 3;
 @SCENE_STATUS_DTS@};
-
+@FOLLOW_STATUS_DTS@
 export interface Answer {
   status: -2 | -1 | 0 | 1 | 2 | 3@SCENE_STATUS_TYPE@;
   q: Float64Array;
@@ -56,4 +56,4 @@ export class Solver {
   run(iterations: number): Answer;
   /** Where the fingertips are and which way they face. */
   contacts(q: ArrayLike<number>): { points: Float64Array; normals: Float64Array };
-@SCENE_DTS@}
+@PALM_DTS@@SCENE_DTS@@FOLLOW_DTS@}

@@ -51,6 +51,7 @@ typedef struct {
  * joint is beyond its limits, negative within), iterations, restarts, status. Leave the rest. */
 typedef struct {
 @STRUCT@
+  double ranges[2 * @MOTORS@]; /* what set_range said: lower ends, then upper ends */
 @SCENE_FIELDS@  @PREFIX@_memory memory;
 } @PREFIX@_solver;
 
@@ -83,7 +84,7 @@ int @PREFIX@_solve(@PREFIX@_solver *solver, const double *points, const double *
 /* Where the fingertips are and which way they face: three numbers a finger each. The solver's
  * memory is used, nothing else of it. */
 void @PREFIX@_contacts(@PREFIX@_solver *solver, const double *q, double *points, double *normals);
-@SCENE_CALLS@
+@PALM_CALLS@@SCENE_CALLS@@FOLLOW_CALLS@
 #ifdef __cplusplus
 }
 #endif

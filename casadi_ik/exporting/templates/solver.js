@@ -15,7 +15,7 @@ export const Status = Object.freeze({
   STALLED: 2,
   ITERATION_LIMIT: 3,
 @SCENE_STATUS_JS@});
-
+@FOLLOW_STATUS_JS@
 async function compiled(source) {
   if (source instanceof WebAssembly.Module) return source;
   if (source === undefined) {
@@ -54,6 +54,8 @@ export class Solver {
     this._points = view(wasm.points_at(), 3 * fingers.length);
     this._normals = view(wasm.normals_at(), 3 * fingers.length);
     this._q0 = view(wasm.q0_at(), motors.length);
+    this._palm = view(wasm.palm_at(), 12);
+    this._posture = view(wasm.posture_at(), motors.length);
     this._q = view(wasm.q_at(), motors.length);
     this._positionError = view(wasm.position_error_at(), fingers.length);
     this._angleError = view(wasm.angle_error_at(), fingers.length);
@@ -87,7 +89,7 @@ export class Solver {
     this._wasm.contacts();
     return { points: this._points.slice(), normals: this._normals.slice() };
   }
-@SCENE_JS@
+@PALM_JS@@SCENE_JS@@FOLLOW_JS@
   _ask(points, normals, q0) {
     filled(this._points, points, "points");
     filled(this._normals, normals, "normals");

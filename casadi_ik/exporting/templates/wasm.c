@@ -5,11 +5,14 @@
 
 static @PREFIX@_solver solver;
 static double points[3 * @GUARD@_FINGERS], normals[3 * @GUARD@_FINGERS], q0[@GUARD@_MOTORS];
+static double palm[12], posture[@GUARD@_MOTORS];
 
 EXPORTED(init) void init(void);
 EXPORTED(points_at) double *points_at(void);
 EXPORTED(normals_at) double *normals_at(void);
 EXPORTED(q0_at) double *q0_at(void);
+EXPORTED(palm_at) double *palm_at(void);
+EXPORTED(posture_at) double *posture_at(void);
 EXPORTED(q_at) double *q_at(void);
 EXPORTED(position_error_at) double *position_error_at(void);
 EXPORTED(angle_error_at) double *angle_error_at(void);
@@ -26,6 +29,8 @@ void init(void) { @PREFIX@_init(&solver); }
 double *points_at(void) { return points; }
 double *normals_at(void) { return normals; }
 double *q0_at(void) { return q0; }
+double *palm_at(void) { return palm; }
+double *posture_at(void) { return posture; }
 double *q_at(void) { return solver.q; }
 double *position_error_at(void) { return solver.position_error; }
 double *angle_error_at(void) { return solver.angle_error; }
@@ -42,4 +47,4 @@ void set_tolerance(int finger, double position, double angle) {
 void set_range(int motor, double lower, double upper) {
   @PREFIX@_set_range(&solver, motor, lower, upper);
 }
-@SCENE_WASM@
+@PALM_WASM@@SCENE_WASM@@FOLLOW_WASM@

@@ -1,0 +1,213 @@
+"""Exported followers and palms: as in Python, and within limits whatever is asked."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.cli.main import main
+
+STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
+SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+PERIOD = 0.004
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+
+FOLLOWED = """
+#include <stdio.h>
+#include "arm.h"
+static arm_follower follower;
+int main(void) { /* q0; then by cycle: points, normals, whether there is a palm, palm */
+  double q0[ARM_MOTORS], row[6 * ARM_FINGERS + 13];
+  int i;
+  if (fread(q0, sizeof q0, 1, stdin) != 1) return 2;
+  if (!arm_follow_from(&follower, q0, 0.0, 0, 0)) return 3;
+  if (arm_follow_from(&follower, q0, PERIOD, 0, 0)) return 3;
+  while (fread(row, sizeof row, 1, stdin) == 1) {
+    const double *palm = row + 6 * ARM_FINGERS;
+    printf("%d", arm_follow(&follower, row, row + 3 * ARM_FINGERS, *palm ? palm + 1 : 0));
+    for (i = 0; i < ARM_MOTORS; ++i) printf(" %a", follower.q[i]);
+    puts("");
+  }
+  return 0;
+}
+"""
+PALMS = """
+#include <stdio.h>
+#include "arm.h"
+static arm_solver solver;
+int main(void) { /* palm, posture */
+  double row[12 + ARM_MOTORS];
+  arm_init(&solver);
+  while (fread(row, sizeof row, 1, stdin) == 1) {
+    int i;
+    printf("%d", arm_solve_palm(&solver, row, row + 12, 0));
+    for (i = 0; i < ARM_MOTORS; ++i) printf(" %a", solver.q[i]);
+    puts("");
+  }
+  /* What was held for a palm is free again. */
+  {
+    double points[3 * ARM_FINGERS], normals[3 * ARM_FINGERS];
+    arm_contacts(&solver, row + 12, points, normals);
+    return arm_solve(&solver, points, normals, 0) != ARM_SOLVED;
+  }
+}
+"""
+
+
+def built(out: Path, name: str, text: str, sources: str, *flags: str) -> Path:
+    (out / f"{name}.c").write_text(text.replace("PERIOD", repr(PERIOD)))
+    files = [str(path.relative_to(out)) for path in out.glob(f"src/{sources}.c")]
+    command = ["gcc", *STRICT, *flags, "-Iinclude", f"{name}.c", *files, "-o", name, "-lm"]
+    done = subprocess.run(command, cwd=out, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[:2000]
+    return out / name
+
+
+def asked(program: Path, *arrays: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """What it says: a status and a configuration a line."""
+    data = b"".join(np.ascontiguousarray(array, dtype=float).tobytes() for array in arrays)
+    done = subprocess.run([program], input=data, capture_output=True)
+    assert done.returncode == 0, done.stderr[:2000]
+    lines = [line.split() for line in done.stdout.decode().splitlines()]
+    return [int(line[0]) for line in lines], np.array(
+        [[float.fromhex(word) for word in line[1:]] for line in lines]
+    )
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("follow") / "solver"
+    words = ["export", "kuka_lwr_barrett", "--prefix", "arm", "--follow", "--out", str(out)]
+    assert main(words) == 0
+    return out
+
+
+def stream(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Targets that move, leap, are out of reach, partly free, or none; and palms of some."""
+    rng = np.random.default_rng(3)
+    ends = np.clip(robot.home + rng.uniform(-0.2, 0.2, (6, 14)), robot.lower, robot.upper)
+    part = np.linspace(0, 1, count // 5)[:, None]
+    q = np.concatenate([a + part * (b - a) for a, b in zip(ends[::2], ends[1::2], strict=True)])
+    q = np.concatenate([q, np.repeat(ends[:2], count // 5, axis=0)])
+    points, normals = robot.contacts(q)
+    points[count // 2 : count // 2 + 20] += 3.0
+    points[30:60, 1] = normals[30:60, 1] = normals[70:90] = np.nan
+    points[100:103, 0, 0], points[110, 2], normals[111, 0] = np.nan, np.inf, 0.0
+    points[120:125] = normals[120:125] = np.nan
+    points[130] = 1e200
+    palms = np.zeros((len(q), 13))
+    poses = robot.palm(q)
+    palms[:, 1:] = np.hstack([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]])
+    palms[40:50, 0] = palms[150:300, 0] = 1
+    return points, normals, palms
+
+
+@needs_gcc
+def test_follows_as_in_python_and_within_limits(robot, project):
+    program = built(project, "followed", FOLLOWED, "arm_follow", "-O1", *SANITIZERS)
+    points, normals, palms = stream(robot, 1000)
+    rows = np.hstack([points.reshape(len(points), -1), normals.reshape(len(points), -1), palms])
+    status, q = asked(program, robot.home, rows)
+
+    follower = ik.Solver(robot).follow(q0=robot.home, period=PERIOD)
+    names = ("HOLDING", "FOLLOWING", "LATE", "MISSED")
+    for row, (ended, found) in enumerate(zip(status, q, strict=True)):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = palms[row, 1:10].reshape(3, 3), palms[row, 10:]
+        expected = follower(points[row], normals[row], pose if palms[row, 0] else None)
+        assert names[ended] == follower.state.status.name, row
+        np.testing.assert_array_equal(found, expected, f"row {row}")
+    assert set(status) == {0, 1, 2, 3}
+
+    steps = np.diff(np.vstack([robot.home, robot.home, q]), axis=0)
+    assert (np.abs(steps) <= follower.velocity * PERIOD * (1 + 1e-9)).all()
+    change = np.abs(np.diff(steps, axis=0))
+    assert (change <= follower.acceleration * PERIOD**2 * (1 + 1e-6) + 1e-12).all()
+    assert (q >= robot.lower).all()
+    assert (q <= robot.upper).all()
+
+
+@needs_gcc
+def test_what_moves_within_reach_is_followed_closely(robot, project):
+    program = built(project, "closely", FOLLOWED, "arm_follow", "-O1")
+    turn = np.linspace(0, 2 * np.pi, 500)[:, None, None]
+    points, normals = robot.contacts(robot.home)
+    points = points + 0.04 * np.concatenate([np.sin(turn), 1 - np.cos(turn), 0 * turn], axis=2)
+    none = np.zeros((len(points), 13))
+    facing = np.broadcast_to(normals.ravel(), (len(points), normals.size))
+    status, q = asked(program, robot.home, np.hstack([points.reshape(500, -1), facing, none]))
+    assert set(status) == {1}
+    assert np.linalg.norm(robot.contacts(q)[0] - points, axis=2).max() < 2e-3
+
+
+@needs_gcc
+def test_palms_as_in_python(robot, project):
+    program = built(project, "palms", PALMS, "*", "-O0", "-Isrc")
+    q = robot.random(np.random.default_rng(4), 60)
+    poses = robot.palm(q)
+    poses[50:55, :3, 3] += 5.0
+    palms = np.hstack([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]])
+    wrong = palms[:1] * 2, np.where(np.arange(12) == 11, np.nan, palms[:1])
+    status, found = asked(program, *np.hstack([palms, q]), *(np.append(w, q[0]) for w in wrong))
+    assert status[60:] == [-2, -2]
+    hand = robot.description.hand_actuators
+    hands = {robot.actuators[i]: q[:, i] for i in hand}
+    batch = ik.Solver(robot).solve_palms(poses, hands)
+    assert status[:60] == batch.status.tolist()
+    np.testing.assert_allclose(found[:60], batch.q, atol=1e-9)
+    assert np.abs(robot.palm(found[:50])[:, :3, 3] - poses[:50, :3, 3]).max() < 5e-3
+    np.testing.assert_array_equal(found[:50][:, list(hand)], q[:50][:, list(hand)])
+
+
+def test_in_single_precision_nothing_follows(tmp_path, capsys):
+    words = ["export", "kuka_lwr_barrett", "--follow", "--single", "--out", str(tmp_path / "s")]
+    assert main(words) == 2
+    assert "--follow: computes in double precision" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+USED = """
+import { FollowStatus, Solver, home, motors, upper } from "./arm.js";
+const solver = await Solver.load(), rows = [];
+solver.followFrom(home, { period: 0.004 });
+let last;
+for (let i = 0; i < 200; ++i) {
+  const { points, normals } = solver.contacts(home.map((x, k) => x + 5e-4 * i * (upper[k] - x)));
+  last = solver.follow(points, normals);
+  rows.push([...last.q]);
+}
+const ended = last.status === FollowStatus.FOLLOWING && Math.max(...last.positionError) < 1e-3;
+const length = last.velocity.length === motors.length;
+let refused = false;
+try { solver.followFrom(home, { period: 0 }); }
+catch (error) { refused = error instanceof RangeError; }
+console.log(JSON.stringify({ rows, ended, refused, length }));
+"""
+
+
+@pytest.mark.skipif(
+    shutil.which("node") is None or importlib.util.find_spec("ziglang") is None,
+    reason="needs node and the package ziglang",
+)
+def test_in_javascript_too(tmp_path):
+    out = tmp_path / "module"
+    words = ["export", "ar10", "--prefix", "arm", "--target", "wasm", "--follow"]
+    assert main([*words, "--out", str(out)]) == 0
+    (out / "use.mjs").write_text(USED)
+    done = subprocess.run(["node", "use.mjs"], cwd=out, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert (said["ended"], said["refused"], said["length"]) == (True, True, True)
+    robot = ik.load_robot("ar10")
+    follower = ik.Solver(robot).follow(q0=robot.home, period=0.004)
+    for i, row in enumerate(said["rows"]):
+        targets = robot.contacts(robot.home + 5e-4 * i * (robot.upper - robot.home))
+        np.testing.assert_allclose(row, follower(*targets), atol=1e-9)
