@@ -24,7 +24,7 @@ from casadi_ik.grasps import GraspObject, Sphere
 from casadi_ik.robots import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.so3 import exp_so3
-from grasp_synthesis.patches import Patch
+from grasp_synthesis.patches import Patch, primitive
 from grasp_synthesis.programme import Programme
 
 LENGTH = 0.1  # [m] unit of positions in the programme
@@ -96,7 +96,7 @@ class TipPinchProblem:
         kinematics = actuated(robot, q).kinematics
         hand = kinematics.links[root]
         rotation = exp_so3(turn) @ ca.DM(np.array(axes).T)
-        patches = [Patch(item.shape, side, box_axis, edge_margin) for side in sides.values()]
+        patches = [Patch(primitive(item), side, box_axis, edge_margin) for side in sides.values()]
         points, normals, rows, facing = [], [], [], []
         for i, (name, patch) in enumerate(zip(sides, patches, strict=True)):
             point, normal = kinematics.contact(name)

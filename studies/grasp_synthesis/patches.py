@@ -13,7 +13,22 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.grasps import BentCapsule, Box, Cylinder, EllipticCylinder, Shape, Sphere
+from casadi_ik.grasps import (
+    BentCapsule,
+    Box,
+    Cylinder,
+    EllipticCylinder,
+    GraspObject,
+    Shape,
+    Sphere,
+)
+from casadi_ik.grasps.mesh_shape import MeshShape
+
+
+def primitive(item: GraspObject) -> Shape:
+    """The shape of an object that is no mesh: shipped ones are none."""
+    assert not isinstance(item.shape, MeshShape)
+    return item.shape
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.grasps import BentCapsule, Cylinder, GraspObject, Sphere
 from casadi_ik.symbolic.kinematics import Pose
 from grasp_synthesis.hand import ArmHand, full_posture
-from grasp_synthesis.patches import Patch
+from grasp_synthesis.patches import Patch, primitive
 from grasp_synthesis.programme import Programme
 from grasp_synthesis.recipes import Recipe
 
@@ -54,8 +54,8 @@ class PinchProblem:
 
     def __init__(self, hand: ArmHand, item: GraspObject, recipe: Recipe) -> None:
         self.hand, self.recipe = hand, recipe
-        thumb = Patch(item.shape, +1, recipe.box_axis, recipe.edge_margin)
-        finger = Patch(item.shape, -1, recipe.box_axis, recipe.edge_margin)
+        thumb = Patch(primitive(item), +1, recipe.box_axis, recipe.edge_margin)
+        finger = Patch(primitive(item), -1, recipe.box_axis, recipe.edge_margin)
         posture, place = ca.SX.sym("posture", 5), ca.SX.sym("place", 3)
         u_thumb, u_finger = ca.SX.sym("u_thumb", 2), ca.SX.sym("u_finger", 2)
         squeeze = ca.SX.sym("squeeze", 2)  # friction coefficient, tension between the fingers
