@@ -79,6 +79,7 @@ def test_a_joint_of_an_arm_with_two_spheres_may_be_held_in_another_turn(tmp_path
 
 FIXED = ("fr3_joint_3", "fr3_joint_4", "trifinger_finger_2_0")
 OTHERS_FIXED = ("fr3_joint_1", "fr3_joint_4", "trifinger_finger_1_0")
+OF_THE_ARM = ("fr3_joint_1", "fr3_joint_4")
 
 
 @pytest.mark.parametrize("compiled", [True, False])
@@ -101,10 +102,18 @@ OTHERS_FIXED = ("fr3_joint_1", "fr3_joint_4", "trifinger_finger_1_0")
                 *(0.223291, 0.098716, -0.228548),
             ],
         ),
+        (
+            OF_THE_ARM,
+            [
+                *(-2.090603, -0.128606, 0.883355, -1.395061, 1.718212, 3.905984, 0.543886),
+                *(0.416687, 0.965512, -0.019154, 0.334969, 1.051129, -0.369165),
+                *(0.47602, 0.889617, -0.566708),
+            ],
+        ),
     ],
 )
-def test_motors_of_arm_and_hand_held_together(names, q, compiled):
-    """No table holds the hand's postures: some targets need more rounds than usual."""
+def test_several_motors_held(names, q, compiled):
+    """No table holds the hand's postures, nor has the arm all motions of a palm: more rounds."""
     robot = ik.load_robot("fr3+trifinger")
     points, normals = robot.contacts(np.array([q]))
     fixed = {name: q[robot.actuators.index(name)] for name in names}

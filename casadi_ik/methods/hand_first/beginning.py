@@ -10,6 +10,7 @@ from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.methods.common.contact_fit import fresh_fit
+from casadi_ik.methods.common.numeric_arm import SIX
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.problem.contacts.kinds import suffix
 from casadi_ik.problem.status import Phase
@@ -91,7 +92,6 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             **t,
         }
     )
-    still = ca.sum1(t["lower"][hand] >= t["upper"][hand])
     zero = {item.name: ca.SX.zeros(item.size) for item in layouts.state}
     state = layouts.state.pack(
         zero
@@ -100,7 +100,7 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
             "best_q": here,
             "best_cost": sys.float_info.max,
             "least": sys.float_info.max,
-            "part_held": ca.logic_and(still > 0, still < len(hand)),
+            "held": _is_held(robot, t),
             "phase": ca.if_else(t["nearest"], float(Phase.REFINEMENT), float(Phase.CANDIDATE)),
             "candidate": -t["nearest"],
         }
@@ -108,6 +108,17 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
     )
     inputs = [*vectors.values(), here, given, postures]
     return ca.Function(name, inputs, shared(state, parameters))
+
+
+def _is_held(robot: RobotDescription, t: dict[str, Expr]) -> Expr:
+    """1 if motors of the hand are held, or so many of the arm that no palm pose is left to it.
+
+    A hand that is held as a whole needs no search.
+    """
+    hand, arm = list(robot.hand_actuators), list(robot.arm_actuators)
+    free_hand, free_arm = (ca.sum1(t["lower"][rows] < t["upper"][rows]) for rows in (hand, arm))
+    less = ca.logic_or(free_hand < len(hand), free_arm < min(len(arm), SIX))
+    return ca.logic_and(less, free_hand > 0)
 
 
 def _is_number(x: Expr) -> Expr:

@@ -21,7 +21,7 @@ eight a reachable target was given up one round too early; sixteen cost a tenth 
 contacts contradict each other. A hand with more than `MANY` motors comes back to a minimum that
 just misses from many sides before it finds the way past it: one target had come back 166 times ten
 rounds before it was solved. Likewise a hand of whose motors some are held, since no table holds its
-postures."""
+postures, or one whose arm is left with less than a palm's six motions."""
 
 SURE = 1e-8
 """Cost (0.01 mm, 0.1 mrad) above which this is a minimum, and not a long flat valley."""
@@ -33,7 +33,7 @@ rounds of all kinds, 55 after 64, 14 after 100, 6 after 150 and 2 after the last
 
 NEAR, NEAR_OF_MANY, NEAR_SHRINKS = 0.02, 10.0, 60.0
 """Cost (14 mm, 8 deg) from which on a target that still misses is taken to be out of reach; of a
-hand with more than `MANY` motors, or some of them held, another one (0.3 m), and after the k-th of
+hand with more than `MANY` motors, or of held ones, another one (0.3 m), and after the k-th of
 the `RUGGED` rounds at most `NEAR_SHRINKS` / (k + 1), since the longer a target stays far off the
 less there is to hope. Some that can be reached stay there long: one had more than 3 after 7 rounds
 and was solved in the 18th, one 0.3 after 26 and was solved in the 75th."""

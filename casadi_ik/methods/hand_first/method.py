@@ -141,13 +141,13 @@ class HandFirstMethod(LoopedMethod):
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
         """Whether a round may still help: see `most_returns` and `rugged`."""
         layout = self.step.layouts.state
-        returns, cost, part_held = (
-            states[:, layout.slice(name).start] for name in ("returns", "best_cost", "part_held")
+        returns, cost, held = (
+            states[:, layout.slice(name).start] for name in ("returns", "best_cost", "held")
         )
-        most = np.where(part_held > 0, RETURNS_OF_MANY, self._returns)
+        most = np.where(held > 0, RETURNS_OF_MANY, self._returns)
         further = number - self._rugged
         if further >= 0:
-            near = np.where(part_held > 0, NEAR_OF_MANY, self._near)
+            near = np.where(held > 0, NEAR_OF_MANY, self._near)
             return (returns < most) & (cost < np.minimum(near, NEAR_SHRINKS / (further + 1)))
         # No more hands of tables if their fits come back to a minimum that just misses.
         tables = VARIED <= number < self.options.rounds

@@ -346,7 +346,7 @@ static int begin_round(rounds *job, int64_t number) {
 
 static int is_hopeful(const rounds *job, int64_t number) {
   const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
-  const int held = job->state[STATE_PART_HELD] > 0;
+  const int held = job->state[STATE_HELD] > 0;
   const double most = held ? RETURNS_OF_HELD : RETURNS, near = held ? NEAR_OF_HELD : NEAR_COST;
   const int64_t rugged = number - (ROUNDS - RUGGED);
   if (rugged >= 0) {

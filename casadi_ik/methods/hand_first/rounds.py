@@ -34,7 +34,7 @@ DIMENSIONS = (
 """Of the arrays in `rounds`."""
 
 STATE = (
-    *("q", "phase", "candidate", "earlier", "part_held", "returns"),
+    *("q", "phase", "candidate", "earlier", "held", "returns"),
     *("best_cost", "best_q", "counts"),
 )
 """What rounds.c reads and writes of a state."""

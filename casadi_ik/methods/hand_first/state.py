@@ -85,7 +85,7 @@ class HandFirstLayouts:
                 Field("near", doc="cost of the near fit that last went on to the arm, 0: none"),
                 Field("balanced", doc="cost of the refinement last balanced, 0: none"),
                 Field("least", doc="smallest largest part of the tolerances balanced to so far"),
-                Field("part_held", doc="1 if some of the hand's motors are held, others not"),
+                Field("held", doc="1 if held motors leave hand or arm less than its motions"),
                 Field("returns", doc="how often a fit or a balance ended where one had before"),
                 Field("margin", doc="best margin of the arm so far, negative: a violation"),
                 Field("arm", (len(self.robot.arm_actuators),), doc="arm with the best margin"),
