@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
 from casadi_ik.problem.hand_motors import OUTWARDS, motor_ends
 from casadi_ik.problem.joint_frames import link_frames, placed
 from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.verdict import TOLERANCE_SLACK
 from casadi_ik.robots.description import Joint, RobotDescription
 
 MEETING = 1e-9
@@ -92,6 +94,26 @@ class ArmSpan:
         frames = link_frames(self.robot, {name: values}, len(values))
         rotation, origin = placed(frames[self.robot.palm_link], self.robot.palm_placement)
         return np.linalg.norm(origin + rotation @ self.wrist - self.shoulder, axis=1)
+
+
+def palms_in_span(arm: ArmSpan | None, problems: Problems) -> NDArray[np.bool_] | None:
+    """(k,) whether palms that are given have the wrist within the arm's span, tolerances aside.
+
+    Args:
+        arm: The span; None: nothing is known.
+        problems: k targets with palms, of one arm.
+    """
+    if arm is None or problems.palms is None:
+        return None
+    fixed = problems.fixed
+    one = problems if fixed is None or fixed.ndim == 1 else replace(problems, fixed=fixed[0])
+    near, far = arm.span(one)
+    allowed = problems.largest_tolerance
+    turned = 2 * np.sin(min(allowed.angle, np.pi) / 2) * np.linalg.norm(arm.wrist)
+    loose = (1 + TOLERANCE_SLACK) * (allowed.position + turned) + ROUNDING
+    wrist = problems.palms[:, :3, :3] @ arm.wrist + problems.palms[:, :3, 3]
+    away = np.linalg.norm(wrist - arm.shoulder, axis=1)
+    return (away >= near - loose) & (away <= far + loose)
 
 
 def arm_span(robot: RobotDescription) -> ArmSpan | None:

@@ -104,6 +104,19 @@ class LoopedMethod(ABC):
         """
         return (problems,)
 
+    def rounds_for(self, problems: Problems) -> int:
+        """How often solves of targets are begun in one search, the first time included."""
+        del problems
+        return self.rounds
+
+    def reachable(self, problems: Problems) -> NDArray[np.bool_] | None:
+        """(k,) which targets may be reached, where that is easily told; None: all may.
+
+        The others get a first round, which leads near them.
+        """
+        del problems
+        return None
+
     def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
         """(k,) whether failed solves take part in a round after the first.
 
@@ -194,7 +207,7 @@ class LoopedMethod(ABC):
     def stepper(self, problems: Problems, q0: Array) -> Stepper:
         """One target, one iteration at a time; see `Method.stepper`."""
         self._check(problems)
-        rounds = product(self.searches(problems), range(self.rounds))
+        rounds = product(self.searches(problems), range(self.rounds_for(problems)))
         first, _ = next(rounds)
 
         def next_round(status: int, state: Array) -> Start | None:
@@ -224,10 +237,15 @@ class LoopedMethod(ABC):
         states = np.empty((count, self.graph.state.size))
         status = np.empty(count, dtype=np.int64)
         left, some, here, last = np.arange(count), problems, q0, None
-        every = self.rounds if rounds is None else rounds
+        every = self.rounds_for(problems)
+        every = every if rounds is None else min(every, rounds)
+        possible: NDArray[np.bool_] | None = None
         for place, (asked, number) in enumerate(product(self.searches(problems), range(every))):
             if place:
                 left = np.flatnonzero(status != Status.SOLVED)
+                if place == 1 and len(left):
+                    possible = self.reachable(problems)
+                left = left if possible is None else left[possible[left]]
                 if not len(left):
                     break
                 if number and not trace:

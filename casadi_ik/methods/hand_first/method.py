@@ -31,14 +31,14 @@ from casadi_ik.methods.hand_first.going_on import (
     goes_on,
     most_returns,
     near_cost,
-    rugged,
 )
 from casadi_ik.methods.hand_first.one_by_one import OneByOne
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.restarts import VALLEYS, Restarts, later
+from casadi_ik.methods.hand_first.restarts import VALLEYS, Restarts, first_rugged, later
 from casadi_ik.methods.hand_first.rounds import RoundsPlan
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
+from casadi_ik.problem.arm_span import ArmSpan, arm_span, palms_in_span
 from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Quick
 from casadi_ik.problem.preference import PREFERENCES
@@ -83,8 +83,9 @@ class HandFirstMethod(LoopedMethod):
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
         motors = len(robot.hand_actuators)
-        self.rounds = options.rounds + later(motors)
-        self._rugged = self.rounds - rugged(motors)
+        self._rugged = first_rugged(options)
+        every = options.rounds + later(motors)
+        self.rounds = min(every, options.max_rounds or every)
         self._near, self._returns = near_cost(motors), most_returns(motors)
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(
@@ -152,6 +153,18 @@ class HandFirstMethod(LoopedMethod):
         # No more hands of tables if their fits come back to a minimum that just misses.
         tables = VARIED <= number < self.options.rounds
         return (returns < most) | (cost < SURE) | (not tables)
+
+    def rounds_for(self, problems: Problems) -> int:
+        """So many; of hands that are given none from anywhere but what every target gets."""
+        return self.rounds if problems.palms is None else min(self.rounds, self._rugged)
+
+    def reachable(self, problems: Problems) -> NDArray[np.bool_] | None:
+        """Whether palms that are given are where the arm can hold its wrist."""
+        return None if problems.palms is None else palms_in_span(self._span, problems)
+
+    @cached_property
+    def _span(self) -> ArmSpan | None:
+        return arm_span(self.robot)
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """The step counts them."""

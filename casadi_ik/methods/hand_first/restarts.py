@@ -89,6 +89,11 @@ def later(motors: int) -> int:
     return VALLEYS + ANYWHERE + rugged(motors)
 
 
+def first_rugged(options: HandFirstParameters) -> int:
+    """Rounds before those from anywhere that not every target gets."""
+    return options.rounds + VALLEYS + ANYWHERE
+
+
 @dataclass(frozen=True, eq=False)
 class Spread:
     """How postures of a table are spread.

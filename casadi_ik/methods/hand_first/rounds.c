@@ -348,7 +348,7 @@ static int is_hopeful(const rounds *job, int64_t number) {
   const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
   const int held = job->state[STATE_HELD] > 0;
   const double most = held ? RETURNS_OF_HELD : RETURNS, near = held ? NEAR_OF_HELD : NEAR_COST;
-  const int64_t rugged = number - (ROUNDS - RUGGED);
+  const int64_t rugged = number - FIRST_RUGGED;
   if (rugged >= 0) {
     return returns < most && cost < near && cost < NEAR_SHRINKS / (double) (rugged + 1);
   }

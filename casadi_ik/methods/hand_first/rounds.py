@@ -119,7 +119,7 @@ class RoundsPlan:
             "TABLE_ROUNDS": self.options.rounds,
             "ROUNDS": self.rounds,
             "VALLEYS": restarts.VALLEYS,
-            "RUGGED": going_on.rugged(len(layouts.robot.hand_actuators)),
+            "FIRST_RUGGED": restarts.first_rugged(self.options),
             "VARIED": going_on.VARIED,
             "RETURNS": going_on.most_returns(len(layouts.robot.hand_actuators)),
             "RETURNS_OF_HELD": going_on.RETURNS_OF_MANY,
