@@ -71,7 +71,8 @@ class Solver(MovingSolver, ChoosingSolver, SurroundedSolver):
             finger_step: The option of this name: "ipopt" (the default of the paper's methods) or
                 "closed-form", the same answer, much faster. Methods without a finger step take no
                 notice.
-            options: Fields of the method's parameter record (`QiuParameters`), by name.
+            options: Fields of the method's parameter record (`QiuParameters`), by name. Of
+                hand-first {"max_rounds": 1} is the limit of effort: see `HandFirstParameters`.
             compiled: False keeps to CasADi's virtual machine: the same iterates up to rounding,
                 slower.
             scene: What stands about the robot (`load_scene`, `Scene`): being solved then includes

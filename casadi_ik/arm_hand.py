@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,35 @@ class ArmHand:
         if not np.all(np.isfinite(array)):
             raise InputError(f"{name}: holds NaN or infinity, expected finite numbers")
         return array
+
+    def start(self, q0: ArrayLike | None, name: str = "q0") -> Array:
+        """A configuration to start from, checked; None gives `home`.
+
+        A warning says if a motor that turns would be more than a turn beyond its limits, as it is
+        where q0 is in degrees.
+
+        Raises:
+            InputError: As for `configuration`.
+        """
+        start = self.configuration(q0, name)
+        if q0 is None:
+            return start
+        middle, far = self._far
+        beyond = np.abs(start - middle) > far
+        if beyond.any():
+            *_, i = np.argwhere(beyond)[0].tolist()
+            value, ends = start[beyond][0], f"{self.lower[i]:.3g} to {self.upper[i]:.3g}"
+            text = f"{name}: {self.actuators[i]} is {value:g} rad, far beyond its limits {ends} rad"
+            # From here, whoever asked: Python says the same once.
+            warnings.warn(f"{text}; degrees are np.deg2rad(...)", stacklevel=1)
+        return start
+
+    @cached_property
+    def _far(self) -> tuple[Array, Array]:
+        """(n,) middles of all motors, and how far from it is a turn beyond the limits."""
+        units = [actuator.unit for actuator in self.description.actuators]
+        turn = np.where([unit == "rad" for unit in units], 2 * np.pi, np.inf)
+        return (self.lower + self.upper) / 2, (self.upper - self.lower) / 2 + turn
 
     def joints(self, q: ArrayLike) -> dict[str, Any]:
         """Positions of all movable joints after the couplings.

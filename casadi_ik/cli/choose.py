@@ -16,6 +16,7 @@ from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import (
     located,
     the_object_pose,
+    the_options,
     the_robot,
     the_scene,
     the_start,
@@ -49,7 +50,12 @@ def choose(arguments: argparse.Namespace) -> Answer:
         invalid=arguments.invalid,
     )
     check_outputs([("--out", out)], inputs=[path])
-    solver = Solver(robot, tolerance=the_tolerance(arguments), scene=the_scene(arguments))
+    solver = Solver(
+        robot,
+        tolerance=the_tolerance(arguments),
+        options=the_options(arguments),
+        scene=the_scene(arguments),
+    )
     with located(str(path)):
         ranking = solver.choose(
             grasps,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from casadi_ik.cli.shared_options import add_object_pose, add_scene, add_tolerances
+from casadi_ik.cli.shared_options import add_effort, add_object_pose, add_scene, add_tolerances
 from casadi_ik.cli.values import file_name, numbers, one_of, positive, whole
 from casadi_ik.problem.preference import PREFERENCES
 
@@ -134,6 +134,7 @@ def add_choose(commands: Any) -> None:
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"
     )
     add_tolerances(parser)
+    add_effort(parser)
     parser.add_argument(
         "--out", metavar="RANKED.json", type=file_name(), required=True, help="write the answers"
     )

@@ -15,7 +15,13 @@ from casadi_ik.cli.import_parser import add_import
 from casadi_ik.cli.log_parser import add_log
 from casadi_ik.cli.reach_parser import add_reach
 from casadi_ik.cli.say import PROGRAM
-from casadi_ik.cli.shared_options import add_object_pose, add_scene, add_size_limits, add_tolerances
+from casadi_ik.cli.shared_options import (
+    add_effort,
+    add_object_pose,
+    add_scene,
+    add_size_limits,
+    add_tolerances,
+)
 from casadi_ik.cli.values import assignment, file_name, npz_or_folder, numbers, one_of, whole
 from casadi_ik.cli.view_parser import add_view
 from casadi_ik.errors import InputError
@@ -247,6 +253,7 @@ def _add_solver_options(parser: argparse.ArgumentParser) -> None:
         "--seed", metavar="N", type=whole(0), default=0, help="of all random numbers (default: 0)"
     )
     add_tolerances(parser)
+    add_effort(parser)
     parser.add_argument(
         "--limits",
         metavar="enforce|ignore",

@@ -85,15 +85,22 @@ def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:
     if method not in METHODS:
         raise UnknownNameError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
     scene = the_scene(arguments)
-    with located(f"--method {method}", (UnsupportedError,)), located("--finger-step"):
+    about = "--finger-step" if arguments.max_rounds is None else "--max-rounds"
+    with located(f"--method {method}", (UnsupportedError,)), located(about):
         return Solver(
             robot,
             method,
             the_tolerance(arguments),
             arguments.limits,
             arguments.finger_step,
+            options=the_options(arguments),
             scene=scene,
         )
+
+
+def the_options(arguments: argparse.Namespace) -> dict[str, int]:
+    """What was said of the method's own parameters."""
+    return {} if arguments.max_rounds is None else {"max_rounds": arguments.max_rounds}
 
 
 def the_tolerance(arguments: argparse.Namespace) -> Tolerance:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from casadi_ik.cli.values import file_name, numbers, positive
+from casadi_ik.cli.values import file_name, numbers, positive, whole
 
 
 def add_tolerances(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +20,17 @@ def add_tolerances(parser: argparse.ArgumentParser) -> None:
         metavar="RADIANS",
         type=positive,
         help="when a contact normal counts as reached (default: 0.0524, 3 deg)",
+    )
+
+
+def add_effort(parser: argparse.ArgumentParser) -> None:
+    """How long a target is tried."""
+    parser.add_argument(
+        "--max-rounds",
+        metavar="N",
+        type=whole(1),
+        help="rounds of hand postures at most before a target is given up; 1 solves nearly all "
+        "that can be reached (default: as many as may help)",
     )
 
 

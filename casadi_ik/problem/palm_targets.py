@@ -73,12 +73,15 @@ def postures_of(robot: ArmHand, postures: Sequence[Mapping[str, float]]) -> Arra
     return found
 
 
-def hand_postures(robot: ArmHand, postures: Mapping[str, ArrayLike], count: int) -> Array:
+def hand_postures(
+    robot: ArmHand, postures: Mapping[str, ArrayLike] | ArrayLike, count: int
+) -> Array:
     """(k, n) positions of all motors that move fingers; NaN for the others.
 
     Args:
         robot: The robot.
-        postures: Positions (k,), or one for all, by actuator [rad or m].
+        postures: Positions (k,), or one for all, by actuator [rad or m]; or configurations (k, n)
+            or (n,), of which the motors that move fingers count.
         count: k.
 
     Raises:
@@ -86,6 +89,10 @@ def hand_postures(robot: ArmHand, postures: Mapping[str, ArrayLike], count: int)
         InputError: As for `hand_posture`, or another number of positions; the message names the
             row.
     """
+    if not isinstance(postures, Mapping):
+        every = robot.configuration(postures, "postures")
+        motors = [robot.actuators.index(name) for name in hand_motors(robot.description)]
+        postures = {robot.actuators[i]: every[..., i] for i in motors}
     columns: dict[str, Array] = {}
     for name, value in postures.items():
         try:

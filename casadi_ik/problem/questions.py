@@ -188,7 +188,7 @@ class Questions:
         Raises:
             InputError: Not one configuration; the message has its name.
         """
-        start = self.robot.configuration(q0, name)
+        start = self.robot.start(q0, name)
         if start.ndim != 1:
             raise InputError(f"{name}: found shape {start.shape}, expected ({len(start[0])},)")
         return start

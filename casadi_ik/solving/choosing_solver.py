@@ -72,7 +72,7 @@ class ChoosingSolver:
     def solve_palms(
         self,
         palms: ArrayLike,
-        postures: Mapping[str, ArrayLike],
+        postures: Mapping[str, ArrayLike] | ArrayLike,
         q0: ArrayLike | None = None,
         seed: int = 0,
         jobs: int = 1,
@@ -85,7 +85,7 @@ class ChoosingSolver:
         Args:
             palms: (k, 4, 4) poses of `robot.palm` in the base frame.
             postures: Positions (k,), or one for all, of every motor that moves a finger, by name
-                [rad or m].
+                [rad or m]; or configurations (k, n) or (n,) of which these motors are taken.
             q0: (n,) or (k, n) start; None is `robot.home`.
             seed: As for `solve`.
             jobs: Threads, at least 1.
@@ -103,7 +103,7 @@ class ChoosingSolver:
 
         Example:
             >>> q = robot.random(np.random.default_rng(4), 50)
-            >>> hands = dict(zip(robot.actuators[7:], q[:, 7:].T))
+            >>> hands = dict(zip(robot.actuators[7:], q[:, 7:].T))  # or q itself
             >>> batch = solver.solve_palms(robot.palm(q), hands)
             >>> bool(batch.success.all()), bool(batch.palm_position_error.max() < 1e-3)
             (True, True)

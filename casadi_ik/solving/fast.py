@@ -81,7 +81,7 @@ class FastSolver:
                 at home, and one far from limits is wanted.
 
         Returns:
-            q (n,) [rad or m], which the next call overwrites (`q.copy()` stays), and the status.
+            q (n,) [rad or m] and the status.
 
         Raises:
             InputError: Wrong shapes or numbers.
@@ -101,7 +101,7 @@ class FastSolver:
         status = one()
         if status is None:
             return self._slowly(points, normals, q0)
-        return self._q, STATUSES[status]
+        return self._q.copy(), STATUSES[status]
 
     def _slowly(
         self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None

@@ -46,7 +46,7 @@ class Run:
         Raises:
             InputError: Wrong shape or numbers.
         """
-        return robot.configuration(self.q0, "q0")
+        return robot.start(self.q0)
 
     def starts(self, robot: ArmHand, count: int) -> Array:
         """(count, n) where each solve begins.

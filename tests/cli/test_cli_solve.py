@@ -267,3 +267,15 @@ def test_contacts_go_with_the_object(
     done = run("solve", grasp_file(), *FAST, "--object-pose", "1", "2")
     assert done.exit == 2
     assert "--object-pose: found 2 numbers, expected six" in done.err
+
+
+@pytest.mark.filterwarnings("default:q0")
+def test_effort_is_limited_and_degrees_are_noticed(run: Command, robot: ik.ArmHand) -> None:
+    degrees = [f"{value:g}" for value in np.rad2deg(robot.home)]
+    done = run("solve", "cup", "--q0", *degrees, "--max-rounds", "1")
+    assert done.exit == 0
+    (line,) = done.err.splitlines()
+    assert "q0: lwr_joint_2 is 30 rad, far beyond its limits" in line
+    refused = run("solve", "cup", "--method", "thumb-first", "--max-rounds", "1")
+    assert refused.exit == 2
+    assert "--max-rounds: option 'max_rounds' does not exist" in refused.err

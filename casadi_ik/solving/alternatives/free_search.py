@@ -209,7 +209,7 @@ class FreeSearch:
     def of_rounds(self, every: bool = False) -> Iterator[tuple[Array, NDArray[np.intp]]]:
         """Answers with other hands, of the targets that are not free, round by round."""
         method = self.trials.method
-        for number in range(min(ROUNDS, method.options.rounds)):
+        for number in range(min(ROUNDS, method.options.rounds, method.rounds)):
             # Where a round has brought no other hand, the next will not either.
             rows = np.flatnonzero((~self.free | (every and not number)) & self._fresh)
             if not len(rows):
