@@ -110,6 +110,10 @@ class ArmHand:
 
         Raises:
             InputError: As for `configuration`.
+
+        Example:
+            >>> bool((robot.start(None) == robot.home).all())
+            True
         """
         start = self.configuration(q0, name)
         if q0 is None:
