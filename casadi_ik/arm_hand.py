@@ -154,7 +154,7 @@ class ArmHand:
             >>> print(round(np.rad2deg(joints["lwr_joint_2"]), 6))
             30.0
         """
-        (theta,) = self._kernels.joints(self.configuration(q))
+        (theta,) = self._kernels.joints(_for_kernels(self.configuration(q)))
         return _by_name(self.description.joint_names, theta)
 
     def toggle_margins(self, q: ArrayLike) -> dict[str, Any]:
@@ -196,7 +196,7 @@ class ArmHand:
             >>> points.shape, bool(np.allclose(np.linalg.norm(normals, axis=1), 1))
             ((3, 3), True)
         """
-        points, normals = self._kernels.contacts(self.configuration(q))
+        points, normals = self._kernels.contacts(_for_kernels(self.configuration(q)))
         return points, normals
 
     def contact_frames(self, q: ArrayLike) -> Array:
@@ -224,7 +224,7 @@ class ArmHand:
 
     def frames_at(self, q: Array) -> Array:
         """`contact_frames` of configurations that need not be finite; NaN gives NaN."""
-        (frames,) = self._kernels.contact_frames(q)
+        (frames,) = self._kernels.contact_frames(_for_kernels(q))
         return frames.reshape(*frames.shape[:-2], len(self.fingers), 4, 4)
 
     def errors(self, q: ArrayLike, points: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
@@ -264,7 +264,7 @@ class ArmHand:
             Distances [m] (f,) or (k, f), angles [rad] the same, and () or (k,) by how much the
             worst actuator or joint is beyond its limits [rad or m].
         """
-        position, angle, beyond = self._kernels.deviations(q, points, normals)
+        position, angle, beyond = self._kernels.deviations(_for_kernels(q), points, normals)
         # A kernel's single number has no dimension of its own, even that of a single finger.
         by_finger = (*beyond.shape, len(self.fingers))
         return position.reshape(by_finger), angle.reshape(by_finger), beyond
@@ -277,7 +277,7 @@ class ArmHand:
         Raises:
             InputError: See `configuration`.
         """
-        (beyond,) = self._kernels.beyond(self.configuration(q))
+        (beyond,) = self._kernels.beyond(_for_kernels(self.configuration(q)))
         return beyond
 
     def palm(self, q: ArrayLike) -> Array:
@@ -290,7 +290,7 @@ class ArmHand:
             >>> robot.palm(robot.home).shape
             (4, 4)
         """
-        (pose,) = self._kernels.palm(self.configuration(q))
+        (pose,) = self._kernels.palm(_for_kernels(self.configuration(q)))
         return pose
 
     def links(self, q: ArrayLike) -> dict[str, Array]:
@@ -309,7 +309,7 @@ class ArmHand:
             >>> robot.links(robot.home)["lwr_flange"].shape
             (4, 4)
         """
-        (poses,) = self._kernels.links(self.configuration(q))
+        (poses,) = self._kernels.links(_for_kernels(self.configuration(q)))
         names = self.description.links
         stacked = poses.reshape(*poses.shape[:-2], len(names), 4, 4)
         return {name: stacked[..., i, :, :] for i, name in enumerate(names)}
@@ -355,6 +355,11 @@ class ArmHand:
     @cached_property
     def _kernels(self) -> RobotKernels:
         return RobotKernels(self.description)
+
+
+def _for_kernels(q: Array) -> Array:
+    """(n,) or (k, n); of a robot of one motor () or (k,), as its kernels have a single number."""
+    return q[..., 0] if q.shape[-1] == 1 else q
 
 
 def load_robot(name_or_path: str | Path) -> ArmHand:

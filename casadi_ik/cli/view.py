@@ -114,7 +114,8 @@ def _kind(name: str) -> str:
         )
     if name in shipped_names("grasps"):
         return "grasp"
-    if "+" in name or name in shipped_names("arm_hands"):
+    kinds = ("arm_hands", "arms", "hands")
+    if "+" in name or any(name in shipped_names(kind) for kind in kinds):
         return "robot"
     raise UnknownNameError(
         f"{name!r} is neither a shipped grasp (casadi-ik grasps) nor a shipped robot (casadi-ik "

@@ -6,6 +6,9 @@ from pathlib import Path
 
 from casadi_ik.errors import DescriptionError, UnknownNameError
 
+FOREIGN = (".urdf", ".xacro", ".xml", ".mjcf")
+"""Names' ends of robots' files that are imported."""
+
 
 def models_folder() -> Path:
     """The folder ``models``.
@@ -64,20 +67,36 @@ def resolve(name_or_path: str | Path, kind: str, beside: Path | None = None) -> 
     return path
 
 
-def resolve_robot(name_or_path: str | Path, beside: Path | None = None) -> Path | tuple[Path, Path]:
-    """The file of a robot, or those of an arm and a hand that a plus sign joins.
+def resolve_robot(
+    name_or_path: str | Path, beside: Path | None = None
+) -> Path | tuple[Path | None, Path | None]:
+    """The file of a robot, or those of an arm and a hand, of which one may stand alone.
 
     Args:
-        name_or_path: A shipped arm-hand, the path of a YAML file, or "ARM+HAND" of shipped names.
+        name_or_path: A shipped arm-hand, arm or hand, "ARM+HAND" of shipped names, or the path of
+            a YAML file.
         beside: See `resolve`.
 
     Raises:
         UnknownNameError: No shipped description has that name.
-        DescriptionError: The path does not exist.
+        DescriptionError: The path does not exist, or is of a file that has to be imported.
     """
     text = str(name_or_path)
     path_like = isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml"))
+    if text.endswith(FOREIGN):
+        raise DescriptionError(
+            f"{text}: is a robot's file, expected a description, which says where its fingertips "
+            f"are: casadi-ik import {text} --out {Path(text).stem}.yaml makes one"
+        )
     arm, plus, hand = text.partition("+")
-    if path_like or not plus:
+    if not path_like and plus:
+        return resolve(arm, "arms"), resolve(hand, "hands")
+    if not path_like and text in shipped_names("arms"):
+        return resolve(text, "arms"), None
+    if not path_like and text in shipped_names("hands") and text not in shipped_names("arm_hands"):
+        return None, resolve(text, "hands")
+    try:
         return resolve(name_or_path, "arm_hands", beside)
-    return resolve(arm, "arms"), resolve(hand, "hands")
+    except UnknownNameError as error:
+        more = "or an arm, a hand or ARM+HAND of the catalogue (casadi-ik robots)"
+        raise UnknownNameError(f"{error}, {more}") from None

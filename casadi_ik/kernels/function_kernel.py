@@ -211,6 +211,8 @@ class FunctionKernel:
             self._names, self.input_shapes, self._input_sizes, inputs, strict=True
         ):
             array = doubles(values)
+            if not shape and array.ndim == 2 and array.shape[1] == 1:
+                array = array[:, 0]  # vectors of one number
             arrays.append(array)
             if array.shape == shape:
                 steps.append(0)

@@ -62,7 +62,7 @@ def _finger(name: str, hand: HandPart, flat: FlatJoints) -> Finger:
         if by_child[link].type != "fixed":
             chain.append(by_child[link].name)
         link = by_child[link].parent
-    if not chain:
+    if not chain and hand.actuators:
         raise DescriptionError(
             f"{where}.link: no joint moves {entry.link!r} against the palm {hand.tip_link!r}"
         )

@@ -28,7 +28,14 @@ from casadi_ik.robots.fingers import the_fingers
 from casadi_ik.robots.flat import flattened
 from casadi_ik.robots.home import the_home
 from casadi_ik.robots.part import HandPart, Part, told_apart
-from casadi_ik.robots.schema import ArmFile, ArmFromFile, ArmHandFile, HandFile, ImportedFile
+from casadi_ik.robots.schema import (
+    ArmFile,
+    ArmFromFile,
+    ArmHandFile,
+    HandFile,
+    ImportedFile,
+    PadEntry,
+)
 
 
 def load_description(name_or_path: str | Path) -> RobotDescription:
@@ -36,9 +43,10 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
 
     Args:
         name_or_path: A shipped name (`shipped_names("arm_hands")`), a shipped arm and a shipped
-            hand joined by a plus sign ("panda+allegro_right"), or the path of a YAML file, whose
-            ``arm`` and ``hand`` may be shipped names or paths relative to it, or may stand in
-            somebody's URDF or MJCF.
+            hand joined by a plus sign ("panda+allegro_right"), one of the two alone ("panda",
+            whose one fingertip ``flange`` is its tip, facing along z; "allegro_right", which
+            stands on a fixed base), or the path of a YAML file, whose ``arm`` and ``hand`` may be
+            shipped names or paths relative to it, or may stand in somebody's URDF or MJCF.
 
     Raises:
         UnknownNameError: No shipped description has that name.
@@ -49,11 +57,21 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
     return _pair(*found) if isinstance(found, tuple) else _robot(found)
 
 
-def _pair(arm_path: Path, hand_path: Path) -> RobotDescription:
+FLANGE = HandPart(
+    "flange",
+    "flange",
+    "flange",
+    *([], [], {}, "flange", np.eye(4), {}),
+    pads={"flange": PadEntry("flange", (0.0, 0.0, 1.0))},
+)
+"""What an arm has that stands alone: its tip, which touches what is before it."""
+
+
+def _pair(arm_path: Path | None, hand_path: Path | None) -> RobotDescription:
     """A shipped arm with a shipped hand, as their files say that they are put together."""
-    arm = arm_part(_read(arm_path, ArmFile)[0], arm_path)
-    hand = hand_part(_read(hand_path, HandFile)[0], hand_path)
-    name = f"{arm_path.stem}+{hand_path.stem}"
+    arm = None if arm_path is None else arm_part(_read(arm_path, ArmFile)[0], arm_path)
+    hand = FLANGE if hand_path is None else hand_part(_read(hand_path, HandFile)[0], hand_path)
+    name = "+".join(path.stem for path in (arm_path, hand_path) if path is not None)
     return _joined(name, arm, hand.mount, hand, list(hand.pads), hand.thumb, {}, name, {}, {})
 
 

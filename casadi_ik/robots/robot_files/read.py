@@ -15,9 +15,6 @@ from casadi_ik.robots.robot_files.xml_text import parse_xml, read_text
 MACRO_TAGS = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
 """How the tags of macros begin."""
 
-SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
-"""Of the files that are read."""
-
 
 def read_tree(path: Path, xacro: bool = False) -> RobotTree:
     """Read a robot's file.
