@@ -74,8 +74,8 @@ def test_bad_contact(
     ("changes", "fragment"),
     [
         ({"robot": None}, "robot: missing, expected it in the file or --robot"),
-        ({"robot": "ur5"}, "robot: no shipped arm-hand is called 'ur5'"),
-        ({"robot": "own/ur5.yaml"}, "robot: "),
+        ({"robot": "no_such"}, "robot: no shipped arm-hand is called 'no_such'"),
+        ({"robot": "own/no_such.yaml"}, "robot: "),
         ({"colour": "red"}, "colour"),
         ({"posture": {"bh_spread": "wide"}}, "posture.bh_spread: "),
     ],
@@ -150,7 +150,7 @@ def test_missing_grasp(name: str, fragment: str, refused: Callable[..., str]) ->
 @pytest.mark.parametrize(
     ("words", "fragment"),
     [
-        ("--robot ur5", "--robot: no shipped arm-hand is called 'ur5'"),
+        ("--robot no_such", "--robot: no shipped arm-hand is called 'no_such'"),
         ("--robot ./nowhere.yaml", "nowhere.yaml: no such file"),
         ("--method magic", "--method: found 'magic', expected one of "),
         ("--limits some", "--limits: found 'some', expected one of enforce, ignore"),
