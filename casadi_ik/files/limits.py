@@ -10,7 +10,7 @@ from casadi_ik.errors import InputError
 VARIABLE = "CASADI_IK_LIMITS"
 """Factor in the environment by which all limits are multiplied."""
 
-RAISED = f"({VARIABLE}=4 in the environment allows four times as much)"
+RAISED = f"(--size-limits 4, or {VARIABLE}=4 in the environment, allows four times as much)"
 """Said where a limit is met."""
 
 

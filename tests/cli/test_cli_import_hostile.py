@@ -214,7 +214,7 @@ limited="true"/><geom size="0.01"/></body></body>
 
 PLAIN = {"assets": "", "bodies": "", "axis": "1 0 0", "range": "0 1", "place": "0.05", "pull": "1"}
 
-GIANTS = "takes more than 2 s of computing or 307 MiB (CASADI_IK_LIMITS=4 in the environment allows"
+GIANTS = "takes more than 2 s of computing or 307 MiB (--size-limits 4, or CASADI_IK_LIMITS=4"
 
 MODELS = {
     "plain": ({}, ""),
