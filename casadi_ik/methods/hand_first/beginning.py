@@ -116,7 +116,9 @@ def _is_held(robot: RobotDescription, t: dict[str, Expr]) -> Expr:
     A hand that is held as a whole needs no search.
     """
     hand, arm = list(robot.hand_actuators), list(robot.arm_actuators)
-    free_hand, free_arm = (ca.sum1(t["lower"][rows] < t["upper"][rows]) for rows in (hand, arm))
+    free_hand, free_arm = (
+        ca.sum1(t["lower"][rows] < t["upper"][rows]) if rows else 0 for rows in (hand, arm)
+    )
     less = ca.logic_or(free_hand < len(hand), free_arm < min(len(arm), SIX))
     return ca.logic_and(less, free_hand > 0)
 
