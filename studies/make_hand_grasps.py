@@ -61,7 +61,7 @@ ITEMS = {
     "shadow": ("tomato_soup_can", "cup", "orange"),
     "robotiq_3f": ("mustard_bottle", "potted_meat_can", "bleach_cleanser"),
     "panda_hand": ("mustard_bottle", "tomato_soup_can", "sugar_box"),
-    "robotiq_2f85": ("potted_meat_can", "tennis_ball"),
+    "robotiq_2f85": ("potted_meat_can", "tomato_soup_can", "mustard_bottle", "tennis_ball"),
 }
 """What each hand pinches. Four motors touch no ball with three exact pads."""
 

@@ -92,8 +92,12 @@ class Contact:
         for name, vector in vectors.items():
             object.__setattr__(self, name, vector)
 
-    def at(self, pose: ArrayLike) -> Contact:
+    def at(self: Any, pose: ArrayLike | None = None) -> Contact:
         """The contact that moves with a frame into the base frame.
+
+        Of the class, ``Contact.at(pose)`` asks for a fingertip's whole pose: the point is the
+        pose's origin, the normal its first axis, the tangent its second, as
+        `ArmHand.contact_frames` gives them.
 
         Args:
             pose: (4, 4) where the frame is in which this one is given.
@@ -106,7 +110,11 @@ class Contact:
             >>> pose[:3, 3] = [1.0, 0.0, 0.0]
             >>> print(ik.Contact([0.0, 0.0, 0.5]).at(pose).point)
             [1.  0.  0.5]
+            >>> print(ik.Contact.at(pose).normal, ik.Contact.at(pose).tangent)
+            [1. 0. 0.] [0. 1. 0.]
         """
+        if pose is None or not isinstance(self, Contact):
+            return Contact(np.zeros(3), [1, 0, 0], tangent=[0, 1, 0]).at(one_pose(self))
         motion = one_pose(pose)
         turn = motion[:3, :3]
         if not np.isfinite(self.point).all():

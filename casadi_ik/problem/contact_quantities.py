@@ -189,9 +189,11 @@ class _Hand:
             effect = ball.effect[real]
             best = max(best, value.max(initial=-np.inf))
             near = most <= best + GAP[unit]
-            if seen > MOST:
+            if seen > MOST or not self.motors:
                 near[:] = True
             found = max(found, most[near].max(initial=-np.inf))
+            if near.all():
+                break
             boxes, widest = boxes[~near], effect[~near].argmax(axis=1)
             rows = np.arange(len(boxes))
             middle = boxes.mean(axis=1)[rows, widest]

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.hand_motors import hand_motors
+from casadi_ik.problem.problems import Problems
 
 DETERMINED = 0.15
 """Contacts that move by less than this when their palm moves by 1 (turned [rad], or shifted by
@@ -131,24 +132,37 @@ def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array
     back = np.swapaxes(turn, 1, 2)
     points = (points - here[:, None, :3, 3]) @ back + palms[:, None, :3, 3]
     normals = normals @ back
-    free = _stiffness(points, normals) < DETERMINED
+    free = _leave_free(points, normals)
     if not free.any():
         return points, normals, {}
     tangents = robot.contact_frames(q)[..., :3, 1] @ back
     return points, normals, {"tangents": np.where(free[:, None, None], tangents, np.nan)}
 
 
-def _stiffness(points: Array, normals: Array) -> Array:
-    """(k,) how much contacts move at least, lengths by `LENGTH`, per unit motion of the palm."""
-    off = (points - points.mean(axis=1, keepdims=True)) / LENGTH
+def free_palms(robot: ArmHand, problems: Problems) -> NDArray[np.bool_]:
+    """(k,) whether a hand that meets its contacts can still move as a whole.
+
+    A line or a plane is taken for the point it goes through.
+    """
+    if not robot.description.arm_actuators:
+        return np.zeros(len(problems), dtype=bool)
+    facing = np.concatenate([problems.vectors(name) for name in ("normals", "tangents")], axis=1)
+    return _leave_free(problems.points, facing)
+
+
+def _leave_free(points: Array, facing: Array) -> NDArray[np.bool_]:
+    """(k,) whether points (k, f, 3) [m] and directions (k, m, 3) leave the palm free; NaN: none."""
+    placed, known = (~np.isnan(vectors[..., :1]) for vectors in (points, facing))
+    count = np.maximum(placed.sum(axis=1, keepdims=True), 1)
+    off = (points - np.nansum(points, axis=1, keepdims=True) / count) / LENGTH
     f = points.shape[1]
-    moved = np.zeros((len(points), 6, 2 * f, 3))
+    moved = np.zeros((len(points), 6, f + facing.shape[1], 3))
     for i, axis in enumerate(np.eye(3)):
-        moved[:, i, :f] = axis
-        moved[:, 3 + i, :f] = np.cross(axis, off)
-        moved[:, 3 + i, f:] = np.cross(axis, normals)
+        moved[:, i, :f] = axis * placed
+        moved[:, 3 + i, :f] = np.cross(axis, np.where(placed, off, 0.0))
+        moved[:, 3 + i, f:] = np.cross(axis, np.where(known, facing, 0.0))
     values = np.linalg.svd(moved.reshape(len(points), 6, -1), compute_uv=False)
-    return np.asarray(values[:, -1], dtype=np.float64)
+    return np.asarray(values[:, -1] < DETERMINED)
 
 
 def held_too(postures: Array, fixed: Array | None, actuators: Sequence[str]) -> Array:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Rows
@@ -98,7 +98,7 @@ class Trials:
         return self.run(states, parameters)
 
     def posture_rows(
-        self, problems: Problems, start: Array, postures: Array
+        self, problems: Problems, start: Array, postures: Array, turns: ArrayLike = 0.0
     ) -> tuple[Array, Array]:
         """Rows of the loop that know a single hand posture each.
 
@@ -106,9 +106,11 @@ class Trials:
             problems: k targets.
             start: (k, n).
             postures: (k, hand).
+            turns: (k,) numbers, another palm for each where contacts leave the palm free.
         """
         states, parameters = self.method.rows(problems, start, postures[:, None], begun=True)
         states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
+        states[:, self.state.slice("turn").start] = turns
         return states, parameters
 
     def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:

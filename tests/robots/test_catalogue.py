@@ -65,8 +65,9 @@ HANDS = [
     "unitree_dex3",
     "panda_hand",
     "robotiq_2f85",
+    "tool",
 ]
-GRIPPERS = ("panda_hand", "robotiq_2f85")
+FEWER = {"panda_hand": 2, "robotiq_2f85": 2, "tool": 1}
 
 PUBLISHED = json.loads(Path(__file__).with_name("published_poses.json").read_text())
 
@@ -91,11 +92,11 @@ def test_every_arm_takes_a_hand(arm):
 @pytest.mark.parametrize("hand", HANDS)
 def test_every_hand_goes_on_an_arm(hand):
     description = load_description(f"ur5e+{hand}")
-    assert len(description.fingers) >= (2 if hand in GRIPPERS else 3)
+    assert len(description.fingers) >= FEWER.get(hand, 3)
     assert description.actuator_names[:6] == tuple(f"ur5e_joint_{i}" for i in range(1, 7))
     assert description.sources
     for finger in description.fingers:
-        assert finger.joints
+        assert finger.joints or hand == "tool"
         np.testing.assert_allclose(np.linalg.norm(finger.normal), 1, atol=1e-12)
 
 
@@ -125,7 +126,7 @@ def test_hands_stand_where_published_files_have_them(hand):
     part = hand_part(read(path, HandFile)[0], path)
     for q, links in zip(known["q"], known["links"], strict=True):
         found = Postures(part).poses(dict(zip(known["joints"], q, strict=True)))
-        assert len(links) >= (2 if hand in GRIPPERS else 3)
+        assert len(links) >= FEWER.get(hand, 3)
         for link, pose in links.items():
             np.testing.assert_allclose(found[link][:3], pose, atol=known["tolerance"])
 

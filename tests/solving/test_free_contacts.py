@@ -71,3 +71,20 @@ def test_what_a_hand_of_one_motor_misses_is_diagnosed(name):
     assert not batch.success.all()
     for solved, why in zip(batch.success, batch.diagnoses, strict=True):
         assert solved == (why is None)
+
+
+def test_an_arm_with_a_tool():
+    robot, solver = robot_of("panda+tool"), solver_of("panda+tool")
+    q = robot.random(np.random.default_rng(0), 100)
+    points, normals = robot.contacts(q)
+    assert solver.solve_batch(points, normals).success.all()
+    assert solver.solve_batch(points, np.full_like(normals, np.nan), q0=robot.home).success.all()
+    frame = robot.contact_frames(q[0])[0]
+    tip = ik.Contact.at(frame)
+    solution = solver.solve(ik.Grasp({"tip": tip}))
+    np.testing.assert_allclose(robot.contact_frames(solution.q)[0], frame, atol=1e-2)
+    assert len(solver.solve_all(ik.Grasp({"tip": tip}))) > 1
+    far = solver.solve(ik.Grasp({"tip": ik.Contact(tip.point + 3.0, tip.normal)}))
+    assert far.status is ik.Status.UNREACHABLE
+    batch = solver.solve_batch(1.25 * points[:20], normals[:20], diagnose=True)
+    assert [why is None for why in batch.diagnoses] == batch.success.tolist()

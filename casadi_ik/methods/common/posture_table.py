@@ -56,7 +56,7 @@ class PostureTable:
         q[:, columns] = self.postures = self.spread(0, size)
         self._pulled = pull > 0
         half_ranges = self.ranges / 2
-        scales = np.sqrt(pull / len(columns)) / half_ranges
+        scales = np.sqrt(pull / max(len(columns), 1)) / half_ranges
         key = contact_shape(len(robot.fingers), scales if self._pulled else ())
         contacts = robot.contacts(q)
         rows = (*contacts, self.postures) if self._pulled else contacts
@@ -118,7 +118,7 @@ def differing(postures: Array, ranges: Array, count: int, similar: float) -> Arr
 
 def squared_distance(one: Array, other: Array) -> Array:
     """Squared lengths (...) of differences (..., m), summed in order: the same bits anywhere."""
-    total = np.square(one[..., 0] - other[..., 0])
-    for column in range(1, one.shape[-1]):
+    total = np.zeros(np.broadcast_shapes(one.shape, other.shape)[:-1])
+    for column in range(one.shape[-1]):
         total += np.square(one[..., column] - other[..., column])
     return total

@@ -149,7 +149,8 @@ def fit_step(
     rotation, origin = compose((x.rotation, x.origin), exp_se3(damped.step[:6]))
     reached = PalmAndHand(rotation, origin, clip(x.hand + damped.step[6:], bounds))
     there, _ = _rows(layouts, arm, reached, p)
-    size = ca.mmax(ca.fabs(reached.hand - x.hand))
+    # A tool has no motors that could move.
+    size = ca.mmax(ca.fabs(reached.hand - x.hand)) if x.hand.numel() else ca.SX(0)
     return Tried(reached, before, there, damped.promised, size)
 
 

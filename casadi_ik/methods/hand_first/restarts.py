@@ -253,6 +253,8 @@ class Restarts:
             which: The round, from 0. Even ones keep motors at a limit there; odd ones do not.
         """
         columns = self._hand
+        if not columns:  # a tool
+            return np.empty((len(q), self._options.candidates, 0))
         rigid, slopes = self._slopes(q, problems)
         ends = np.minimum(q - self._robot.lower, self._robot.upper - q)[:, columns]
         held = (ends < AT_END) * HELD if which % 2 == 0 else np.zeros_like(ends)

@@ -55,9 +55,9 @@ static map_job mapping(int64_t count, const double **inputs, const int64_t *inpu
 }
 
 static double apart(const double *one, const double *other) {
-  double sum = (one[0] - other[0]) * (one[0] - other[0]);
+  double sum = 0.0;
   int i;
-  for (i = 1; i < N_HAND; ++i) sum += (one[i] - other[i]) * (one[i] - other[i]);
+  for (i = 0; i < N_HAND; ++i) sum += (one[i] - other[i]) * (one[i] - other[i]);
   return sum;
 }
 

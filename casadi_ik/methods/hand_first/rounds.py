@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array
 from casadi_ik.grasps.arrays import LARGE, SMALL, UNIT
 from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
 from casadi_ik.kernels.codegen import define
@@ -93,7 +94,9 @@ class RoundsPlan:
         return self.enforce_limits and mends(self.layouts.robot)
 
     def constants(
-        self, reals: Mapping[str, float] | None = None, arrays: Mapping[str, Array] | None = None
+        self,
+        reals: Mapping[str, float] | None = None,
+        arrays: Mapping[str, NDArray[Any]] | None = None,
     ) -> str:
         """All of them but the `sizes`, as C text.
 
@@ -168,13 +171,13 @@ class RoundsPlan:
         slices = map(self.layouts.state.slice, going_on.CARRIED)
         return [place for one in slices for place in range(one.start, one.stop)]
 
-    def _arrays(self) -> dict[str, Array]:
+    def _arrays(self) -> dict[str, NDArray[Any]]:
         robot, hands = self.layouts.robot, self.hands
         hand, spreads = list(robot.hand_actuators), hands.spreads
         lower, upper = hands.anywhere_bounds(self.enforce_limits)
         fresh, state = fresh_fit(), self.layouts.state
         return {
-            "HAND": np.array(hand),
+            "HAND": np.array(hand, dtype=np.int64),
             "CARRIED": np.array(self._carried),
             "FRESH_PLACES": np.array([state.slice(name).start for name in fresh]),
             "FRESH_VALUES": np.array([float(value) for value in fresh.values()]),

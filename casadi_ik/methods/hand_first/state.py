@@ -75,6 +75,7 @@ class HandFirstLayouts:
                 Field("phase"),
                 Field("candidate", doc="index of the hand posture started from; -1: all as in q0"),
                 Field("earlier", doc="hand postures tried in earlier rounds"),
+                Field("turn", doc="which palm of those that contacts leave free comes first"),
                 Field("damping"),
                 Field("growth", doc="factor of the damping if the next step gains nothing"),
                 Field("cost", doc="cost at q (or at palm and hand)"),

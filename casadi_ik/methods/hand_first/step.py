@@ -162,7 +162,7 @@ class HandFirstStep:
         exhausted = s["candidate"] >= count
         q = self._with_hand(p["start"], hand)
         contacts = hand_contacts(self.robot, hand, self.robot.hand_actuators)
-        number = ca.fmax(s["candidate"] + s["earlier"], 0.0)
+        number = ca.fmax(s["candidate"] + s["earlier"], 0.0) + s["turn"]
         rotation, origin = best_palm(contacts, layouts.contacts, p, number)
         after = layouts.state.pack(
             self.layouts.counted(s, Phase.CANDIDATE)

@@ -44,6 +44,8 @@ def _build(name: str, rows: int, hand: int) -> ca.Function:
     """As operations on whole matrices: unrolled they would be tens of thousands."""
     rigid, given = ca.MX.sym("rigid", 6, rows), ca.MX.sym("slopes", hand, rows)
     held, slopes = ca.MX.sym("held", hand), given.T
+    if not hand:  # a tool
+        return ca.Function(name, [rigid, given, held], [ca.MX(0, 1)])
     # The palm follows as well as it can: what is left of a motor's motion counts.
     for base in _orthonormal(rigid.T):
         slopes = slopes - base @ (base.T @ slopes)

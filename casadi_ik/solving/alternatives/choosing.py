@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
+from casadi_ik.problem.palm_targets import free_palms
 from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Status
@@ -175,16 +176,17 @@ class _Part:
         owner = np.repeat(rows, count)
         asked = self.problems.rows(owner)
         starts = self.limits.of(owner).clip(self.begin[owner])
-        flat = postures.reshape(-1, postures.shape[2])
-        ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat))
+        flat = postures.reshape(len(owner), postures.shape[2])
+        turns = np.tile(np.arange(count), len(rows))
+        ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat, turns))
         ends[~self.trials.solved(asked, ends, asked.enforce_limits)] = np.nan
         every = np.concatenate([q[:, None], ends.reshape(len(rows), count, n)], axis=1)
-        hand = self.finder.hand
-        robot = self.finder.robot
-        parts = every[:, :, hand] / (robot.upper - robot.lower)[hand]
-        kept: Bools = np.all(np.isfinite(parts), axis=2)
+        kept: Bools = np.all(np.isfinite(every), axis=2)
+        free = np.repeat(free_palms(self.finder.robot, some), count + 1)
+        parts = self.finder.hand_parts(np.nan_to_num(every).reshape(-1, n), free)
+        parts = parts.reshape(len(rows), count + 1, -1)
         for i in range(1, count + 1):
-            apart = np.abs(parts[:, i, None] - parts[:, :i]).max(axis=2) >= DISTINCT
+            apart = np.abs(parts[:, i, None] - parts[:, :i]).max(axis=2, initial=0) >= DISTINCT
             kept[:, i] &= (apart | ~kept[:, :i]).all(axis=1)
         place, which = np.nonzero(kept)
         return every[place, which], rows[place]

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -18,6 +19,7 @@ from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.palm_targets import free_palms
 from casadi_ik.problem.preference import CLEARANCE, preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
@@ -28,6 +30,9 @@ from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.measures import manipulability
 from casadi_ik.symbolic.srs_arm import SrsArm
+
+PALMS = np.array([0.1, 0.1, 0.1, 2.0])
+"""What turns [rad] and shifts [m] of a palm that is free count as, beside parts of ranges."""
 
 DISTINCT = 0.05
 """Hands and arms that are searched count as different if a motor differs by this part of its
@@ -189,7 +194,8 @@ class AlternativeFinder:
         postures = np.concatenate([method.postures(problems, number)[0] for number in rounds])
         starts = np.tile(limits.clip(q0), (len(postures), 1))
         asked = repeated(problems, len(postures))
-        states, parameters = trials.posture_rows(asked, starts, postures)
+        turns = np.arange(len(postures))
+        states, parameters = trials.posture_rows(asked, starts, postures, turns)
         loose = parameters.copy()
         trials.set_tolerance(parameters, CLOSE)
         q = trials.run(states, parameters)
@@ -199,7 +205,24 @@ class AlternativeFinder:
             # Reachable thanks to the tolerances only, if at all.
             q = np.concatenate([q, trials.run(states, loose)])
             kept = q[trials.solved(problems, q, problems.enforce_limits)]
-        return [kept[i] for i in distinct(self._parts(kept, self.hand), DISTINCT)]
+        parts = self.hand_parts(kept, np.repeat(free_palms(self.robot, problems), len(kept)))
+        return [kept[i] for i in distinct(parts, DISTINCT)]
+
+    def hand_parts(self, q: Array, free: NDArray[np.bool_]) -> Array:
+        """What tells hands apart: motors as parts of their ranges, and palms that are free.
+
+        Args:
+            q: (m, n).
+            free: (m,) whether contacts leave the palm free, see `free_palms`.
+
+        Returns:
+            (m, h) or, where any palm is free, (m, h + 12).
+        """
+        parts = self._parts(q, self.hand)
+        if not free.any():
+            return parts
+        palms = self.robot.palm(q)[:, :3] * PALMS
+        return np.concatenate([parts, palms.reshape(-1, 12) * free[:, None]], axis=1)
 
     def _arms(
         self,

@@ -27,13 +27,14 @@ class FreeFinder:
     Attributes:
         robot: The robot.
         trials: The loop of hand-first.
-        hand: Positions in q of the hand's actuators.
+        hand_parts: What tells hands apart, see `AlternativeFinder`.
     """
 
     def __init__(self, finder: AlternativeFinder, compiled: bool = True) -> None:
         """Take what enumerates solutions."""
         self._finder = finder
-        self.robot, self.trials, self.hand = finder.robot, finder.trials, finder.hand
+        self.robot, self.trials = finder.robot, finder.trials
+        self.hand_parts = finder.hand_parts
         self._compiled = compiled
 
     @cached_property

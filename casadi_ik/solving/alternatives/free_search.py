@@ -21,6 +21,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
 from casadi_ik.problem.collision_report import CollisionReport
+from casadi_ik.problem.palm_targets import free_palms
 from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.problem.problems import Problems
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
@@ -118,7 +119,9 @@ class FreeSearch:
         robot, hand = finder.robot, finder.hand
         self._idle = IdleFingers(robot, problems)
         self._ranges = np.maximum(robot.upper - robot.lower, LEAST_RANGE)
-        self._known, self._swung = (Different(count, len(hand), ALIKE) for _ in range(2))
+        self._palms = free_palms(robot, problems)
+        size = len(hand) + 12 * bool(self._palms.any())
+        self._known, self._swung = (Different(count, size, ALIKE) for _ in range(2))
         self._fresh = np.ones(count, dtype=bool)
 
     @cached_property
@@ -163,7 +166,7 @@ class FreeSearch:
             self._fresh[owner] = True
             return
         room = self.around.rows(owner).held.check(q).room
-        parts = (q / self._ranges)[:, self.finder.hand]
+        parts = self.finder.hand_parts(q, self._palms[owner])
         fresh = self._known.add(parts, owner)
         self._fresh[owner[fresh]] = True
         self.hands.append((q[fresh], owner[fresh], room[fresh]))
@@ -220,9 +223,10 @@ class FreeSearch:
             count = postures.shape[1]
             owner = np.repeat(rows, count)
             starts = self.limits.of(owner).clip(self.starts[owner])
-            flat = postures.reshape(-1, postures.shape[2])
+            flat = postures.reshape(len(owner), postures.shape[2])
             asked = self.problems.rows(owner)
-            ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat))
+            turns = number * count + np.tile(np.arange(count), len(rows))
+            ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat, turns))
             yield self._solved(ends, owner)
 
     def _from_anywhere(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:

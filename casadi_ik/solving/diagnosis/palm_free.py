@@ -144,10 +144,9 @@ class PalmFree:
         """Fit postures (c, p, hand) to c of the targets."""
         trials = self._trials
         targets = np.repeat(chosen, postures.shape[1])
-        start = q0[targets]
-        states, parameters = trials.posture_rows(
-            problems.rows(targets), start, postures.reshape(len(start), -1)
-        )
+        start, flat = q0[targets], postures.reshape(len(targets), postures.shape[2])
+        turns = np.tile(np.arange(postures.shape[1]), len(chosen))
+        states, parameters = trials.posture_rows(problems.rows(targets), start, flat, turns)
         parameters[:, trials.parameters.slice("alone")] = 1.0
         parameters[:, trials.parameters.slice("reach")] = 0.0
         return self._run(problems, targets, states, parameters)

@@ -253,12 +253,15 @@ class Prover:
             target, lower, upper = target[wanted], lower[wanted], upper[wanted]
             boxes += np.bincount(target, minlength=count)
             refuted, scores = self._test(
-                *(end.reshape(-1, *size) for end in (lower, upper)),
+                *(end.reshape(len(end), *size) for end in (lower, upper)),
                 *(*limits, points[target], normals[target]),
                 *(tolerance, asked[target], *arm),
             )
             refuted, scores = refuted > 0, scores.reshape(lower.shape)
             reach[target[refuted[:, 1] & ~refuted[:, 0]]] = True
+            if not lower.shape[1]:  # a tool has no postures to divide
+                given_up[target[~refuted.any(axis=1)]] = True
+                continue
             widest = scores.argmax(axis=1)
             rows = np.arange(len(target))
             tiny = (upper - lower)[rows, widest] < finest
