@@ -35,6 +35,7 @@ def test_an_arm_alone_is_a_robot_whose_fingertip_is_its_tip(rng: np.random.Gener
     palm = robot.palm(q)
     np.testing.assert_allclose(points[:, 0], palm[:, :3, 3], atol=1e-12)
     np.testing.assert_allclose(normals[:, 0], palm[:, :3, 2], atol=1e-12)
+    assert ik.Solver(robot).solve_batch(points, normals).success.all()
 
 
 @pytest.mark.parametrize("name", ["arm.urdf", "some/hand.xacro", "hand.xml"])
