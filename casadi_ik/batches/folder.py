@@ -109,11 +109,12 @@ class BatchFolder:
             InputError: Its file is damaged, or has the answers to other targets.
         """
         arrays = self._arrays(number)
-        found = int(arrays.pop("first_row", -1)), len(arrays.get("status", ()))
-        if found != (first_row, count):
+        rows = arrays.pop("row", np.zeros(0))
+        if not np.array_equal(rows, first_row + np.arange(count)):
+            found = f"{len(rows)} targets from {rows[0]} on" if len(rows) else "no row"
             raise InputError(
-                f"{self.part(number)}: found {found[1]} rows from {found[0]} on, expected {count} "
-                f"from {first_row} on; remove it and go on"
+                f"{self.part(number)}: row: found {found}, expected {count} targets from "
+                f"{first_row} on; remove it and go on"
             )
         return arrays
 

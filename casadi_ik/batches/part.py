@@ -44,7 +44,7 @@ class SolvedPart:
     Attributes:
         number: Of the part.
         count: Targets of it.
-        answers: An npz of the arrays of `columns`, and `first_row`, the number of the first target.
+        answers: An npz of the arrays of `columns`, and `row`, each target's number among all.
         log: An MCAP log, if one was asked for; solves are numbered as among all targets.
         faults: What is wrong with a target, by its number among all.
     """
@@ -78,8 +78,9 @@ def solve_part(solver: bytes, asked: Asked, part: Part) -> SolvedPart:
         )
         log = None if path is None else path.read_bytes()
     answers = io.BytesIO()
-    np.savez(answers, allow_pickle=False, first_row=part.first_row, **columns(block.solution))
     count = len(block.solution)
+    numbers = part.first_row + np.arange(count)
+    np.savez(answers, allow_pickle=False, row=numbers, **columns(block.solution))
     return SolvedPart(part.number, count, answers.getvalue(), log, dict(block.faults))
 
 

@@ -82,12 +82,11 @@ def _value(said: dict[str, Any]) -> str:
     if said["type"] == "object":
         return f"by name: {_value(said['additionalProperties'])}"
     if said["type"] == "array":
-        count = f"{said['minItems']} × " if "minItems" in said else "list of "
-        return (
-            f"[{count}{_value(said['items'])}]"
-            if "minItems" in said
-            else count + _value(said["items"])
-        )
+        items = said["items"]
+        if isinstance(items, list):  # a fixed number of them, all of one kind
+            items = items[0]
+        value = _value(items)
+        return f"[{said['minItems']} × {value}]" if "minItems" in said else f"list of {value}"
     return {"integer": "whole number", "boolean": "true or false"}[said["type"]]
 
 

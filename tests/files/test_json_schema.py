@@ -109,7 +109,7 @@ def small(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: small(item) for key, item in value.items() if key != "collision"}
     if isinstance(value, list):
-        return [small(item) for item in value[: 1 if isinstance(value[0], dict) else 3]]
+        return [small(item) for item in value[: 1 if value and isinstance(value[0], dict) else 3]]
     return value
 
 
