@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -88,3 +89,17 @@ def test_an_arm_with_a_tool():
     assert far.status is ik.Status.UNREACHABLE
     batch = solver.solve_batch(1.25 * points[:20], normals[:20], diagnose=True)
     assert [why is None for why in batch.diagnoses] == batch.success.tolist()
+
+
+def test_a_chain_that_is_one_finger(tmp_path: Path) -> None:
+    """A robot's file of a single chain is taken for a hand of one finger on a base."""
+    file = tmp_path / "chain.urdf"
+    file.write_text(ik.load_robot("puma560").urdf())
+    description = tmp_path / "chain.yaml"
+    description.write_text(
+        f"name: chain\nhand:\n  file: {file.name}\n  palm: {{link: puma560_base}}\n"
+        "thumb: thumb\nfingers:\n  thumb: {link: flange_contact, normal: [0, 1, 0]}\n"
+    )
+    robot = ik.load_robot(description)
+    points, normals = robot.contacts(robot.random(np.random.default_rng(3), 1000))
+    assert ik.Solver(robot).solve_batch(points, normals).success.all()

@@ -111,7 +111,9 @@ def _build(name: str, layouts: HandFirstLayouts) -> ca.Function:
 
 
 def _is_held(robot: RobotDescription, t: dict[str, Expr]) -> Expr:
-    """1 if motors of the hand are held, or so many of the arm that no palm pose is left to it.
+    """1 if motors of the hand are held, or the arm's free ones cannot take the palm to any pose.
+
+    Fewer than six are too few, be they held, of a short arm or of a hand that stands alone.
 
     A hand that is held as a whole needs no search.
     """
@@ -119,7 +121,7 @@ def _is_held(robot: RobotDescription, t: dict[str, Expr]) -> Expr:
     free_hand, free_arm = (
         ca.sum1(t["lower"][rows] < t["upper"][rows]) if rows else 0 for rows in (hand, arm)
     )
-    less = ca.logic_or(free_hand < len(hand), free_arm < min(len(arm), SIX))
+    less = ca.logic_or(free_hand < len(hand), free_arm < SIX)
     return ca.logic_and(less, free_hand > 0)
 
 
