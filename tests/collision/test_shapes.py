@@ -138,3 +138,28 @@ def test_shipped_robots_stand_free_at_home(name):
     found = check.around(asked).check(robot.home[None])
     assert found.free[0], found.pair(0)
     assert all(one.reason for one in check.model.excluded)
+
+
+@pytest.mark.parametrize(
+    ("arm", "link", "corner"),
+    [
+        # Corners [mm] of what is seen of them: dexsuite/dex-urdf at 93505db3c0b2 (iiwa),
+        # example-robot-data 6.0.0 (Jaco, UR10), robosuite 1.5.2 (Sawyer, bullet_data).
+        ("iiwa14", "iiwa14_link_2", [-55.0, -237.3, 40.0]),
+        ("iiwa7", "iiwa7_link_2", [34.0, -216.8, -58.9]),
+        ("jaco2", "jaco2_link_2", [42.7, -3.5, 11.5]),
+        ("ur10", "ur10_link_2", [-664.1, 101.6, 253.6]),
+        ("sawyer", "sawyer_link_1", [-67.9, 2.9, 1.0]),
+    ],
+)
+def test_shapes_hold_what_is_seen_of_an_arm(arm, link, corner):
+    """The corners that stood out the most of shapes fitted to what is there for collisions."""
+    shapes = ik.load_robot(f"{arm}+barrett_bh8_280").description.shapes
+    point = np.array(corner) / 1e3
+    apart = []
+    for one in shapes.capsules:
+        if one.link == link:
+            square = one.half @ one.half
+            along = np.clip((point - one.center) @ one.half / square, -1, 1) if square else 0.0
+            apart.append(np.linalg.norm(point - one.center - along * one.half) - one.radius)
+    assert min(apart) < 1e-4
