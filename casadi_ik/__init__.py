@@ -1,16 +1,13 @@
 """Arm-hand inverse kinematics from fingertip contacts: fast, exact and explained."""
 
-from casadi_ik import logs
+from casadi_ik import logs, papers
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.collision.scene import Scene, load_scene
-from casadi_ik.control import ScrewControl
 from casadi_ik.datasets import Candidates, load_candidates
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
-from casadi_ik.methods.registry import METHODS, register_method
-from casadi_ik.methods.screw_control.objectives import ScrewTask
 from casadi_ik.motion.approaching import Approach, ReachStatus
 from casadi_ik.motion.follower import Follower
 from casadi_ik.motion.following import FollowState, FollowStatus
@@ -26,6 +23,7 @@ from casadi_ik.problem.ranking import Choice, Ranking
 from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trajectory import Trajectory
+from casadi_ik.registry import METHODS, register_method
 from casadi_ik.solving.alternatives.branches import ArmBranch
 from casadi_ik.solving.alternatives.finder import Alternative
 
@@ -57,8 +55,6 @@ __all__ = [
     "Reason",
     "Retargeter",
     "Scene",
-    "ScrewControl",
-    "ScrewTask",
     "Solution",
     "Solver",
     "Status",
@@ -71,6 +67,7 @@ __all__ = [
     "load_robot",
     "load_scene",
     "logs",
+    "papers",
     "register_method",
     "shipped_grasps",
     "shipped_names",

@@ -16,13 +16,13 @@ from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.write.opening import recorder_of
-from casadi_ik.methods.registry import METHODS, build_method, with_finger_step
 from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
 from casadi_ik.problem.recorder import Recorder
 from casadi_ik.problem.solution import BatchSolution, Solution
+from casadi_ik.registry import METHODS, build_method, with_finger_step
 from casadi_ik.solving.choosing_solver import ChoosingSolver
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.fast import FastSolver

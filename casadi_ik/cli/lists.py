@@ -11,7 +11,7 @@ from casadi_ik.cli.report import fields, table
 from casadi_ik.files.reading import convert, read_yaml
 from casadi_ik.files.shipped import resolve, shipped_names
 from casadi_ik.grasps.load import GraspFile
-from casadi_ik.methods.registry import METHODS, method_summary
+from casadi_ik.registry import METHODS, method_summary
 from casadi_ik.robots import load_description
 from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile
 from casadi_ik.symbolic.closed_arms.in_words import form_in_words

@@ -22,8 +22,8 @@ from casadi_ik.errors import (
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.files.shipped import resolve, resolve_robot
 from casadi_ik.grasps import Grasp, load_grasp
-from casadi_ik.methods.registry import METHODS
 from casadi_ik.problem.problems import Tolerance, fixed_array
+from casadi_ik.registry import METHODS
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.methods.registry import METHODS
+from casadi_ik.registry import METHODS
 
 if TYPE_CHECKING:
     from casadi_ik.viewing import Viewer

@@ -14,10 +14,10 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import Kind
 from casadi_ik.errors import DescriptionError
 from casadi_ik.kernels.constants import number, numbers
-from casadi_ik.methods.registry import build_method
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.status import Status
+from casadi_ik.registry import build_method
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.freeing import freed_at_once
 

@@ -27,9 +27,9 @@ from casadi_ik.kernels.lookup import TILE
 from casadi_ik.methods.hand_first.beginning import terms
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.rounds import RoundsPlan, source_text
-from casadi_ik.methods.registry import build_method
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.verdict import LIMIT_SLACK
+from casadi_ik.registry import build_method
 
 SIGNATURE = re.compile(r"EXPORT (?:LANES_TARGET )?int casadi_ik_\w+\((\w+) \*job\)")
 

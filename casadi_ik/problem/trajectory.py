@@ -27,7 +27,7 @@ class Trajectory:
 
     Example:
         >>> ar10 = ik.load_robot("ar10")
-        >>> control = ik.ScrewControl(ar10, ik.ScrewTask("pose", "index"))
+        >>> control = ik.papers.ScrewControl(ar10, ik.papers.ScrewTask("pose", "index"))
         >>> run = control.run(ar10.home, control.target(ar10.home), steps=3)
         >>> run.q.shape, bool(run.error_norm[-1] < 1e-9)
         ((4, 10), True)

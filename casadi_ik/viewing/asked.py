@@ -13,7 +13,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.grasps.pose import inverse
-from casadi_ik.methods.registry import METHODS
+from casadi_ik.registry import METHODS
 from casadi_ik.viewing.frames import facing
 
 

@@ -10,6 +10,9 @@ from sphinx.domains.python import PyObject
 
 import casadi_ik
 
+PAGES = {"logs": "logs.md", "papers": "../slider_hands.md"}
+"""Where submodules are described."""
+
 
 def documented(*names: str) -> str:
     """What autodoc is told to show: "Solver", "logs.open", "errors.InputError"."""
@@ -50,7 +53,7 @@ def index_of_names() -> str:
         thing = found(name)
         text = inspect.getdoc(thing) if not isinstance(thing, tuple) else "Names of the methods."
         first = (text or "").split("\n\n")[0].replace("\n", " ").replace("|", r"\|")
-        page = f"[`{name}`](logs.md)" if inspect.ismodule(thing) else ""
+        page = f"[`{name}`]({PAGES[name]})" if inspect.ismodule(thing) else ""
         rows.append(f"| {page or f'{{py:obj}}`~casadi_ik.{name}`'} | {first} |")
     return "\n".join(rows)
 

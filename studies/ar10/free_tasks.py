@@ -37,10 +37,12 @@ def offsets(robot: ik.ArmHand, out: Path, goals: int, rng: np.random.Generator, 
     }
     left: dict[str, Array] = {}
     for label, (kind, length) in kinds.items():
-        control = ik.ScrewControl(
-            robot, ik.ScrewTask(kind, "thumb", relative_to="index"), gain, length=length
+        control = ik.papers.ScrewControl(
+            robot, ik.papers.ScrewTask(kind, "thumb", relative_to="index"), gain, length=length
         )
-        whole = ik.ScrewControl(robot, ik.ScrewTask("pose", "thumb", relative_to="index"), gain)
+        whole = ik.papers.ScrewControl(
+            robot, ik.papers.ScrewTask("pose", "thumb", relative_to="index"), gain
+        )
         found = []
         for posture, turn, shift in zip(postures, turns, shifts, strict=True):
             # The pose of a hand that is not quite the model: 2 degrees and 1 mm off per axis.
@@ -100,12 +102,12 @@ def null_space(
     robot: ik.ArmHand, goals: int, rng: np.random.Generator, gains: Sequence[float]
 ) -> str:
     """What the task leaves free keeps the sliders away from their limits."""
-    task = ik.ScrewTask("distance", "thumb", relative_to="index")
+    task = ik.papers.ScrewTask("distance", "thumb", relative_to="index")
     used = [i for i, name in enumerate(robot.actuators) if name.startswith(("thumb", "index"))]
     starts = robot.lower + rng.uniform(0.0, 1.0, (goals, len(robot.home))) * span(robot)
     rows = []
     for centring in gains:
-        control = ik.ScrewControl(robot, task, 0.5, centring=centring)
+        control = ik.papers.ScrewControl(robot, task, 0.5, centring=centring)
         margins, errors = [], []
         for start in starts:
             run = control.run(start, {"distance": np.array(0.04)}, 200)

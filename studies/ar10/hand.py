@@ -27,7 +27,7 @@ def span(robot: ik.ArmHand) -> Array:
     return robot.upper - robot.lower
 
 
-def final_distance(control: ik.ScrewControl, start: Array, goal: Array, steps: int) -> float:
+def final_distance(control: ik.papers.ScrewControl, start: Array, goal: Array, steps: int) -> float:
     """Distance of the tip from the goal's after so many steps [mm]."""
     target = control.target(goal)
     end = control.run(start, target, steps).points[-1]

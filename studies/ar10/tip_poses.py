@@ -45,7 +45,7 @@ def index_pose(
     resolution: float,
 ) -> str:
     """Figs. 2, 3 and Table I: the index fingertip's pose for several gains."""
-    task = ik.ScrewTask("pose", "index")
+    task = ik.papers.ScrewTask("pose", "index")
     start, goal = within(robot, 0.1), within(robot, 0.637)
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     path, norms = figure.subplots(1, 2)
@@ -53,18 +53,18 @@ def index_pose(
     random_goals = robot.lower + rng.uniform(0.1, 0.9, (goals, len(start))) * span(robot)
     for gain, color in zip(gains, cycle(COLORS), strict=False):
         for step, style in ((0.0, "-"), (resolution, ":")):
-            control = ik.ScrewControl(robot, task, gain, resolution=step)
+            control = ik.papers.ScrewControl(robot, task, gain, resolution=step)
             run = control.run(start, control.target(goal), STEPS)
             label = "" if step else f"gain {gain:g}"
             draw_run(path, norms, run, label, color, style)
             if not step:
                 rates.append((gain, run.rate(1e-7)))
-        coarse = ik.ScrewControl(robot, task, gain, resolution=resolution)
+        coarse = ik.papers.ScrewControl(robot, task, gain, resolution=resolution)
         ended = Final(np.array([final_distance(coarse, start, g, 300) for g in random_goals]))
         x, y = TABLE_I.get(gain, (np.nan, np.nan))
         printed = ("", "") if np.isnan(x) else (f"{x:.2f}, {y:.2f}", f"{np.hypot(x, y):.2f}")
         rows.append((f"{gain:g}", *printed, str(ended)))
-    finish(path, norms, ik.ScrewControl(robot, task).target(goal)["pose"], resolution)
+    finish(path, norms, ik.papers.ScrewControl(robot, task).target(goal)["pose"], resolution)
     figure.savefig(out / "index_pose.png", dpi=110)
     steps = f"{1e3 * resolution:g} mm"
     header = f"model, sliders in {steps}: left over {goals} goals, median / 90th percentile [mm]"
@@ -96,17 +96,17 @@ law's rate would be g itself.
 
 def relative_pose(robot: ik.ArmHand, out: Path, gains: Sequence[float], resolution: float) -> str:
     """Figs. 4 and 5: the thumb's tip seen from the index fingertip."""
-    task = ik.ScrewTask("pose", "thumb", relative_to="index")
+    task = ik.papers.ScrewTask("pose", "thumb", relative_to="index")
     start, goal = within(robot, 0.1), within(robot, 0.537)
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     path, norms = figure.subplots(1, 2)
     rates, ends = [], []
-    target = ik.ScrewControl(robot, task).target(goal)
+    target = ik.papers.ScrewControl(robot, task).target(goal)
     for gain, color in zip(gains, cycle(COLORS), strict=False):
-        run = ik.ScrewControl(robot, task, gain).run(start, target, STEPS)
+        run = ik.papers.ScrewControl(robot, task, gain).run(start, target, STEPS)
         draw_run(path, norms, run, f"gain {gain:g}", color, "-", axes=(0, 1))
         rates.append((gain, run.rate(1e-7)))
-        coarse = ik.ScrewControl(robot, task, gain, resolution=resolution)
+        coarse = ik.papers.ScrewControl(robot, task, gain, resolution=resolution)
         ends.append(1e3 * (coarse.run(start, target, 300).points[-1] - translation(target)))
         draw_run(path, norms, coarse.run(start, target, STEPS), "", color, ":", axes=(0, 1))
     finish(
@@ -115,7 +115,7 @@ def relative_pose(robot: ik.ArmHand, out: Path, gains: Sequence[float], resoluti
     # The display of eq. (15) has no column for the index's proximal joint: it never moves.
     printed = np.full(len(start), np.inf)
     printed[robot.actuators.index("index_proximal_slider")] = 0.0
-    literal = ik.ScrewControl(robot, task, 0.6, speed=printed).run(start, target, 300)
+    literal = ik.papers.ScrewControl(robot, task, 0.6, speed=printed).run(start, target, 300)
     left = 1e3 * (literal.points[-1] - translation(target))
     draw_run(path, norms, literal, "gain 0.6, eq. (15) as printed", "#666666", "--", axes=(0, 1))
     norms.set_xlim(-1, STEPS)

@@ -14,7 +14,7 @@ from targets import grasp_arms
 import casadi_ik as ik
 from casadi_ik.errors import InputError
 from casadi_ik.files.shipped import models_folder
-from casadi_ik.methods.registry import option_names
+from casadi_ik.registry import option_names
 
 ROBOT = "kuka_lwr_barrett"
 METHODS = tuple(

@@ -11,10 +11,8 @@ from scipy.linalg import expm, logm
 
 import casadi_ik as ik
 from casadi_ik.methods.common.palm_fit import HandContacts, best_palm
-from casadi_ik.methods.qiu import palm_estimate
-from casadi_ik.methods.qiu.hierarchy import combine
-from casadi_ik.methods.qiu.palm_motion import MILLIMETRE, palm_motion
-from casadi_ik.methods.qiu.tasks import Task
+from casadi_ik.papers.qiu import tasks
+from casadi_ik.papers.qiu.tasks import MILLIMETRE, Task, combine, palm_motion
 from casadi_ik.problem.contacts.kinds import USUAL
 from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.target import Target
@@ -54,7 +52,7 @@ def test_palm_estimate(rng: np.random.Generator) -> None:
     z = np.cross(x, y)
     x = np.cross(y, z)
     expected = np.stack([v / np.linalg.norm(v) for v in (x, y, z)], axis=1)
-    assert number(palm_estimate.axes_through([ca.SX(v) for v in p])) == pytest.approx(expected)
+    assert number(tasks.axes_through([ca.SX(v) for v in p])) == pytest.approx(expected)
 
 
 def test_normal_error_and_angle(rng: np.random.Generator) -> None:

@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.methods import registry
+from casadi_ik import registry
 
 WITHOUT = {
     "METHODS",  # a tuple of names
-    "logs",  # a module; its names have their own
+    "logs",  # modules; their names have their own
+    "papers",
     "logs.Compression",  # three words
     "logs.detect_events",  # takes what a recorder is given while a batch runs
 }
-METHODS_TOO = ("ArmHand", "Solver", "Grasp", "Contact", "Scene", "ScrewControl", "logs.Log")
+METHODS_TOO = ("ArmHand", "Solver", "Grasp", "Contact", "Scene", "papers.ScrewControl", "logs.Log")
 """Classes of which every method has an example of its own, apart from those named here."""
 PLAIN = {
     "ArmHand.configuration",  # checks and copies
@@ -28,14 +29,18 @@ PLAIN = {
     "ArmHand.deviations",
     "ArmHand.toggle_margins",
     "ArmHand.view",  # a server and a browser; tests/viewing has them
-    "ScrewControl.stepper",  # as Solver.stepper
+    "papers.ScrewControl.stepper",  # as Solver.stepper
     "logs.Log.attachment",
     "logs.Log.sources",
 }
 
 
 def public_names() -> list[str]:
-    return [*ik.__all__, *(f"logs.{name}" for name in ik.logs.__all__)]
+    return [
+        *ik.__all__,
+        *(f"logs.{name}" for name in ik.logs.__all__),
+        *(f"papers.{name}" for name in ik.papers.__all__),
+    ]
 
 
 def found(name: str) -> Any:

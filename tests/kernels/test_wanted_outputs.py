@@ -8,8 +8,8 @@ import numpy as np
 import casadi_ik as ik
 from casadi_ik.kernels.codegen import function_source
 from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.methods.registry import build_method
 from casadi_ik.problem.problems import Problems, Tolerance
+from casadi_ik.registry import build_method
 
 from .graphs import needs_compiler
 

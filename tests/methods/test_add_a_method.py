@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
+from casadi_ik import registry
 from casadi_ik.errors import InputError
-from casadi_ik.methods import registry
 
 PAGE = Path(__file__).parents[2] / "docs" / "add_a_method.md"
 

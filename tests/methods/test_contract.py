@@ -14,7 +14,7 @@ import casadi_ik as ik
 from casadi_ik.errors import InputError, UnknownNameError, UnsupportedError
 from casadi_ik.kernels.codegen import row_major
 from casadi_ik.kernels.lanes import lanes_source
-from casadi_ik.methods.registry import build_method, method_summary
+from casadi_ik.registry import build_method, method_summary
 
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
 ROBOTS = ik.shipped_names("arm_hands")

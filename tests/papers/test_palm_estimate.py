@@ -10,7 +10,7 @@ from toy_robots import replace
 
 import casadi_ik as ik
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.methods.qiu.palm_estimate import axes_through, base_axes, palm_orientation
+from casadi_ik.papers.qiu.tasks import axes_through, base_axes, palm_orientation
 from casadi_ik.problem.target import Target
 
 

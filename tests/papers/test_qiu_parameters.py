@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from casadi_ik.errors import InputError
-from casadi_ik.methods.qiu.parameters import QiuParameters
+from casadi_ik.papers.qiu.parameters import QiuParameters
 
 
 def test_defaults_are_the_papers():

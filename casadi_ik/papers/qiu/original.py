@@ -11,15 +11,16 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.methods.common.limits import kept_within, limit_mask
-from casadi_ik.methods.qiu.hierarchy import combine
-from casadi_ik.methods.qiu.palm_estimate import palm_orientation, thumb_first
-from casadi_ik.methods.qiu.parameters import OriginalParameters
-from casadi_ik.methods.qiu.tasks import (
+from casadi_ik.papers.qiu.parameters import OriginalParameters
+from casadi_ik.papers.qiu.tasks import (
     Task,
+    combine,
     contact_tasks,
     damped,
+    palm_orientation,
     palm_orientation_task,
     selective,
+    thumb_first,
 )
 from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.problems import Problems

@@ -7,8 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from casadi_ik.methods.qiu.hierarchy import combine
-from casadi_ik.methods.qiu.tasks import Task, contact_tasks, damped, palm_orientation_task
+from casadi_ik.papers.qiu.tasks import Task, combine, contact_tasks, damped, palm_orientation_task
 from casadi_ik.problem.target import Target
 from casadi_ik.symbolic.actuated import actuated
 

@@ -7,8 +7,8 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.methods.qiu.method import EnhancedMethod
-from casadi_ik.methods.qiu.parameters import QiuParameters
+from casadi_ik.papers.qiu.method import EnhancedMethod
+from casadi_ik.papers.qiu.parameters import QiuParameters
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Phase, Status
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields
 
 from casadi_ik.errors import InputError
-from casadi_ik.methods.qiu.hierarchy import PROJECTIONS as HIERARCHIES
+from casadi_ik.papers.qiu.tasks import PROJECTIONS as HIERARCHIES
 
 ORDERS = ("per-finger", "points-first")
 """Order of the tasks of the original methods: finger by finger, or all points, then all normals."""

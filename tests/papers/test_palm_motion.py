@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from casadi_ik.methods.qiu.palm_motion import palm_motion
+from casadi_ik.papers.qiu.tasks import palm_motion
 from casadi_ik.problem.target import Target
 from casadi_ik.symbolic.actuated import actuated
 

@@ -9,7 +9,7 @@ from toy_robots import replace
 
 import casadi_ik as ik
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.methods.qiu.finger_step import finger_step_function
+from casadi_ik.papers.qiu.finger_step import finger_step_function
 from casadi_ik.robots import load_description
 from casadi_ik.symbolic.planar_finger import planar_finger
 

@@ -20,8 +20,7 @@ from casadi_ik.kernels import FunctionKernel, LoopKernel
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import McapRecorder
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
-from casadi_ik.methods.screw_control.objectives import ScrewTask
-from casadi_ik.methods.screw_control.step import ScrewControlStep
+from casadi_ik.papers.screw_tasks import ScrewControlStep, ScrewTask
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.solution import BatchSolution
@@ -46,7 +45,7 @@ class ScrewControl:
 
     Example:
         >>> ar10 = ik.load_robot("ar10")  # sliders in metres
-        >>> control = ik.ScrewControl(ar10, ik.ScrewTask("pose", "index"), gain=0.5)
+        >>> control = ik.papers.ScrewControl(ar10, ik.papers.ScrewTask("pose", "index"), gain=0.5)
         >>> goal = control.target(ar10.home + 0.001)
         >>> run = control.run(ar10.home, goal, steps=30)
         >>> bool(run.error_norm[-1] < 1e-3 * run.error_norm[0])
@@ -136,7 +135,7 @@ class ScrewControl:
 
         Example:
             >>> ar10 = ik.load_robot("ar10")
-            >>> control = ik.ScrewControl(ar10, ik.ScrewTask("pose", "index"))
+            >>> control = ik.papers.ScrewControl(ar10, ik.papers.ScrewTask("pose", "index"))
             >>> {name: value.shape for name, value in control.target(ar10.home).items()}
             {'pose': (8,)}
         """
@@ -170,7 +169,7 @@ class ScrewControl:
 
         Example:
             >>> ar10 = ik.load_robot("ar10")
-            >>> control = ik.ScrewControl(ar10, ik.ScrewTask("pose", "index"))
+            >>> control = ik.papers.ScrewControl(ar10, ik.papers.ScrewTask("pose", "index"))
             >>> control.run(ar10.home, control.target(ar10.home), steps=5).times.shape
             (6,)
         """

@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.methods.qiu.enhanced import EnhancedStep
-from casadi_ik.methods.qiu.finger_step import finger_step_function
-from casadi_ik.methods.qiu.parameters import QiuParameters
+from casadi_ik.papers.qiu.enhanced import EnhancedStep
+from casadi_ik.papers.qiu.finger_step import finger_step_function
+from casadi_ik.papers.qiu.parameters import QiuParameters
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Phase, Status
 

@@ -10,10 +10,7 @@ from toy_robots import replace, write_coupled_robot
 import casadi_ik as ik
 from casadi_ik.errors import InputError
 from casadi_ik.methods.common.whole_contacts import whole_residual
-from casadi_ik.methods.ipopt.contacts import LENGTH
-from casadi_ik.methods.ipopt.parameters import IpoptParameters
-from casadi_ik.methods.ipopt.watch import EXACT
-from casadi_ik.methods.ipopt.whole_nlp import WholeNlp, limited_joints
+from casadi_ik.papers.ipopt import EXACT, LENGTH, IpoptParameters, WholeNlp, limited_joints
 from casadi_ik.problem.contacts.kinds import usual
 from casadi_ik.problem.contacts.rows import ContactRows
 from casadi_ik.problem.status import Status

@@ -18,9 +18,9 @@ def toy(tmp_path_factory) -> ik.ArmHand:
     return ik.load_robot(write_coupled_robot(tmp_path_factory.mktemp("toy")))
 
 
-def law(toy, kind="position", relative_to="thumb", gain=0.5, **options) -> ik.ScrewControl:
-    task = ik.ScrewTask(kind, "left", relative_to)
-    return ik.ScrewControl(toy, task, gain, compiled=False, **options)
+def law(toy, kind="position", relative_to="thumb", gain=0.5, **options) -> ik.papers.ScrewControl:
+    task = ik.papers.ScrewTask(kind, "left", relative_to)
+    return ik.papers.ScrewControl(toy, task, gain, compiled=False, **options)
 
 
 def middle(toy):
@@ -62,7 +62,7 @@ def test_error_falls_by_the_gain_per_step(kind, relative_to, toy, rng):
 
 def test_the_compiled_loop_makes_the_same_steps(toy, rng):
     control = law(toy)
-    fast = ik.ScrewControl(toy, control.task, 0.5)
+    fast = ik.papers.ScrewControl(toy, control.task, 0.5)
     target = control.target(posture(toy, rng))
     slow, quick = (each.run(None, target, 20) for each in (control, fast))
     np.testing.assert_allclose(quick.q, slow.q, atol=1e-12)
@@ -169,7 +169,9 @@ def test_bad_input_is_one_clear_error(make, error, words, toy):
 def test_an_arm_helps_where_a_finger_alone_cannot_reach(rng):
     """On Baxter the index tip goes 10 cm away; arm and sliders share the work, within limits."""
     baxter = ik.load_robot("baxter_ar10")
-    control = ik.ScrewControl(baxter, ik.ScrewTask("position", "index"), 0.3, compiled=False)
+    control = ik.papers.ScrewControl(
+        baxter, ik.papers.ScrewTask("position", "index"), 0.3, compiled=False
+    )
     start = 0.5 * (baxter.lower + baxter.upper)
     goal = control.target(start)["point"] + [0.05, 0.07, -0.05]
     run = control.run(start, {"point": goal}, 60)

@@ -9,9 +9,9 @@ from casadi_ik.arrays import Array, Counts
 from casadi_ik.kernels import StepGraph
 from casadi_ik.methods.common.limits import starts_within
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
-from casadi_ik.methods.qiu.enhanced import EnhancedStep
-from casadi_ik.methods.qiu.original import OriginalStep
-from casadi_ik.methods.qiu.parameters import OriginalParameters, QiuParameters
+from casadi_ik.papers.qiu.enhanced import EnhancedStep
+from casadi_ik.papers.qiu.original import OriginalStep
+from casadi_ik.papers.qiu.parameters import OriginalParameters, QiuParameters
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian

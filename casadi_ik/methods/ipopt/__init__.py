@@ -1,1 +1,0 @@
-"""The whole arm-hand as one nonlinear program, the slow reference."""

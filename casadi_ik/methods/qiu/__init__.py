@@ -1,1 +1,0 @@
-"""The methods of Qiu & Kermani 2021."""

@@ -1,1 +1,0 @@
-"""The screw control law of Chandra et al. 2019."""

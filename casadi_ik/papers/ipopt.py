@@ -1,0 +1,662 @@
+"""The method `ipopt`: the whole arm-hand as one nonlinear program, the slow, trusted reference.
+
+Ipopt solves it from q0 and then from random starts. The residuals of the contacts have formulas of
+their own, so that an error in the conditions of the other methods shows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.kernels.cancellation import interrupt_afterwards, is_cancelled, stop_if_cancelled
+from casadi_ik.kernels.forks import ForkSafeLock
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.stepper import Stepper
+from casadi_ik.problem.contacts.kinds import Kinds, usual
+from casadi_ik.problem.jacobian_measures import JacobianMeasures
+from casadi_ik.problem.method import Outcome
+from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.trace import (
+    ANGLE_ERROR,
+    COST,
+    LIMIT_MASK,
+    PHASE,
+    POSITION_ERROR,
+    RESTART,
+    STATUS,
+    STEP_SIZE,
+    Q,
+    TraceFormat,
+    packed,
+    trace_format,
+)
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.couplings import joint_positions
+from casadi_ik.symbolic.kinematics import Kinematics
+
+
+@dataclass(frozen=True)
+class IpoptParameters:
+    """Parameters of the method.
+
+    Attributes:
+        restarts: Starts drawn at random within the limits after the one from q0; 0 for none. Of
+            150 targets with every joint within 1 deg of a limit, 10 restarts missed 11 (local
+            minima), 30 one, 46 none; of 750 others 9 were enough.
+        max_iterations: Budget of Ipopt's iterations, each start anew.
+        optimality: Ipopt's own tolerance (``tol``) on its scaled optimality error. The contacts
+            end up off by about its root where a coordinate stands at a bound.
+    """
+
+    restarts: int = 50
+    max_iterations: int = 300
+    optimality: float = 1e-14
+
+    def __post_init__(self) -> None:
+        for name, least in (("restarts", 0), ("max_iterations", 1)):
+            value = getattr(self, name)
+            if not (isinstance(value, int) and not isinstance(value, bool) and value >= least):
+                raise InputError(f"{name}: found {value!r}, expected a whole number >= {least}")
+        value = self.optimality
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not (number and math.isfinite(value) and value > 0):
+            raise InputError(f"optimality: found {value!r}, expected a number > 0")
+
+
+LENGTH = 0.1
+"""Position errors are divided by this [m], so that they weigh like the normals' (unit vectors)."""
+
+PLACES = {"point": 3, "line": 3, "plane": 1}
+FACINGS = {"normal": 3, "frame": 9}
+"""Rows by condition."""
+
+
+@dataclass(frozen=True)
+class NlpContacts:
+    """Residuals of all contacts: places by `LENGTH` of all fingers, then facings.
+
+    Attributes:
+        kinds: By finger.
+
+    Raises:
+        UnsupportedError: A condition that the program has no formula for.
+    """
+
+    kinds: Kinds
+
+    def __post_init__(self) -> None:
+        for kind in self.kinds:
+            if kind.place not in PLACES or kind.facing not in FACINGS:
+                raise UnsupportedError(
+                    f"method 'ipopt' knows no contacts of the kind {kind.place} and {kind.facing}"
+                )
+
+    @property
+    def sizes(self) -> list[int]:
+        """Rows of each place, then of each facing."""
+        places = [PLACES[kind.place] for kind in self.kinds]
+        return places + [FACINGS[kind.facing] for kind in self.kinds]
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """Targets and weights."""
+        f = len(self.kinds)
+        asked = {name for kind in self.kinds for name in (kind.place, kind.facing)}
+        own = {"frame": "tangents", "line": "lines", "plane": "planes"}
+        return (
+            Field("points", (f, 3), unit="m", doc="contact points, base frame; 0 if free"),
+            Field("normals", (f, 3), doc="outward pad normals, base frame; 0 if free"),
+            *(
+                Field(array, (f, 3), doc="unit vectors, base frame; 0 if free")
+                for name, array in own.items()
+                if name in asked
+            ),
+            Field("weights", (f, 2), doc="1 where point, normal count, 0 where free"),
+        )
+
+    def residual(self, robot: RobotDescription, q: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        """All rows at q (n, 1)."""
+        kinematics = actuated(robot, q).kinematics
+        places, facings = [], []
+        for i, (name, kind) in enumerate(zip(robot.finger_names, self.kinds, strict=True)):
+            point, normal = kinematics.contact(name)
+            off = (point - p["points"][i, :].T) / LENGTH
+            if kind.place == "line":
+                # What is left of the way to the line's point without its part along the line.
+                along = p["lines"][i, :].T
+                off = off - along @ (along.T @ off)
+            elif kind.place == "plane":
+                off = p["planes"][i, :] @ off
+            places.append(off * p["weights"][i, 0])
+            facing = normal - p["normals"][i, :].T
+            if kind.facing == "frame":
+                tangent = p["tangents"][i, :].T
+                facing = _turned(kinematics, name, p["normals"][i, :].T, tangent)
+            facings.append(facing * p["weights"][i, 1])
+        return ca.vertcat(*places, *facings)
+
+    def errors(self, residuals: Array) -> tuple[Array, Array]:
+        """Distances [m] and angles [rad], (k, f) each and zero where free, of residuals (k, r)."""
+        ends = np.cumsum(self.sizes)[:-1]
+        parts = np.split(residuals, ends, axis=1)
+        lengths = np.stack([np.linalg.norm(part, axis=1) for part in parts], axis=1)
+        f = len(self.kinds)
+        return lengths[:, :f] * LENGTH, 2 * np.arcsin(np.minimum(lengths[:, f:] / 2, 1.0))
+
+
+def _turned(kinematics: Kinematics, finger: str, normal: ca.SX, tangent: ca.SX) -> ca.SX:
+    """Difference (9, 1) of two frames; its length is the chord of the angle between them.
+
+    Two rotations that differ by an angle a differ by 8 sin(a / 2)^2 in squares of all entries. A
+    tangent of zero is free: then the difference of the normals alone.
+    """
+    own, facing = kinematics.tangent(finger), kinematics.contact(finger)[1]
+    given = ca.dot(tangent, tangent)
+    half = ca.sqrt(ca.SX(2)) / 2
+    first = (facing - normal) * ca.if_else(given > 0.5, half, 1.0)
+    second = (own - tangent) * half
+    third = (ca.cross(facing, own) - ca.cross(normal, tangent)) * half
+    return ca.vertcat(first, *(ca.if_else(given > 0.5, rows, 0.0) for rows in (second, third)))
+
+
+NEAR = 0.1
+"""Cost below which a start is taken for a solution nearly there, and Ipopt started warm."""
+
+COLD, WARM = 0.1, 1e-11
+"""Barrier parameter mu to begin with."""
+
+PULL = 1e-8
+"""Weight of the distance from a warm start: decides only along the arm's self-motion, where the
+barrier alone would draw the arm to the middle of its range."""
+
+INSIDE = 1e-8
+"""A start at a bound is moved inside by this part of the range (or of its size)."""
+
+
+@dataclass(frozen=True, eq=False)
+class NlpRun:
+    """The run from one start; a row per iteration, the start itself first.
+
+    Attributes:
+        q: (n,) configuration reached, within its bounds.
+        residual: (r,) residual there.
+        inside: Whether the coupled joints are within their limits there.
+        status: How Ipopt ended: STALLED (at a minimum, whether it meets the contacts or not),
+            ITERATION_LIMIT or INVALID.
+        path: (rows, n) configurations.
+        residuals: (rows, r) residuals there.
+        barrier: (rows,) Ipopt's mu; NaN if Ipopt was not needed.
+        infeasibility: (rows,) largest violation of a constraint, Ipopt's ``inf_pr``.
+        regularization: (rows,) what Ipopt added to the diagonal of the Hessian.
+    """
+
+    q: Array
+    residual: Array
+    inside: bool
+    status: Status
+    path: Array
+    residuals: Array
+    barrier: Array
+    infeasibility: Array
+    regularization: Array
+
+    @property
+    def cost(self) -> float:
+        """Squared residual at the end."""
+        return float(self.residual @ self.residual)
+
+
+class WholeNlp:
+    """The program for one robot; targets, weights and bounds are numbers of a solve.
+
+    Attributes:
+        contacts: The contacts' rows.
+        parameters: Layout of the targets: points (f, 3) [m], normals (f, 3), what their kinds have
+            beside, weights (f, 2), 1 where a point (a normal) counts, 0 where it is free.
+        residual: ``(q, parameters) -> r`` (rows, 1).
+    """
+
+    def __init__(self, robot: RobotDescription, options: IpoptParameters, kinds: Kinds) -> None:
+        """Build the graphs and both solvers, cold and warm."""
+        n = len(robot.actuators)
+        self.contacts = NlpContacts(kinds)
+        self.parameters = Layout(self.contacts.fields)
+        self._n, self._rows = n, sum(self.contacts.sizes)
+        self._lower = robot.lower
+        # Sliders of millimetres and joints of radians move the contacts alike once scaled.
+        metres = np.array([actuator.unit == "m" for actuator in robot.actuators])
+        self._scale = np.where(metres, robot.upper - robot.lower, 1.0)
+        limited = limited_joints(robot)
+        self._joint_lower, self._joint_upper = (
+            robot.joint_lower[limited],
+            robot.joint_upper[limited],
+        )
+
+        q, p = ca.SX.sym("q", n), self.parameters.symbols("p")
+        residual = self.contacts.residual(robot, q, self.parameters.unpack(p))
+        joints = joint_positions(robot, q)[limited]
+        self.residual = ca.Function("residual", [q, p], [residual], ["q", "p"], ["r"])
+        self._joints = ca.Function("joints", [q], [ca.densify(joints)])
+
+        x, s = ca.SX.sym("x", n), ca.SX.sym("s", self._rows)
+        scaled = x * self._scale
+        start, pull = ca.SX.sym("start", n), ca.SX.sym("pull")
+        rows = ca.vertcat(self.residual(scaled, p) - s, self._joints(scaled))
+        self.program = {
+            "x": ca.vertcat(x, s),
+            "p": ca.vertcat(p, start, pull),
+            "f": (ca.sumsqr(s) + pull * ca.sumsqr(x - start)) / 2,
+            "g": rows,
+        }
+        self._watch = Watch(n + self._rows, rows.numel(), self.program["p"].numel())
+        self._solvers = {mu: self._solver(mu, options) for mu in (COLD, WARM)}
+        # Ipopt's callback hands its rows to this object, so one solve at a time.
+        self._lock = ForkSafeLock()
+
+    def _solver(self, barrier: float, options: IpoptParameters) -> ca.Function:
+        settings: dict[str, Any] = {
+            "iteration_callback": self._watch,
+            "error_on_fail": False,
+            "print_time": False,
+            "show_eval_warnings": False,
+            "ipopt.print_level": 0,
+            "ipopt.sb": "yes",
+            "ipopt.tol": options.optimality,
+            "ipopt.compl_inf_tol": options.optimality,
+            "ipopt.acceptable_iter": 0,
+            "ipopt.max_iter": options.max_iterations,
+            "ipopt.mu_init": barrier,
+            "ipopt.bound_mult_init_method": "mu-based" if barrier == WARM else "constant",
+            "ipopt.bound_relax_factor": 0.0,
+            "ipopt.bound_push": INSIDE,
+            "ipopt.bound_frac": INSIDE,
+            "ipopt.slack_bound_push": INSIDE,
+            "ipopt.slack_bound_frac": INSIDE,
+        }
+        return ca.nlpsol("whole", "ipopt", self.program, settings)
+
+    def solve(self, start: Array, parameters: Array, lower: Array, upper: Array) -> NlpRun:
+        """Run Ipopt from one start.
+
+        Args:
+            start: (n,) where to begin.
+            parameters: Targets and weights, see `parameters`.
+            lower: (n,) bounds of q; below the robot's, limits are ignored, those of joints as well.
+            upper: (n,) bounds of q.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C while Ipopt was at work.
+            CancelledError: This thread has been told to stop.
+        """
+        stop_if_cancelled()
+        enforced = bool(np.all(lower >= self._lower))
+        joints = (self._joint_lower, self._joint_upper)
+        if not enforced:
+            joints = (np.full_like(joints[0], -np.inf), np.full_like(joints[1], np.inf))
+        first = self._residual(start, parameters)
+        cost = float(first @ first)
+        if cost < EXACT**2 and self._within(start, joints):
+            return self._unmoved(start, first, Status.STALLED)
+        free, zero = np.full(self._rows, np.inf), np.zeros(self._rows)
+        with self._lock, interrupt_afterwards():
+            self._watch.begin(self._rows, joints)
+            begin, near = start / self._scale, cost < NEAR
+            solver = self._solvers[WARM if near else COLD]
+            answer = solver(
+                x0=np.concatenate([begin, first]),
+                p=np.concatenate([parameters, begin, [PULL if near else 0.0]]),
+                lbx=np.concatenate([lower / self._scale, -free]),
+                ubx=np.concatenate([upper / self._scale, free]),
+                lbg=np.concatenate([zero, joints[0]]),
+                ubg=np.concatenate([zero, joints[1]]),
+            )
+            path, rows = self._watch.end()
+            stats: dict[str, Any] = solver.stats()
+        if not len(path):  # Ipopt could not evaluate the start
+            return self._unmoved(start, first, Status.INVALID)
+        path = path[:, : self._n] * self._scale
+        residuals = rows[:, : self._rows]
+        q = np.clip(np.array(answer["x"]).ravel()[: self._n] * self._scale, lower, upper)
+        residual = self._residual(q, parameters)
+        status = _ENDINGS.get(stats["return_status"], Status.STALLED)
+        if not np.all(np.isfinite(residual)):
+            status = Status.INVALID
+            finite = np.flatnonzero(np.isfinite(residuals).all(axis=1))
+            q = np.clip(path[finite[-1]], lower, upper) if len(finite) else start
+            residual = self._residual(q, parameters)
+        return NlpRun(
+            q=q,
+            residual=residual,
+            inside=self._within(q, joints),
+            status=status,
+            path=path,
+            residuals=residuals,
+            barrier=_column(stats, "mu", len(path)),
+            infeasibility=_column(stats, "inf_pr", len(path)),
+            regularization=_column(stats, "regularization_size", len(path)),
+        )
+
+    def _residual(self, q: Array, parameters: Array) -> Array:
+        return np.array(self.residual(q, parameters)).ravel()
+
+    def _within(self, q: Array, limits: tuple[Array, Array]) -> bool:
+        return within(np.array(self._joints(q)).ravel(), limits)
+
+    def _unmoved(self, q: Array, residual: Array, status: Status) -> NlpRun:
+        """A run without Ipopt: one row."""
+        nothing = np.full(1, np.nan)
+        return NlpRun(q, residual, True, status, q[None], residual[None], nothing, nothing, nothing)
+
+
+_ENDINGS = {
+    "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
+    "Invalid_Number_Detected": Status.INVALID,
+}
+"""What Ipopt's endings mean; all others leave it standing at a point."""
+
+
+def limited_joints(robot: RobotDescription) -> list[int]:
+    """Joints whose limits the bounds of q do not imply: positions in `robot.joint_names`.
+
+    Every joint depends on one actuator, and where all couplings on the way are monotone, the
+    ends of the actuator's range tell.
+    """
+    q = ca.SX.sym("q", len(robot.actuators))
+    theta = ca.Function("theta", [q], [joint_positions(robot, q)])
+    ends = np.stack([np.array(theta(end)).ravel() for end in (robot.lower, robot.upper)])
+    beyond = (ends.min(axis=0) < robot.joint_lower - JOINT_SLACK) | (
+        ends.max(axis=0) > robot.joint_upper + JOINT_SLACK
+    )
+    by_name = {joint.name: joint for joint in robot.movable}
+    found = []
+    for i, joint in enumerate(robot.movable):
+        bent, current = False, joint
+        while current is not None and current.coupling is not None:
+            bent |= not current.coupling.monotone
+            current = by_name.get(current.coupling.of)
+        if joint.coupling is not None and (bent or beyond[i] or not np.isfinite(ends[:, i]).all()):
+            found.append(i)
+    return found
+
+
+def _column(stats: dict[str, Any], name: str, rows: int) -> Array:
+    """A quantity Ipopt keeps by iteration; NaN where it kept none (a restoration phase)."""
+    kept = np.asarray(stats.get("iterations", {}).get(name, []), dtype=float)
+    column = np.full(rows, np.nan)
+    if len(kept) == rows:
+        column[:] = kept
+    return column
+
+
+EXACT = 1e-8
+"""Root of the cost at which the contacts count as met exactly: no iteration is spent beyond."""
+
+JOINT_SLACK = 1e-9
+"""Rounding allowed at the limit of a coupled joint [rad or m]."""
+
+
+class Watch(ca.Callback):
+    """Keeps every iterate, and stops Ipopt once the contacts are met exactly or nobody waits.
+
+    For a program over x = (motors, slacks s) whose constraints are (r - s, joints). One solve at
+    a time: `begin`, then Ipopt, then `end`.
+    """
+
+    def __init__(self, nx: int, ng: int, parameters: int) -> None:
+        """Remember the sizes of the program."""
+        ca.Callback.__init__(self)
+        sizes = {"x": nx, "f": 1, "g": ng, "lam_x": nx, "lam_g": ng, "lam_p": parameters}
+        self._sizes = [sizes[name] for name in ca.nlpsol_out()]
+        self._wanted = [ca.nlpsol_out().index(name) for name in ("x", "g")]
+        self._path: list[Array] = []
+        self._rows: list[Array] = []
+        self._contacts = 0
+        self._joints: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
+        self.construct("watch", {})
+
+    def begin(self, contacts: int, joints: tuple[Array, Array]) -> None:
+        """A new solve: how many rows of the constraints are r - s, and the limits of the others."""
+        self._path, self._rows = [], []
+        self._contacts, self._joints = contacts, joints
+
+    def end(self) -> tuple[Array, Array]:
+        """(rows, nx) iterates x, and of each r and the joints (rows, ng)."""
+        return np.array(self._path), np.array(self._rows)
+
+    def get_n_in(self) -> int:
+        """Everything a solver returns."""
+        return len(self._sizes)
+
+    def get_n_out(self) -> int:
+        """Whether to stop."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Dense columns."""
+        return ca.Sparsity.dense(self._sizes[i], 1)
+
+    def has_eval_buffer(self) -> bool:
+        """Numbers are taken where they are, without matrices around them."""
+        return True
+
+    def eval_buffer(self, arg: Any, res: Any) -> int:
+        """Called by Ipopt at the start and after every iteration."""
+        x, rows = (np.frombuffer(arg[i], dtype=float).copy() for i in self._wanted)
+        rows[: self._contacts] += x[len(x) - self._contacts :]
+        self._path.append(x)
+        self._rows.append(rows)
+        r, joints = rows[: self._contacts], rows[self._contacts :]
+        met = r @ r < EXACT**2 and within(joints, self._joints)
+        np.frombuffer(res[0], dtype=float)[0] = met or is_cancelled()
+        return 0
+
+
+def within(joints: Array, limits: tuple[Array, Array]) -> bool:
+    """Whether coupled joints are within their lower and upper limits."""
+    return bool(
+        np.all(joints >= limits[0] - JOINT_SLACK) and np.all(joints <= limits[1] + JOINT_SLACK)
+    )
+
+
+AT_LIMIT = 1e-6
+"""A motor this close to its limit [rad or m] counts as standing there; Ipopt stays inside."""
+
+
+class IpoptMethod:
+    """`ipopt`: one start from q0, then random ones until the contacts are met.
+
+    An iteration is a row of the trace: every start counts its first point and every step of
+    Ipopt. Of several starts in vain the one with the smallest cost is returned. Threads take
+    turns, since Ipopt's callback serves one solve at a time.
+
+    Attributes:
+        name: Name of the method.
+        options: Its numbers.
+    """
+
+    name = "ipopt"
+
+    def __init__(
+        self,
+        robot: RobotDescription,
+        options: IpoptParameters,
+        compiled: bool = True,
+        kinds: Kinds | None = None,
+    ) -> None:
+        """Remember the robot; the program is built when first needed.
+
+        Args:
+            robot: The robot.
+            options: The numbers.
+            compiled: Makes no difference: Ipopt calls its graphs in the virtual machine.
+            kinds: Of the contacts, by finger; None: point and normal.
+        """
+        del compiled
+        self._kinds = kinds or usual(len(robot.fingers))
+        self.options = options
+        self._robot = robot
+
+    @cached_property
+    def program(self) -> WholeNlp:
+        """The program; it serves every target."""
+        return WholeNlp(self._robot, self.options, self._kinds)
+
+    def for_kinds(self, kinds: Kinds) -> IpoptMethod:
+        """The same for contacts of other kinds."""
+        return self if kinds == self._kinds else IpoptMethod(self._robot, self.options, kinds=kinds)
+
+    def prepare(self) -> None:
+        """Build the program."""
+        _ = self.program
+
+    @cached_property
+    def record(self) -> Layout:
+        """What is logged of an iteration."""
+        robot = self._robot
+        return Layout.record(
+            Q.of(robot, "actuator positions before the step"),
+            COST.of(robot, "squared residual before the step"),
+            Field("barrier", (), "f8", "", "Ipopt's barrier parameter mu"),
+            POSITION_ERROR.of(robot),
+            ANGLE_ERROR.of(robot),
+            Field("infeasibility", (), "f4", "", "largest violation of a constraint (inf_pr)"),
+            Field("regularization", (), "f4", "", "added to the diagonal of the Hessian"),
+            STEP_SIZE.of(robot, "largest motor change of the step"),
+            LIMIT_MASK.of(robot),
+            RESTART.of(robot, "number of the start, 0 that from q0"),
+            PHASE.of(robot),
+            STATUS.of(robot),
+        )
+
+    @property
+    def trace_format(self) -> TraceFormat:
+        """How its traces are to be read."""
+        return trace_format(self.record, self._robot, measures=self._measures)
+
+    @cached_property
+    def _measures(self) -> JacobianMeasures:
+        return JacobianMeasures(self._robot)
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """The parameter record as a plain mapping."""
+        return dataclasses.asdict(self.options)
+
+    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+        """Not to be had.
+
+        Raises:
+            UnsupportedError: Always.
+        """
+        del problems, q0
+        raise UnsupportedError(
+            f"method {self.name!r} cannot be stepped by hand: Ipopt runs its iterations itself and "
+            "only reports them; a log holds them all"
+        )
+
+    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+        """Solve a batch; see `Method.run`.
+
+        The random numbers of a target are those of the seed and the target's number in the whole
+        batch.
+        """
+        robot, count = self._robot, len(problems)
+        q = np.zeros((count, len(robot.actuators)))
+        status, iterations, restarts = (np.zeros(count, dtype=np.int64) for _ in range(3))
+        elapsed = np.zeros(count)
+        traces = [np.zeros(0, self.record.dtype)]
+        targets = self._targets(problems)
+        starts = np.clip(q0, robot.lower, robot.upper) if problems.enforce_limits else q0
+        for row in range(count):
+            begin = time.perf_counter()
+            sequence = np.random.SeedSequence([seed, problems.number(row)])
+            runs = self._runs(starts[row], targets[row], problems, np.random.default_rng(sequence))
+            best = min(runs, key=lambda run: run.cost)
+            q[row] = best.q
+            status[row] = _ending(best, problems, self.program.contacts)
+            iterations[row] = sum(len(run.path) for run in runs)
+            restarts[row] = len(runs) - 1
+            if trace:
+                traces.append(self._trace(runs, Status(int(status[row]))))
+            elapsed[row] = time.perf_counter() - begin
+        return Outcome(
+            q=q,
+            status=status,
+            iterations=iterations,
+            restarts=restarts,
+            time=elapsed,
+            phases={Phase.WHOLE_SYSTEM.label: iterations.copy()},
+            rows=np.concatenate(traces) if trace else None,
+        )
+
+    def _runs(
+        self, start: Array, targets: Array, problems: Problems, rng: np.random.Generator
+    ) -> list[NlpRun]:
+        """One run after the other, until the contacts are met or the starts are used up."""
+        robot, runs = self._robot, []
+        lower, upper = problems.bounds(robot, np.inf)
+        for _ in range(self.options.restarts + 1):
+            runs.append(self.program.solve(start, targets, lower, upper))
+            if _ending(runs[-1], problems, self.program.contacts) is Status.SOLVED:
+                break
+            start = rng.uniform(robot.lower, robot.upper)
+        return runs
+
+    def _targets(self, problems: Problems) -> Array:
+        """(k, ...) parameters of the program; what is free is zero."""
+        layout, count = self.program.parameters, len(problems)
+        counts = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
+        values = {
+            item.name: np.nan_to_num(problems.vectors(item.name))
+            for item in layout
+            if item.name != "weights"
+        } | {"weights": np.stack(counts, axis=2)}
+        targets = np.zeros((count, layout.size))
+        for item in layout:
+            targets[:, layout.slice(item.name)] = values[item.name].reshape(count, item.size)
+        return targets
+
+    def _trace(self, runs: list[NlpRun], status: Status) -> NDArray[Any]:
+        rows = np.zeros(sum(len(run.path) for run in runs), dtype=self.record.dtype)
+        residuals = np.concatenate([run.residuals for run in runs])
+        q = np.concatenate([run.path for run in runs])
+        distances, angles = self.program.contacts.errors(residuals)
+        at_limit = (q <= self._robot.lower + AT_LIMIT) | (q >= self._robot.upper - AT_LIMIT)
+        rows["q"] = q
+        rows["cost"] = np.sum(residuals**2, axis=1)
+        rows["position_error"], rows["angle_error"] = distances, angles
+        for name in ("barrier", "infeasibility", "regularization"):
+            rows[name] = np.concatenate([getattr(run, name) for run in runs])
+        rows["step_size"] = np.concatenate([_step_sizes(run.path) for run in runs])
+        rows["limit_mask"] = packed(at_limit)
+        rows["restart"] = np.repeat(np.arange(len(runs)), [len(run.path) for run in runs])
+        rows["phase"] = Phase.WHOLE_SYSTEM
+        rows["status"][-1:] = max(status, 0)
+        return rows
+
+
+def _step_sizes(path: Array) -> Array:
+    """(rows,) largest motor change of the step from every row; none from the last."""
+    return np.append(np.abs(np.diff(path, axis=0)).max(axis=1), np.nan)
+
+
+def _ending(run: NlpRun, problems: Problems, contacts: NlpContacts) -> Status:
+    """How a run ended: solved if every contact is within tolerance, whatever Ipopt thinks."""
+    distances, angles = contacts.errors(run.residual[None])
+    met = np.all(distances <= problems.position_tolerance)
+    met = met and np.all(angles <= problems.angle_tolerance)
+    return Status.SOLVED if met and run.inside else run.status

@@ -1,0 +1,343 @@
+"""The tasks of Qiu & Kermani 2021 and how they are combined.
+
+Rows of contacts and of the palm's orientation, the estimate of that orientation from contacts
+(1), (2), steps by damped and selectively damped least squares, a task in the null space of those
+before it, and the palm's motion along the closed chain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import UnsupportedError
+from casadi_ik.problem.contacts.kinds import USUAL
+from casadi_ik.problem.contacts.rows import tip_vectors
+from casadi_ik.problem.target import Target
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.actuated import ActuatedKinematics
+from casadi_ik.symbolic.directions import rotation_between
+from casadi_ik.symbolic.kinematics import forward, number
+from casadi_ik.symbolic.linear_algebra import (
+    damped_pinv_times,
+    project_to_null_space,
+    solve_spd,
+    weighted_damped_pinv_times,
+)
+from casadi_ik.symbolic.measures import svd
+from casadi_ik.symbolic.se3 import log_se3
+from casadi_ik.symbolic.smooth import Expr, safe_norm
+from casadi_ik.symbolic.so3 import euler_zyx, log_so3, mean_rotation, project_to_rotation
+
+MILLIMETRE = 1e-3
+"""The paper's solvers work in millimetres and radians: their damping factors say so."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One end effector's position or orientation.
+
+    Attributes:
+        jacobian: (3, k) over some actuators [mm or rad per rad or m].
+        error: (3, 1) what is left [mm or rad].
+        is_position: Whether it is a position [mm], else an orientation [rad].
+    """
+
+    jacobian: Expr
+    error: Expr
+    is_position: bool
+
+
+TaskSolver = Callable[[Task], Expr]
+"""Turns a task into a step (k, 1) of its actuators."""
+
+
+def palm_orientation_task(
+    body: ActuatedKinematics, desired: Expr, actuators: Sequence[int], euler: bool
+) -> Task:
+    """The palm's orientation; error by Euler angles as in the paper, or by rotation vector.
+
+    Args:
+        body: Kinematics over q.
+        desired: (3, 3) desired orientation of the palm, base frame.
+        actuators: Columns of the Jacobian.
+        euler: True: differences of ZYX Euler angles, each wrapped to (-pi, pi], and the analytic
+            Jacobian. False: rotation logarithm and geometric Jacobian.
+    """
+    current = body.kinematics.palm.rotation
+    if euler:
+        difference = euler_zyx(desired) - euler_zyx(current)
+        wrapped = ca.atan2(ca.sin(difference), ca.cos(difference))
+        return Task(body.palm_euler_jacobian(actuators), wrapped, is_position=False)
+    _, angular = body.palm_jacobian(actuators)
+    return Task(angular, log_so3(desired @ current.T), is_position=False)
+
+
+def contact_tasks(
+    body: ActuatedKinematics, finger: str, goal: Target, actuators: Sequence[int]
+) -> tuple[Task, Task]:
+    """A finger's contact point and normal, Qiu & Kermani 2021, eq. (3)."""
+    tip, target = tip_vectors(body.kinematics, finger), goal.vectors
+    place, facing = USUAL.conditions
+    linear, angular = body.contact_jacobian(finger, actuators)
+    position = Task(linear / MILLIMETRE, place.error(tip, target) / MILLIMETRE, is_position=True)
+    return position, Task(angular, facing.error(tip, target), is_position=False)
+
+
+def damped(damping: Expr) -> TaskSolver:
+    """Damped least squares (Wampler 1986) with one damping factor [mm; rad/rad]."""
+    return lambda task: damped_pinv_times(task.jacobian, task.error, damping)
+
+
+def selective(gamma_max: Expr, longest: Expr, widest: Expr) -> TaskSolver:
+    """Selectively damped least squares (Buss & Kim 2005).
+
+    Args:
+        gamma_max: Largest change of any actuator [rad or m].
+        longest: Position errors are shortened to this [mm].
+        widest: Orientation errors are shortened to this [rad].
+    """
+
+    def solve(task: Task) -> Expr:
+        limit = longest if task.is_position else widest
+        return selectively_damped(task.jacobian, clamped(task.error, limit), gamma_max)
+
+    return solve
+
+
+def weighted_damped(damping: Expr, weights: Expr) -> TaskSolver:
+    """Weighted damped least squares (Chan & Dubey 1995); a heavy actuator (k, 1) moves little."""
+    return lambda task: weighted_damped_pinv_times(task.jacobian, task.error, damping, weights)
+
+
+def weighted(solver: TaskSolver, weights: Expr) -> TaskSolver:
+    """Any solver in the weighted coordinates sqrt(w_i) q_i, as weighted damping does it."""
+    scale = 1 / ca.sqrt(weights)
+
+    def solve(task: Task) -> Expr:
+        scaled = task.jacobian * ca.repmat(scale.T, task.jacobian.shape[0], 1)
+        return scale * solver(Task(scaled, task.error, task.is_position))
+
+    return solve
+
+
+def clamped(error: Expr, longest: Expr) -> Expr:
+    """An error shortened to a length, its direction kept."""
+    return error * ca.fmin(1.0, longest / ca.fmax(safe_norm(error), 1e-12))
+
+
+PROJECTIONS = ("successive", "augmented", "none")
+"""Which null space a lower task has to stay in."""
+
+EXACT = 1e-6
+"""Damping of a projector that is meant to be exact [unit of the task's Jacobian]."""
+
+RANK_FLOOR = 1e-3
+"""Damping of the augmented projector [rad/rad, and m/rad]: below it a row left over
+from the higher tasks counts as dependent on them."""
+
+
+def combine(
+    tasks: Sequence[Task],
+    steps: Sequence[Expr],
+    projection: str,
+    damping: float | None = None,
+) -> Expr:
+    """One step for all tasks (k, 1), the highest first.
+
+    Args:
+        tasks: From the highest priority to the lowest, over the same actuators.
+        steps: (k, 1) of every task by itself.
+        projection: "successive": dq_1 + N_1 dq_2 + N_1 N_2 dq_3 + ..., each N_i of its own task
+            only. "augmented": dq_1 + N_1 dq_2 + N_12 dq_3 + ..., N_12 of the tasks 1 and 2 stacked.
+            "none": the plain sum, no priorities.
+        damping: Of the pseudoinverse in the projectors [mm; rad/rad], so that a lower task leaks
+            into the higher ones; None: the projectors are exact wherever that is possible.
+    """
+    if projection == "none":
+        return sum(steps[1:], steps[0])
+    if projection == "successive":
+        total = steps[0]
+        for level in range(1, len(tasks)):
+            step = steps[level]
+            for higher in reversed(tasks[:level]):
+                step = project_to_null_space(higher.jacobian, step, damping or EXACT)
+            total = total + step
+        return total
+    projectors: list[Projector] = []
+    for higher in tasks[:-1]:
+        projectors.append(_projector(higher, projectors, damping))
+    total = steps[-1]
+    for step, projector in zip(reversed(steps[:-1]), reversed(projectors), strict=True):
+        total = step + projector.of_column(total)
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class Projector:
+    """N = I - Y' Z with Z = (Y Y' + damping^2 I)^-1 Y, kept as its factors, both (3, k).
+
+    Multiplied with vectors one after the other they take a third of the instructions of a product
+    of the matrices.
+    """
+
+    Y: Expr
+    Z: Expr
+
+    def of_column(self, column: Expr) -> Expr:
+        """N v for v (k, 1)."""
+        return column - self.Y.T @ (self.Z @ column)
+
+    def of_rows(self, rows: Expr) -> Expr:
+        """R N for R (r, k)."""
+        return rows - (rows @ self.Y.T) @ self.Z
+
+
+def _projector(task: Task, higher: Sequence[Projector], damping: float | None) -> Projector:
+    """What the tasks so far and one more leave free is N_1 N_2 ... N_k: this is N_k.
+
+    Y = J N_1 ... N_k-1 is the part of the task that the higher ones left to it.
+    """
+    Y = task.jacobian
+    if damping is None:
+        damping, Y = RANK_FLOOR, Y * (MILLIMETRE if task.is_position else 1.0)
+    for projector in higher:
+        Y = projector.of_rows(Y)
+    G = Y @ Y.T + damping**2 * ca.DM.eye(Y.shape[0])
+    # Structurally zero columns stay so: the highest tasks have many.
+    columns = sorted(set(Y.sparsity().get_col()))
+    Z = type(Y)(*Y.shape)
+    Z[:, columns] = solve_spd(G, Y[:, columns])
+    return Projector(Y, Z)
+
+
+NEGLIGIBLE = 1e-9
+"""Singular values below this part of the largest count as zero, their directions as unreachable."""
+
+
+def selectively_damped(jacobian: Expr, error: Expr, gamma_max: Expr) -> Expr:
+    """One SDLS step for one end effector.
+
+    With J = sum sigma_i u_i v_i', alpha_i = u_i' e, N_i = |u_i| = 1 and
+    M_i = sum_j |v_ji| |J_j| / sigma_i:  gamma_i = min(1, N_i / M_i) gamma_max and
+    phi_i = clamp(alpha_i v_i / sigma_i, gamma_i); the step is clamp(sum phi_i, gamma_max). `clamp`
+    shortens a vector so that no entry is larger in magnitude.
+
+    Args:
+        jacobian: (m, n) of one end effector's position or orientation.
+        error: (m, 1), already shortened to the longest error that is to be followed.
+        gamma_max: Largest change of any joint in one step [rad or m].
+
+    Returns:
+        (n, 1) joint step; the pseudo-inverse step wherever nothing needs damping.
+    """
+    n = jacobian.shape[1]
+    U, s, V = svd(jacobian)
+    reach = ca.vertcat(*(safe_norm(jacobian[:, j]) for j in range(n)))
+    total = ca.SX.zeros(n, 1)
+    largest = ca.fmax(ca.mmax(s), 1e-300)
+    for i in range(s.shape[0]):
+        v = V[:, i]
+        counts = s[i] > NEGLIGIBLE * largest
+        inverse = 1 / ca.if_else(counts, s[i], 1.0)
+        effort = inverse * ca.dot(ca.fabs(v), reach)
+        gamma = gamma_max * ca.fmin(1.0, 1 / ca.fmax(effort, 1e-300))
+        phi = shorten(inverse * ca.dot(U[:, i], error) * v, gamma)
+        total = total + ca.if_else(counts, phi, 0.0)
+    return shorten(total, gamma_max)
+
+
+def shorten(step: Expr, largest: Expr) -> Expr:
+    """A vector scaled down so that no entry exceeds `largest` in magnitude."""
+    return step * ca.fmin(1.0, largest / ca.fmax(ca.mmax(ca.fabs(step)), 1e-300))
+
+
+def axes_through(points: list[ca.SX]) -> ca.SX:
+    """The frame of eqs. (1) and (2) through three or more points.
+
+    X runs from the last point to the second, Y from the middle of those towards the first (the
+    thumb), Z = X x Y, and X = Y x Z makes them orthogonal.
+
+    Args:
+        points: Points (3, 1) [m], the thumb's first.
+
+    Returns:
+        R (3, 3) with columns X, Y, Z.
+    """
+    thumb, second, last = points[0], points[1], points[-1]
+    x = second - last
+    y = thumb - (second + last) / 2
+    z = ca.cross(x, y)
+    z = z / ca.fmax(safe_norm(z), 1e-12)
+    y = y / ca.fmax(safe_norm(y), 1e-12)
+    return ca.horzcat(ca.cross(y, z), y, z)
+
+
+def base_axes(robot: RobotDescription) -> Array:
+    """The same frame through the fingers' base points, in the palm frame (3, 3).
+
+    The paper's palm frame has it as the identity; another hand's palm frame may be turned.
+
+    Raises:
+        UnsupportedError: The robot has fewer than three fingers.
+    """
+    if len(robot.fingers) < 3:
+        raise UnsupportedError(
+            f"robot {robot.name!r} has {len(robot.fingers)} fingers; the palm estimate of "
+            "eqs. (1) and (2) needs at least three"
+        )
+    kinematics = forward(robot, ca.SX.zeros(len(robot.movable), 1))
+    child = {joint.name: joint.child for joint in robot.movable}
+    origins = [
+        kinematics.palm.inverse_apply(kinematics.links[child[robot.finger(name).joints[0]]].origin)
+        for name in thumb_first(robot)
+    ]
+    return number(axes_through(origins)).reshape(3, 3)
+
+
+def palm_orientation(robot: RobotDescription, goal: dict[str, Target]) -> ca.SX:
+    """Estimated palm orientation (3, 3) in the frame of the targets.
+
+    The contact points stand in for the fingers' base points.
+    """
+    points = [goal[name].point for name in thumb_first(robot)]
+    return ca.densify(axes_through(points) @ ca.SX(ca.DM(base_axes(robot).T)))
+
+
+def thumb_first(robot: RobotDescription) -> tuple[str, ...]:
+    """Finger names with the thumb in front."""
+    others = tuple(name for name in robot.finger_names if name != robot.thumb)
+    return (robot.thumb, *others)
+
+
+def palm_motion(body: ActuatedKinematics, goals: dict[str, Target]) -> tuple[ca.SX, ca.SX]:
+    """Mean translation and rotation demanded by the fingers, in the palm frame.
+
+    Args:
+        body: Kinematics over q.
+        goals: Targets of the fingers that take part, base frame.
+
+    Returns:
+        translation (3, 1) [mm], eq. (13), and rotation vector (3, 1) [rad], eq. (12).
+    """
+    palm = body.kinematics.palm
+    rotations, translations = [], []
+    for name, goal in goals.items():
+        point, normal = body.kinematics.contact(name)
+        # Everything is seen from the palm. With the shortest rotation between the normals given
+        # in palm coordinates, the sandwich of eq. (12) by the fingertip frame is already done.
+        turn = rotation_between(palm.rotation.T @ normal, palm.rotation.T @ goal.normal)
+        shift = palm.rotation.T @ (goal.point - point) / MILLIMETRE
+        twist = log_se3((turn, shift))
+        lever = palm.inverse_apply(point) / MILLIMETRE
+        rotations.append(turn)
+        translations.append(twist[:3] - ca.cross(twist[3:], lever))
+    translation = sum(translations[1:], translations[0]) / len(translations)
+    if len(rotations) == 2:
+        mean = mean_rotation(*rotations)
+    else:
+        mean = project_to_rotation(sum(rotations[1:], rotations[0]) / len(rotations))
+    return translation, log_so3(mean)
