@@ -55,7 +55,8 @@ def located(name: str, where: str) -> tuple[str, str, int]:
     thing: Any = module
     try:
         for part in parts[count:]:
-            thing = inspect.getattr_static(thing, part)
+            module_like = inspect.ismodule(thing)
+            thing = getattr(thing, part) if module_like else inspect.getattr_static(thing, part)
     except AttributeError as error:
         raise ExtensionError(f"{where}: src: casadi_ik has no {name}") from error
     thing = thing.fget if isinstance(thing, property) else getattr(thing, "func", thing)

@@ -46,7 +46,8 @@ def public_names() -> list[str]:
 def found(name: str) -> Any:
     thing: Any = ik
     for part in name.split("."):
-        thing = inspect.getattr_static(thing, part)
+        module = inspect.ismodule(thing)
+        thing = getattr(thing, part) if module else inspect.getattr_static(thing, part)
     return thing
 
 
