@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 import yaml
 
+from casadi_ik.calibration.estimate import Calibration
 from casadi_ik.calibration.model import tilted
-from casadi_ik.calibration.result import Calibration
 from casadi_ik.errors import InputError
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.shipped import resolve

@@ -10,6 +10,7 @@ about a direction than the prior does.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +18,146 @@ import proxsuite
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
-from casadi_ik.calibration.losses import LOSSES, Loss
 from casadi_ik.calibration.measurements import Measurements
-from casadi_ik.calibration.model import HandModel
-from casadi_ik.calibration.result import UNKNOWN, Calibration
+from casadi_ik.calibration.model import HandModel, Parameter
 from casadi_ik.errors import InputError, UnknownNameError
+
+CAUCHY, HUBER = 2.385, 1.345
+"""Tuning constants for 95 % efficiency on one normal component (Holland & Welsch 1977)."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A loss.
+
+    Attributes:
+        cost: What a component of a measurement costs.
+        weight: Weight of a measurement in the normal equations, cost' / rho.
+        slope: Its share in the mean curvature, weight + rho weight' / m over m components.
+    """
+
+    cost: Callable[[Array], Array]
+    weight: Callable[[Array], Array]
+    slope: Callable[[Array, Array], Array]
+
+
+def _cauchy_cost(rho: Array) -> Array:
+    return 0.5 * CAUCHY**2 * np.log1p((rho / CAUCHY) ** 2)
+
+
+def _cauchy_weight(rho: Array) -> Array:
+    return 1 / (1 + (rho / CAUCHY) ** 2)
+
+
+def _cauchy_slope(rho: Array, m: Array) -> Array:
+    weight = _cauchy_weight(rho)
+    return weight - 2 * (weight * rho / CAUCHY) ** 2 / m
+
+
+def _huber_cost(rho: Array) -> Array:
+    return np.where(rho <= HUBER, 0.5 * rho**2, HUBER * (rho - 0.5 * HUBER))
+
+
+def _huber_weight(rho: Array) -> Array:
+    return HUBER / np.maximum(rho, HUBER)
+
+
+def _huber_slope(rho: Array, m: Array) -> Array:
+    return np.where(rho <= HUBER, 1.0, _huber_weight(rho) * (1 - 1 / m))
+
+
+LOSSES = {
+    "cauchy": Loss(_cauchy_cost, _cauchy_weight, _cauchy_slope),
+    "huber": Loss(_huber_cost, _huber_weight, _huber_slope),
+    "squares": Loss(lambda rho: 0.5 * rho**2, np.ones_like, lambda rho, _: np.ones_like(rho)),
+}
+"""The losses by name."""
+
+
+NORMAL_95 = 1.959964
+"""95 % of a normal variable lie within so many standard deviations."""
+
+UNKNOWN = 1e-6
+"""Singular value, relative to the largest, below which the data say nothing at all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What the data say about the parameters; m measurements, k parameters.
+
+    Attributes:
+        parameters: The parameters.
+        values: (k,) estimates.
+        covariance: (k, k) of the estimates.
+        singular_values: (k,) of the whitened Jacobian in units of the priors, descending.
+        directions: (k, k) their directions in units of the priors, one per row.
+        weights: (m,) weight of each measurement, 1 where it is taken in full.
+        noise: Standard deviations of a measured coordinate [m] and angle [rad]; NaN if no
+            orientation was measured.
+        noise_estimated: Whether the noise is from the data; with too few it is what was assumed.
+        before: (m, 2) misfit of the description: distance [m] and angle [rad, NaN].
+        after: (m, 2) the same of the estimate.
+        iterations: Gauss-Newton steps.
+        converged: Whether the last step was small enough.
+    """
+
+    parameters: tuple[Parameter, ...]
+    values: Array
+    covariance: Array
+    singular_values: Array
+    directions: Array
+    weights: Array
+    noise: tuple[float, float]
+    noise_estimated: bool
+    before: Array
+    after: Array
+    iterations: int
+    converged: bool
+
+    @property
+    def deviation(self) -> Array:
+        """(k,) standard deviations of the estimates."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def interval(self) -> Array:
+        """(k,) half widths of the 95 % intervals."""
+        return NORMAL_95 * self.deviation
+
+    @property
+    def learned(self) -> Array:
+        """(k,) part of the prior's variance that the data took away: 0 nothing, 1 all."""
+        prior = np.array([parameter.prior for parameter in self.parameters])
+        return np.clip(1 - (self.deviation / prior) ** 2, 0.0, 1.0)
+
+    @property
+    def outliers(self) -> NDArray[np.intp]:
+        """Rows that count less than a quarter."""
+        return np.flatnonzero(self.weights < 0.25)
+
+    def unidentified(self, below: float = 1.0) -> list[tuple[float, dict[str, float]]]:
+        """Directions about which the data say less than the priors.
+
+        Args:
+            below: Singular value up to which a direction counts.
+
+        Returns:
+            Singular value and the larger components by parameter, the worst first.
+        """
+        found = []
+        for value, direction in zip(self.singular_values, self.directions, strict=True):
+            if value < below:
+                large = np.flatnonzero(np.abs(direction) > 0.3 * np.abs(direction).max())
+                order = large[np.argsort(-np.abs(direction[large]))]
+                names = {self.parameters[i].name: float(direction[i]) for i in order}
+                found.append((float(value), names))
+        return found[::-1]
+
+    @property
+    def unknown_directions(self) -> int:
+        """How many directions the data say nothing at all about."""
+        return int(np.sum(self.singular_values < UNKNOWN * self.singular_values[0]))
+
 
 CHI_SQUARE_MEDIAN = 2.366
 """Median of the chi-square distribution of 3 degrees of freedom."""

@@ -27,7 +27,7 @@ import sys
 import casadi as ca
 import numpy as np
 import casadi_ik as ik
-from casadi_ik.calibration.parameters import hand_parameters
+from casadi_ik.calibration.model import hand_parameters
 from casadi_ik.symbolic.couplings import coupling_rate, follow, joint_positions
 
 robot = ik.load_robot(sys.argv[1])
