@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
-from casadi_ik.grasps.arrays import real_array
+from casadi_ik.grasps.grasp import real_array
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.on_demand import on_demand
 from casadi_ik.robots import RobotDescription, load_description, to_urdf

@@ -17,11 +17,10 @@ from shape_fitting.writing import write
 
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
-from casadi_ik.importing.capsules import LEAST_SAVING
-from casadi_ik.importing.fitted import MOST, fitted, worst
+from casadi_ik.importing.capsules import LEAST_SAVING, MOST, fitted, worst
 from casadi_ik.importing.posture import Postures
+from casadi_ik.importing.robot_shapes import may_touch
 from casadi_ik.importing.surfaces import Surface, together
-from casadi_ik.importing.touching import may_touch
 from casadi_ik.robots.described_parts import arm_part, hand_part
 from casadi_ik.robots.schema import ArmFile, HandFile
 

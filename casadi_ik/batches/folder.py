@@ -13,8 +13,7 @@ import numpy as np
 
 from casadi_ik.batches.part import SolvedPart
 from casadi_ik.errors import InputError
-from casadi_ik.files.leftovers import tidy
-from casadi_ik.files.writing import written_whole
+from casadi_ik.files.writing import tidy, written_whole
 
 MANIFEST = "batch.json"
 FORMAT = 1

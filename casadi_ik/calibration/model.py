@@ -1,4 +1,4 @@
-"""A hand whose dimensions are symbols: its numbers with their priors, and fingertip poses over them.
+"""A hand whose dimensions are symbols: numbers with priors, and fingertip poses over them.
 
 The same graphs as everywhere: eq. (8) for the triangles, eq. (9) for the four-bars, eq. (3) for the
 chain (Chandra et al. 2019), with the description's numbers as inputs. A four-bar keeps the branch

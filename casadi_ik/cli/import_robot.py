@@ -19,8 +19,8 @@ from casadi_ik.cli.report import fields, files, headline, table
 from casadi_ik.cli.say import PROGRAM
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.importing import imported
+from casadi_ik.importing.capsules import worst
 from casadi_ik.importing.check import largest_difference
-from casadi_ik.importing.fitted import worst
 from casadi_ik.importing.imported import Imported
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.robots.part import PREFIX

@@ -16,8 +16,7 @@ from casadi_ik.collision.scene_file import SceneFile
 from casadi_ik.datasets.conventions import ConventionFile
 from casadi_ik.files.json_schema import json_schema
 from casadi_ik.files.writing import written_whole
-from casadi_ik.grasps.candidates import CandidatesFile
-from casadi_ik.grasps.load import GraspFile
+from casadi_ik.grasps.load import CandidatesFile, GraspFile
 from casadi_ik.grasps.objects import ObjectFile
 from casadi_ik.motion.retarget import Retarget
 from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile, ImportedFile

@@ -13,7 +13,7 @@ from typing import IO, Any
 import numpy as np
 
 from casadi_ik.cli.outputs import folder_of, write_output, writing
-from casadi_ik.files.leftovers import tidy
+from casadi_ik.files.writing import tidy
 
 
 class GrowingNpz:

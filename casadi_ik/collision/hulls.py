@@ -9,8 +9,8 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.collision.solids import Solid, convex, of_object
 from casadi_ik.errors import DescriptionError, MissingExtraError
-from casadi_ik.grasps.mesh_shape import MeshShape
 from casadi_ik.grasps.objects import load_object
+from casadi_ik.grasps.shapes import MeshShape
 
 THIN = 1e-9
 """A hull of less volume [m^3] than this is none."""

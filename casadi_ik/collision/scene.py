@@ -49,8 +49,8 @@ from casadi_ik.files.reading import (
 )
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import in_si
-from casadi_ik.grasps.mesh_shape import load_mesh_shape
 from casadi_ik.grasps.pose import checked_pose, one_pose, rotations_of
+from casadi_ik.grasps.shapes import load_mesh_shape
 from casadi_ik.robots.collision import Touching
 
 TURNS = ("rpy", "quaternion_wxyz", "quaternion_xyzw", "pose")

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.datasets.hand_poses import (
+from casadi_ik.datasets.postures import (
     HandPoses,
     of_fixed_axes,
     of_two_columns,
 )
-from casadi_ik.datasets.torch_files import read_torch
-from casadi_ik.datasets.unpickling import MOST, Packed, read_npy
+from casadi_ik.datasets.unpickling import MOST, Packed, read_npy, read_torch
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.npz import refuse_giants
 from casadi_ik.grasps.pose import inverse, rotations_of

@@ -2,32 +2,251 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import csv
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.batches.target_file import TargetFile
-from casadi_ik.datasets.candidates import INVALIDS, Candidates, Invalid, kept_rows
+from casadi_ik.batches.target_table import polars_module
 from casadi_ik.datasets.conventions import Convention, convention_for, of_robot
-from casadi_ik.datasets.hand_poses import FAR, HandPoses
-from casadi_ik.datasets.hands import palms_of
 from casadi_ik.datasets.layouts import LAYOUTS, READERS, read_layout
-from casadi_ik.datasets.postures import HandPostures, hand_postures
-from casadi_ik.datasets.tables import SUFFIXES, read_table
+from casadi_ik.datasets.postures import (
+    FAR,
+    HandPoses,
+    HandPostures,
+    hand_postures,
+    of_fixed_axes,
+    palms_of,
+)
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.npz import read_npz, refuse_giants
 from casadi_ik.grasps import Contact, Grasp, GraspObject, load_object
-from casadi_ik.grasps.candidates import load_grasp_files
+from casadi_ik.grasps.load import load_grasp_files
 from casadi_ik.grasps.objects import is_mesh
+from casadi_ik.grasps.pose import rotations_of
 from casadi_ik.problem.contacts.arrays import NAMES
 from casadi_ik.problem.hand_motors import finger_joints, hand_motors
 from casadi_ik.problem.problems import DIRECTIONS
+
+Invalid = Literal["error", "drop", "clip"]
+"""What becomes of a row that the hand cannot take."""
+
+INVALIDS = ("error", "drop", "clip")
+
+NOTICED = 1e-4
+"""A fingertip that was shifted less than this [m] counts as where it was."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates(Sequence[Grasp]):
+    """Grasps of a file, in its order; itself a sequence of them.
+
+    Attributes:
+        grasps: The grasps.
+        rows: (k,) their numbers in the file.
+        dropped: How many rows of the file were left out, as they are invalid.
+        clipped: How many have a joint that was beyond its limits, and is at them now.
+        shift: (k,) how far the fingertip that is moved farthest is from where the file has it [m],
+            in the frame of the palm: by clipping, or since joints are coupled that are free in the
+            data.
+        scale: By what factor the object is larger than its mesh; None: the file does not say.
+
+    Example:
+        >>> points, normals = robot.contacts(robot.random(np.random.default_rng(2), 20))
+        >>> np.savez("targets.npz", points=points, normals=normals)
+        >>> candidates = ik.load_candidates("targets.npz", robot)
+        >>> print(candidates)
+        20 candidates
+        >>> candidates.dropped, candidates.clipped, candidates[3].name
+        (0, 0, 'targets[3]')
+    """
+
+    grasps: tuple[Grasp, ...]
+    rows: tuple[int, ...] = ()
+    dropped: int = 0
+    clipped: int = 0
+    shift: Array = field(default_factory=lambda: np.zeros(0))
+    scale: float | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.grasps)
+        object.__setattr__(self, "rows", self.rows or tuple(range(count)))
+        if not len(self.shift):
+            object.__setattr__(self, "shift", np.zeros(count))
+
+    def __len__(self) -> int:
+        return len(self.grasps)
+
+    def __iter__(self) -> Iterator[Grasp]:
+        return iter(self.grasps)
+
+    @overload
+    def __getitem__(self, place: int) -> Grasp: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> tuple[Grasp, ...]: ...
+
+    def __getitem__(self, place: int | slice) -> Grasp | tuple[Grasp, ...]:
+        return self.grasps[place]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What became of rows that could not be taken as they are, in short lines."""
+        whole, found = len(self) + self.dropped, []
+        if self.dropped:
+            found.append(f"{self.dropped} of {whole} rows left out: invalid")
+        if self.clipped:
+            found.append(f"{self.clipped} of {whole} rows have joints put at their limits")
+        moved = 1e3 * self.shift[self.shift > NOTICED]
+        if len(moved):
+            found.append(
+                f"fingertips of {len(moved)} candidates shifted, as the hand's joints are limited "
+                f"and coupled: median {np.median(moved):.1f} mm, at most {moved.max():.1f} mm"
+            )
+        return tuple(found)
+
+    def __str__(self) -> str:
+        size = "" if self.scale is None else f" of an object of scale {self.scale:g}"
+        return "\n".join([f"{len(self)} candidates{size}", *(f"  {note}" for note in self.notes)])
+
+
+def kept_rows(
+    where: str,
+    rows: Sequence[int],
+    faults: Mapping[int, str],
+    beyond: Mapping[int, str],
+    invalid: Invalid,
+) -> NDArray[np.intp]:
+    """Places of the rows that are taken.
+
+    Args:
+        where: File, for messages.
+        rows: Their numbers in the file.
+        faults: What is wrong with a row, by its number.
+        beyond: What is beyond its limits in a row, by its number.
+        invalid: What becomes of these: "clip" takes rows that are beyond limits only.
+
+    Raises:
+        DescriptionError: There are invalid rows that are not to be left out, or none is left.
+    """
+    bad = {**({} if invalid == "clip" else beyond), **faults}
+    if bad and (invalid != "drop" or len(bad) == len(rows)):
+        first = min(bad)
+        clips = invalid == "error" and set(beyond) - set(faults)
+        more = ", 'clip' puts joints at their limits" if clips else ""
+        wayout = f"; invalid='drop' leaves such rows out{more} (--invalid)"
+        raise DescriptionError(
+            f"{where}: row {first}: {bad[first]}; {len(bad)} of {len(rows)} rows are invalid"
+            f"{'' if invalid == 'drop' else wayout}"
+        )
+    return np.array([i for i, row in enumerate(rows) if row not in bad], dtype=np.intp)
+
+
+PLACE = ("x", "y", "z")
+QUATERNION = ("qw", "qx", "qy", "qz")
+ANGLES = ("roll", "pitch", "yaw")
+
+MOST = 2**26
+"""Bytes of a file, and of what is in it."""
+
+SUFFIXES = (".csv", ".npz", ".parquet")
+
+
+def read_table(path: Path) -> HandPoses:
+    """Grasps of a table: x y z [m], qw qx qy qz or roll pitch yaw [rad], then joints by name.
+
+    Raises:
+        DescriptionError: It is damaged, columns are missing, or not of numbers.
+        UnsupportedError: Parquet, and polars is not installed.
+    """
+    readers: Mapping[str, Callable[[Path], Mapping[str, Array]]]
+    readers = dict(zip(map(str, SUFFIXES), (_of_csv, _of_npz, _of_parquet), strict=True))
+    try:
+        if path.suffix.lower() == ".csv":
+            refuse_giants(str(path), path.stat().st_size, MOST)
+        columns = readers[path.suffix.lower()](path)
+    except OSError as error:
+        raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
+    turned = QUATERNION if QUATERNION[0] in columns else ANGLES
+    for name in (*PLACE, *turned):
+        if name not in columns:
+            raise DescriptionError(
+                f"{path}: {name}: missing, expected columns x y z, qw qx qy qz or roll pitch yaw, "
+                f"and joints; found {', '.join(columns)}"
+            )
+    names = tuple(name for name in columns if name not in (*PLACE, *turned))
+    count = len(columns[PLACE[0]])
+
+    def block(of: tuple[str, ...]) -> Array:
+        return np.stack([columns[name] for name in of], axis=1) if of else np.zeros((count, 0))
+
+    rotate = rotations_of if turned is QUATERNION else of_fixed_axes
+    return HandPoses(str(path), block(PLACE), rotate(block(turned)), block(names), names)
+
+
+def _of_csv(path: Path) -> dict[str, Array]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            names, *rows = [row for row in csv.reader(file) if row] or [[]]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise DescriptionError(f"{path}: no CSV file: {error}") from error
+    names = [name.strip() for name in names]
+    if len(set(names)) < len(names):
+        raise DescriptionError(f"{path}: found columns of the same name")
+    values = np.empty((len(rows), len(names)))
+    for i, row in enumerate(rows):
+        if len(row) != len(names):
+            raise DescriptionError(
+                f"{path}: row {i}: found {len(row)} values, expected {len(names)}"
+            )
+        for j, text in enumerate(row):
+            try:
+                values[i, j] = float(text)
+            except ValueError:
+                raise DescriptionError(
+                    f"{path}: row {i}: {names[j]}: found {text!r}, expected a number"
+                ) from None
+    return {name: values[:, j] for j, name in enumerate(names)}
+
+
+def _of_npz(path: Path) -> dict[str, Array]:
+    columns: dict[str, Array] = {}
+    for name, array in read_npz(path, MOST).items():
+        if array.ndim != 1:
+            raise DescriptionError(
+                f"{path}: {name}: found shape {array.shape}, expected a column of numbers"
+            )
+        columns[name] = array
+    if len({len(column) for column in columns.values()}) > 1:
+        raise DescriptionError(f"{path}: found columns of different lengths")
+    return columns
+
+
+def _of_parquet(path: Path) -> Mapping[str, Array]:
+    pl = polars_module()
+    try:
+        scanned = pl.scan_parquet(path)
+        schema = scanned.collect_schema()
+        for name, kind in schema.items():
+            if not kind.is_numeric():
+                raise DescriptionError(
+                    f"{path}: {name}: found values of type {kind}, expected numbers"
+                )
+        count = int(scanned.select(pl.len()).collect().item())
+        refuse_giants(str(path), 8 * len(schema) * count, MOST)
+        frame = scanned.select(pl.all().cast(pl.Float64).fill_null(np.nan)).collect()
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise DescriptionError(f"{path}: no Parquet file: {error}") from error
+    return {name: frame[name].to_numpy() for name in frame.columns}
+
 
 Take = Literal["palm", "contacts"]
 """What a pose and posture of a hand are taken for."""

@@ -1,6 +1,6 @@
 """What is to be touched: contacts, grasps and objects, numpy only."""
 
-from casadi_ik.grasps.grasp import Contact, Grasp
+from casadi_ik.grasps.grasp import Contact, Grasp, Tolerance
 from casadi_ik.grasps.load import load_grasp, shipped_grasps
 from casadi_ik.grasps.objects import GraspObject, load_object
 from casadi_ik.grasps.shapes import (
@@ -11,7 +11,6 @@ from casadi_ik.grasps.shapes import (
     Shape,
     Sphere,
 )
-from casadi_ik.grasps.tolerance import Tolerance
 
 __all__ = [
     "BentCapsule",

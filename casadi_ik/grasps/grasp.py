@@ -2,20 +2,157 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.arrays import Array
+from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import InputError
-from casadi_ik.grasps.arrays import real_array, unit_vectors
 from casadi_ik.grasps.pose import inverse, one_pose
-from casadi_ik.grasps.tolerance import Tolerance
-from casadi_ik.grasps.vectors import MORE, fault, squared
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """When a contact counts as reached.
+
+    Attributes:
+        position: Distance of the contact point [m].
+        angle: Angle of the pad normal [rad].
+
+    Raises:
+        InputError: Not a positive finite number.
+
+    Example:
+        >>> ik.Tolerance(position=1e-3, angle=np.deg2rad(1)).position
+        0.001
+    """
+
+    position: float = 5e-3
+    angle: float = math.radians(3.0)
+
+    def __post_init__(self) -> None:
+        for name, value in (("position", self.position), ("angle", self.angle)):
+            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
+                raise InputError(f"tolerance.{name}: found {value!r}, expected a number > 0")
+
+
+UNIT = 1e-15
+"""A vector whose length is so near to 1 has been normalised before."""
+
+SMALL, LARGE = 1e-100, 1e100
+"""Between these the squares of a length are neither rounded to zero nor infinite."""
+
+
+def real_array(value: Any) -> Array:
+    """A new array of real numbers.
+
+    Raises:
+        ValueError: Something else: text, complex numbers (whose imaginary part would be lost), or
+            masked ones (whose mask would).
+        TypeError: The same.
+    """
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError("a masked array, expected plain numbers (NaN marks what is free)")
+    array = np.array(value)
+    if array.dtype.kind == "c":
+        raise ValueError("complex numbers, expected real ones")
+    return array if array.dtype == np.float64 else np.array(value, dtype=np.float64)
+
+
+def unit_vectors(vectors: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Directions of any length, from the smallest number to the largest.
+
+    Args:
+        vectors: (..., 3); NaN gives NaN.
+
+    Returns:
+        Unit vectors, and (...) which of the vectors are zero (these give NaN). What is of unit
+        length to the last digits stays as it is.
+    """
+    with np.errstate(over="ignore", under="ignore"):
+        length = _length(vectors)
+    odd = (length < SMALL) | (length > LARGE)
+    if odd.any():
+        # By powers of two, which change no digit; in two halves, as one may be out of range.
+        power = np.where(odd, -np.frexp(np.abs(vectors).max(axis=-1))[1], 0)[..., None]
+        vectors = np.ldexp(np.ldexp(vectors, power // 2), power - power // 2)
+        length = _length(vectors)
+    length = np.where(np.abs(length - 1) < UNIT, 1.0, length)
+    zero = length == 0
+    return vectors / np.where(zero, np.nan, length)[..., None], zero
+
+
+def _length(vectors: Array) -> Array:
+    """(...), summed in order: the same bits in an exported solver."""
+    squares = vectors * vectors
+    return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
+
+
+MORE: Mapping[str, str] = {
+    "tangent": "where the contact frame's second axis must point, across the normal",
+    "line": "the contact may be anywhere on the line through the point in this direction",
+    "plane": "the contact may be anywhere on the plane through the point with this normal",
+}
+"""What a contact may have beside point and normal, by name; arrays have an s at the end."""
+
+ACROSS = 1e-6
+"""Largest cosine between a tangent and its normal that counts as rounding."""
+
+
+def fault(vectors: Mapping[str, Array]) -> str | None:
+    """What is wrong with the vectors of one contact: the first line of it, or None.
+
+    Args:
+        vectors: By name; "point" [m] and unit vectors, absent if free.
+    """
+    for name in MORE:
+        if name in vectors and "point" not in vectors:
+            return f"{name}: found one without a point, expected both"
+    if "line" in vectors and "plane" in vectors:
+        return "line and plane: found both, expected one of them"
+    if "tangent" not in vectors:
+        return None
+    if "normal" not in vectors:
+        return "tangent: found one without a normal, expected both"
+    cosine = float(vectors["tangent"] @ vectors["normal"])
+    if not abs(cosine) <= ACROSS:
+        degrees = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        return (
+            f"tangent: found {np.round(vectors['tangent'], 6).tolist()} at {degrees:.4g} deg to "
+            "the normal, expected 90 deg"
+        )
+    return None
+
+
+def faulty(vectors: Mapping[str, Array]) -> Bools:
+    """Which contacts `fault` has something to say about, all at once.
+
+    Args:
+        vectors: (..., 3) by name, as there, of all contacts; NaN where free.
+    """
+    given = {name: ~np.isnan(array[..., 0]) for name, array in vectors.items()}
+    bad = np.zeros_like(given["point"])
+    for name in MORE:
+        if name in given:
+            bad |= given[name] & ~given["point"]
+    if "line" in given and "plane" in given:
+        bad |= given["line"] & given["plane"]
+    if "tangent" in given:
+        cosine = np.einsum("...i,...i->...", vectors["tangent"], vectors["normal"])
+        bad |= given["tangent"] & ~(np.abs(cosine) <= ACROSS)
+    return bad
+
+
+def squared(tangent: Array, normal: Array) -> Array:
+    """Tangents (..., 3) without what rounding left of them along the normals, unit."""
+    across = tangent - normal * np.einsum("...i,...i->...", normal, tangent)[..., None]
+    return across / np.sqrt(np.einsum("...i,...i->...", across, across))[..., None]
+
 
 FREE = np.full(3, np.nan)
 

@@ -19,13 +19,12 @@ from casadi_ik.files.reading import (
     Vector,
     frame_matrix,
     read,
+    read_yaml,
     roll_pitch_yaw,
 )
 from casadi_ik.files.shipped import resolve, shipped_names
 from casadi_ik.files.units import AnyValue, Length, Turn
-from casadi_ik.grasps.grasp import Contact, Grasp
-from casadi_ik.grasps.tolerance import Tolerance
-from casadi_ik.grasps.vectors import MORE
+from casadi_ik.grasps.grasp import MORE, Contact, Grasp, Tolerance
 
 
 class ToleranceEntry(Struct, frozen=True):
@@ -227,3 +226,53 @@ def _loose_numbers(entry: GraspFile) -> Iterator[tuple[str, float]]:
     if entry.object is not None:
         yield from (("object.pose.xyz", value) for value in entry.object.pose.xyz)
         yield from (("object.pose.rpy", value) for value in entry.object.pose.rpy)
+
+
+class CandidatesFile(Struct, frozen=True):
+    """Grasps in a list, of which one is to be chosen.
+
+    Attributes:
+        candidates: Grasps.
+        robot: Of all that name no other.
+        description: One sentence.
+        object: Of all that name no other.
+    """
+
+    candidates: list[GraspFile]
+    robot: str = ""
+    description: str = ""
+    object: ObjectEntry | None = None
+
+
+def load_grasp_files(path: Path) -> tuple[Grasp, ...]:
+    """Load grasps.
+
+    Args:
+        path: A YAML file with a list of grasps (``candidates:``) or with a single one, or a folder
+            of such files, taken by their names.
+
+    Raises:
+        DescriptionError: It is missing, empty or malformed; the message names file and key.
+    """
+    if not path.is_dir():
+        return _of_file(path)
+    files = sorted(item for item in path.iterdir() if item.suffix in (".yaml", ".yml"))
+    if not files:
+        raise DescriptionError(f"{path}: found no YAML file, expected grasp files")
+    return tuple(grasp for file in files for grasp in _of_file(file))
+
+
+def _of_file(path: Path) -> tuple[Grasp, ...]:
+    data = read_yaml(path)
+    if not (isinstance(data, dict) and "candidates" in data):
+        return (load_grasp(path),)
+    file, _ = read(path, CandidatesFile)
+    if not file.candidates:
+        raise DescriptionError(f"{path}: candidates: found none, expected at least one grasp")
+    found = []
+    for i, entry in enumerate(file.candidates):
+        whole = msgspec.structs.replace(
+            entry, robot=entry.robot or file.robot, object=entry.object or file.object
+        )
+        found.append(grasp_of(whole, path, f"{path.stem}[{i}]", f"candidates[{i}]."))
+    return tuple(found)

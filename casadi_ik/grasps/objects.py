@@ -15,9 +15,7 @@ from casadi_ik.files.mesh_file import FORMATS
 from casadi_ik.files.reading import Struct, read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.units import Mass
-from casadi_ik.grasps.mesh_shape import MeshShape, load_mesh_shape
-from casadi_ik.grasps.meshes import Mesh
-from casadi_ik.grasps.shapes import Shape
+from casadi_ik.grasps.shapes import Mesh, MeshShape, Shape, load_mesh_shape
 
 
 class MassEntry(Struct, frozen=True):

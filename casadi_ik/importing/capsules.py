@@ -1,12 +1,12 @@
-"""Meshes as few capsules that hold them.
+"""Meshes as few simple shapes that hold them: capsules, and boxes for what is flat.
 
-A capsule is convex: one that holds a triangle's corners holds the triangle. A mesh is cut where
-that saves most volume, triangle by triangle, and each part gets the smallest capsule that is found.
+Shapes of links come out as a description has them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
+from casadi_ik.files.reading import roll_pitch_yaw
+from casadi_ik.importing.surfaces import Surface
+from casadi_ik.robots.collision_entries import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
 
 Rows = NDArray[np.intp]
 
@@ -279,3 +282,168 @@ def _squared(samples: Array, points: Array, squares: Array) -> Array:
         block = samples[i : i + BLOCK]
         least[i : i + BLOCK] = (block @ turned + squares).min(axis=1) + (block**2).sum(axis=1)
     return np.maximum(least, 0)
+
+
+LEAST_SAVING_OF_BOXES = 0.12
+"""Part of the volume that another box has to save."""
+
+SPREAD = 24
+"""Points along an edge of a box's skin."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedBox:
+    """A box.
+
+    Attributes:
+        rotation: (3, 3) its axes, columns.
+        center: (3,) [m].
+        size: (3,) its edges [m].
+    """
+
+    rotation: Array
+    center: Array
+    size: Array
+
+    @property
+    def volume(self) -> float:
+        """[m^3]."""
+        return float(np.prod(self.size))
+
+    def beyond(self, points: Array) -> Array:
+        """(k,) how far points are outside, negative inside [m]."""
+        local = np.abs((points - self.center) @ self.rotation) - self.size / 2
+        return local.max(axis=1)
+
+    def skin(self) -> Array:
+        """(k, 3) points of its surface."""
+        line = np.linspace(-0.5, 0.5, SPREAD)
+        u, v = (one.ravel() for one in np.meshgrid(line, line))
+        faces = []
+        for axis in range(3):
+            for side in (-0.5, 0.5):
+                face = np.empty((len(u), 3))
+                face[:, axis], face[:, (axis + 1) % 3], face[:, (axis + 2) % 3] = side, u, v
+                faces.append(face)
+        return self.center + (np.concatenate(faces) * self.size) @ self.rotation.T
+
+
+def fit_boxes(triangles: Array, most: int = 3) -> list[FittedBox]:
+    """Boxes that hold a mesh of triangles (t, 3, 3) [m], no more than `most`."""
+    parts = [cut(triangles)]
+    found = [box_around(parts[0].reshape(-1, 3))]
+    while len(parts) < most:
+        options = []
+        for i, part in enumerate(parts):
+            for below in halves(part):
+                two = part[below], part[~below]
+                pair = [box_around(one.reshape(-1, 3)) for one in two]
+                saved = found[i].volume - pair[0].volume - pair[1].volume
+                options.append((saved, i, two, pair))
+        if not options:
+            break
+        saved, i, two, pair = max(options, key=lambda option: option[0])
+        if saved < LEAST_SAVING_OF_BOXES * sum(one.volume for one in found):
+            break
+        parts[i : i + 1], found[i : i + 1] = two, pair
+    return found
+
+
+def box_around(points: Array) -> FittedBox:
+    """A small box that holds points (k, 3) [m], along the frame's axes or the points' own."""
+    _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    if np.linalg.det(axes) < 0:
+        axes[2] *= -1
+    found = []
+    for rotation in (np.eye(3), axes.T):
+        local = points @ rotation
+        low, high = local.min(axis=0), local.max(axis=0)
+        found.append(FittedBox(rotation, rotation @ ((low + high) / 2), high - low))
+    # Its own axes only where they save something: plain numbers are better to read.
+    return found[1] if found[1].volume < 0.9 * found[0].volume else found[0]
+
+
+GRID = 1e4
+"""What is fitted is rounded up to a tenth of a millimetre."""
+
+LARGE = 0.13
+"""Links longer than this [m] may have more capsules than `SMALL`."""
+
+MOST = 4
+"""Capsules of a large link, unless more are asked for."""
+
+SMALL = 2
+"""Capsules of a small link, at the most."""
+
+LEAST = 1e-4
+"""What is smaller than this [m] is no shape."""
+
+
+def fitted(
+    surfaces: Mapping[str, Surface],
+    flat: Collection[str],
+    known: Mapping[str, Sequence[ShapeEntry]] | None = None,
+    most: int = MOST,
+    saving: float = LEAST_SAVING,
+) -> dict[str, list[ShapeEntry]]:
+    """Shapes that hold links.
+
+    Args:
+        surfaces: By link what is to be held, in the link's frame.
+        flat: Links that may be held by boxes: a palm, which fingers come near.
+        known: By link shapes that are simple already; they stay what they are.
+        most: Capsules of a large link, at the most.
+        saving: Part of the volume that another one has to save.
+    """
+    found: dict[str, list[ShapeEntry]] = {}
+    for link, surface in surfaces.items():
+        if known and link in known:
+            found[link] = list(known[link])
+        elif len(surface.triangles) and float(np.ptp(surface.points, axis=0).max()) > LEAST:
+            large = float(np.ptp(surface.points, axis=0).max()) > LARGE
+            triangles = surface.points[surface.triangles]
+            found[link] = _held(triangles, most if large else SMALL, link in flat, saving)
+    return found
+
+
+def _held(triangles: Array, most: int, flat: bool, saving: float) -> list[ShapeEntry]:
+    """Capsules that hold a mesh, or boxes where it may be flat and they hold it closer."""
+    capsules, beyond = fit(triangles, most, saving)
+    boxes = fit_boxes(triangles) if flat else []
+    if boxes:
+        closer = excess(boxes, cut(triangles).reshape(-1, 3))
+        if closer < beyond:
+            return [_box(one, _up(closer, 1e3)) for one in boxes]
+    return [_capsule(one, _up(beyond, 1e3)) for one in capsules]
+
+
+def _capsule(one: FittedCapsule, beyond: float) -> ShapeEntry:
+    first, last = (_rounded(end) for end in (one.first, one.last))
+    radius = math.ceil(one.radius * GRID + 0.9) / GRID
+    if first == last:
+        return SphereEntry(radius=radius, center=first, excess=beyond)
+    return CapsuleEntry(ends=(first, last), radius=radius, excess=beyond)
+
+
+def _box(one: FittedBox, beyond: float) -> ShapeEntry:
+    size = np.ceil(one.size * GRID + 1.1) / GRID
+    rpy = np.round(roll_pitch_yaw(one.rotation), 4)
+    if np.any(rpy):  # what rounding may turn it by
+        size = np.ceil((size + 1e-4 * np.linalg.norm(size)) * GRID) / GRID
+    x, y, z = size.tolist()
+    roll, pitch, yaw = (rpy + 0.0).tolist()
+    return BoxEntry(size=(x, y, z), xyz=_rounded(one.center), rpy=(roll, pitch, yaw), excess=beyond)
+
+
+def _rounded(point: Array) -> tuple[float, float, float]:
+    x, y, z = (np.round(point * GRID) / GRID + 0.0).tolist()
+    return x, y, z
+
+
+def _up(value: float, grid: float) -> float:
+    return math.ceil(grid * value) / grid
+
+
+def worst(shapes: Mapping[str, Sequence[ShapeEntry]]) -> float:
+    """By how much shapes stand out beyond what they hold, at most [m]."""
+    return max((one.excess for found in shapes.values() for one in found), default=0.0)

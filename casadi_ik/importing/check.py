@@ -10,7 +10,7 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.importing.mounted import hand_links
+from casadi_ik.importing.robot_shapes import hand_links
 from casadi_ik.robots.part import PREFIX
 from casadi_ik.robots.robot_files.mjcf_file import joint_name
 from casadi_ik.robots.robot_files.tree import RobotTree

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import casadi as ca
 
-from casadi_ik.files.leftovers import tidy
+from casadi_ik.files.writing import tidy
 from casadi_ik.kernels.cancellation import interrupt_afterwards
 from casadi_ik.kernels.codegen import library_source
 from casadi_ik.kernels.compiler import (

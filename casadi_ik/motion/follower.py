@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
-from casadi_ik.grasps.arrays import real_array
+from casadi_ik.grasps.grasp import real_array
 from casadi_ik.motion.asked import Asked
 from casadi_ik.motion.following import FollowState, FollowStatus
 from casadi_ik.motion.guard import OBSTACLES, Guard

@@ -19,7 +19,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
-from casadi_ik.grasps.arrays import real_array
+from casadi_ik.grasps.grasp import real_array
 
 KEYPOINTS = 21
 """Of a hand."""

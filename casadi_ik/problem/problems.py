@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.grasps import Tolerance
-from casadi_ik.grasps.arrays import real_array, unit_vectors
+from casadi_ik.grasps.grasp import real_array, unit_vectors
 from casadi_ik.grasps.pose import checked_pose
 from casadi_ik.robots.description import RobotDescription
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.grasps.arrays import real_array
+from casadi_ik.grasps.grasp import real_array
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.one_target import OneTarget
 from casadi_ik.problem.preference import preference

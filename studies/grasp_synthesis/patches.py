@@ -22,7 +22,7 @@ from casadi_ik.grasps import (
     Shape,
     Sphere,
 )
-from casadi_ik.grasps.mesh_shape import MeshShape
+from casadi_ik.grasps.shapes import MeshShape
 
 
 def primitive(item: GraspObject) -> Shape:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from casadi_ik.importing.shape_lines import collision_lines
+from casadi_ik.importing.write import collision_lines
 from casadi_ik.robots.collision import Touching
 from casadi_ik.robots.collision_entries import ShapeEntry
 

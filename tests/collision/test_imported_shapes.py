@@ -15,7 +15,7 @@ from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.reading import Frame, convert, frame_matrix
 from casadi_ik.files.units import in_si
 from casadi_ik.importing import capsules, imported
-from casadi_ik.importing.shape_lines import collision_lines
+from casadi_ik.importing.write import collision_lines
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.robots import load_description
 from casadi_ik.robots.collision import Touching, capsules_of

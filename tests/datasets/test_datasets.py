@@ -16,8 +16,7 @@ import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.cli.report import reasons
 from casadi_ik.datasets.conventions import load_convention
-from casadi_ik.datasets.hand_poses import HandPoses
-from casadi_ik.datasets.hands import link_poses
+from casadi_ik.datasets.postures import HandPoses, link_poses
 from casadi_ik.errors import DescriptionError, UnknownNameError, UnsupportedError
 from casadi_ik.grasps import load_object
 from casadi_ik.problem.hand_motors import hand_motors

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays_of
 
 import casadi_ik as ik
 from casadi_ik.errors import DescriptionError, InputError, RowError
-from casadi_ik.grasps.vectors import MORE, fault, faulty
+from casadi_ik.grasps.grasp import MORE, fault, faulty
 from casadi_ik.logs import one_solve
 from casadi_ik.problem.contacts.arrays import NAMES, by_kinds, more_arrays
 from casadi_ik.problem.contacts.conditions import CONDITIONS

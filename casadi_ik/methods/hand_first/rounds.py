@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.grasps.arrays import LARGE, SMALL, UNIT
+from casadi_ik.grasps.grasp import LARGE, SMALL, UNIT
 from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
 from casadi_ik.kernels.codegen import define
 from casadi_ik.kernels.constants import define_arrays, number

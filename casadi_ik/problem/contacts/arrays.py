@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnknownNameError
-from casadi_ik.grasps.arrays import unit_vectors
-from casadi_ik.grasps.vectors import MORE, fault, faulty, squared
+from casadi_ik.grasps.grasp import MORE, fault, faulty, squared, unit_vectors
 from casadi_ik.problem.contacts.kinds import Kinds, kind_of, usual
 from casadi_ik.problem.problems import DIRECTIONS, Problems
 

@@ -214,4 +214,4 @@ CONDITIONS: dict[str, Condition] = {
         ),
     )
 }
-"""What can be asked. To add a condition, add a row; if it needs new data, see `grasps.vectors`."""
+"""What can be asked. To add a condition, add a row; if it needs new data, see `grasps.grasp`."""
