@@ -21,7 +21,7 @@ from casadi_ik.importing.capsules import LEAST_SAVING, MOST, fitted, worst
 from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.robot_shapes import may_touch
 from casadi_ik.importing.surfaces import Surface, together
-from casadi_ik.robots.described_parts import arm_part, hand_part
+from casadi_ik.robots.parts import arm_part, hand_part
 from casadi_ik.robots.schema import ArmFile, HandFile
 
 

@@ -26,8 +26,7 @@ from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.robots.collision import LinkCapsule, LinkSolid
-from casadi_ik.robots.described_parts import arm_part, hand_part
-from casadi_ik.robots.part import Part
+from casadi_ik.robots.parts import Part, arm_part, hand_part
 from casadi_ik.robots.schema import ArmFile, HandFile
 
 SHARE = "example_robot_data/cmeel.prefix/share/example-robot-data/robots"

@@ -23,7 +23,7 @@ from casadi_ik.importing.capsules import worst
 from casadi_ik.importing.check import largest_difference
 from casadi_ik.importing.imported import Imported
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.robots.part import PREFIX
+from casadi_ik.robots.parts import PREFIX
 from casadi_ik.symbolic.closed_arms.in_words import form_in_words, is_searched
 
 SAMPLES = 20

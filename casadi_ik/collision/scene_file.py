@@ -6,7 +6,7 @@ import msgspec
 
 from casadi_ik.files.reading import Angles, Point, Struct
 from casadi_ik.files.units import Length, Pure
-from casadi_ik.robots.collision_entries import TouchingEntry
+from casadi_ik.robots.schema import TouchingEntry
 
 Quaternion = tuple[Pure, Pure, Pure, Pure]
 PoseRow = tuple[Pure, Pure, Pure, Length]

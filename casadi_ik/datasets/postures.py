@@ -1,4 +1,4 @@
-"""Poses and postures of a hand as a data set has them, and the nearest that a robot's hand can take."""
+"""Postures of a hand as a data set has them, and the nearest that a robot's hand can take."""
 
 from __future__ import annotations
 

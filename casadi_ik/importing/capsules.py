@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.robots.collision_entries import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
+from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, ShapeEntry, SphereEntry
 
 Rows = NDArray[np.intp]
 

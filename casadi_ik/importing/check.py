@@ -11,7 +11,7 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.importing.robot_shapes import hand_links
-from casadi_ik.robots.part import PREFIX
+from casadi_ik.robots.parts import PREFIX
 from casadi_ik.robots.robot_files.mjcf_file import joint_name
 from casadi_ik.robots.robot_files.tree import RobotTree
 from casadi_ik.robots.robot_files.urdf_file import bare, pinocchio

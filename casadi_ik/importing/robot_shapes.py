@@ -18,10 +18,10 @@ from casadi_ik.importing.capsules import GRID, fitted
 from casadi_ik.importing.posture import Jointed, Postures
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.robots.collision import Touching, capsules_of
-from casadi_ik.robots.collision_entries import ShapeEntry
 from casadi_ik.robots.description import Actuator, Joint, RobotDescription
-from casadi_ik.robots.part import PREFIX
+from casadi_ik.robots.parts import PREFIX
 from casadi_ik.robots.robot_files.tree import RobotTree
+from casadi_ik.robots.schema import ShapeEntry
 
 
 def hand_links(robot: RobotDescription) -> frozenset[str]:

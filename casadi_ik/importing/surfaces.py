@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.mesh_file import FARTHEST, read_mesh
-from casadi_ik.robots.robot_files.file_shapes import pose_of, simple_shape, values_of
 from casadi_ik.robots.robot_files.foreign import package_folders
-from casadi_ik.robots.robot_files.tree import RobotTree
-from casadi_ik.robots.robot_files.xml_text import Element
+from casadi_ik.robots.robot_files.tree import Element, RobotTree, pose_of, simple_shape, values_of
 
 AROUND = 24
 """Points around an axis."""

@@ -15,7 +15,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.importing.guess import Pad
 from casadi_ik.robots.collision import Touching
-from casadi_ik.robots.collision_entries import ShapeEntry
+from casadi_ik.robots.schema import ShapeEntry
 
 PLAIN = re.compile(r"[A-Za-z_/.][A-Za-z0-9_./+-]*")
 """What YAML takes for text without quotes; nothing that it could take for anything else."""

@@ -1,9 +1,4 @@
-"""Shapes of links: what stands in a description, and the capsules it becomes.
-
-A capsule is all that is within its radius of a segment; one without length is a sphere. Boxes and
-cylinders stay what they are, and have capsules beside that hold them: where two of them, or one of
-them and a solid of a scene, are apart, the capsules stand for one.
-"""
+"""Shapes of links for collisions, and the pairs of links that are checked."""
 
 from __future__ import annotations
 
@@ -17,7 +12,8 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, Point, frame_matrix
-from casadi_ik.robots.collision_entries import (
+from casadi_ik.robots.robot_files.tree import attribute, parse_xml, read_text
+from casadi_ik.robots.schema import (
     BoxEntry,
     CapsuleEntry,
     CollisionEntry,
@@ -25,7 +21,24 @@ from casadi_ik.robots.collision_entries import (
     ShapeEntry,
     SphereEntry,
 )
-from casadi_ik.robots.robot_files.srdf_file import srdf_pairs
+
+
+def srdf_pairs(path: Path) -> list[tuple[tuple[str, str], str]]:
+    """The pairs of ``disable_collisions``, each with the file's reason.
+
+    Raises:
+        DescriptionError: The file cannot be read, is no SRDF, or a pair lacks a link.
+    """
+    element = parse_xml(read_text(path), path)
+    if element.tag != "robot":
+        raise DescriptionError(f"{path}: found <{element.tag}>, expected <robot> of an SRDF")
+    found: list[tuple[tuple[str, str], str]] = []
+    for i, pair in enumerate(element.iter("disable_collisions")):
+        where = f"{path}: disable_collisions[{i}]"
+        links = attribute(pair, "link1", where), attribute(pair, "link2", where)
+        found.append((links, f"{path.name}: {pair.get('reason', 'no reason given')}"))
+    return found
+
 
 MOST_AROUND = 4
 """Capsules across a side of a box or a cylinder, at the most."""

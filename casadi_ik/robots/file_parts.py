@@ -10,15 +10,20 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.robots.checks import check_couplings
 from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
-from casadi_ik.robots.collision_entries import CollisionEntry
 from casadi_ik.robots.couplings import Coupling, Linear
 from casadi_ik.robots.description import Actuator, Joint, frozen
-from casadi_ik.robots.part import HandPart, Part
+from casadi_ik.robots.parts import HandPart, Part, check_couplings
 from casadi_ik.robots.robot_files.read import read_tree
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, turned
-from casadi_ik.robots.schema import ArmFromFile, ContactEntry, HandFromFile, LinkFrame, PadEntry
+from casadi_ik.robots.schema import (
+    ArmFromFile,
+    CollisionEntry,
+    ContactEntry,
+    HandFromFile,
+    LinkFrame,
+    PadEntry,
+)
 
 ENDLESS = 2 * math.pi
 """A joint without ends may turn this far to either side [rad]."""

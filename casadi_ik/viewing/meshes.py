@@ -8,7 +8,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.importing.imported import tree_of
 from casadi_ik.importing.surfaces import Surface, link_surfaces
-from casadi_ik.robots.part import PREFIX
+from casadi_ik.robots.parts import PREFIX
 
 
 def robot_meshes(robot: ArmHand, path: Path) -> dict[str, Surface]:

@@ -10,7 +10,7 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.surfaces import Surface, link_surfaces
-from casadi_ik.robots.part import Part
+from casadi_ik.robots.parts import Part
 from casadi_ik.robots.robot_files.read import read_tree
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
 

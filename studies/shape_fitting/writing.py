@@ -7,7 +7,7 @@ from pathlib import Path
 
 from casadi_ik.importing.write import collision_lines
 from casadi_ik.robots.collision import Touching
-from casadi_ik.robots.collision_entries import ShapeEntry
+from casadi_ik.robots.schema import ShapeEntry
 
 
 def write(

@@ -19,7 +19,7 @@ from casadi_ik.importing.write import collision_lines
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.robots import load_description
 from casadi_ik.robots.collision import Touching, capsules_of
-from casadi_ik.robots.collision_entries import BoxEntry, CapsuleEntry, CollisionEntry
+from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, CollisionEntry
 
 PLACE = '<origin xyz="0 0 0.02" rpy="0.3 0.2 0.1"/>'
 SIMPLE = {

@@ -14,7 +14,7 @@ from casadi_ik.collision.model import collision_model
 from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.robots import load_description
 from casadi_ik.robots.collision import capsules_of
-from casadi_ik.robots.collision_entries import BoxEntry, CylinderEntry
+from casadi_ik.robots.schema import BoxEntry, CylinderEntry
 
 
 def test_shapes_come_with_the_parts(tmp_path):

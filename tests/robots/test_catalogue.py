@@ -21,7 +21,7 @@ from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.importing.posture import Postures
 from casadi_ik.robots import load_description
-from casadi_ik.robots.described_parts import arm_part, hand_part
+from casadi_ik.robots.parts import arm_part, hand_part
 from casadi_ik.robots.schema import ArmFile, HandFile
 
 ARMS = [

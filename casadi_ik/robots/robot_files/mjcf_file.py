@@ -12,9 +12,15 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
 from casadi_ik.robots.couplings import Coupling, Linear, Polynomial
 from casadi_ik.robots.robot_files.confined import MODEL, confined
-from casadi_ik.robots.robot_files.file_shapes import mjcf_shapes
-from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, fixed, turned
-from casadi_ik.robots.robot_files.xml_text import FURTHEST, check_size
+from casadi_ik.robots.robot_files.tree import (
+    FURTHEST,
+    RobotTree,
+    TreeJoint,
+    check_size,
+    fixed,
+    mjcf_shapes,
+    turned,
+)
 
 WORLD = "world"
 """MuJoCo's name of what does not move."""

@@ -8,9 +8,8 @@ from pathlib import Path
 from casadi_ik.errors import DescriptionError
 from casadi_ik.robots.robot_files.confined import MACROS, confined
 from casadi_ik.robots.robot_files.mjcf_file import read_mjcf
-from casadi_ik.robots.robot_files.tree import RobotTree
+from casadi_ik.robots.robot_files.tree import RobotTree, parse_xml, read_text
 from casadi_ik.robots.robot_files.urdf_file import read_urdf
-from casadi_ik.robots.robot_files.xml_text import parse_xml, read_text
 
 MACRO_TAGS = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
 """How the tags of macros begin."""

@@ -22,15 +22,17 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, MissingExtraError
 from casadi_ik.robots.couplings import Coupling, Linear
-from casadi_ik.robots.robot_files.file_shapes import urdf_shapes
-from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint, parents_first
-from casadi_ik.robots.robot_files.xml_text import (
+from casadi_ik.robots.robot_files.tree import (
     FURTHEST,
     Element,
+    RobotTree,
+    TreeJoint,
     attribute,
     check_size,
     check_vector,
     number,
+    parents_first,
+    urdf_shapes,
 )
 
 KINEMATIC = ("origin", "parent", "child", "axis", "limit")

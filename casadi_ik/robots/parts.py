@@ -1,0 +1,401 @@
+"""An arm or a hand as a part of a robot: checked, and read from our own files joint by joint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import DescriptionError
+from casadi_ik.files.reading import Frame, frame_matrix
+from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
+from casadi_ik.robots.description import Actuator, Joint, frozen
+from casadi_ik.robots.schema import (
+    ActuatorEntry,
+    ArmFile,
+    ContactEntry,
+    HandFile,
+    JointEntry,
+    PadEntry,
+)
+
+LONGEST_NAME = 100
+"""Characters of a name."""
+
+
+def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: Path) -> None:
+    """Whether every coupling ends at an actuator, and every actuator moves something.
+
+    Args:
+        joints: The movable joints by name.
+        actuators: The actuators.
+        path: The file they stand in.
+
+    Raises:
+        DescriptionError: See above; or a coupling follows something of another unit, or a slider
+            leaves its triangle.
+    """
+    units = {joint.name: "m" if joint.type == "prismatic" else "rad" for joint in joints.values()}
+    units |= {actuator.name: actuator.unit for actuator in actuators}
+    followed = {joint.coupling.of for joint in joints.values() if joint.coupling is not None}
+    for actuator in actuators:
+        if actuator.name not in joints and actuator.name not in followed:
+            raise DescriptionError(
+                f"{path}: actuators.{actuator.name}: moves nothing; expected the name of a joint, "
+                "or a coupling that follows it"
+            )
+    for joint in joints.values():
+        _check_coupling(joint, joints, {actuator.name for actuator in actuators}, path)
+        if (coupling := joint.coupling) is None:
+            continue
+        if coupling.source_unit and units[coupling.of] != coupling.source_unit:
+            raise DescriptionError(
+                f"{path}: joint {joint.name!r}: coupling.of: {coupling.of!r} is in "
+                f"{units[coupling.of]}, expected something in {coupling.source_unit}"
+            )
+        motor = next((one for one in actuators if one.name == coupling.of), None)
+        if motor is not None:
+            where = f"{path}: joint {joint.name!r}: coupling"
+            coupling.check_stroke(motor.name, motor.lower, motor.upper, where)
+
+
+def _check_coupling(
+    joint: Joint, by_name: dict[str, Joint], actuators: set[str], path: Path
+) -> None:
+    """Follow a joint's couplings down to an actuator."""
+    where = f"{path}: joint {joint.name!r}"
+    followed, current = [joint.name], joint
+    while current.coupling is not None:
+        source = current.coupling.of
+        if source in followed:
+            cycle = " -> ".join([*followed, source])
+            raise DescriptionError(f"{where}: coupling.of: is a cycle {cycle}")
+        if source in actuators:
+            return
+        if source not in by_name:
+            raise DescriptionError(
+                f"{where}: coupling.of: unknown joint or actuator {source!r}; known: "
+                + ", ".join([*by_name, *sorted(actuators - set(by_name))])
+            )
+        followed.append(source)
+        current = by_name[source]
+    if current.name not in actuators:
+        raise DescriptionError(
+            f"{where}: coupling: missing, and there is no {current.name!r} under 'actuators'"
+        )
+
+
+def unique(names: Iterable[str], where: str) -> None:
+    """Refuse a name that appears twice."""
+    seen: set[str] = set()
+    for name in names:
+        usable(name, where)
+        if name in seen:
+            raise DescriptionError(f"{where}: {name!r} appears twice")
+        seen.add(name)
+
+
+def usable(name: str, where: str) -> None:
+    """Refuse a name that is empty, or too long to be read in a table or a file's name."""
+    if not 0 < len(name) <= LONGEST_NAME:
+        raise DescriptionError(
+            f"{where}: found a name of {len(name)} characters, expected 1 to {LONGEST_NAME}"
+        )
+
+
+def known_link(link: str, root: str, joints: list[Joint], where: str) -> str:
+    """The link, if it is the root or some joint's child."""
+    links = [root, *(joint.child for joint in joints)]
+    if link not in links:
+        raise DescriptionError(f"{where}: unknown link {link!r}; known: {', '.join(links)}")
+    return link
+
+
+def known_source(tags: str, sources: dict[str, str], where: str) -> None:
+    """Refuse source tags (separated by blanks or commas) that are empty or not explained."""
+    for tag in tags.replace(",", " ").split():
+        if tag not in sources:
+            raise DescriptionError(f"{where}: unknown tag {tag!r}; sources: {', '.join(sources)}")
+    if not tags.strip():
+        raise DescriptionError(f"{where}: is empty; every number needs its source")
+
+
+def positive(value: float, where: str) -> float:
+    """The value, if it is above zero."""
+    if not value > 0:
+        raise DescriptionError(f"{where}: found {value:.6g}, expected > 0")
+    return value
+
+
+PREFIX = "hand_"
+"""Put before a name of the hand that the arm has as well."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """An arm, or what all parts have.
+
+    Attributes:
+        name: What it is called.
+        where: Its file and key, for messages.
+        root: Its base link.
+        joints: Its joints, parents before children.
+        actuators: Its motors.
+        sources: Where its numbers come from, by tag.
+        tip_link: Link that carries what comes next: an arm's tip, a hand's palm.
+        tip: (4, 4) pose of the tip or palm frame in that link.
+        home: Positions of some motors.
+        shapes: Of its links, for collisions.
+    """
+
+    name: str
+    where: str
+    root: str
+    joints: list[Joint]
+    actuators: list[Actuator]
+    sources: dict[str, str]
+    tip_link: str
+    tip: Array
+    home: dict[str, float]
+    shapes: Shapes = NO_SHAPES
+
+
+@dataclass(frozen=True)
+class HandPart(Part):
+    """A hand.
+
+    Attributes:
+        pads: Its contact frames, by finger.
+        thumb: The finger placed first, if it says so itself.
+        mount: (4, 4) pose of its root on an arm's tip, if the robot says nothing.
+    """
+
+    pads: dict[str, ContactEntry | PadEntry] = field(default_factory=dict)
+    thumb: str | None = None
+    mount: Array = field(default_factory=lambda: np.eye(4))
+
+
+def told_apart(hand: HandPart, arm: Part) -> HandPart:
+    """The hand, with `PREFIX` before every name of a link, joint or motor that the arm has too."""
+    links = {arm.root, *(joint.child for joint in arm.joints)}
+    movers = {joint.name for joint in arm.joints} | {one.name for one in arm.actuators} | {"mount"}
+    theirs = {joint.name for joint in hand.joints} | {one.name for one in hand.actuators}
+    theirs_links = {hand.root, *(joint.child for joint in hand.joints)}
+
+    def link(name: str) -> str:
+        return _free(name, links, theirs_links)
+
+    def mover(name: str) -> str:
+        return _free(name, movers, theirs)
+
+    joints = [
+        replace(
+            joint,
+            name=mover(joint.name),
+            parent=link(joint.parent),
+            child=link(joint.child),
+            coupling=joint.coupling
+            and msgspec.structs.replace(joint.coupling, of=mover(joint.coupling.of)),
+        )
+        for joint in hand.joints
+    ]
+    return replace(
+        hand,
+        root=link(hand.root),
+        joints=joints,
+        actuators=[replace(one, name=mover(one.name)) for one in hand.actuators],
+        shapes=hand.shapes.renamed({name: link(name) for name in theirs_links}),
+        tip_link=link(hand.tip_link),
+        home={mover(name): value for name, value in hand.home.items()},
+        pads={
+            name: msgspec.structs.replace(pad, link=link(pad.link))
+            for name, pad in hand.pads.items()
+        },
+    )
+
+
+def _free(name: str, taken: set[str], own: set[str]) -> str:
+    if name not in taken:
+        return name
+    while name in taken or name in own:
+        name = PREFIX + name
+    return name
+
+
+JOINT_TYPES = ("revolute", "prismatic", "fixed")
+
+
+def arm_part(arm: ArmFile, path: Path) -> Part:
+    """An arm, checked.
+
+    Raises:
+        DescriptionError: With file, key, what was found and what was expected.
+    """
+    joints = _joints(arm.joints, arm.root, arm.sources, "arm", path)
+    actuators = _actuators(None, joints, arm.sources, "arm", path)
+    tip = known_link(arm.tip.link, arm.root, joints, f"{path}: tip.link")
+    known_source(arm.tip.source, arm.sources, f"{path}: tip.source")
+    pose = frame_matrix(Frame(arm.tip.xyz, arm.tip.rpy))
+    return Part(
+        arm.name,
+        str(path),
+        arm.root,
+        joints,
+        actuators,
+        arm.sources,
+        tip,
+        pose,
+        arm.home,
+        _shapes(arm, joints, path),
+    )
+
+
+def hand_part(hand: HandFile, path: Path) -> HandPart:
+    """A hand, checked.
+
+    Raises:
+        DescriptionError: With file, key, what was found and what was expected.
+    """
+    joints = _joints(hand.joints, hand.root, hand.sources, "hand", path)
+    actuators = _actuators(hand.actuators, joints, hand.sources, "hand", path)
+    palm = known_link(hand.palm.link, hand.root, joints, f"{path}: palm.link")
+    known_source(hand.palm.source, hand.sources, f"{path}: palm.source")
+    for name, finger in hand.fingers.items():
+        known_source(finger.source, hand.sources, f"{path}: fingers.{name}.source")
+    return HandPart(
+        hand.name,
+        str(path),
+        hand.root,
+        joints,
+        actuators,
+        hand.sources,
+        palm,
+        frame_matrix(Frame(hand.palm.xyz, hand.palm.rpy)),
+        hand.home,
+        _shapes(hand, joints, path),
+        dict(hand.fingers),
+        hand.thumb,
+        frame_matrix(hand.mount),
+    )
+
+
+def _shapes(part: ArmFile | HandFile, joints: list[Joint], path: Path) -> Shapes:
+    if part.collision is not None and part.collision.links:
+        known_source(part.collision.source, part.sources, f"{path}: collision.source")
+    links = (part.root, *(joint.child for joint in joints))
+    return link_shapes(part.collision, links, path)
+
+
+def _joints(
+    entries: list[JointEntry], root: str, sources: dict[str, str], part: str, path: Path
+) -> list[Joint]:
+    """Checked joints, parents before children."""
+    names = [entry.name for entry in entries]
+    unique(names, f"{path}: joints")
+    unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
+    for entry in entries:
+        where = f"{path}: joint {entry.name!r}"
+        if entry.type not in JOINT_TYPES:
+            raise DescriptionError(
+                f"{where}: type: found {entry.type!r}, expected one of {', '.join(JOINT_TYPES)}"
+            )
+        low, high = entry.limits
+        if not low <= high:
+            raise DescriptionError(f"{where}: limits: lower {low:.6g} is above upper {high:.6g}")
+        if not np.linalg.norm(entry.axis) > 1e-9:
+            raise DescriptionError(f"{where}: axis: is zero, expected a direction")
+        if entry.velocity is not None:
+            positive(entry.velocity, f"{where}: velocity")
+        known_source(entry.source, sources, f"{where}: source")
+        if entry.coupling is not None:
+            entry.coupling.check(f"{where}: coupling")
+    by_parent: dict[str, list[JointEntry]] = {}
+    for entry in entries:
+        by_parent.setdefault(entry.parent, []).append(entry)
+    ordered: list[JointEntry] = []
+    frontier = [root]
+    while frontier:
+        children = by_parent.pop(frontier.pop(0), [])
+        ordered += children
+        frontier += [entry.child for entry in children]
+    if by_parent:
+        stray = next(iter(by_parent.values()))[0]
+        links = {entry.child for entry in entries}
+        problem = "is part of a frame cycle" if stray.parent in links else "is no link"
+        raise DescriptionError(
+            f"{path}: joint {stray.name!r}: parent: {stray.parent!r} {problem}; "
+            f"expected a chain of joints down to the root {root!r}"
+        )
+    ordered.sort(key=lambda entry: names.index(entry.name))
+    return [_joint(entry, part) for entry in _parents_first(ordered, root)]
+
+
+def _parents_first(entries: list[JointEntry], root: str) -> list[JointEntry]:
+    """The file's own order, moved only where a child stands before its parent."""
+    placed, known = [], {root}
+    waiting = list(entries)
+    while waiting:
+        entry = next(item for item in waiting if item.parent in known)
+        waiting.remove(entry)
+        placed.append(entry)
+        known.add(entry.child)
+    return placed
+
+
+def _joint(entry: JointEntry, part: str) -> Joint:
+    axis = np.asarray(entry.axis, dtype=float)
+    return Joint(
+        name=entry.name,
+        parent=entry.parent,
+        child=entry.child,
+        type=entry.type,
+        placement=frozen(frame_matrix(entry.origin)),
+        axis=frozen(axis / np.linalg.norm(axis)),
+        lower=entry.limits[0],
+        upper=entry.limits[1],
+        velocity=math.inf if entry.velocity is None else entry.velocity,
+        coupling=entry.coupling,
+        part=part,
+    )
+
+
+def _actuators(
+    entries: dict[str, ActuatorEntry] | None,
+    joints: list[Joint],
+    sources: dict[str, str],
+    part: str,
+    path: Path,
+) -> list[Actuator]:
+    """The part's actuators, after checking that every coupling ends at one of them."""
+    by_name = {joint.name: joint for joint in joints if joint.type != "fixed"}
+    if entries is None:
+        entries = {name: ActuatorEntry() for name, j in by_name.items() if j.coupling is None}
+    actuators = []
+    for name, entry in entries.items():
+        where = f"{path}: actuators.{name}"
+        joint = by_name.get(name)
+        if joint is not None and joint.coupling is not None:
+            raise DescriptionError(f"{where}: joint {name!r} follows {joint.coupling.of!r} already")
+        if entry.limits is None and joint is None:
+            raise DescriptionError(f"{where}: limits: missing (no joint has this name)")
+        if entry.unit not in ("rad", "m"):
+            raise DescriptionError(f"{where}: unit: found {entry.unit!r}, expected 'rad' or 'm'")
+        low, high = entry.limits or ((joint.lower, joint.upper) if joint else (0.0, 0.0))
+        if not low < high:
+            raise DescriptionError(
+                f"{where}: limits: lower {low:.6g} is not below upper {high:.6g}"
+            )
+        velocity = joint.velocity if joint else math.inf
+        if entry.velocity is not None:
+            velocity = positive(entry.velocity, f"{where}: velocity")
+        if entry.source or joint is None:
+            known_source(entry.source, sources, f"{where}: source")
+        unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit
+        actuators.append(Actuator(name, unit, low, high, velocity, part))
+    check_couplings(by_name, actuators, path)
+    return actuators
