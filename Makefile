@@ -73,7 +73,7 @@ page: $(VENV)/dev.stamp
 
 # Where the other solvers are installed (pip install -e ".[peers]") they are measured too.
 bench: $(VENV)/dev.stamp
-	$(BIN)/python studies/bench.py
+	$(BIN)/python studies/bench.py --report out/bench
 
 notebooks: $(VENV)/dev.stamp
 	$(BIN)/jupyter execute --inplace notebooks/*.ipynb

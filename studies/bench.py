@@ -1,279 +1,171 @@
-"""Timings on this machine: `make bench` prints them and writes studies/results/bench/README.md.
+"""Timings on this machine, by turns with another checkout of the package if one is named.
 
-python studies/bench.py             # everything, some minutes
-python studies/bench.py --quick     # small sizes, to see that it runs
+::
+
+    python studies/bench.py                                    # everything that is quick
+    python studies/bench.py --part batch fast --robots ur5e+shadow --against ../other
+    python studies/bench.py --part first-use export logs --report out/bench
+    python studies/bench.py --part peers --robots panda+allegro_right      # extra `peers`
+    python studies/bench.py --part view --page out/page/index.html         # needs Chromium
+
+Every package measured has a process of its own that runs the same code (`bench_parts.py`, public
+names only); the two take turns, and of all turns the least counts. Machines differ and are noisy:
+quote ratios.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
-import statistics
+import json
+import os
+import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
-import bench_log_parts
-import bench_logs
-import numpy as np
-from bench_first_use import first_use
-from bench_report import Section, write_report
-from peers import installed, kinds, measured
-from targets import random_arm_targets
+from bench_parts import ABROAD, CASES, Case
+from rich.console import Console
+from runner import command, markdown_table, program, provenance, write_page
 
-import casadi_ik as ik
+from casadi_ik.batches.code import code_version
+from casadi_ik.errors import InputError
 
-ROBOT = "kuka_lwr_barrett"
-REPORT = Path(__file__).parent / "results" / "bench" / "README.md"
+ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+shadow", "xarm6+leap")
+USUAL = ("batch", "fast", "single", "scene", "follow")
 
+INTRODUCTION = """
+Least of {turns} turns; processor time of the measured thread, verdicts included, unless the row
+says otherwise. Counts are of the answers that were timed. Load of the machine at the end: {load}.
+"""
 
-@dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
-
-    Attributes:
-        batch: Targets per batch.
-        repeats: Of every measurement.
-        memory: Solves of the memory test.
-        peers: Targets of each kind for other solvers.
-        iterations: Targets on which the paper's methods iterate.
-        later: Processes that find the cache full.
-    """
-
-    batch: int = 6000
-    repeats: int = 7
-    memory: int = 1_000_000
-    peers: int = 60
-    iterations: int = 120
-    later: int = 3
+AGAINST = """
+*other* is the package in `{path}`, measured by turns by the same code. *ratio:* least time here
+over least time there; *by turns:* the median of the ratios of single turns.
+"""
 
 
-QUICK = Sizes(batch=240, repeats=2, memory=2_000, peers=12, iterations=4, later=1)
+class Worker:
+    """A process that measures one package."""
 
-
-@dataclass(frozen=True)
-class Timing:
-    """Seconds of several repetitions, each divided by what was done in it."""
-
-    least: float
-    median: float
-
-    @property
-    def cells(self) -> tuple[str, str]:
-        """In microseconds."""
-        return f"{1e6 * self.least:.1f}", f"{1e6 * self.median:.1f}"
-
-
-def timed(
-    run: Callable[[], object], repeats: int, count: int, clock: Callable[[], float]
-) -> Timing:
-    """Time a call that does `count` things; one call goes uncounted before."""
-    run()
-    times = []
-    for _ in range(repeats):
-        begin = clock()
-        run()
-        times.append((clock() - begin) / count)
-    return Timing(min(times), statistics.median(times))
-
-
-def solves(robot: ik.ArmHand, sizes: Sizes) -> Section:
-    """Hand-first on one thread, a solve in a batch."""
-    rows = []
-    for kind, tolerance, targets in kinds(robot, sizes.batch, 0):
-        solver = ik.Solver(robot, tolerance=tolerance)
-        solver.solve_batch(*targets)  # may compile
-        batch = solver.solve_batch(*targets)
-        count = len(targets[0])
-        timing = timed(
-            lambda s=solver, t=targets: s.solve_batch(*t), sizes.repeats, count, time.thread_time
+    def __init__(self, package: Path) -> None:
+        """Start it; a package is a folder that holds `casadi_ik`."""
+        self.package = package
+        environment = os.environ | {"PYTHONPATH": str(package)}
+        self._process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("bench_parts.py"))],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+            cwd=package,
         )
-        inside = f"{1e6 * float(batch.time.mean()):.1f}"
-        solved = f"{100 * batch.success.mean():.2f}"
-        rows.append((kind, solved, *timing.cells, inside, f"{batch.iterations.mean():.1f}"))
-    note = (
-        f"{sizes.batch} targets of each kind, {sizes.repeats} repetitions of `solve_batch`, CPU "
-        "time of one thread, verdicts included; the last but one column is `solution.time`."
-    )
-    columns = "targets", "solved %", "least µs", "median µs", "of it in the solve µs", "iterations"
-    return Section("hand-first, a solve in a batch", columns, rows, note)
 
-
-def single(robot: ik.ArmHand, sizes: Sizes) -> Section:
-    """`Solver.solve` of one grasp against the same in a batch."""
-    rows = []
-    for kind, tolerance, (points, normals) in kinds(robot, 60, 0):
-        solver = ik.Solver(robot, tolerance=tolerance)
-        grasps = [
-            ik.Grasp({n: ik.Contact(*c) for n, *c in zip(robot.fingers, p, m, strict=True)})
-            for p, m in zip(points, normals, strict=True)
-        ]
-        count = len(grasps)
-        one = timed(
-            lambda s=solver, g=grasps: [s.solve(grasp) for grasp in g],
-            sizes.repeats,
-            count,
-            time.thread_time,
-        )
-        many = timed(
-            lambda s=solver, p=points, n=normals: s.solve_batch(p, n),
-            sizes.repeats,
-            count,
-            time.thread_time,
-        )
-        rows.append((kind, one.cells[0], many.cells[0], f"{1e6 * (one.least - many.least):.0f}"))
-    columns = "targets", "Solver.solve µs", "in a batch µs", "on top µs"
-    return Section("One grasp at a time", columns, rows, "CPU time, the least of all repetitions.")
-
-
-def diagnoses(robot: ik.ArmHand, sizes: Sizes) -> Section:
-    """What the reason costs where there is no solution."""
-    rng = np.random.default_rng(0)
-    count = max(sizes.batch // 60, 4)
-    points, normals = robot.contacts(robot.random(rng, count))
-    turned = normals + rng.normal(0, 0.5, normals.shape)
-    turned /= np.linalg.norm(turned, axis=2, keepdims=True)
-    away = np.array([[[1.5, 0.0, 0.0]]])
-    sets = {
-        "1.5 m too far": (points + away, normals),
-        "contacts moved by 30 mm": (points + rng.normal(0, 0.03, points.shape), normals),
-        "normals turned by 30 deg": (points, turned),
-    }
-    solver = ik.Solver(robot)
-    rows = []
-    for name, targets in sets.items():
-        found = solver.solve_batch(*targets, diagnose=True).diagnoses
-        asked = [row for row, diagnosis in enumerate(found) if diagnosis is not None]
-        there = targets[0][asked], targets[1][asked]
-        bare, full = (
-            timed(
-                lambda t=there, d=diagnose: solver.solve_batch(*t, diagnose=d),
-                max(sizes.repeats // 2, 1),
-                len(asked),
-                time.thread_time,
-            ).least
-            for diagnose in (False, True)
-        )
-        cells = f"{1e3 * bare:.2f}", f"{1e3 * (full - bare):.2f}", f"{full / bare - 1:.1f}"
-        rows.append((name, str(len(asked)), *cells))
-    columns = "targets", "not solved", "solve ms", "diagnosis ms", "ratio"
-    return Section("Why not: a diagnosis", columns, rows, "CPU time of one thread, per target.")
-
-
-def threads(robot: ik.ArmHand, sizes: Sizes) -> Section:
-    """Two threads against one."""
-    rows = []
-    for kind, tolerance, targets in kinds(robot, 4 * sizes.batch, 0)[:2]:
-        solver = ik.Solver(robot, tolerance=tolerance)
-        one, two = (
-            timed(
-                lambda s=solver, t=targets, j=jobs: s.solve_batch(*t, jobs=j),
-                sizes.repeats,
-                len(targets[0]),
-                time.perf_counter,
+    def measure(self, case: Case) -> dict[str, float] | None:
+        """One turn: quantities by name; None: this package, or this machine, cannot."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(case) + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            raise InputError(f"{self.package}: the measurement of {' '.join(map(str, case))} died")
+        said = json.loads(line)
+        if "error" in said:
+            Console(stderr=True).print(
+                f"{self.package}: {' '.join(map(str, case))}: {said['error']}"
             )
-            for jobs in (1, 2)
-        )
-        rows.append((kind, one.cells[0], two.cells[0], f"{one.least / two.least:.2f}"))
-    columns = "targets", "jobs=1 µs", "jobs=2 µs", "ratio"
-    note = "Wall time, the least of all repetitions; needs two idle cores."
-    return Section("Threads", columns, rows, note)
+        return said.get("found")
+
+    def stop(self) -> None:
+        """End the process."""
+        self._process.communicate("")
 
 
-def memory(robot: ik.ArmHand, sizes: Sizes) -> Section:
-    """Peak of the memory after a tenth of the solves and after all of them."""
-    solver = ik.Solver(robot)
-    rng = np.random.default_rng(0)
-    part = sizes.memory // 10
-    rows = []
-    for done in range(1, 11):
-        for _ in solver.solve_blocks(_hands(robot, rng, part)):
-            pass
-        rows.append((f"{done * part}", f"{_peak():.1f}"))
-    chosen = [rows[0], rows[4], rows[9]]
-    grown = f"{float(rows[9][1]) - float(rows[0][1]):.1f}"
-    note = f"Peak of the whole process; from the first to the last row it grew by {grown} MB."
-    return Section("Memory over solves in blocks", ("solves", "peak MB"), chosen, note)
+@contextmanager
+def worker(package: Path) -> Iterator[Worker]:
+    """A worker while it is needed."""
+    if not (package / "casadi_ik").is_dir():
+        raise InputError(f"--against: found no folder casadi_ik in {package}, expected a checkout")
+    started = Worker(package.resolve())
+    try:
+        yield started
+    finally:
+        started.stop()
 
 
-def _hands(
-    robot: ik.ArmHand, rng: np.random.Generator, count: int
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    for start in range(0, count, 4096):
-        yield robot.contacts(robot.random(rng, min(4096, count - start)))
+def measured(
+    cases: list[Case], here: Worker, other: Worker | None, turns: int
+) -> Iterator[tuple[Case, list[dict[str, float]], list[dict[str, float]]]]:
+    """Cases with what every turn found here, and there."""
+    for case in cases:
+        mine, theirs = list[dict[str, float]](), list[dict[str, float]]()
+        for turn in range(1 if case[0] in ABROAD else turns):
+            sides = [(here, mine), *([(other, theirs)] if other else [])]
+            # Who is first in a turn is second in the next.
+            for side, found in sides if turn % 2 == 0 else reversed(sides):
+                if (one := side.measure(case)) is not None:
+                    found.append(one)
+        yield case, mine, theirs
 
 
-def _peak() -> float:
-    """Largest resident size so far [MB]."""
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return used / (2**20 if sys.platform == "darwin" else 2**10)
+def rows_of(
+    case: Case, mine: list[dict[str, float]], theirs: list[dict[str, float]]
+) -> Iterator[list[str]]:
+    """A row per quantity of a case."""
+    what = " ".join(map(str, case[2:]))
+    for name in mine[0] if mine else ():
+        here = min(one[name] for one in mine)
+        cells = [case[0], str(case[1]), what, name, _number(here)]
+        there = [one[name] for one in theirs if name in one]
+        if there:
+            least = min(there)
+            paired = [one[name] / other for one, other in zip(mine, there, strict=False) if other]
+            middle = sorted(paired)[len(paired) // 2] if paired else float("nan")
+            ratio = here / least if least else float("nan")
+            cells += [_number(least), f"{ratio:.3f}", f"{middle:.3f}"]
+        elif theirs:
+            cells += ["", "", ""]
+        yield cells
 
 
-def iterations(robot: ik.ArmHand, sizes: Sizes) -> Section:
-    """What an iteration of the other methods costs."""
-    names = ik.shipped_grasps(robot.name)
-    each = max(sizes.iterations // len(names), 1)
-    rng = np.random.default_rng(0)
-    targets = random_arm_targets(robot, names, each, rng)
-    rows = []
-    for method in ik.METHODS:
-        if method in ("hand-first", "ipopt"):
-            continue
-        steps = ("closed-form", "ipopt") if method.startswith("enhanced") else (None,)
-        for finger_step in steps:
-            settings: dict[str, Any] = {"finger_step": finger_step} if finger_step else {}
-            solver = ik.Solver(robot, method, **settings)
-            slow = finger_step == "ipopt"
-            points, normals = (array[: 2 if slow else None] for array in targets)
-            total = int(solver.solve_batch(points, normals).iterations.sum())
-            timing = timed(
-                lambda s=solver, p=points, n=normals: s.solve_batch(p, n),
-                1 if slow else sizes.repeats,
-                total,
-                time.thread_time,
-            )
-            rows.append((method, finger_step or "", *timing.cells))
-    columns = "method", "finger step", "least µs", "median µs"
-    return Section("An iteration of other methods", columns, rows, "CPU time of one thread.")
-
-
-MEASUREMENTS: dict[str, Callable[[ik.ArmHand, Sizes], Section]] = {
-    "memory": memory,
-    "solves": solves,
-    "single": single,
-    "diagnoses": diagnoses,
-    "threads": threads,
-    "first-use": lambda _, sizes: first_use(ik.METHODS, sizes.later),
-    "iterations": iterations,
-    "logs": lambda _, sizes: bench_logs.report(sizes.batch, sizes.repeats),
-    "log-parts": lambda _, sizes: bench_log_parts.report(sizes.batch, sizes.repeats),
-    "peers": lambda _, sizes: measured(sizes.peers, 0, installed()),
-}
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure, print, write the report."""
+    """Measure, print, and write the report if one is asked for."""
     parser = argparse.ArgumentParser(description="Timings on this machine.")
-    parser.add_argument("--quick", action="store_true", help="small sizes; no report unless --out")
-    parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=list(MEASUREMENTS))
-    parser.add_argument("--out", type=Path, help=f"the report (default: {REPORT.name} of results)")
+    parser.add_argument("--part", nargs="+", choices=CASES, default=USUAL, help=", ".join(CASES))
+    parser.add_argument("--robots", nargs="+", default=ROBOTS)
+    parser.add_argument("--count", type=int, default=4000, help="targets of a batch")
+    parser.add_argument("--turns", type=int, default=7, help="of every measurement")
+    parser.add_argument("--against", type=Path, help="folder of another checkout of the package")
+    parser.add_argument("--page", type=Path, default=Path(), help="of view: index.html (make page)")
+    parser.add_argument("--report", type=Path, help="folder of the report")
     options = parser.parse_args(arguments)
-    robot = ik.load_robot(ROBOT)
-    found = []
-    for name in options.only:
-        section = MEASUREMENTS[name](robot, QUICK if options.quick else Sizes())
-        section.show()
-        found.append(section)
-    out = options.out or (None if options.quick else REPORT)
-    if out is not None:
-        words = ["--quick"] * options.quick
-        if len(found) < len(MEASUREMENTS):
-            words += ["--only", *options.only]
-        write_report(out, " ".join(["python studies/bench.py", *words]), found)
+    cases = [
+        case
+        for part in options.part
+        for case in CASES[part](list(options.robots), options.count, str(options.page.resolve()))
+    ]
+    console, rows = Console(), list[list[str]]()
+    heads = ["part", "robot", "of", "quantity", "here"]
+    heads += ["other", "ratio", "by turns"] if options.against else []
+    with ExitStack() as stack:
+        here = stack.enter_context(worker(Path(__file__).resolve().parents[1]))
+        other = stack.enter_context(worker(options.against)) if options.against else None
+        for case, mine, theirs in measured(cases, here, other, options.turns):
+            for row in rows_of(case, mine, theirs):
+                rows.append(row)
+                console.print("  ".join(row), soft_wrap=True, highlight=False)
+    if options.report:
+        load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
+        parts = [INTRODUCTION.format(turns=options.turns, load=load)]
+        parts += [AGAINST.format(path=options.against)] if options.against else []
+        parts += [markdown_table(heads, rows), f"`{command(__file__, arguments)}`"]
+        write_page("Timings", [*parts, provenance({"bench": code_version()})], options.report)
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

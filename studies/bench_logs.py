@@ -18,7 +18,7 @@ from typing import Any, Self, get_args
 
 import numpy as np
 from bench_report import Section
-from targets import random_arm_targets
+from samplers import random_arm_targets
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

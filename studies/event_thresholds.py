@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from bench_logs import Kept
 from runner import command, markdown_table, program, write_page
-from targets import any_configuration, random_arm_targets
+from samplers import random_arm_targets, random_hands
 
 import casadi_ik as ik
 from casadi_ik.logs import EventKind, EventRules, Keep, McapRecorder
@@ -131,7 +131,7 @@ def targets_of(robot: ik.ArmHand, count: int, seed: int) -> tuple[np.ndarray, np
     """Shipped grasps on random arms and random hands, half and half."""
     rng, names = np.random.default_rng(seed), ik.shipped_grasps(robot.name)
     grasps = random_arm_targets(robot, names, max(count // 2 // len(names), 1), rng)
-    hands = robot.contacts(any_configuration(robot, rng, count // 2))
+    hands = robot.contacts(random_hands(robot, rng, count // 2))
     points, normals = (np.concatenate(pair) for pair in zip(grasps, hands, strict=True))
     return points, normals
 

@@ -20,7 +20,7 @@ import numpy as np
 from bench_report import Section
 from peer_qp import Mink, Pink, Placo
 from peer_steps import Peer, Scipy
-from targets import random_arm_targets
+from samplers import random_arm_targets
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

@@ -25,10 +25,9 @@ from typing import Any
 
 import numpy as np
 from diagnosis import moved
-from hard_targets import close_to_limits, corners, random_hands, singular_arms
 from impossible_targets import CLASSES, impossible
-from missed import ROBOTS as SHIPPED_AND_MADE
-from missed import load
+from misses import ROBOTS as SHIPPED_AND_MADE
+from misses import load
 from rich.console import Console
 from rich.progress import Progress
 from runner import (
@@ -41,6 +40,7 @@ from runner import (
     write_page,
 )
 from runner.results import code_version
+from samplers import corners, near_limits, random_hands, singular_arms
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
@@ -87,7 +87,7 @@ def blind_hands(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Arra
 KINDS = {
     "random": random_hands,
     "corners": corners,
-    "near limits": close_to_limits,
+    "near limits": near_limits,
     "near-singular arms": singular_arms,
     "blind hands": blind_hands,
 }

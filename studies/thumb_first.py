@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from closed_chain.report import OURS, PAPER, figure, options, title, write
 from runner import command, program
-from targets import random_arm_targets
+from samplers import random_arm_targets
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from runner import Setting, Study, TargetSet
-from targets import grasp_arms
+from samplers import grasp_arms
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError

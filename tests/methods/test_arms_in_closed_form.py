@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from targets import near_limits
+from samplers import near_limits
 
 import casadi_ik as ik
 from casadi_ik.kernels.lanes import lanes_source

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from robot_variants import derived_robot
-from targets import HARD, near_limits
+from samplers import HARD, near_limits
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnknownNameError

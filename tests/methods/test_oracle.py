@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hard_targets
 import numpy as np
 import numpy_oracle
 import pytest
+from samplers import SAMPLERS
 
 import casadi_ik as ik
 
@@ -25,7 +25,7 @@ ROBOTS = {
 )
 def test_all_are_solved_and_every_answer_is_right(name, kind, tolerance):
     robot = ik.load_robot(name)
-    q = hard_targets.SETS[kind](robot, np.random.default_rng(31), COUNT)
+    q = dict(SAMPLERS.values())[kind](robot, np.random.default_rng(31), COUNT)
     assert numpy_oracle.beyond_limits(robot, q).max() <= 1e-9
     points, normals = numpy_oracle.contacts(robot, q)
     batch = ik.Solver(robot, tolerance=ik.Tolerance(*tolerance)).solve_batch(points, normals)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from robot_variants import derived_robot, thumb_of
-from targets import shipped_hands
+from samplers import shipped_hands
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from targets import (
-    any_configuration,
-    near_limits_on_singular_arms,
+from samplers import (
+    aligned_arms,
+    near_limits_on_aligned_arms,
     random_arm_targets,
-    singular,
+    random_hands,
 )
 from trace_checks import Kept, check_trace
 
@@ -52,7 +52,7 @@ def run(robot: ik.ArmHand, method: str) -> SolveBlock:
     grasps = random_arm_targets(robot, ("cup", "mug"), 4, rng)
     # The original methods converge from next to the target only.
     near = robot.home + rng.normal(size=(4, len(robot.home))) * [[0.02], [0.02], [1e-3], [1e-3]]
-    hard = (any_configuration, near_limits_on_singular_arms, singular)
+    hard = (random_hands, near_limits_on_aligned_arms, aligned_arms)
     q = [np.clip(near, robot.lower, robot.upper), *(draw(robot, rng, 6) for draw in hard)]
     points, normals = (
         np.concatenate([first, second])

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from runner import Setting, Study, TargetSet, program, run
-from targets import any_configuration, near_limits
+from samplers import near_limits, random_hands
 
 from casadi_ik.logs import Keep
 
@@ -14,7 +14,7 @@ CHANGED = Setting("loose", "hand-first", tolerance=(2e-3, 0.05))
 STUDY = Study(
     "small",
     "kuka_lwr_barrett",
-    (TargetSet("random hands", any_configuration), TargetSet("near limits", near_limits)),
+    (TargetSet("random hands", random_hands), TargetSet("near limits", near_limits)),
     (Setting("loose", "hand-first"), Setting("exact", "hand-first", tolerance=(1e-6, 1e-6))),
     count=40,
     block=4,

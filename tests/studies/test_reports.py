@@ -9,13 +9,12 @@ import math
 import numpy as np
 import polars as pl
 import pytest
-import success
 import table_one
 from qiu_table import figures
 from qiu_table.paper import METHODS, TABLE_I, printed_mean
 from qiu_table.settings import ablation_study, readings_study, table_study
 from qiu_table.tables import readings
-from runner import Setting, read_results, run
+from runner import read_results, run
 
 import casadi_ik as ik
 
@@ -119,31 +118,3 @@ def test_table_has_every_method_both_ways():
     assert [setting.limits for setting in study.settings] == ["ignore", "enforce"] * 2
     assert study.settings[0].options == {"finger_step": "closed-form"}
     assert len(list(study.blocks())) == 3 * 4 * 12
-
-
-def test_success(tmp_path, capsys):
-    out, report = tmp_path / "results", tmp_path / "report"
-    common = ["--out", str(out), "--report", str(report), "--block", "4"]
-    success.main(["--count", "4", *common])
-    text = (report / "report.md").read_text()
-    assert "## Misses\n\nNone." in text
-    found = metrics(report)
-    for key in ("5 mm, 3 deg", "1e-6 m, 1e-6 rad"):
-        assert found[f"success/{key}/all/success"]["value"] == 100
-        assert found[f"success/{key}/all/success"]["n"] == 4 * 17
-    capsys.readouterr()
-    success.main(["--rerun", "near limits", "3", *common])
-    assert capsys.readouterr().out.count("SOLVED") == 2
-
-
-def test_misses_are_listed(tmp_path):
-    """A tolerance nothing can meet: every row is there, with the command that solves it again."""
-    impossible = Setting("impossible", "hand-first", tolerance=(1e-18, 1e-18))
-    whole = success.study(1, 5, 1)
-    whole = dataclasses.replace(whole, settings=(impossible,), sets=whole.sets[-2:])
-    run(whole, tmp_path / "results")
-    success.write_report(whole, tmp_path / "results", tmp_path / "report")
-    text = (tmp_path / "report" / "report.md").read_text()
-    again = '`python studies/success.py --seed 5 --rerun "near limits on near-singular arms" 0`'
-    assert again in text
-    assert "| all | 2 | 2 | 0.000" in text

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import ar10_success
 import calibration
 import closed_chain_singularities
 import closed_chain_workspace
@@ -55,17 +54,6 @@ def test_gains_and_resolution_of_the_sliders(tmp_path: Path) -> None:
     assert "| 0.3 |  |  |" in text  # the paper has no such gain
     assert "| 1 | -0.60, -0.71 | 0.93 |" in text
     assert within(robot, 0.5) == pytest.approx((robot.lower + robot.upper) / 2)
-
-
-def test_tolerances_of_the_sliders(tmp_path: Path) -> None:
-    names = [ar10_success.tolerance_name(*each) for each in ar10_success.TOLERANCES]
-    assert names == ["5 mm, 3 deg", "1e-6 m, 1e-6 rad"]
-    given = ["--count", "6", "--tolerance", "2e-3", "0.02", "--out", str(tmp_path)]
-    ar10_success.main(given)
-    text = (tmp_path / "report.md").read_text()
-    rows = [line for line in text.splitlines() if line.startswith(("| ar10", "| baxter"))]
-    assert len(rows) == 2 * len(ar10_success.SETS) - 1
-    assert all("| 2 mm, 1.146 deg |" in row for row in rows)
 
 
 def test_parts_of_outliers(tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from samplers import near_limits
 from scipy.optimize import brentq, least_squares
 from scipy.spatial.transform import Rotation
-from targets import near_limits
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

@@ -1,0 +1,553 @@
+"""What `bench.py` measures; as a program the process that measures one version of the package.
+
+A case is a part's name, a robot and more words or numbers; of it a measurement is made ready once
+and then called turn by turn. Public names of the package only: other versions run this, too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from samplers import SAMPLERS, random_arm_targets, suits
+
+import casadi_ik as ik
+
+Found = dict[str, float]
+Case = tuple[Any, ...]
+Targets = tuple[Any, Any]
+
+TOLERANCES = {"5mm": ik.Tolerance(), "1e-6": ik.Tolerance(1e-6, 1e-6)}
+WARM = 300
+"""Targets solved before times are taken, at most."""
+
+OF_FILE = 200_000
+"""Targets of a file of many."""
+
+FAST, SINGLE = 1000, 200
+"""Calls of a turn."""
+
+SCENE = {
+    "table": {"kind": "box", "size": [1.6, 1.6, 0.04], "xyz": [0.0, 0.0, -0.1]},
+    "post": {"kind": "cylinder", "radius": 0.06, "length": 0.6, "xyz": [0.45, 0.25, 0.3]},
+}
+CHOSEN = 50
+"""Candidates of a choice."""
+
+CYCLES, PERIOD = 500, 1e-3
+"""Of following, and their length [s]."""
+
+
+def drawn(robot: ik.ArmHand, sampler: str, count: int) -> Targets:
+    """Contacts of a sampler, the same in every process."""
+    return robot.contacts(SAMPLERS[sampler][1](robot, np.random.default_rng(0), count))
+
+
+def grasps_of(robot: ik.ArmHand, points: Any, normals: Any) -> list[ik.Grasp]:
+    """Contacts as grasps."""
+    return [
+        ik.Grasp({n: ik.Contact(*c) for n, *c in zip(robot.fingers, p, m, strict=True)})
+        for p, m in zip(points, normals, strict=True)
+    ]
+
+
+@contextlib.contextmanager
+def clock(found: Found, name: str, count: int, wall: bool = False) -> Any:
+    """Processor time of this thread (or time on the wall) of what is done, by its count [us]."""
+    now = time.perf_counter if wall else time.thread_time
+    begun = now()
+    yield
+    found[name] = 1e6 * (now() - begun) / count
+
+
+def batch(robot: str, sampler: str, tolerance: str, count: int) -> Callable[[], Found]:
+    """`solve_batch`, a target."""
+    solver = ik.Solver(ik.load_robot(robot), tolerance=TOLERANCES[tolerance])
+    targets = drawn(solver.robot, sampler, count)
+    solver.solve_batch(*(array[:WARM] for array in targets))
+    solver.solve_batch(*targets)
+
+    def measure() -> Found:
+        found: Found = {}
+        with clock(found, "us", count):
+            solved = solver.solve_batch(*targets)
+        return found | {"missed": float((~solved.success).sum())}
+
+    return measure
+
+
+def fast(robot: str, count: int) -> Callable[[], Found]:
+    """`Solver.fast`, a call."""
+    solver = ik.Solver(ik.load_robot(robot))
+    targets = list(zip(*drawn(solver.robot, "random", count), strict=True))
+    call, home = solver.fast(), solver.robot.home
+    for points, normals in targets:
+        call(points, normals, home)
+
+    def measure() -> Found:
+        found: Found = {}
+        with clock(found, "us", count):
+            for points, normals in targets:
+                call(points, normals, home)
+        return found
+
+    return measure
+
+
+def single(robot: str, count: int) -> Callable[[], Found]:
+    """`Solver.solve`, a call."""
+    solver = ik.Solver(ik.load_robot(robot))
+    grasps = grasps_of(solver.robot, *drawn(solver.robot, "random", count))
+
+    def measure() -> Found:
+        found: Found = {}
+        with clock(found, "us", count):
+            for grasp in grasps:
+                solver.solve(grasp)
+        return found
+
+    measure()
+    return measure
+
+
+def scene(robot: str, count: int) -> Callable[[], Found]:
+    """Batch and choice among a table and a post, and all solutions without them."""
+    solver = ik.Solver(ik.load_robot(robot), scene=ik.Scene(SCENE))
+    plain = ik.Solver(solver.robot)
+    targets = drawn(solver.robot, "random", count)
+    grasps = grasps_of(solver.robot, *(array[:CHOSEN] for array in targets))
+    home = solver.robot.home
+
+    def measure() -> Found:
+        found: Found = {}
+        with clock(found, "batch us", count):
+            solved = solver.solve_batch(*targets)
+        with clock(found, "choose us a candidate", CHOSEN):
+            ranked = solver.choose(grasps, q0=home)
+        with clock(found, "solve_all us", 5):
+            for grasp in grasps[:5]:
+                plain.solve_all(grasp)
+        counts = {"not free": float((~solved.success).sum()), "answered": float(ranked.answered)}
+        return found | counts
+
+    measure()
+    return measure
+
+
+def follow(robot: str) -> Callable[[], Found]:
+    """A cycle of a follower of a slow motion."""
+    solver = ik.Solver(ik.load_robot(robot))
+    arm_hand, rng = solver.robot, np.random.default_rng(0)
+    middle, half = (arm_hand.lower + arm_hand.upper) / 2, (arm_hand.upper - arm_hand.lower) / 2
+    ways = rng.uniform(-0.1, 0.1, (2, len(middle))) * half
+    turn = np.linspace(0, 0.5, CYCLES)[:, None]
+    path = middle + ways[0] * np.sin(turn) + ways[1] * turn**2
+    targets = list(zip(*arm_hand.contacts(path), strict=True))
+
+    def measure() -> Found:
+        found, follower = Found(), solver.follow(path[0], PERIOD)
+        with clock(found, "us", CYCLES):
+            for points, normals in targets:
+                follower(points, normals)
+        return found
+
+    measure()
+    return measure
+
+
+def diagnosis(robot: str, kind: str, count: int) -> Callable[[], Found]:
+    """What the reason costs where there is no solution."""
+    solver, rng = ik.Solver(ik.load_robot(robot)), np.random.default_rng(0)
+    points, normals = drawn(solver.robot, "random", count)
+    if kind == "far":
+        points = points + np.array([1.5, 0.0, 0.0])
+    elif kind == "moved":
+        points = points + rng.normal(0, 0.03, points.shape)
+    else:
+        normals = normals + rng.normal(0, 0.5, normals.shape)
+        normals = normals / np.linalg.norm(normals, axis=2, keepdims=True)
+    left = ~solver.solve_batch(points, normals, diagnose=True).success
+    asked = points[left], normals[left]
+
+    def measure() -> Found:
+        found: Found = {}
+        with clock(found, "solve us", len(asked[0])):
+            solver.solve_batch(*asked)
+        with clock(found, "with reason us", len(asked[0])):
+            solver.solve_batch(*asked, diagnose=True)
+        return found | {"not solved": float(left.sum())}
+
+    return measure
+
+
+def methods(robot: str, method: str, step: str) -> Callable[[], Found]:
+    """An iteration of a method on shipped grasps."""
+    arm_hand = ik.load_robot(robot)
+    solver = ik.Solver(arm_hand, method, finger_step=step or None)
+    each = 1 if step == "ipopt" else 10
+    names = ik.shipped_grasps(robot)[: 2 if step == "ipopt" else None]
+    targets = random_arm_targets(arm_hand, names, each, np.random.default_rng(0))
+    total = int(solver.solve_batch(*targets).iterations.sum())
+
+    def measure() -> Found:
+        found: Found = {}
+        with clock(found, "us an iteration", total):
+            solver.solve_batch(*targets)
+        return found | {"iterations": float(total)}
+
+    return measure
+
+
+def threads(robot: str, count: int) -> Callable[[], Found]:
+    """Two threads and one, time on the wall."""
+    solver = ik.Solver(ik.load_robot(robot))
+    targets = drawn(solver.robot, "random", count)
+    solver.solve_batch(*targets)
+
+    def measure() -> Found:
+        found: Found = {}
+        for jobs in (1, 2):
+            with clock(found, f"jobs={jobs} us (wall)", count, wall=True):
+                solver.solve_batch(*targets, jobs=jobs)
+        return found
+
+    return measure
+
+
+def memory(robot: str, count: int) -> Callable[[], Found]:
+    """How much memory grows over many solves in blocks, after a tenth of them."""
+    resource = importlib.import_module("resource")
+    solver = ik.Solver(ik.load_robot(robot))
+
+    def peak() -> float:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+
+    def measure() -> Found:
+        rng, tenth = np.random.default_rng(0), count // 10
+        grown = list[float]()
+        for _ in range(10):
+            blocks = [solver.robot.contacts(solver.robot.random(rng, tenth))]
+            for _ in solver.solve_blocks(blocks):
+                pass
+            grown.append(peak())
+        return {"peak MB": grown[-1], "grown MB": grown[-1] - grown[0]}
+
+    return measure
+
+
+def many(robot: str, count: int) -> Callable[[], Found]:
+    """`casadi-ik batch --resume` of a folder of files on two processes: rate and memory."""
+    psutil = importlib.import_module("psutil")
+    arm_hand = ik.load_robot(robot)
+    folder = Path(tempfile.mkdtemp(prefix="casadi_ik-bench-"))
+    targets, solved = folder / "targets", folder / "solved"
+    targets.mkdir()
+    for number in range(-(-count // OF_FILE)):
+        rng, size = np.random.default_rng([0, number]), min(OF_FILE, count - number * OF_FILE)
+        points, normals = arm_hand.contacts(arm_hand.random(rng, size))
+        np.savez(targets / f"targets-{number:05d}.npz", points=points, normals=normals)
+    words = [str(targets), "--robot", robot, "--resume", "--jobs", "2", "--out", str(solved)]
+
+    def memory_of(process: Any) -> float:
+        total = 0.0
+        for one in (process, *process.children(recursive=True)):
+            with contextlib.suppress(psutil.Error):
+                total += one.memory_full_info().uss / 2**20
+        return total
+
+    def measure() -> Found:
+        before, found, most = _children(), Found(), [0.0]
+        with clock(found, "us a target (wall)", count, wall=True):
+            command = [sys.executable, "-m", "casadi_ik", "batch", *words]
+            process = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            while process.poll() is None:
+                most.append(memory_of(process))
+                time.sleep(0.5)
+        parts = [np.load(path)["success"] for path in sorted(solved.glob("part-*.npz"))]
+        missed = count - sum(int(part.sum()) for part in parts)
+        spent = 1e6 * (_children() - before) / count
+        later = float(np.median(most[len(most) // 2 :]))
+        memory = {"peak MB, not shared": max(most), "MB in the second half": later}
+        return found | {"us a target (all processes)": spent, "missed": missed} | memory
+
+    return measure
+
+
+FIRST = {
+    "single": "solver.solve(grasp)",
+    "fast": "solver.fast()(points, normals)",
+    "batch": "solver.solve_batch(*(np.tile(a, (8, 1, 1)) for a in (points, normals)))",
+    "scene": "solver = ik.Solver(robot, scene=ik.load_scene('table')); "
+    "solver.choose([grasp], q0=robot.home)",
+}
+"""What is asked first: as a program."""
+
+PROGRAM = """
+import time
+import numpy as np
+begin = time.perf_counter()
+import casadi_ik as ik
+imported = time.perf_counter()
+robot = ik.load_robot({robot!r})
+solver = ik.Solver(robot, {method!r})
+points, normals = robot.contacts(robot.home)
+contacts = zip(robot.fingers, points, normals)
+grasp = ik.Grasp({{name: ik.Contact(p, n) for name, p, n in contacts}})
+{ask}
+print(imported - begin, time.perf_counter() - imported)
+"""
+
+
+def first_use(robot: str, ask: str, method: str) -> Callable[[], Found]:
+    """A new process to its first answer, with an empty cache of kernels and with a full one."""
+
+    def measure() -> Found:
+        with tempfile.TemporaryDirectory() as place:
+            program = PROGRAM.format(robot=robot, method=method, ask=FIRST[ask])
+
+            def run() -> tuple[float, float, float]:
+                before = _children()
+                environment = os.environ | {"CASADI_IK_CACHE": place}
+                text = subprocess.run(
+                    [sys.executable, "-c", program],
+                    env=environment,
+                    capture_output=True,
+                    text=True,
+                    check=True,
+                ).stdout
+                imported, answered = map(float, text.split())
+                return imported, answered, _children() - before
+
+            _, cold, cpu = run()
+            imported, warm, _ = run()
+        times = {"empty cache s (wall)": cold, "empty cache s (all processes)": cpu}
+        return times | {"full cache s (wall)": warm, "import s (wall)": imported}
+
+    return measure
+
+
+def _children() -> float:
+    return sum(os.times()[2:4])
+
+
+def export(robot: str, target: str, *flags: str) -> Callable[[], Found]:
+    """The exported solver, built with the machine's compiler."""
+    folder = Path(tempfile.mkdtemp(prefix="casadi_ik-bench-")) / "solver"
+    words = [robot, "--out", str(folder), "--target", target, "--prefix", "arm", *flags]
+    _run(sys.executable, "-m", "casadi_ik", "export", *words)
+    if target == "wasm":
+        found = {"bytes": float(sum(path.stat().st_size for path in folder.glob("*.wasm")))}
+
+        def in_node() -> Found:
+            times = json.loads(_run("node", "test.mjs", folder=folder))
+            return found | {"us in node (wall, median)": times["median"]}
+
+        node = subprocess.run(["node", "--version"], capture_output=True).returncode == 0
+        return in_node if node else lambda: found
+    _run("make", folder=folder)
+    table = _run("size", "-t", "build/libarm.a", folder=folder).splitlines()[1:]
+    texts = {line.split()[5]: int(line.split()[0]) for line in table}
+    tables = sum(size for name, size in texts.items() if "tables" in name)
+    whole = next(size for name, size in texts.items() if name.startswith("(TOTALS)"))
+
+    def measure() -> Found:
+        said = json.loads(_run("build/bench", "2", "20000", folder=folder))
+        times = {"us": said["cpu_mean"], "99.9 % us (wall)": said["p99.9"]}
+        return times | {"code bytes": whole - tables, "table bytes": float(tables)}
+
+    return measure
+
+
+def _run(*words: str, folder: Path | None = None) -> str:
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(words)}: {done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def logs(robot: str, method: str, compression: str, count: int) -> Callable[[], Found]:
+    """A batch with a log of every iteration over one without; its size; reading it."""
+    settings: dict[str, Any] = {}
+    if method != "hand-first":
+        settings, count = {"finger_step": "closed-form", "limits": "ignore"}, max(count // 25, 12)
+    solver = ik.Solver(ik.load_robot(robot), method, **settings)
+    targets = drawn(solver.robot, "grasps" if suits(solver.robot, "grasps") else "random", count)
+    path = Path(tempfile.mkdtemp(prefix="casadi_ik-bench-")) / "bench.mcap"
+    iterations = int(solver.solve_batch(*targets).iterations.sum())
+
+    def logged(found: Found, name: str, **options: Any) -> None:
+        begun = time.process_time()
+        with clock(found, f"{name} us a solve (wall)", count, wall=True):
+            solver.solve_batch(*targets, **options)
+        found[f"{name} us a solve (all threads)"] = 1e6 * (time.process_time() - begun) / count
+
+    def measure() -> Found:
+        found: Found = {"iterations": float(iterations)}
+        logged(found, "without")
+        logged(found, "logged", log=path, compression=compression)
+        found["bytes an iteration"] = path.stat().st_size / iterations
+        log = ik.logs.open(path)
+        with clock(found, "read us an iteration", iterations):
+            table = log.iterations()
+        with clock(found, "to polars us an iteration", iterations):
+            table.frame()
+        sampled = ik.logs.Keep(sample=0.01)
+        logged(found, "sampled", log=path, compression=compression, keep=sampled)
+        return found
+
+    return measure
+
+
+def peer(robot: str, sampler: str, tolerance: str, name: str, count: int) -> Callable[[], Found]:
+    """Another solver on the same targets with restarts, judged by our verdict; see `peers`."""
+    peers = importlib.import_module("peers")
+    arm_hand = ik.load_robot(robot)
+    targets = drawn(arm_hand, sampler, count)
+    ours = batch(robot, sampler, tolerance, count)
+    one, fine = fast(robot, count), TOLERANCES[tolerance]
+
+    def measure() -> Found:
+        run = peers.run_peer(name, arm_hand, targets, fine)
+        mean = 1e6 * float(run.times.mean())
+        mine, alone = (min(way()["us"] for _ in range(5)) for way in (ours, one))
+        found = {"us": mean, "99 % us": 1e6 * float(np.quantile(run.times, 0.99))}
+        found |= {"over our batch": mean / mine, "over our fast": mean / alone}
+        return found | {"solved %": 100 * run.solved, "first start %": 100 * run.first}
+
+    return measure
+
+
+def view(page: str, painted: bool, flow: bool) -> Callable[[], Found]:
+    """From the mouse to the drawn answer in a browser; see `bench_view`."""
+    return partial(importlib.import_module("bench_view").measure, page, painted, flow)
+
+
+MEASUREMENTS: dict[str, Callable[..., Callable[[], Found]]] = {
+    "batch": batch,
+    "fast": fast,
+    "single": single,
+    "scene": scene,
+    "follow": follow,
+    "diagnosis": diagnosis,
+    "methods": methods,
+    "threads": threads,
+    "memory": memory,
+    "many": many,
+    "first-use": first_use,
+    "export": export,
+    "logs": logs,
+    "peers": peer,
+    "view": view,
+}
+
+ABROAD = ("first-use", "memory", "many", "peers", "view")
+"""Measured once."""
+
+
+def _samplers(robot: str) -> list[str]:
+    there = ik.load_robot(robot)
+    return [name for name in ("random", "grasps", "limits") if suits(there, name)]
+
+
+def _batches(robots: list[str], count: int, _: str) -> list[Case]:
+    return [
+        ("batch", robot, sampler, tolerance, count)
+        for robot in robots
+        for sampler in _samplers(robot)
+        for tolerance in TOLERANCES
+    ]
+
+
+def _first_uses(robots: list[str], *_: Any) -> list[Case]:
+    asks: list[Case] = [
+        ("first-use", robot, ask, "hand-first") for robot in robots for ask in FIRST
+    ]
+    return asks
+
+
+def _methods(*_: Any) -> list[Case]:
+    steps = {name: ("closed-form", "ipopt") for name in ik.METHODS if name.startswith("enhanced")}
+    others = [name for name in ik.METHODS if name not in ("hand-first", "ipopt")]
+    return [
+        ("methods", "kuka_lwr_barrett", name, step)
+        for name in others
+        for step in steps.get(name, ("",))
+    ]
+
+
+def _peers(robots: list[str], count: int, _: str) -> list[Case]:
+    names = importlib.import_module("peers").installed()
+    return [
+        ("peers", robot, sampler, tolerance, name, min(count, 60))
+        for robot in robots
+        for sampler in _samplers(robot)[:2]
+        for tolerance in TOLERANCES
+        for name in names
+    ]
+
+
+CASES: dict[str, Callable[[list[str], int, str], list[Case]]] = {
+    "batch": _batches,
+    "fast": lambda robots, *_: [("fast", robot, FAST) for robot in robots],
+    "single": lambda robots, *_: [("single", robot, SINGLE) for robot in robots],
+    "scene": lambda robots, count, _: [("scene", name, min(count, 200)) for name in robots],
+    "follow": lambda robots, *_: [("follow", robot) for robot in robots],
+    "diagnosis": lambda robots, *_: [
+        ("diagnosis", robot, kind, 60) for robot in robots for kind in ("far", "moved", "turned")
+    ],
+    "methods": _methods,
+    "threads": lambda robots, count, _: [("threads", robot, 4 * count) for robot in robots],
+    "memory": lambda robots, count, _: [("memory", robot, 50 * count) for robot in robots[:1]],
+    "many": lambda robots, count, _: [("many", robot, count) for robot in robots],
+    "first-use": _first_uses,
+    "export": lambda robots, *_: [
+        ("export", robot, *words)
+        for robot in robots
+        for words in (("c",), ("c", "--single"), ("c", "--scene", "8"), ("wasm",))
+    ],
+    "logs": lambda _, count, __: [
+        ("logs", "kuka_lwr_barrett", method, compression, count)
+        for method in ("hand-first", "enhanced-dls")
+        for compression in ("zstd", "lz4", "none")
+    ],
+    "peers": _peers,
+    "view": lambda _, __, page: [
+        ("view", where, painted, flow)
+        for where in ("server", *([page] if Path(page).is_file() else []))
+        for painted, flow in ((True, False), (False, False), (False, True))
+    ],
+}
+"""The cases of every part, from robots, targets of a batch, and the page without a server."""
+
+
+@cache
+def _ready(case: Case) -> Callable[[], Found]:
+    return MEASUREMENTS[case[0]](*case[1:])
+
+
+def serve() -> None:
+    """Measure cases as they come, a line of JSON each."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print is no answer
+    for line in sys.stdin:
+        try:
+            said: dict[str, Any] = {"found": _ready(tuple(json.loads(line)))()}
+        except Exception as error:
+            said = {"error": f"{type(error).__name__}: {error}"[:300]}
+        answers.write(json.dumps(said) + "\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    serve()

@@ -1,1 +1,0 @@
-"""How nearly contacts can be met at all: by Ipopt, sharing nothing but the kinematics."""

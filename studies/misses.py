@@ -1,0 +1,586 @@
+r"""Does `hand-first` miss targets that can be reached? Any robots, samplers and tolerances.
+
+Targets are the contacts of configurations within limits, so all of them are reachable; of noisy
+contacts a minimax program says whether they are. Two of the robots are made up, with limits of
+followers that are narrower than their motors'::
+
+    python studies/misses.py                                        # 10,000 of every kind
+    python studies/misses.py --count 200000 --seed 1 --jobs 2       # twelve millions in all
+    python studies/misses.py --robots ar10 --sampler limits         # a part of it
+    python studies/misses.py --sampler climb --minutes 30           # towards the hardest
+    python studies/misses.py --robots pairs --sampler random limits singular --fingers all 3 \
+        --count 300 --ratio                                         # every arm with every hand
+    python studies/misses.py --robots kuka_lwr_barrett --sampler noise --noise 4 2 \
+        --tolerance default
+
+A run that is killed goes on where it stopped. Every miss is listed with its configuration.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from climbing import climb, read_search
+from made_robots import MADE, made_robot
+from minimax import MinimaxProgram
+from runner import (
+    Metric,
+    command,
+    interval_text,
+    markdown_table,
+    program,
+    provenance,
+    rate_metric,
+    write_metrics,
+    write_page,
+)
+from runner.figures import figure, title
+from runner.parts import read_parts, run_parts
+from samplers import SAMPLERS, finger_sets, noisy, random_hands, suits
+
+import casadi_ik as ik
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
+
+ROBOTS = ("kuka_lwr_barrett", "kuka_lwr_barrett_coupled", "ar10", "baxter_ar10", *MADE)
+USUAL = ("random", "one-arm", "corners", "limits", "singular")
+OTHERS = {"palms": "palms of random hands", "noise": "noisy contacts of random hands"}
+"""What is asked for is a palm with a hand's posture, or contacts that a camera saw."""
+
+REFERENCE, SCALE = "kuka_lwr_barrett", 1000
+"""`--ratio`: times over those of so many random targets of this robot, in the same process."""
+
+SHOWN = 30
+"""Misses listed in the report; a file beside it has all of them."""
+
+STARTS = 20
+"""Of the minimax program for a target."""
+
+INTRODUCTION = """
+All targets are contacts of configurations within limits, hence reachable. *Missed:* the verdict,
+which is recomputed from the answer by forward kinematics, finds a contact outside its tolerance or
+a motor or joint outside its limits. *Hands on one arm:* the hand uniform, the arm at 60 % of its
+range. *Corners:* every motor by itself at its lower limit, at its upper one, or anywhere, a third
+each; *near limits:* within 1 deg (a slider: a fiftieth of its stroke) of them. *Near-singular
+arms:* of 32 random arms the one whose palm Jacobian has the smallest singular value. *Aligned
+arms:* elbow straight, shoulder or wrist aligned, or all three, off by 1e-3 to 1e-9 rad. Intervals
+are Wilson's, 95 %. Times are of single targets of a batch [us] and hold what else the machine did.
+"""
+
+NOISY = """
+*Noisy contacts:* Gaussian noise of {:g} mm on every coordinate of the points and of {:g} deg on the
+normals, so that not all can be met. *Possible:* of so many of the missed, those for which Ipopt
+finds a configuration within tolerance (minimise t with every error at most t times its tolerance)
+from the configuration before the noise, the answer or random ones, {} starts at most.
+"""
+
+CLIMBING = """
+Climbers walk over the configurations within limits, towards targets whose solve takes many
+iterations (half of them also towards badly conditioned ones).
+"""
+
+CAUSES = """
+*Solved now:* by the code that wrote this page. *Given the hand:* with the hand's motors fixed where
+they were when the target was made; what that solves was missed because no posture came near enough,
+the others because no arm was found that holds the hand where it fits. *From nearby:* from a start
+within 0.1 of every motor's range. *At limits:* mean over the missed of the part of arm and hand
+motors within a thousandth of their range. *Off:* the largest error of a contact in the best answer.
+"""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some targets, solved in one call.
+
+    Attributes:
+        robot: Name of the robot.
+        sampler: Key of `SAMPLERS` or of `OTHERS`.
+        fingers: Which have a contact, see `finger_sets`.
+        tolerance: See `tolerance_of`.
+        number: Of the part.
+        size: Targets in it.
+        seed: Of the targets.
+        folder: Where the files of made robots are put.
+        noise: Standard deviation of contacts [mm] and [deg], of noisy ones.
+        looked: How many missed ones of noisy contacts are given to Ipopt.
+        ratio: Whether times are set beside those of the reference.
+    """
+
+    robot: str
+    sampler: str
+    fingers: str
+    tolerance: str
+    number: int
+    size: int
+    seed: int
+    folder: Path
+    noise: tuple[float, float] = (0.0, 0.0)
+    looked: int = 0
+    ratio: bool = False
+
+    @property
+    def path(self) -> Path:
+        """Where its counts are."""
+        kind = (
+            f"{self.sampler} {self.noise[0]:g} {self.noise[1]:g}" if self.looked else self.sampler
+        )
+        name = f"{self.number:05d}-{self.size}-{self.seed}.json"
+        return Path(self.robot) / f"{kind}, {self.fingers}" / self.tolerance / name
+
+    @property
+    def kind(self) -> str:
+        """What is tried, in words."""
+        words = OTHERS[self.sampler] if self.sampler in OTHERS else SAMPLERS[self.sampler][0]
+        return words if self.fingers == "all" else f"{words}; {self.fingers} fingers"
+
+
+def tolerance_of(text: str) -> ik.Tolerance:
+    """Reads "default", one number of metres and of radians, or two, "METRES,RADIANS"."""
+    if text == "default":
+        return ik.Tolerance()
+    try:
+        position, _, angle = text.partition(",")
+        return ik.Tolerance(float(position), float(angle or position))
+    except ValueError as error:
+        raise InputError(
+            f"--tolerance: found {text!r}, expected default, NUMBER or METRES,RADIANS"
+        ) from error
+
+
+def tolerance_name(text: str) -> str:
+    """A tolerance in the units in which it is a plain number."""
+    one = tolerance_of(text)
+    if one.position < 1e-4:
+        return f"{one.position:.2g} m, {one.angle:.2g} rad".replace("e-0", "e-")
+    return f"{1e3 * one.position:g} mm, {np.rad2deg(one.angle):.4g} deg"
+
+
+def load(name: str, folder: Path) -> ik.ArmHand:
+    """A shipped robot, or a made one whose files are put into a folder."""
+    return ik.load_robot(made_robot(name, folder) if name in MADE else name)
+
+
+@cache
+def _solver(robot: str, tolerance: str, folder: Path) -> ik.Solver:
+    return ik.Solver(load(robot, folder), tolerance=tolerance_of(tolerance))
+
+
+@cache
+def _reference(tolerance: str, folder: Path) -> tuple[ik.Solver, tuple[Array, Array]]:
+    solver = _solver(REFERENCE, tolerance, folder)
+    targets = solver.robot.contacts(solver.robot.random(np.random.default_rng(0), SCALE))
+    solver.solve_batch(*targets)
+    return solver, targets
+
+
+def _scale(part: Part) -> float:
+    """Processor time of a target of the reference [s]."""
+    solver, targets = _reference(part.tolerance, part.folder)
+    begun = time.thread_time()
+    solver.solve_batch(*targets)
+    return (time.thread_time() - begun) / SCALE
+
+
+def solve(part: Part) -> dict[str, Any]:
+    """Solve a part and count."""
+    solver = _solver(part.robot, part.tolerance, part.folder)
+    robot = solver.robot
+    title_ = OTHERS.get(part.sampler) or SAMPLERS[part.sampler][0]
+    rng = np.random.default_rng([part.seed, zlib.crc32(title_.encode()), part.number])
+    draw = random_hands if part.sampler in OTHERS else SAMPLERS[part.sampler][1]
+    q = draw(robot, rng, part.size)
+    points, normals = robot.contacts(q)
+    if part.sampler == "noise":
+        metres, angle = 1e-3 * part.noise[0], float(np.radians(part.noise[1]))
+        points, normals = noisy(points, normals, rng, metres, angle)
+    held = finger_sets(robot, [part.fingers])[part.fingers]
+    free = np.setdiff1d(np.arange(len(robot.fingers)), held)
+    points[:, free] = normals[:, free] = np.nan
+
+    def answers(count: int) -> ik.BatchSolution:
+        if part.sampler == "palms":
+            return solver.solve_palms(robot.palm(q[:count]), q[:count])
+        return solver.solve_batch(points[:count], normals[:count])
+
+    answers(min(part.size, 300))  # no time holds a first use
+    before = _scale(part) if part.ratio else np.nan
+    begun = time.thread_time()
+    batch = answers(part.size)
+    seconds = time.thread_time() - begun
+    after = _scale(part) if part.ratio else np.nan
+    lost = np.flatnonzero(~batch.success)
+    found: dict[str, Any] = {
+        "count": part.size,
+        "seconds": seconds,
+        "ratio": 2 * seconds / part.size / (before + after) if part.ratio else None,
+        "iterations": int(batch.iterations.sum()),
+        "most iterations": int(batch.iterations.max()),
+        "restarted": int((batch.restarts > 0).sum()),
+        "most restarts": int(batch.restarts.max()),
+        "times": [1e6 * float(np.quantile(batch.time, share)) for share in (0.5, 0.99, 1.0)],
+        "missed": [
+            {"row": int(row), "status": str(batch.status_names[row]), "q": q[row].tolist()}
+            for row in lost
+        ],
+    }
+    if part.sampler == "noise":
+        rows = lost[: part.looked].tolist()
+        possible = 0
+        names = [robot.fingers[i] for i in held]
+        ipopt = MinimaxProgram(robot, tolerance_of(part.tolerance), names) if rows else None
+        for row in rows:
+            assert ipopt is not None
+            starts = robot.random(np.random.default_rng([part.seed, row]), STARTS)
+            starts[0], starts[1] = q[row], batch.q[row]
+            possible += ipopt.nearest(points[row], normals[row], starts).factor <= 1
+        found |= {"looked": len(rows), "possible": possible}
+    return found
+
+
+def robots_of(words: Sequence[str]) -> list[str]:
+    """Names of robots; "pairs" is every shipped arm with every shipped hand, "tour" each once."""
+    arms, hands = ik.shipped_names("arms"), ik.shipped_names("hands")
+    names: list[str] = []
+    for word in words:
+        if word == "pairs":
+            pairs = [f"{arm}+{hand}" for arm in arms for hand in hands]
+            # Mixed, so that a run that is stopped has seen something of every arm and every hand.
+            names += sorted(pairs, key=lambda pair: zlib.crc32(pair.encode()))
+        elif word == "tour":
+            names += [f"{arm}+{hands[i % len(hands)]}" for i, arm in enumerate(arms)]
+        else:
+            names.append(word)
+    return list(dict.fromkeys(names))
+
+
+def parts_of(options: argparse.Namespace) -> Iterator[Part]:
+    """All parts, a little of everything first."""
+    folder = options.out / "robots"
+    block = min(options.block, options.count)
+    robots = {name: load(name, folder) for name in robots_of(options.robots)}
+    for number in range(-(-options.count // block)):
+        for name, robot in robots.items():
+            for sampler in options.sampler:
+                palms = sampler == "palms"
+                if sampler == "climb" or not suits(robot, sampler):
+                    continue
+                if palms and not robot.description.arm_actuators:
+                    continue
+                noisy_ = sampler == "noise"
+                for fingers in finger_sets(robot, ["all"] if palms else options.fingers):
+                    for tolerance in options.tolerance:
+                        yield Part(
+                            *(name, sampler, fingers, tolerance, number, block),
+                            seed=options.seed,
+                            folder=folder,
+                            noise=tuple(options.noise) if noisy_ else (0.0, 0.0),
+                            looked=options.looked if noisy_ else 0,
+                            ratio=options.ratio,
+                        )
+
+
+@dataclass(frozen=True)
+class Climb:
+    """The search of one robot.
+
+    Attributes:
+        robot: Its name.
+        size: How long it takes in all [s].
+        options: Of the study.
+    """
+
+    robot: str
+    size: float
+    options: argparse.Namespace
+
+    @property
+    def path(self) -> Path:
+        """Where its figures are put when it is through."""
+        return Path("climb") / f"{self.robot}-{self.size:g}-{self.options.seed}.json"
+
+    @property
+    def state(self) -> Path:
+        """Where its climbers are."""
+        return self.options.out / "climb" / f"{self.robot}-{self.options.seed}.state.json"
+
+
+def search(asked: Climb) -> dict[str, Any]:
+    """Climb for as long as is asked."""
+    folder = asked.options.out / "robots"
+    solvers = {name: _solver(asked.robot, name, folder) for name in asked.options.tolerance}
+    found = climb(solvers, asked.state, asked.size, asked.options.seed)
+    return {"seconds": found["seconds"]}
+
+
+def causes(robot: ik.ArmHand, tolerance: ik.Tolerance, q: Array) -> list[str]:
+    """The row of a table for configurations (k, n) whose contacts were missed."""
+    points, normals = robot.contacts(q)
+    solver = ik.Solver(robot, tolerance=tolerance)
+    batch = solver.solve_batch(points, normals)
+    left = np.flatnonzero(~batch.success)
+    text = [f"{len(q)}", f"{len(q) - len(left)}"]
+    if not len(left):
+        return [*text, *5 * ["-"]]
+    arm, hand = (
+        list(motors)
+        for motors in (robot.description.arm_actuators, robot.description.hand_actuators)
+    )
+    ranges, rng = robot.upper - robot.lower, np.random.default_rng(0)
+    given = near = 0
+    for row in left.tolist():
+        target = points[row : row + 1], normals[row : row + 1]
+        fixed = {robot.actuators[i]: float(q[row, i]) for i in hand}
+        given += int(solver.solve_batch(*target, fixed=fixed).success[0])
+        start = q[row] + 0.1 * ranges * rng.uniform(-1, 1, len(ranges))
+        start = np.clip(start, robot.lower, robot.upper)
+        near += int(solver.solve_batch(*target, q0=start).success[0])
+    at_limits = np.minimum(q - robot.lower, robot.upper - q) < 1e-3 * ranges
+    shares = [
+        f"{100 * at_limits[left][:, motors].mean():.0f} %" if motors else "-"
+        for motors in (arm, hand)
+    ]
+    off = 1e6 * np.median(np.nanmax(batch.position_error[left], axis=1))
+    return [*text, f"{given} of {len(left)}", f"{near} of {len(left)}", *shares, f"{off:.3g} um"]
+
+
+Row = dict[str, Any]
+
+
+def rows_of(options: argparse.Namespace) -> tuple[list[Row], str]:
+    """What was found by robot, kind and tolerance (many robots: all kinds together), and codes."""
+    done, codes = read_parts(options.out, parts_of(options))
+    many = len(robots_of(options.robots)) > 2 * len(ROBOTS)
+    groups: dict[tuple[str, str, str], list[tuple[Part, Row]]] = {}
+    for part, found in done:
+        kind = "all kinds" if many else part.kind
+        groups.setdefault((part.robot, kind, part.tolerance), []).append((part, found))
+    rows: list[Row] = []
+    for (robot, kind, tolerance), some in groups.items():
+        found = [one for _, one in some]
+        usual = [one["ratio"] for part, one in some if part.sampler == "random"]
+        row: Row = {"robot": robot, "kind": kind, "tolerance": tolerance}
+        row |= {key: sum(one[key] for one in found) for key in ("count", "iterations", "restarted")}
+        row["mean"] = 1e6 * sum(one["seconds"] for one in found) / row["count"]
+        row["most restarts"] = max(one["most restarts"] for one in found)
+        row["most iterations"] = max(one["most iterations"] for one in found)
+        median, slow, worst = zip(*(one["times"] for one in found), strict=True)
+        row["times"] = float(np.median(median)), float(np.median(slow)), max(worst)
+        if options.ratio:
+            row["ratio"] = max(one["ratio"] for one in found)
+            row["usual"] = float(np.mean(usual or [np.nan]))
+        row["looked"] = sum(one.get("looked", 0) for one in found)
+        row["possible"] = sum(one.get("possible", 0) for one in found)
+        row["missed"] = [
+            {"place": f"{part.kind}-{part.number:05d}, row {miss['row']}"} | miss
+            for part, one in some
+            for miss in one["missed"]
+        ]
+        rows.append(row)
+    return rows, codes
+
+
+def climbed_rows(options: argparse.Namespace) -> tuple[list[Row], str]:
+    """The same of the climbing search."""
+    rows: list[Row] = []
+    codes = set[str]()
+    for robot in robots_of(options.robots) if "climb" in options.sampler else ():
+        state = Climb(robot, 0, options).state
+        if not state.exists():
+            continue
+        found = read_search(state)
+        codes.add(found["code"])
+        for tolerance in options.tolerance:
+            iterations, restarts = found["most"].get(tolerance, (0, 0))
+            missed = [one for one in found["missed"] if one["tolerance"] == tolerance]
+            row: Row = {"robot": robot, "kind": "climbing", "tolerance": tolerance}
+            row |= {"count": found["total"], "seconds": found["seconds"]}
+            row |= {"most iterations": iterations, "most restarts": restarts}
+            row["missed"] = [{"place": "climbing"} | one for one in missed]
+            rows.append(row)
+    return rows, ", ".join(sorted(codes))
+
+
+def _lost(row: Row) -> str:
+    """How many were missed, and with which verdicts."""
+    counts = Counter(miss["status"] for miss in row["missed"])
+    words = ", ".join(f"{count} {name}" for name, count in counts.most_common())
+    return f"{len(row['missed'])}" + (f" ({words})" if words else "")
+
+
+def _first(row: Row, metrics: list[Metric]) -> list[str]:
+    name = f"misses/{row['robot']}/{row['kind']}/{tolerance_name(row['tolerance'])}"
+    rate = rate_metric(name, row["count"] - len(row["missed"]), row["count"])
+    metrics.append(rate)
+    cells = [row["robot"], row["kind"], tolerance_name(row["tolerance"]), f"{row['count']:,}"]
+    return [*cells, _lost(row), interval_text(rate, 5)]
+
+
+def table_of(rows: list[Row], metrics: list[Metric]) -> str:
+    """The table of what was drawn."""
+    heads = ["robot", "targets", "tolerance", "n", "missed", "solved %", "iterations", "most"]
+    heads += ["restarted %", "most restarts", "median [us]", "99 %", "worst", "mean"]
+    heads += ["ratio, random", "largest"] if "ratio" in rows[0] else []
+    noise = rows[0]["kind"].startswith(OTHERS["noise"])
+    lines = []
+    for row in rows:
+        cells = [f"{row['iterations'] / row['count']:.1f}", f"{row['most iterations']:,}"]
+        cells += [f"{100 * row['restarted'] / row['count']:.2f}", f"{row['most restarts']}"]
+        cells += [f"{time_:,.0f}" for time_ in (*row["times"], row["mean"])]
+        cells += [f"{row[key]:.2f}" for key in ("usual", "ratio") if key in row]
+        cells += [f"{row['possible']} of {row['looked']}"] if noise else []
+        lines.append([*_first(row, metrics), *cells])
+    return markdown_table([*heads, *(["possible"] if noise else [])], lines)
+
+
+def climbed_table(rows: list[Row], metrics: list[Metric]) -> str:
+    """The table of the climbing search."""
+    heads = ["robot", "targets", "tolerance", "n", "missed", "solved %", "minutes"]
+    lines = [
+        [
+            *(*_first(row, metrics), f"{row['seconds'] / 60:.1f}"),
+            *(f"{row['most iterations']:,}", f"{row['most restarts']}"),
+        ]
+        for row in rows
+    ]
+    return markdown_table([*heads, "most iterations", "most restarts"], lines)
+
+
+def why(rows: list[Row], folder: Path) -> list[str]:
+    """Parts of the report on misses: causes, and the list."""
+    lost = [row for row in rows if row["missed"]]
+    listed = [
+        [row["robot"], tolerance_name(row["tolerance"]), miss["place"], miss["status"], text]
+        for row in lost
+        for miss in row["missed"]
+        for text in [" ".join(f"{x:.9g}" for x in miss["q"])]
+    ]
+    if not listed:
+        return ["## Misses", "None."]
+    cells = []
+    for robot, tolerance in dict.fromkeys((row["robot"], row["tolerance"]) for row in lost):
+        mine = [row for row in lost if (row["robot"], row["tolerance"]) == (robot, tolerance)]
+        of_contacts = [row for row in mine if row["kind"] != OTHERS["palms"]]
+        q = np.array([miss["q"] for row in of_contacts for miss in row["missed"]])
+        if len(q):
+            found = causes(load(robot, folder), tolerance_of(tolerance), q)
+            cells.append([robot, tolerance_name(tolerance), *found])
+    heads = ["robot", "tolerance", "missed", "solved now", "of the rest, given the hand"]
+    heads += ["from nearby", "arm motors at limits", "hand motors at limits", "off, median"]
+    parts = ["## Why", CAUSES, markdown_table(heads, cells)] if cells else []
+    names = ["robot", "tolerance", "target", "status", "q"]
+    return [*parts, "## Misses", markdown_table(names, listed[:SHOWN])]
+
+
+def heat_map(rows: list[Row], path: Path) -> None:
+    """Pairs of arm and hand: ratio of times as colour, misses as numbers, finest tolerance."""
+    finest = min((row["tolerance"] for row in rows), key=lambda t: tolerance_of(t).position)
+    pairs = {tuple(row["robot"].split("+")): row for row in rows if row["tolerance"] == finest}
+    arms, hands = (sorted({pair[i] for pair in pairs}) for i in (0, 1))
+    ratios = np.full((len(arms), len(hands)), np.nan)
+    drawn, grid = figure(1, 1, 4.5 + 0.3 * len(hands), 3.4 + 0.25 * len(arms))
+    axes = grid[0, 0]
+    for (arm, hand), row in pairs.items():
+        i, j = arms.index(arm), hands.index(hand)
+        ratios[i, j], missed = row["usual"], len(row["missed"])
+        text = f"{ratios[i, j]:.1f}" + (f"\n({missed})" if missed else "")
+        color = "white" if ratios[i, j] > 4.5 else "#c0392b" if missed else "black"
+        axes.text(j, i, text, ha="center", va="center", fontsize=7, color=color)
+    image = axes.imshow(ratios, cmap="YlGnBu", vmin=0, vmax=8, alpha=0.7, aspect="auto")
+    axes.set_xticks(range(len(hands)), hands, rotation=45, ha="right")
+    axes.set_yticks(range(len(arms)), arms)
+    drawn.colorbar(image, ax=axes, shrink=0.6).set_label(f"time of a target, {REFERENCE} = 1")
+    name = f"random targets, {tolerance_name(finest)}; (missed of all kinds)"
+    title(axes, name, "hand", "arm")
+    drawn.tight_layout()
+    drawn.savefig(path)
+
+
+def write_report(options: argparse.Namespace, run_by: str) -> None:
+    """Write the report on what there is."""
+    (drawn, codes), (climbed, others) = rows_of(options), climbed_rows(options)
+    noise = [row for row in drawn if row["kind"].startswith(OTHERS["noise"])]
+    rows, metrics = [row for row in drawn if row not in noise], list[Metric]()
+    total = sum(row["count"] for row in [*rows, *climbed])
+    lost = sum(len(row["missed"]) for row in [*rows, *climbed])
+    body = [INTRODUCTION, f"{total:,} solves, {lost} missed."]
+    options.report.mkdir(parents=True, exist_ok=True)
+    if options.ratio and rows and all("+" in row["robot"] for row in rows):
+        heat_map(rows, options.report / "pairs.png")
+        body += ["![time and misses of every pair](pairs.png)"]
+    body += [table_of(rows, metrics)] if rows else []
+    if noise:
+        body += ["## Noisy contacts", NOISY.format(*options.noise, STARTS)]
+        body += [table_of(noise, metrics)]
+    if climbed:
+        body += ["## Climbing", CLIMBING, climbed_table(climbed, metrics)]
+    body += why([*rows, *climbed], options.out / "robots")
+    if lost > SHOWN:
+        every = [
+            {"robot": row["robot"], "kind": row["kind"], "tolerance": row["tolerance"]}
+            | {"status": miss["status"], "q": " ".join(map(repr, miss["q"]))}
+            for row in [*rows, *climbed]
+            for miss in row["missed"]
+        ]
+        pl.DataFrame(every).write_csv(options.report / "misses.csv")
+    code = ", ".join(sorted({codes, others} - {""})) or None
+    body += ["## Where this comes from", f"`{run_by}`", provenance({"misses": code})]
+    write_page("Reachable targets that hand-first misses", body, options.report)
+    write_metrics(metrics, options.report / "metrics.json")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Solve what is missing and write the report."""
+    parser = argparse.ArgumentParser(description="Reachable targets that hand-first misses.")
+    parser.add_argument(
+        "--robots", nargs="+", default=ROBOTS, help="names; pairs: all of the catalogue; tour"
+    )
+    kinds = (*SAMPLERS, *OTHERS, "climb")
+    parser.add_argument("--sampler", nargs="+", default=USUAL, choices=kinds, metavar="SAMPLER",
+                        help=", ".join(kinds))  # fmt: skip
+    parser.add_argument(
+        "--tolerance", nargs="+", default=("default", "1e-6"), help="default, T or METRES,RADIANS"
+    )
+    parser.add_argument(
+        "--fingers", nargs="+", default=("all",), help="all, a number from the thumb on, A+B"
+    )
+    parser.add_argument("--count", type=int, default=10_000, help="targets of every kind")
+    parser.add_argument("--block", type=int, default=10_000, help="targets solved in one call")
+    parser.add_argument("--seed", type=int, default=0, help="of the targets")
+    parser.add_argument(
+        "--minutes", type=float, default=1.0, help="of climbing, all robots together"
+    )
+    parser.add_argument(
+        "--noise", type=float, nargs=2, default=(4.0, 2.0), metavar=("MM", "DEG"),
+        help="standard deviation of noisy contacts",
+    )  # fmt: skip
+    parser.add_argument("--looked", type=int, default=10, help="missed noisy ones Ipopt looks at")
+    parser.add_argument("--ratio", action="store_true", help=f"times over those of {REFERENCE}")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster instead")
+    parser.add_argument("--out", type=Path, default=Path("out/misses"), help="counts by block")
+    parser.add_argument("--report", type=Path, help="folder (default: OUT/report)")
+    options = parser.parse_args(arguments)
+    options.report = options.report or options.out / "report"
+    for text in options.tolerance:
+        tolerance_of(text)
+    run_parts(solve, parts_of(options), options.out, jobs=options.jobs, dask=options.dask)
+    if "climb" in options.sampler:
+        robots = robots_of(options.robots)
+        each = 60 * options.minutes * options.jobs / len(robots)
+        searches = [Climb(robot, each, options) for robot in robots]
+        run_parts(search, searches, options.out, jobs=options.jobs, title="seconds of climbing")
+    write_report(options, command(__file__, arguments))
+
+
+if __name__ == "__main__":
+    program(main)

@@ -1,0 +1,53 @@
+"""Figures in one style."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+
+from casadi_ik.arrays import Array
+from casadi_ik.palette import FAINT, INK
+from casadi_ik.views.picture import new_figure
+
+PAPER, OURS, THIRD, FOURTH = COLORS = "#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6"
+"""What the paper does, what we do, others."""
+
+
+def figure(rows: int, columns: int, width: float = 4.2, height: float = 3.7) -> tuple[Any, Any]:
+    """A figure and its axes (rows, columns), dressed plainly; a panel's size in inches."""
+    drawn = new_figure(width * columns, height * rows, 110)
+    grid = drawn.subplots(rows, columns, squeeze=False)
+    for axes in grid.ravel():
+        axes.tick_params(colors=FAINT, labelsize=8)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    return drawn, grid
+
+
+def title(axes: Axes, text: str, x: str, y: str) -> None:
+    """Say what a panel shows."""
+    axes.set_title(text, loc="left", size=10, color=INK)
+    axes.set_xlabel(x, size=9, color=INK)
+    axes.set_ylabel(y, size=9, color=INK)
+
+
+def field(
+    axes: Axes, x: Array, y: Array, values: Array, bins: int, low: float, high: float, cmap: str
+) -> QuadMesh:
+    """Median of values over cells of the plane; cells with fewer than five are left white."""
+    edges = [np.linspace(v.min(), v.max(), bins + 1) for v in (x, y)]
+    i, j = (np.clip(np.digitize(v, e) - 1, 0, bins - 1) for v, e in zip((x, y), edges, strict=True))
+    cell = i * bins + j
+    order = np.argsort(cell, kind="stable")
+    starts = np.searchsorted(cell[order], np.arange(bins * bins + 1))
+    sorted_values = values[order]
+    medians = np.full(bins * bins, np.nan)
+    for c in range(bins * bins):
+        part = sorted_values[starts[c] : starts[c + 1]]
+        if len(part) >= 5:
+            medians[c] = np.median(part)
+    grid = medians.reshape(bins, bins).T
+    return axes.pcolormesh(*edges, grid, cmap=cmap, vmin=low, vmax=high, rasterized=True)

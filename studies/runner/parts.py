@@ -1,0 +1,122 @@
+"""Parts of a study, each done once: here or on a Dask cluster, kept when complete."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import joblib
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.progress import TimeRemainingColumn as TimeRemaining
+from rich.text import Text
+
+from casadi_ik.batches.code import code_version
+from runner.cluster import backend
+
+PART = ".part"
+"""Ending of a file that is not complete."""
+
+
+class Part(Protocol):
+    """Some targets, solved in one call.
+
+    Attributes:
+        path: Where their results are, relative to the study's folder.
+        size: How many there are.
+    """
+
+    @property
+    def path(self) -> Path: ...  # noqa: D102
+
+    @property
+    def size(self) -> float: ...  # noqa: D102
+
+
+P = TypeVar("P", bound=Part)
+
+
+def solved(
+    solve: Callable[[P], Any],
+    parts: Sequence[P],
+    jobs: int = 1,
+    dask: str | None = None,
+    title: str = "targets",
+    until: float = float("inf"),
+) -> Iterator[tuple[P, Any]]:
+    """Parts and what came of them, in the order in which they are done.
+
+    Args:
+        solve: A function at the top of a module, so that other processes can call it.
+        parts: What it is called with.
+        jobs: Processes on this machine.
+        dask: Address of a Dask scheduler whose workers solve instead.
+        title: Of the progress bar.
+        until: No part is begun after this time [s, `time.monotonic`].
+
+    Raises:
+        InputError: The cluster cannot be used.
+    """
+    if not parts:
+        return
+    with backend(jobs, dask), _progress() as progress:
+        task = progress.add_task(title, total=sum(part.size for part in parts))
+        parallel: Any = joblib.Parallel(return_as="generator_unordered")
+        begun = (part for part in parts if time.monotonic() < until)
+        for part, found in parallel(joblib.delayed(_with)(solve, part) for part in begun):
+            yield part, found
+            progress.advance(task, part.size)
+
+
+def run_parts(
+    solve: Callable[[P], dict[str, Any]], parts: Iterable[P], folder: Path, **where: Any
+) -> None:
+    """Solve the parts that a folder does not have, and keep each as JSON as soon as it is done.
+
+    A run that is killed loses the parts being solved and nothing else; the next one goes on.
+
+    Args:
+        solve: See `solved`; what it returns can be written as JSON.
+        parts: All parts.
+        folder: Where their files are and go.
+        where: The other arguments of `solved`.
+    """
+    todo = [part for part in parts if not (folder / part.path).exists()]
+    for part, found in solved(solve, todo, **where):
+        keep(folder / part.path, json.dumps({"code": code_version(), "found": found}))
+
+
+def read_parts(folder: Path, parts: Iterable[P]) -> tuple[list[tuple[P, dict[str, Any]]], str]:
+    """The parts that are done, with what was found, and versions of the code that found it."""
+    there = [part for part in parts if (folder / part.path).exists()]
+    kept = [json.loads((folder / part.path).read_text(encoding="utf-8")) for part in there]
+    codes = ", ".join(sorted({entry["code"] for entry in kept}))
+    return [(part, entry["found"]) for part, entry in zip(there, kept, strict=True)], codes
+
+
+def keep(path: Path, content: str | bytes) -> None:
+    """Write a file that is there whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.stem}-{os.getpid()}{PART}")
+    part.write_bytes(content.encode() if isinstance(content, str) else content)
+    part.replace(path)
+
+
+def _with(solve: Callable[[P], Any], part: P) -> tuple[P, Any]:
+    return part, solve(part)
+
+
+class _Rate(ProgressColumn):
+    """Solves per second."""
+
+    def render(self, task: Task) -> Text:
+        return Text("" if task.speed is None else f"{task.speed:.0f} solves/s")
+
+
+def _progress() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate())
+    return Progress(*columns, TimeRemaining(), console=Console(stderr=True))

@@ -1,0 +1,246 @@
+"""Configurations whose contacts are the targets of studies: reachable by construction.
+
+A sampler draws (count, n) configurations of any robot. Public names of the package are used only,
+so that the same targets can be given to another version of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+import casadi_ik as ik
+from casadi_ik.arrays import Array
+
+Sampler = Callable[[ik.ArmHand, np.random.Generator, int], Array]
+
+DRAWS = 32
+"""Arms of which the one nearest to a singularity is taken."""
+
+AMID = 0.6
+"""Where the one arm of random hands stands within its limits."""
+
+NUDGE = 1e-6
+"""Difference [rad or m] from which slopes are taken."""
+
+LENGTH = 0.1
+"""This many metres weigh like a radian."""
+
+
+def random_hands(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Every actuator uniform within its limits."""
+    return robot.random(rng, count)
+
+
+def hands_on_one_arm(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Random hands on an arm amid its limits: what a hand can do is what is tried."""
+    q = robot.random(rng, count)
+    arm = _arm(robot)
+    q[:, arm] = (robot.lower + AMID * (robot.upper - robot.lower))[arm]
+    return q
+
+
+def corners(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Every actuator by itself at its lower limit, at its upper one or anywhere."""
+    q, where = robot.random(rng, count), rng.integers(0, 3, (count, len(robot.lower)))
+    return np.where(where == 0, robot.lower, np.where(where == 1, robot.upper, q))
+
+
+def near_limits(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Likewise, within 1 deg of the limit; a slider within a fiftieth of its stroke."""
+    q = robot.random(rng, count)
+    turning = [actuator.unit == "rad" for actuator in robot.description.actuators]
+    widest = np.where(turning, np.radians(1), (robot.upper - robot.lower) / 50)
+    near = rng.uniform(0, np.minimum(widest, robot.upper - robot.lower), q.shape)
+    where = rng.integers(0, 3, q.shape)
+    return np.where(where == 0, robot.lower + near, np.where(where == 1, robot.upper - near, q))
+
+
+def singular_arms(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Hands at corners on arms that are the nearest to singular of several."""
+    q, arm = corners(robot, rng, count), _arm(robot)
+    if not arm:
+        return q
+    draws = robot.random(rng, count * DRAWS)
+    smallest = palm_slopes(robot, draws).reshape(count, DRAWS)
+    chosen = draws.reshape(count, DRAWS, -1)[np.arange(count), smallest.argmin(axis=1)]
+    q[:, arm] = chosen[:, arm]
+    return q
+
+
+def shipped_hands(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Hands of the robot's shipped grasps, one after the other, on random arms."""
+    names = ik.shipped_grasps(robot.name)
+    parts = [grasp_arms(robot, rng, -(-count // len(names)), name) for name in names]
+    return np.stack(parts, axis=1).reshape(-1, len(robot.actuators))[:count]
+
+
+def aligned_arms(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Elbow straight, shoulder or wrist aligned, or all of them; to 1e-3 ... 1e-9 rad.
+
+    For arms of seven joints whose first, third and fifth axes meet the one before in a shoulder,
+    an elbow and a wrist.
+    """
+    return _aligned(robot, rng, robot.random(rng, count))
+
+
+def shipped_hands_on_aligned_arms(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Hands of three parallel fingers leave a freedom, and such arms hardly any."""
+    return _aligned(robot, rng, shipped_hands(robot, rng, count))
+
+
+def near_limits_on_aligned_arms(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """Hands near their limits on arms near a singularity."""
+    return _aligned(robot, rng, near_limits(robot, rng, count))
+
+
+SAMPLERS: dict[str, tuple[str, Sampler]] = {
+    "random": ("random hands", random_hands),
+    "one-arm": ("hands on one arm", hands_on_one_arm),
+    "corners": ("corners", corners),
+    "limits": ("near limits", near_limits),
+    "singular": ("corners on near-singular arms", singular_arms),
+    "grasps": ("shipped grasps", shipped_hands),
+    "aligned": ("aligned arms", aligned_arms),
+    "aligned-grasps": ("shipped grasps on aligned arms", shipped_hands_on_aligned_arms),
+    "aligned-limits": ("near limits on aligned arms", near_limits_on_aligned_arms),
+}
+"""By option: title and sampler."""
+
+HARD = tuple(draw for name, (_, draw) in SAMPLERS.items() if name not in ("one-arm", "singular"))
+"""Everything that is hard for an arm-hand of seven joints and shipped grasps."""
+
+
+def suits(robot: ik.ArmHand, sampler: str) -> bool:
+    """Whether a robot has what a sampler needs: shipped grasps, seven joints that can be zero."""
+    if sampler.endswith("grasps") and not (ik.shipped_grasps(robot.name) and _arm(robot)):
+        return False
+    if not sampler.startswith("aligned"):
+        return True
+    middle = [1, 3, 5]
+    straight = (robot.lower[middle] < -0.01).all() and (robot.upper[middle] > 0.01).all()
+    return len(_arm(robot)) == 7 and bool(straight)
+
+
+def grasp_arms(robot: ik.ArmHand, rng: np.random.Generator, count: int, grasp: str) -> Array:
+    """A grasp's hand posture, held as the grasp file says, on uniformly random arms.
+
+    As in Qiu & Kermani 2021, section III: "for each hand configuration, randomly generate 10,000
+    arm configurations that are uniformly distributed within the arm's joint limits".
+
+    Args:
+        robot: The robot.
+        rng: Source of the arm configurations.
+        count: Arm configurations.
+        grasp: A shipped grasp.
+
+    Returns:
+        (count, n) configurations.
+    """
+    q = robot.random(rng, count)
+    for actuator, value in _posture(grasp):
+        q[:, robot.actuators.index(actuator)] = value
+    return q
+
+
+def random_arm_targets(
+    robot: ik.ArmHand, names: tuple[str, ...], count: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Contacts of `grasp_arms` of several grasps.
+
+    Returns:
+        points [m] and normals, (len(names) * count, f, 3), grasp by grasp.
+    """
+    return robot.contacts(np.concatenate([grasp_arms(robot, rng, count, name) for name in names]))
+
+
+def noisy(
+    points: Array, normals: Array, rng: np.random.Generator, metres: float, angle: float
+) -> tuple[Array, Array]:
+    """Contacts (k, f, 3) with Gaussian noise on every coordinate; unit normals."""
+    points = points + rng.normal(0, metres, points.shape)
+    normals = normals + rng.normal(0, angle, normals.shape)
+    return points, normals / np.linalg.norm(normals, axis=2, keepdims=True)
+
+
+def finger_sets(robot: ik.ArmHand, asked: list[str]) -> dict[str, list[int]]:
+    """Places in `robot.fingers` of those that have a contact, by name of the set.
+
+    Args:
+        robot: The robot.
+        asked: "all", a number of fingers from the thumb on, or names joined by plus signs; sets
+            that a robot cannot have, or has already, are left out.
+    """
+    every = list(range(len(robot.fingers)))
+    first = robot.fingers.index(robot.thumb) if robot.thumb else 0
+    sets: dict[str, list[int]] = {}
+    for word in asked:
+        if word == "all":
+            chosen = every
+        elif word.isdigit():
+            chosen = sorted([first, *(f for f in every if f != first)][: int(word)])
+        else:
+            chosen = [i for i, name in enumerate(robot.fingers) if name in word.split("+")]
+        if chosen and chosen not in sets.values():
+            sets[word] = chosen
+    return sets
+
+
+def palm_slopes(robot: ik.ArmHand, q: Array) -> Array:
+    """(k,) smallest singular value of how the palm moves with the arm, metres by `LENGTH`."""
+    here = robot.palm(q)
+    rows = []
+    for column in _arm(robot):
+        moved = q.copy()
+        moved[:, column] += NUDGE
+        change = (robot.palm(moved) - here) / NUDGE
+        turned = change[:, :3, :3] @ here[:, :3, :3].transpose(0, 2, 1)
+        turn = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], axis=1)
+        rows.append(np.concatenate([change[:, :3, 3] / LENGTH, turn], axis=1))
+    return np.linalg.svd(np.stack(rows, axis=2), compute_uv=False)[:, -1]
+
+
+def contact_slopes(robot: ik.ArmHand, q: Array) -> Array:
+    """(k,) smallest singular value of how all contacts move with all motors, elbow aside.
+
+    Where it is small the contacts hardly tell where the motors are. An arm of more than six joints
+    moves without moving the palm; that motion is not counted.
+    """
+    points, normals = robot.contacts(q)
+    columns = []
+    ranges = robot.upper - robot.lower
+    for column in range(q.shape[1]):
+        moved = q.copy()
+        step = NUDGE * min(1.0, float(ranges[column]))
+        moved[:, column] += step
+        there = robot.contacts(moved)
+        scale = min(1.0, float(ranges[column])) / step
+        change = [(there[0] - points) / LENGTH * scale, (there[1] - normals) * scale]
+        columns.append(np.concatenate([part.reshape(len(q), -1) for part in change], axis=1))
+    values = np.linalg.svd(np.stack(columns, axis=2), compute_uv=False)
+    spare = max(len(_arm(robot)) - 6, 0)
+    # A point and a direction are five numbers.
+    return values[:, min(q.shape[1] - spare, 5 * len(robot.fingers)) - 1]
+
+
+def _arm(robot: ik.ArmHand) -> list[int]:
+    return list(robot.description.arm_actuators)
+
+
+def _aligned(robot: ik.ArmHand, rng: np.random.Generator, q: Array) -> Array:
+    arm, count = _arm(robot), len(q)
+    drawn = robot.random(rng, count)
+    off = rng.normal(0, 1e-3, (count, 3)) * 10.0 ** -rng.integers(0, 6, (count, 1))
+    which = rng.integers(0, 4, count)
+    for j, column in enumerate((1, 3, 5)):
+        rows = (which == j) | (which == 3)
+        drawn[rows, column] = off[rows, j]
+    q[:, arm] = drawn[:, arm]
+    return q
+
+
+@cache
+def _posture(grasp: str) -> tuple[tuple[str, float], ...]:
+    return tuple(ik.load_grasp(grasp).posture.items())

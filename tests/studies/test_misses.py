@@ -1,0 +1,90 @@
+"""The study of misses: it counts, goes on where it stopped, lists what is lost, and climbs."""
+
+from __future__ import annotations
+
+import json
+
+import made_robots
+import misses
+import numpy as np
+import pytest
+from samplers import SAMPLERS, finger_sets, palm_slopes, singular_arms, suits
+
+import casadi_ik as ik
+
+ONE = ["--robots", "kuka_lwr_barrett", "--tolerance", "default"]
+
+
+@pytest.mark.parametrize("name", [*made_robots.MADE, "kuka_lwr_barrett"])
+def test_targets_are_within_limits(tmp_path, rng, name):
+    robot = misses.load(name, tmp_path)
+    for sampler, (_, draw) in SAMPLERS.items():
+        if suits(robot, sampler):
+            q = draw(robot, rng, 40)
+            assert q.shape == (40, len(robot.actuators))
+            assert robot.beyond_limits(q).max() <= 1e-9
+
+
+def test_singular_arms_are_nearer_to_singular(robot, rng):
+    usual = palm_slopes(robot, robot.random(rng, 200))
+    assert np.median(palm_slopes(robot, singular_arms(robot, rng, 200))) < np.median(usual) / 4
+
+
+def test_a_count_goes_on_and_lists_what_is_lost(tmp_path):
+    asked = [*ONE, "--sampler", "random", "--block", "40", "--out", str(tmp_path)]
+    misses.main([*asked, "--count", "40"])
+    (first,) = (tmp_path / "kuka_lwr_barrett").rglob("*.json")
+    kept = json.loads(first.read_text())
+    kept["found"]["missed"] = [{"row": 3, "status": "STALLED", "q": [0.25] * 14}]
+    first.write_text(json.dumps(kept))
+    misses.main([*asked, "--count", "80"])
+    assert len(list((tmp_path / "kuka_lwr_barrett").rglob("*.json"))) == 2
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "80 solves, 1 missed." in text
+    assert "| 80 | 1 (1 STALLED) |" in text
+    assert "random hands-00000, row 3" in text
+    assert "| kuka_lwr_barrett | 5 mm, 3 deg | 1 | 1 |" in text, "it can be solved"
+
+
+def test_palms_noise_and_few_fingers(tmp_path):
+    asked = [*ONE, "--sampler", "palms", "noise", "limits", "--fingers", "all", "2"]
+    asked += ["--count", "30", "--noise", "6", "3", "--looked", "1", "--out", str(tmp_path)]
+    misses.main([*asked, "--ratio"])
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "| kuka_lwr_barrett | palms of random hands | 5 mm, 3 deg | 30 | 0 |" in text
+    assert "| kuka_lwr_barrett | near limits; 2 fingers | 5 mm, 3 deg | 30 | 0 |" in text
+    assert "Gaussian noise of 6 mm" in text
+    assert text.count(" of 1 |") >= 1
+
+
+def test_a_search_goes_on_and_climbs(tmp_path):
+    states = []
+    for minutes in ("0.02", "0.04"):
+        asked = [*ONE, "--sampler", "climb", "--minutes", minutes, "--out", str(tmp_path)]
+        misses.main(asked)
+        (path,) = (tmp_path / "climb").glob("*.state.json")
+        states.append(json.loads(path.read_text())["search"])
+    first, then = states
+    assert then["total"] > first["total"] > 0
+    assert np.median(then["score"]) >= np.median(first["score"])
+    assert "## Climbing" in (tmp_path / "report" / "report.md").read_text()
+
+
+def test_pairs_and_fingers():
+    toured = misses.robots_of(["tour"])
+    assert {name.split("+")[0] for name in toured} == set(ik.shipped_names("arms"))
+    assert {name.split("+")[1] for name in toured} == set(ik.shipped_names("hands"))
+    assert set(toured) < set(misses.robots_of(["pairs"]))
+    robot = ik.load_robot("panda+allegro_right")
+    sets = finger_sets(robot, ["all", "3", "4", "thumb+ring"])
+    assert set(sets) == {"all", "3", "thumb+ring"}
+    assert robot.fingers.index(robot.thumb) in sets["3"]
+
+
+def test_a_heat_map_of_pairs(tmp_path):
+    rows = [
+        {"robot": pair, "tolerance": "1e-6", "usual": 1.5, "missed": [], "kind": "all kinds"}
+        for pair in ("panda+leap", "ur5e+leap", "ur5e+shadow")
+    ]
+    misses.heat_map(rows, tmp_path / "pairs.png")
+    assert (tmp_path / "pairs.png").stat().st_size > 5_000
