@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.collision.solids import Kind, of_object
+from casadi_ik.collision.solids import EXPORTED, of_object, stated
 from casadi_ik.exporting.project import checked_prefix, write_folder
 from casadi_ik.exporting.wasm import wasm_project
 from casadi_ik.grasps.load import shipped_grasps
@@ -65,26 +65,15 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
             if np.linalg.norm(points[i] - points[k]) < CLOSE:
                 points[k] = normals[k] = np.nan
         parts = of_object(load_object(grasp.object).shape)
-        if len(parts) >= CAPACITY or any(solid.kind is Kind.CONVEX for solid, _ in parts):
+        if len(parts) >= CAPACITY or any(solid.kind not in EXPORTED for solid, _ in parts):
             continue
-        solids = []
-        for solid, place in parts:
-            pose = grasp.object_pose @ place
-            factor = [2, 2, 2] if solid.kind is Kind.BOX else [1, 2, 1]
-            solids.append(
-                {
-                    "kind": int(solid.kind),
-                    "size": (solid.size * factor).tolist(),
-                    "pose": [*pose[:3, :3].ravel().tolist(), *pose[:3, 3].tolist()],
-                }
-            )
         found.append(
             {
                 "name": file,
                 "object": grasp.object.replace("_", " "),
                 "points": [None if np.isnan(p).any() else p.tolist() for p in points],
                 "normals": [None if np.isnan(n).any() else n.tolist() for n in normals],
-                "solids": solids,
+                "solids": [stated(solid, grasp.object_pose @ place) for solid, place in parts],
             }
         )
     if not found:

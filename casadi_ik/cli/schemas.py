@@ -12,7 +12,7 @@ from rich.text import Text
 from casadi_ik.cli.answer import Answer
 from casadi_ik.cli.outputs import writing
 from casadi_ik.cli.report import headline
-from casadi_ik.collision.scene_file import SceneFile
+from casadi_ik.collision.scene import SceneFile
 from casadi_ik.datasets.conventions import ConventionFile
 from casadi_ik.files.json_schema import json_schema
 from casadi_ik.files.writing import written_whole

@@ -1,226 +1,297 @@
-"""Distances of capsules in numpy, with where and which way they are nearest.
+"""Pairs of shapes as arrays, and their distances in numpy.
 
-The same as the compiled driver gives: for machines without a compiler, and for gradients.
+The compiled driver (``kernels/drivers/clearance.c``) gives the same distances; numpy serves where
+there is no compiler, and where few distances are wanted: gaps between things, nearest points.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.solids import GROUP, Kind, Solid
-from casadi_ik.collision.table import Table
-
-CUTS = 40
-"""Cuts of the interval in which a segment is nearest to a solid."""
-
-CLOSE = 1e-7
-"""Where tangents and function agree to this [m], the least is found."""
-
-TINY = 1e-30
-
-AT_ONCE = 256
-"""Segments that are held against a cloud together."""
+from casadi_ik.collision.scene import Item
+from casadi_ik.collision.solids import Kind, Solid, along_rays, spread
 
 
 @dataclass(frozen=True, eq=False)
-class Nearest:
-    """Distances of k configurations' pairs (p).
+class Table:
+    """What a distance kernel works on.
 
     Attributes:
-        distance: (k, p) [m], the pairs' offsets taken off.
-        first: (k, p) where on the first segment, -1 to 1 from its middle.
-        second: (k, p) where on the second, likewise; 0 on a solid.
-        way: (k, p, 3) how the distance grows with the place of the first's nearest point.
+        radii: (s,) radii of the robot's capsules [m].
+        halves: (s,) half lengths of their segments [m].
+        pairs: (p, 2) a capsule; another, or s + a solid.
+        own: How many solids are the robot's own; they come first.
+        offsets: (p,) how much farther than the scene's margin a pair has to be apart [m].
+        solids: The solids.
+        places: Pose (4, 4) of every other solid in its item's frame.
+        items: Name of the item of every other solid.
+        names: (p, 2) what each pair is called: links, or a link and an item.
+        moving: Links that an arm may move while its palm stays.
+        margins: (p,) what each pair has to be apart, beyond what its shapes may overlap [m].
     """
 
-    distance: Array
-    first: Array
-    second: Array
-    way: Array
+    radii: Array
+    halves: Array
+    pairs: NDArray[np.int32]
+    offsets: Array
+    own: int
+    solids: tuple[Solid, ...]
+    places: tuple[Array, ...]
+    items: tuple[str, ...]
+    names: tuple[tuple[str, str], ...]
+    moving: frozenset[str] = frozenset()
+    margins: Array = field(default_factory=lambda: np.zeros(0))
+    _parted: dict[frozenset[str], tuple[Table, Table]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    def poses(
+        self, items: dict[str, Item], moved: str | None = None, to: Array | None = None
+    ) -> Array:
+        """(n, 12) rotation row by row and origin of every solid of a scene, or (k, n, 12).
+
+        Args:
+            items: Where things are, by name.
+            moved: The item that is elsewhere in every row.
+            to: (k, 4, 4) where it is.
+        """
+        found = [
+            pose_row((to if name == moved and to is not None else items[name].pose) @ place)
+            for place, name in zip(self.places, self.items, strict=True)
+        ]
+        return np.stack(np.broadcast_arrays(*found), axis=-2) if found else np.zeros((0, 12))
+
+    @cached_property
+    def for_driver(self) -> tuple[NDArray[np.void], Array]:
+        """The solids (n, 7 of 8 bytes) and the planes (m, 4) as the driver has them."""
+        form = [("kind", "<i8"), ("size", "<f8", 3), ("reach", "<f8"), ("first", "<i8")]
+        rows = np.zeros(len(self.solids), dtype=np.dtype([*form, ("planes", "<i8")]))
+        first = 0
+        for i, solid in enumerate(self.solids):
+            rows[i] = (solid.kind, solid.size, solid.reach, first, len(solid.planes))
+            first += len(solid.planes)
+        return rows, np.concatenate([np.zeros((0, 4)), *(one.planes for one in self.solids)])
+
+    @cached_property
+    def held(self) -> Table:
+        """The pairs whose distances follow from the hand and where its palm is."""
+        return self.only(~self._swinging)
+
+    @cached_property
+    def swung(self) -> Table:
+        """The pairs whose distances depend on the arm that holds the palm."""
+        return self.only(self._swinging)
+
+    @cached_property
+    def of_robot(self) -> Table:
+        """The pairs of the robot with itself."""
+        return self.only(self._within)
+
+    @cached_property
+    def of_scene(self) -> Table:
+        """The pairs of the robot with what stands about it."""
+        return self.only(~self._within)
+
+    def parted(self, links: frozenset[str]) -> tuple[Table, Table]:
+        """The pairs that one of some links is in, and all others; worked out once."""
+        if links not in self._parted:
+            within = np.array([not links.isdisjoint(pair) for pair in self.names], dtype=bool)
+            self._parted[links] = self.only(within), self.only(~within)
+        return self._parted[links]
+
+    @property
+    def _swinging(self) -> NDArray[np.bool_]:
+        return np.array([not self.moving.isdisjoint(pair) for pair in self.names], dtype=bool)
+
+    @property
+    def _within(self) -> NDArray[np.bool_]:
+        return self.pairs[:, 1] < len(self.radii) + self.own
+
+    def only(self, rows: NDArray[np.bool_]) -> Table:
+        """The same with some of the pairs."""
+        names = tuple(name for name, kept in zip(self.names, rows.tolist(), strict=True) if kept)
+        return replace(
+            self,
+            pairs=np.ascontiguousarray(self.pairs[rows]),
+            offsets=self.offsets[rows],
+            names=names,
+            margins=self.margins[rows],
+        )
 
 
-def nearest(where: Array, poses: Array, table: Table) -> Nearest:
+def pose_row(pose: Array) -> Array:
+    """(..., 12) rotation row by row, then the origin, of poses (..., 4, 4)."""
+    turn = pose[..., :3, :3].reshape(*pose.shape[:-2], 9)
+    return np.concatenate([turn, pose[..., :3, 3]], axis=-1)
+
+
+def nearest(where: Array, poses: Array, table: Table) -> tuple[Array, Array]:
     """Distances of all pairs of a table.
 
     Args:
         where: (k, ...) where the robot's shapes are, as `collision.model.placed` gives it.
         poses: (k, n, 12) or (n, 12) of a scene's solids.
         table: The pairs.
+
+    Returns:
+        (k, p) distances [m], the pairs' offsets taken off; (k, p) where on the first segment it is
+        nearest, -1 to 1 from its middle.
     """
     k, p, s = len(where), len(table.pairs), len(table.radii)
-    placed = where[:, : 6 * s].reshape(k, s, 6)
-    theirs = np.broadcast_to(poses, (k, *poses.shape[-2:]))
+    segments = where[:, : 6 * s].reshape(k, s, 6)
     own = where[:, 6 * s : 6 * s + 12 * table.own].reshape(k, table.own, 12)
-    places = np.concatenate([own, theirs], axis=1)
+    places = np.concatenate([own, np.broadcast_to(poses, (k, *poses.shape[-2:]))], axis=1)
     one, other = table.pairs[:, 0], table.pairs[:, 1]
-    radius = table.radii[one] + table.offsets
-    found = Nearest(np.empty((k, p)), np.zeros((k, p)), np.zeros((k, p)), np.zeros((k, p, 3)))
+    distance, along = np.empty((k, p)), np.empty((k, p))
     robot = np.flatnonzero(other < s)
-    if len(robot):
-        i, j = one[robot], other[robot]
-        parts = _segments(placed[:, i], placed[:, j])
-        _put(found, robot, parts, radius[robot] + table.radii[j])
+    distance[:, robot], along[:, robot] = between_segments(
+        segments[:, one[robot]], segments[:, other[robot]]
+    )
+    distance[:, robot] -= table.radii[other[robot]]
     for number, solid in enumerate(table.solids):
         rows = np.flatnonzero(other == s + number)
         if len(rows):
-            parts = _from_solid(solid, placed[:, one[rows]], places[:, number])
-            wide = solid.size[0] if solid.kind in (Kind.CAPSULE, Kind.CLOUD) else 0.0
-            _put(found, rows, parts, radius[rows] + wide)
-    return found
+            distance[:, rows], along[:, rows] = from_solid(
+                solid, segments[:, one[rows]], places[:, number]
+            )
+    return distance - (table.radii[one] + table.offsets), along
 
 
-def _put(
-    found: Nearest, rows: NDArray[np.intp], parts: tuple[Array, Array, Array, Array], less: Array
-) -> None:
-    found.distance[:, rows] = parts[0] - less
-    found.first[:, rows], found.second[:, rows], found.way[:, rows] = parts[1:]
+def between_segments(a: Array, b: Array) -> tuple[Array, Array]:
+    """Least distances (...) [m] of segments (..., 6), middles and halves; and where on the first.
 
-
-def segment_distances(a: Array, b: Array) -> Array:
-    """Least distances (...) [m] of segments (..., 6), middles and halves."""
-    return _segments(a, b)[0]
-
-
-def _segments(a: Array, b: Array) -> tuple[Array, Array, Array, Array]:
-    """Least distances of segments (..., 6)."""
+    Source: C. Ericson, Real-Time Collision Detection, section 5.1.9.
+    """
     r, g, h = a[..., :3] - b[..., :3], a[..., 3:], b[..., 3:]
+    tiny = 1e-30  # of squares [m^2]: a segment of no length is a point
 
     def dot(x: Array, y: Array) -> Array:
         return np.einsum("...i,...i->...", x, y)
 
     aa, bb, both, d, f = dot(g, g), dot(h, h), dot(g, h), dot(g, r), dot(h, r)
-    over_a = np.where(aa > TINY, 1 / np.maximum(aa, TINY), 0.0)
-    over_b = np.where(bb > TINY, 1 / np.maximum(bb, TINY), 0.0)
-    t = np.clip((both * f - bb * d) / np.maximum(aa * bb - both * both, TINY), -1, 1)
-    s = np.clip((both * t + f) * over_b, -1, 1)
-    t = np.clip((both * s - d) * over_a, -1, 1)
-    apart = r + t[..., None] * g - s[..., None] * h
-    length = np.linalg.norm(apart, axis=-1)
-    return length, t, s, apart / np.maximum(length, TINY)[..., None]
+    t = np.clip((both * f - bb * d) / np.maximum(aa * bb - both * both, tiny), -1, 1)
+    u = np.clip((both * t + f) / np.maximum(bb, tiny), -1, 1)
+    t = np.clip((both * u - d) / np.maximum(aa, tiny), -1, 1)
+    return np.linalg.norm(r + t[..., None] * g - u[..., None] * h, axis=-1), t
 
 
-def _from_solid(solid: Solid, a: Array, pose: Array) -> tuple[Array, Array, Array, Array]:
-    """Least signed distances of segments (k, p, 6) from a solid at poses (k, 12)."""
+def from_solid(solid: Solid, segments: Array, pose: Array) -> tuple[Array, Array]:
+    """Least distances (k, p) [m] of segments (k, p, 6) from a solid at poses (k, 12).
+
+    Returns:
+        The distances, and where on the segments they are, -1 to 1 from their middles.
+    """
     rotation, origin = pose[:, :9].reshape(-1, 3, 3), pose[:, 9:]
-    if solid.kind is Kind.CAPSULE:
-        axis = rotation[:, :, 2] * solid.size[1]
-        both = np.concatenate([origin, axis], axis=1)[:, None]
-        return _segments(a, np.broadcast_to(both, a.shape))
-    c = np.einsum("kji,kpj->kpi", rotation, a[..., :3] - origin[:, None])
-    h = np.einsum("kji,kpj->kpi", rotation, a[..., 3:])
-    t, value, way = (_from_points if solid.kind is Kind.CLOUD else _lowest)(solid, c, h)
-    turned = np.einsum("kij,kpj->kpi", rotation, way)
-    return value, t, np.zeros_like(t), turned
+    c = np.einsum("kji,kpj->kpi", rotation, segments[..., :3] - origin[:, None])
+    h = np.einsum("kji,kpj->kpi", rotation, segments[..., 3:])
+    if solid.kind is not Kind.CLOUD:
+        return _least(lambda t: solid.distance(c + t[..., None] * h), np.linalg.norm(h, axis=-1))
+    distance, along = np.empty(c.shape[:-1]), np.empty(c.shape[:-1])
+    long = np.maximum((h * h).sum(axis=-1), 1e-30)
+    for row, (middles, halves) in enumerate(zip(c, h, strict=True)):  # not convex: every point
+        away = solid.points - middles[:, None]
+        t = np.clip(np.einsum("pmi,pi->pm", away, halves) / long[row, :, None], -1, 1)
+        apart = np.linalg.norm(away - t[..., None] * halves[:, None], axis=-1)
+        distance[row] = apart.min(axis=1) - solid.size[0]
+        along[row] = np.take_along_axis(t, apart.argmin(axis=1)[:, None], axis=1)[:, 0]
+    return distance, along
 
 
-def _from_points(solid: Solid, c: Array, h: Array) -> tuple[Array, Array, Array]:
-    """Where on segments a cloud's points are nearest, how far that is, and the way out."""
-    groups = solid.planes.reshape(-1, GROUP + 1, 4)
-    middles, wide = groups[:, 0, :3], groups[:, 0, 3]
-    parts = _parts_of(c.reshape(-1, 3)), _parts_of(h.reshape(-1, 3))
-    found = [_nearest_points(groups, middles, wide, a, b) for a, b in zip(*parts, strict=True)]
-    t, length, way = (np.concatenate(some) for some in zip(*found, strict=True))
-    shape = c.shape[:-1]
-    return t.reshape(shape), length.reshape(shape), way.reshape(*shape, 3)
+def _least(distance: Callable[[Array], Array], half: Array) -> tuple[Array, Array]:
+    """Lower bound of convex functions' least value between -1 and 1, and where: golden section.
+
+    Args:
+        distance: Values (...) at places (...).
+        half: (...) how fast it may grow.
+    """
+    golden = (np.sqrt(5) - 1) / 2
+    low, high = np.full(half.shape, -1.0), np.ones(half.shape)
+    inner = low + (1 - golden) * 2, low + golden * 2
+    left, right = map(distance, inner)
+    for _ in range(46):
+        falls = left > right
+        low, high = np.where(falls, inner[0], low), np.where(falls, high, inner[1])
+        width = high - low
+        new = np.where(falls, low + golden * width, high - golden * width)
+        value = distance(new)
+        inner = np.where(falls, inner[1], new), np.where(falls, new, inner[0])
+        left, right = np.where(falls, right, value), np.where(falls, value, left)
+    middle = (low + high) / 2
+    return distance(middle) - half * (high - low), middle
 
 
-def _parts_of(rows: Array) -> list[Array]:
-    return [rows[i : i + AT_ONCE] for i in range(0, max(len(rows), 1), AT_ONCE)]
+def gaps(item: Item, others: Sequence[Item], poses: Array) -> Array:
+    """Distances (k,) [m] of a thing at poses (k, 4, 4) from others; negative: they overlap.
+
+    Points of either's surface against the other: exact to a few millimetres.
+
+    Args:
+        item: What is moved.
+        others: The rest.
+        poses: Of the item, base frame.
+    """
+    least = np.full(len(poses), np.inf)
+    placed = [(solid, other.pose @ place) for other in others for solid, place in other.parts]
+    for (solid, part), (other, place) in product(item.parts, placed):
+        points = surface_points(solid)[: 0 if other.kind is Kind.CLOUD else None]
+        theirs = surface_points(other)
+        for row, pose in enumerate(poses @ part):
+            seen = np.linalg.inv(place) @ pose
+            here = _points_from(points, seen, other) - _around(solid)
+            there = _points_from(theirs, np.linalg.inv(seen), solid) - _around(other)
+            least[row] = min(least[row], here, there)
+    return least
 
 
-def _nearest_points(
-    groups: Array, middles: Array, wide: Array, c: Array, h: Array
-) -> tuple[Array, Array, Array]:
-    def apart(points: Array, c: Array, h: Array) -> tuple[Array, Array]:
-        away, along = points - c, np.maximum((h * h).sum(axis=-1), TINY)
-        t = np.clip((away * h).sum(axis=-1) / along, -1, 1)
-        return t, t[..., None] * h - away
-
-    far = np.linalg.norm(apart(middles, c[:, None], h[:, None])[1], axis=-1)
-    near = far - wide <= (far + wide).min(axis=1)[:, None] + CLOSE
-    row, group = np.nonzero(near)
-    t, way = apart(groups[group, 1:, :3], c[row, None], h[row, None])
-    length = np.linalg.norm(way, axis=-1)
-    best = length.argmin(axis=1)
-    each = np.arange(len(row))
-    t, length, way = t[each, best], length[each, best], way[each, best]
-    # Rows ascend; of each the first of its groups in order of distance.
-    order = np.lexsort((length, row))
-    first = order[np.append(True, np.diff(row[order]) > 0)]
-    return t[first], length[first], way[first] / np.maximum(length[first], TINY)[:, None]
+def _around(solid: Solid) -> float:
+    """How far a solid reaches beyond its `surface_points` [m]."""
+    return float(solid.size[0]) if solid.kind is Kind.CLOUD else 0.0
 
 
-def _lowest(solid: Solid, c: Array, h: Array) -> tuple[Array, Array, Array]:
-    """Where on segments a solid is nearest, a lower bound of that distance, and the way out."""
-
-    def look(t: Array) -> tuple[Array, Array, Array]:
-        value, way = signed(solid, c + t[..., None] * h)
-        return value, np.einsum("...i,...i->...", way, h), way
-
-    low, high = np.full(c.shape[:-1], -1.0), np.ones(c.shape[:-1])
-    left, right = look(low), look(high)
-    inner = (left[1] < 0) & (right[1] > 0)
-    first = right[0] < left[0]
-    t, best = np.where(first, high, low), np.where(first, right[0], left[0])
-    way = np.where(first[..., None], right[2], left[2])
-    bound = best
-    (lv, ls, lw), (rv, rs, rw) = left, right
-    for cut in range(CUTS + 1):
-        steep = np.where(inner, ls - rs, -1.0)
-        meet = (rv - lv + ls * low - rs * high) / steep
-        bound = np.where(inner, np.minimum(lv + ls * (meet - low), best), best)
-        if not (best - bound >= CLOSE).any():
-            break
-        here = (low + high) / 2 if cut % 3 == 2 else np.clip(meet, low, high)
-        value, slope, way_here = look(here)
-        nearer = (value < best) & inner
-        t, best = np.where(nearer, here, t), np.where(nearer, value, best)
-        way = np.where(nearer[..., None], way_here, way)
-        falls = slope < 0
-        side = (falls & inner)[..., None], (~falls & inner)[..., None]
-        lw, rw = np.where(side[0], way_here, lw), np.where(side[1], way_here, rw)
-        low, lv, ls = (np.where(falls, x, y) for x, y in ((here, low), (value, lv), (slope, ls)))
-        high, rv, rs = (np.where(falls, y, x) for x, y in ((here, high), (value, rv), (slope, rs)))
-    # Where two faces meet the nearest point stays on their edge: both pull, balanced.
-    share = (rs / np.where(inner, rs - ls, 1.0))[..., None]
-    return t, bound, np.where(inner[..., None], share * lw + (1 - share) * rw, way)
+def _points_from(points: Array, pose: Array, solid: Solid) -> float:
+    """Least distance of points (m, 3), which are at a pose in the frame of a solid, from it."""
+    if not len(points):
+        return np.inf
+    return float(solid.distance(points @ pose[:3, :3].T + pose[:3, 3]).min())
 
 
-def signed(solid: Solid, p: Array) -> tuple[Array, Array]:
-    """Signed distances of points (..., 3) from a solid in its frame, and their gradients."""
-    if solid.kind is Kind.CAPSULE:
-        foot = np.zeros_like(p)
-        foot[..., 2] = np.clip(p[..., 2], -solid.size[1], solid.size[1])
-        off = np.linalg.norm(p - foot, axis=-1)
-        return off - solid.size[0], (p - foot) / np.maximum(off, TINY)[..., None]
+def surface_points(solid: Solid, rays: int = 256, steps: int = 12) -> Array:
+    """(k, 3) points of a solid's surface in its frame, along its edges too.
+
+    Of a half-space, or of a body whose origin is not in it, none; of a cloud its points.
+
+    Args:
+        solid: The solid.
+        rays: How many points all around.
+        steps: Points along a sharp edge that is as long as the solid.
+    """
     if solid.kind is Kind.CLOUD:
-        _, off, way = _from_points(solid, p, np.zeros_like(p))
-        return off - solid.size[0], way
-    if solid.kind is Kind.HALF_SPACE:
-        return p[..., 2], np.broadcast_to([0.0, 0.0, 1.0], p.shape)
-    if solid.kind is Kind.CONVEX:
-        values = p @ solid.planes[:, :3].T - solid.planes[:, 3]
-        which = values.argmax(axis=-1)
-        value = np.take_along_axis(values, which[..., None], axis=-1)[..., 0]
-        return value, solid.planes[which, :3]
-    if solid.kind is Kind.CYLINDER:
-        from_axis = np.linalg.norm(p[..., :2], axis=-1)
-        excess = np.stack([from_axis - solid.size[0], np.abs(p[..., 2]) - solid.size[1]], axis=-1)
-        around = p[..., :2] / np.maximum(from_axis, TINY)[..., None]
-        ways = np.zeros((*p.shape[:-1], 2, 3))
-        ways[..., 0, :2] = around
-        ways[..., 1, 2] = np.where(p[..., 2] < 0, -1.0, 1.0)
-    else:
-        excess = np.abs(p) - solid.size
-        ways = np.where(p < 0, -1.0, 1.0)[..., None] * np.eye(3)
-    out = np.maximum(excess, 0.0)
-    length = np.linalg.norm(out, axis=-1)
-    outside = length > 0
-    deep = np.take_along_axis(ways, excess.argmax(axis=-1)[..., None, None], axis=-2)[..., 0, :]
-    outer = np.einsum("...i,...ij->...j", out, ways) / np.maximum(length, TINY)[..., None]
-    value = np.where(outside, length, excess.max(axis=-1))
-    return value, np.where(outside[..., None], outer, deep)
+        return solid.points
+    if not np.isfinite(solid.reach) or solid.distance(np.zeros(3)) >= 0:
+        return np.zeros((0, 3))
+    step = solid.reach / steps
+    edges = [
+        np.linspace(one, other, 2 + int(np.linalg.norm(other - one) / step))
+        for one, other in zip(*_sharp_edges(*solid.mesh()), strict=True)
+    ]
+    return np.concatenate([along_rays(solid, spread(rays)), *edges])
+
+
+def _sharp_edges(points: Array, triangles: NDArray[np.int64]) -> tuple[Array, Array]:
+    """(e, 3) and (e, 3) the ends of edges at which a closed surface bends by more than 35 deg."""
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    order = np.lexsort(edges.T)
+    faces = (order // 3).reshape(-1, 2)  # each edge is one of two triangles
+    bent = (normals[faces[:, 0]] * normals[faces[:, 1]]).sum(axis=1) < np.cos(np.deg2rad(35.0))
+    found = edges[order[::2][bent]]
+    return points[found[:, 0]], points[found[:, 1]]

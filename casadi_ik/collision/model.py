@@ -1,9 +1,9 @@
-"""The shapes of a robot, and which of them are checked against each other."""
+"""The shapes of a robot, and which of them are checked against each other and against a scene."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
+from casadi_ik.collision.distances import Table, from_solid, pose_row
+from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import Solid, box, cylinder
-from casadi_ik.errors import UnsupportedError
+from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.robots.collision import LinkCapsule, Shapes, Touching
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
@@ -199,3 +201,94 @@ def own_solids(robot: RobotDescription) -> tuple[Solid, ...]:
         x, y, z = one.size.tolist()
         found.append(box((x, y, z)) if one.kind == "box" else cylinder(x, y))
     return tuple(found)
+
+
+def pair_table(
+    model: CollisionModel, scene: Scene, touched_by: Sequence[str], carried: bool = False
+) -> Table:
+    """The pairs of a robot and a scene.
+
+    Args:
+        model: The robot's shapes.
+        scene: What stands about it.
+        touched_by: Links that may touch what is grasped.
+        carried: Whether what is grasped moves with the hand: then links that cannot move count.
+
+    Raises:
+        DescriptionError: The scene speaks of a link or a solid that is not there, or of one that
+            stands in the robot's base.
+    """
+    links, known = model.links, set(model.robot.links) | set(scene.items)
+    stated = {frozenset(one.links) for one in scene.touching}
+    named = [("touching", i, one.links) for i, one in enumerate(scene.touching)]
+    named += [("margins", i, tuple(pair)) for i, pair in enumerate(scene.margins)]
+    for key, i, pair in named:
+        for name in sorted(set(pair) - known):
+            raise DescriptionError(
+                f"{scene.name}: {key}[{i}].links: unknown {name!r}; known: "
+                + ", ".join([*scene.items, *model.robot.links])
+            )
+    own, count = own_solids(model.robot), len(model.capsules)
+    parts = [(item, *part) for item in scene.items.values() for part in item.parts]
+    rows: list[tuple[tuple[int, int], float, float, tuple[str, str]]] = []
+
+    def add(pair: tuple[int, int], names: tuple[str, str], usual: float, overlap: float) -> None:
+        if frozenset(names) not in stated:
+            margin = scene.margins.get(frozenset(names), usual)
+            rows.append((pair, overlap + (margin - scene.margin), margin, names))
+
+    for k, (item, _, _) in enumerate(parts, start=count + len(own)):
+        grasped = item.name == scene.grasped
+        for i, link in enumerate(links):
+            # What cannot move is where it was put: no answer could change that.
+            fixed = model.is_fixed(link) and not (carried and grasped)
+            if not fixed and not (grasped and link in touched_by):
+                usual = scene.margin if item.margin is None else item.margin
+                add((i, k), (link, item.name), usual, 0.0)
+    for (i, j), overlap in zip(model.pairs.tolist(), model.offsets.tolist(), strict=True):
+        add((i, j), model.names(i, j), scene.margin, overlap)
+    return Table(
+        radii=model.radii,
+        halves=model.halves,
+        pairs=np.array([pair for pair, _, _, _ in rows], dtype=np.int32).reshape(-1, 2),
+        offsets=np.array([offset for _, offset, _, _ in rows]),
+        own=len(own),
+        solids=(*own, *(solid for _, solid, _ in parts)),
+        places=tuple(place for _, _, place in parts),
+        items=tuple(item.name for item, _, _ in parts),
+        names=tuple(names for _, _, _, names in rows),
+        margins=np.array([margin for _, _, margin, _ in rows]),
+        moving=model.moving,
+    )
+
+
+def check_base(model: CollisionModel, scene: Scene, where: Array) -> None:
+    """Refuse a scene with something in the robot's base: all would be in collision.
+
+    A base's shapes are larger than the base, so that a table under it may touch them; what is
+    deeper than a shape's radius is meant by nobody.
+
+    Args:
+        model: The robot's shapes.
+        scene: The scene.
+        where: Where the shapes are, as `placed` gives it.
+
+    Raises:
+        DescriptionError: The middle line of a shape of the base is inside a solid.
+    """
+    stated = {frozenset(one.links) for one in scene.touching}
+    for name, item in scene.items.items():
+        for i, link in enumerate(model.links):
+            if not model.is_fixed(link) or frozenset((link, name)) in stated:
+                continue
+            segment = where[6 * i : 6 * i + 6].reshape(1, 1, 6)
+            depths = [
+                -float(from_solid(solid, segment, pose_row(item.pose @ place)[None])[0].item())
+                for solid, place in item.parts
+            ]
+            if max(depths) > 0:
+                raise DescriptionError(
+                    f"{scene.name}: solids.{name}: stands {1e3 * max(depths):.1f} mm inside "
+                    f"{link!r}, which cannot move; expected it beside the robot's base "
+                    "(or the two under 'touching')"
+                )

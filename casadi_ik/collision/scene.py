@@ -1,4 +1,4 @@
-"""Scenes: solids with poses and names, margins, and what may be touched."""
+"""Scenes: solids with poses and names, margins, what may be touched; and the files they are in."""
 
 from __future__ import annotations
 
@@ -6,28 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.hulls import hull, hulls, object_solids
 from casadi_ik.collision.point_files import finite_points, read_points
-from casadi_ik.collision.scene_file import (
-    BoxEntry,
-    CapsuleEntry,
-    ConvexEntry,
-    CylinderEntry,
-    HalfSpaceEntry,
-    MeshEntry,
-    ObjectEntry,
-    PointCloudEntry,
-    SceneFile,
-    SolidEntry,
-    SphereEntry,
-)
 from casadi_ik.collision.solids import (
     Solid,
     box,
@@ -35,12 +21,18 @@ from casadi_ik.collision.solids import (
     cloud,
     cylinder,
     half_space,
+    hull,
+    hulls,
+    object_solids,
     thinned,
 )
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.mesh_file import read_mesh
 from casadi_ik.files.reading import (
+    Angles,
     Frame,
+    Point,
+    Struct,
     convert,
     frame_matrix,
     read,
@@ -48,19 +40,326 @@ from casadi_ik.files.reading import (
     refuse_non_finite,
 )
 from casadi_ik.files.shipped import resolve
-from casadi_ik.files.units import in_si
+from casadi_ik.files.units import Length, Pure, in_si
 from casadi_ik.grasps.pose import checked_pose, one_pose, rotations_of
 from casadi_ik.grasps.shapes import load_mesh_shape
 from casadi_ik.robots.collision import Touching
-
-TURNS = ("rpy", "quaternion_wxyz", "quaternion_xyzw", "pose")
-"""How a solid may be turned."""
-
-UNIT = 0.01
-"""What a quaternion's length may be off one: it is rounded where it is written down."""
+from casadi_ik.robots.schema import TouchingEntry
 
 MOST_BALLS = 100_000
 """Of a point cloud."""
+
+Part = tuple[Solid, Array]
+"""A solid and its (4, 4) pose in the frame of what it is part of."""
+
+Quaternion = tuple[Pure, Pure, Pure, Pure]
+PoseRow = tuple[Pure, Pure, Pure, Length]
+
+
+class Entry(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", kw_only=True
+):
+    """What a file says of every solid of a scene.
+
+    Attributes:
+        xyz: Its origin in the robot's base frame [m].
+        rpy: Angles about the base's fixed axes x, y, z [rad]; or how it is turned as
+        quaternion_wxyz: a unit quaternion, scalar first, or
+        quaternion_xyzw: scalar last (as ROS has it).
+        pose: (4, 4) rows of its pose, instead of all these; translation in [m].
+        margin: Distance to keep from it [m]; left out: the scene's.
+    """
+
+    xyz: Point | None = None
+    rpy: Angles | None = None
+    quaternion_wxyz: Quaternion | None = None
+    quaternion_xyzw: Quaternion | None = None
+    pose: tuple[PoseRow, PoseRow, PoseRow, PoseRow] | None = None
+    margin: Length | None = None
+
+    positive: ClassVar[tuple[str, ...]] = ()
+    """Numbers that have to be above zero."""
+
+    allowed_zero: ClassVar[tuple[str, ...]] = ("margin",)
+    """Numbers that must not be below zero."""
+
+    def _solid(self) -> Solid:
+        """The solid that it is, of a kind that is one by itself."""
+        raise NotImplementedError
+
+    def _solids(self, where: str, folder: Path) -> list[Part]:
+        """The solids it consists of."""
+        del where, folder
+        return [(self._solid(), np.eye(4))]
+
+    def solids(self, where: str, folder: Path) -> tuple[Part, ...]:
+        """The solids it consists of, after its numbers are checked.
+
+        Args:
+            where: File and key, for the message.
+            folder: What relative paths count from.
+
+        Raises:
+            DescriptionError: A number is out of range, or a file cannot be read.
+        """
+        for key in self.positive:
+            value = getattr(self, key)
+            if not 0 < (min(value) if isinstance(value, tuple) else value) < math.inf:
+                raise DescriptionError(f"{where}.{key}: found {value}, expected > 0")
+        for key in self.allowed_zero:
+            value = getattr(self, key)
+            if value is not None and not 0 <= value < math.inf:
+                raise DescriptionError(f"{where}.{key}: found {value:g}, expected >= 0 m")
+        return tuple(self._solids(where, folder))
+
+    def matrix(self, where: str) -> Array:
+        """(4, 4) of its pose; how it is turned may be said in one of four ways.
+
+        Raises:
+            DescriptionError: It is said in several, or is no pose.
+        """
+        ways = ("rpy", "quaternion_wxyz", "quaternion_xyzw", "pose")
+        turns = [key for key in ways if getattr(self, key) is not None]
+        if self.pose is not None and self.xyz is not None:
+            turns.append("xyz")
+        if len(turns) > 1:
+            raise DescriptionError(f"{where}: found {' and '.join(turns)}, expected one of them")
+        if self.pose is not None:
+            try:
+                return one_pose(self.pose, f"{where}.pose")
+            except InputError as error:
+                raise DescriptionError(str(error)) from error
+        pose = frame_matrix(Frame(self.xyz or (0.0, 0.0, 0.0), self.rpy or (0.0, 0.0, 0.0)))
+        for key, shift in (("quaternion_wxyz", 0), ("quaternion_xyzw", 1)):
+            given = getattr(self, key)
+            if given is not None:
+                length = math.hypot(*given)
+                if abs(length - 1) > 0.01:  # it is rounded where it is written down
+                    raise DescriptionError(f"{where}.{key}: found length {length:g}, expected 1")
+                pose[:3, :3] = rotations_of(np.roll(given, shift)[None])[0]
+        return pose
+
+
+class BoxEntry(Entry, frozen=True, tag="box", kw_only=True):
+    """A box about its pose's origin.
+
+    Attributes:
+        size: Along its own x, y and z [m].
+    """
+
+    size: tuple[Length, Length, Length]
+
+    positive: ClassVar[tuple[str, ...]] = ("size",)
+
+    def _solid(self) -> Solid:
+        return box(self.size)
+
+
+class SphereEntry(Entry, frozen=True, tag="sphere", kw_only=True):
+    """A ball.
+
+    Attributes:
+        radius: [m].
+    """
+
+    radius: Length
+
+    positive: ClassVar[tuple[str, ...]] = ("radius",)
+
+    def _solid(self) -> Solid:
+        return capsule(self.radius, 0.0)
+
+
+class CylinderEntry(Entry, frozen=True, tag="cylinder", kw_only=True):
+    """A cylinder along z.
+
+    Attributes:
+        radius: [m].
+        length: [m].
+    """
+
+    radius: Length
+    length: Length
+
+    positive: ClassVar[tuple[str, ...]] = ("radius", "length")
+
+    def _solid(self) -> Solid:
+        return cylinder(self.radius, self.length)
+
+
+class CapsuleEntry(Entry, frozen=True, tag="capsule", kw_only=True):
+    """A capsule along z.
+
+    Attributes:
+        radius: [m].
+        length: Of its segment, without the caps [m].
+    """
+
+    radius: Length
+    length: Length
+
+    positive: ClassVar[tuple[str, ...]] = ("radius",)
+    allowed_zero: ClassVar[tuple[str, ...]] = ("margin", "length")
+
+    def _solid(self) -> Solid:
+        return capsule(self.radius, self.length / 2)
+
+
+class HalfSpaceEntry(Entry, frozen=True, tag="half-space", kw_only=True):
+    """All below the plane z = 0 of its pose."""
+
+    def _solid(self) -> Solid:
+        return half_space()
+
+
+class MeshEntry(Entry, frozen=True, tag="mesh", kw_only=True):
+    """The convex hull of a mesh, or of several that are one thing.
+
+    Attributes:
+        file: A path, counted from the scene's file, or several.
+        scale: Factor of its coordinates.
+        parts: What hangs together in a mesh is a convex part by itself.
+    """
+
+    file: str | list[str]
+    scale: float = 1.0
+    parts: bool = False
+
+    positive: ClassVar[tuple[str, ...]] = ("scale",)
+
+    def _solids(self, where: str, folder: Path) -> list[Part]:
+        files = [folder / Path(name).expanduser() for name in self._names]
+        if not files:
+            raise DescriptionError(f"{where}.file: found none, expected at least one")
+        if self.parts:
+            return hulls(load_mesh_shape(files, self.scale, f"{where}.file"), f"{where}.file")
+        meshes = [self.scale * read_mesh(file, f"{where}.file")[0] for file in files]
+        return [_centred(points, f"{where}.file") for points in meshes]
+
+    @property
+    def _names(self) -> list[str]:
+        return [self.file] if isinstance(self.file, str) else self.file
+
+
+class ConvexEntry(Entry, frozen=True, tag="convex", kw_only=True):
+    """The convex hull of points.
+
+    Attributes:
+        points: Some that it is the hull of, in its own frame [m].
+    """
+
+    points: list[Point]
+
+    def _solids(self, where: str, folder: Path) -> list[Part]:  # noqa: ARG002
+        return [_centred(np.array(self.points, dtype=float), f"{where}.points")]
+
+
+def _centred(points: Array, where: str) -> Part:
+    """The convex hull of points (k, 3), about their mean."""
+    pose = np.eye(4)
+    if points.ndim == 2 and len(points):
+        pose[:3, 3] = points.mean(axis=0)
+    return hull(points - pose[:3, 3], where), pose
+
+
+class PointCloudEntry(Entry, frozen=True, tag="point-cloud", kw_only=True):
+    """Balls about points, as a camera or a scanner sees them.
+
+    Attributes:
+        radius: Of every ball [m].
+        file: npy, npz, PLY, PCD or a table of x, y, z; a path, counted from the scene's file.
+        points: The points themselves, instead of a file [m].
+        voxel: Edge of the cubes of a grid in each of which the points become one [m]; its ball is
+            wider by how far they are from it. 0: all are kept.
+        scale: Factor of a file's coordinates.
+    """
+
+    radius: Length
+    file: str = ""
+    points: list[Point] = msgspec.field(default_factory=list)
+    voxel: Length = 0.0
+    scale: float = 1.0
+
+    positive: ClassVar[tuple[str, ...]] = ("radius", "scale")
+    allowed_zero: ClassVar[tuple[str, ...]] = ("margin", "voxel")
+
+    def _solids(self, where: str, folder: Path) -> list[Part]:
+        if (len(self.points) > 0) == bool(self.file):
+            raise DescriptionError(f"{where}: expected a point cloud's file or its points")
+        if self.file:
+            path = folder / Path(self.file).expanduser()
+            found = self.scale * read_points(path, f"{where}.file")
+        else:
+            found = finite_points(np.asarray(self.points), f"{where}.points")
+        found, wider = thinned(found, self.voxel) if self.voxel > 0 else (found, 0.0)
+        if len(found) > MOST_BALLS:
+            raise DescriptionError(
+                f"{where}: found {len(found)} points, expected at most {MOST_BALLS} (see 'voxel')"
+            )
+        return cloud(found, self.radius + wider)
+
+
+class ObjectEntry(Entry, frozen=True, tag="object", kw_only=True):
+    """An object.
+
+    Attributes:
+        object: A shipped object, or the path of an object file or of a mesh.
+    """
+
+    object: str
+
+    def _solids(self, where: str, folder: Path) -> list[Part]:  # noqa: ARG002
+        try:
+            return object_solids(self.object)
+        except (UnknownNameError, DescriptionError) as error:
+            raise DescriptionError(f"{where}.object: {error}") from error
+
+
+SolidEntry = (
+    BoxEntry
+    | SphereEntry
+    | CylinderEntry
+    | CapsuleEntry
+    | HalfSpaceEntry
+    | MeshEntry
+    | ConvexEntry
+    | PointCloudEntry
+    | ObjectEntry
+)
+
+
+class MarginEntry(Struct, frozen=True):
+    """Two of links and solids, and how far they have to be apart whatever else is said.
+
+    Attributes:
+        links: Names of links or solids.
+        margin: Distance to keep [m].
+    """
+
+    links: tuple[str, str]
+    margin: Length
+
+
+class SceneFile(Struct, frozen=True):
+    """A scene: ``models/scenes/*.yaml``.
+
+    Attributes:
+        solids: What stands there, by name.
+        margin: Distance to keep, also between links [m].
+        grasped: Name of the solid that is grasped: links with a contact may touch it.
+        margins: Distances of two, before the solid's and the scene's.
+        touching: Pairs that may touch.
+        name: What it is called; left out: as its file.
+        description: One sentence.
+    """
+
+    solids: dict[str, SolidEntry] = msgspec.field(default_factory=dict)
+    margin: Length = 0.0
+    grasped: str | None = None
+    margins: list[MarginEntry] = msgspec.field(default_factory=list)
+    touching: list[TouchingEntry] = msgspec.field(default_factory=list)
+    name: str = ""
+    description: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,18 +421,19 @@ class Scene:
         Raises:
             DescriptionError: One line that names the key, what was found and what was expected.
         """
-        clouds: dict[str, np.ndarray] = {}
-        plain: dict[str, Any] = {}
-        for key, value in (solids or {}).items():
-            plain[key] = value
-            if isinstance(value, Mapping) and value.get("kind") == "point-cloud":
-                # Arrays of so many numbers, some of them NaN, are looked at as arrays.
-                points = value.get("points")
-                if isinstance(points, np.ndarray):
-                    clouds[key] = points
-                    plain[key] = {**value, "points": []}
+        # Arrays of very many numbers, some of them NaN, are read as arrays.
+        clouds = {
+            key: value["points"]
+            for key, value in (solids or {}).items()
+            if isinstance(value, Mapping)
+            and value.get("kind") == "point-cloud"
+            and isinstance(value.get("points"), np.ndarray)
+        }
         data = {
-            "solids": {key: _plain(value) for key, value in plain.items()},
+            "solids": {
+                key: _plain({**value, "points": []} if key in clouds else value)
+                for key, value in (solids or {}).items()
+            },
             "margin": margin,
             "grasped": grasped,
             "touching": [_plain(one) for one in touching],
@@ -142,7 +442,10 @@ class Scene:
         where = Path(name)
         raw = in_si(data)
         refuse_non_finite(raw, where)
-        self._take(convert(raw, SceneFile, where), where, clouds)
+        entry = convert(raw, SceneFile, where)
+        for key, points in clouds.items():
+            entry.solids[key] = msgspec.structs.replace(entry.solids[key], points=points)
+        self._take(entry, where)
         self.name = name
 
     @classmethod
@@ -154,19 +457,15 @@ class Scene:
         scene.name = entry.name or path.stem
         return scene
 
-    def _take(
-        self, entry: SceneFile, path: Path, clouds: Mapping[str, np.ndarray] = MappingProxyType({})
-    ) -> None:
+    def _take(self, entry: SceneFile, path: Path) -> None:
         if not entry.margin >= 0:
             raise DescriptionError(f"{path}: margin: found {entry.margin:g}, expected >= 0 m")
         self.margin = entry.margin
         self.items: dict[str, Item] = {}
         for name, solid in entry.solids.items():
             where = f"{path}: solids.{name}"
-            if solid.margin is not None and not solid.margin >= 0:
-                raise DescriptionError(f"{where}.margin: found {solid.margin:g}, expected >= 0 m")
-            parts = tuple(_parts(solid, where, path, clouds.get(name)))
-            self.items[name] = Item(name, parts, _pose(solid, where), solid.margin)
+            parts = solid.solids(where, path.parent)
+            self.items[name] = Item(name, parts, solid.matrix(where), solid.margin)
         self.grasped = entry.grasped
         if entry.grasped is not None and entry.grasped not in self.items:
             known = ", ".join(self.items) or "none"
@@ -263,102 +562,6 @@ def grasped_in(scene: Scene | None) -> str:
     if scene is None or scene.grasped is None:
         raise InputError("object_pose: found one, expected a scene that says what is 'grasped'")
     return scene.grasped
-
-
-def _pose(entry: SolidEntry, where: str) -> Array:
-    """(4, 4) of a solid; how it is turned may be said in one of four ways."""
-    turns = [key for key in TURNS if getattr(entry, key) is not None]
-    if entry.pose is not None and entry.xyz is not None:
-        turns.append("xyz")
-    if len(turns) > 1:
-        raise DescriptionError(f"{where}: found {' and '.join(turns)}, expected one of them")
-    if entry.pose is not None:
-        try:
-            return one_pose(entry.pose, f"{where}.pose")
-        except InputError as error:
-            raise DescriptionError(str(error)) from error
-    pose = frame_matrix(Frame(entry.xyz or (0.0, 0.0, 0.0), entry.rpy or (0.0, 0.0, 0.0)))
-    for key, shift in (("quaternion_wxyz", 0), ("quaternion_xyzw", 1)):
-        given = getattr(entry, key)
-        if given is not None:
-            length = math.hypot(*given)
-            if abs(length - 1) > UNIT:
-                raise DescriptionError(f"{where}.{key}: found length {length:g}, expected 1")
-            pose[:3, :3] = rotations_of(np.roll(given, shift)[None])[0]
-    return pose
-
-
-def _parts(
-    entry: SolidEntry, where: str, path: Path, points: np.ndarray | None
-) -> list[tuple[Solid, Array]]:
-    here = np.eye(4)
-    for key in ("size", "radius", "length", "scale"):
-        value = getattr(entry, key, 1.0)
-        least = min(value) if isinstance(value, tuple) else value
-        if not 0 < least < math.inf and not (isinstance(entry, CapsuleEntry) and key == "length"):
-            raise DescriptionError(f"{where}.{key}: found {value}, expected > 0")
-    match entry:
-        case BoxEntry():
-            return [(box(entry.size), here)]
-        case SphereEntry():
-            return [(capsule(entry.radius, 0.0), here)]
-        case CylinderEntry():
-            return [(cylinder(entry.radius, entry.length), here)]
-        case CapsuleEntry():
-            if not entry.length >= 0:
-                raise DescriptionError(f"{where}.length: found {entry.length}, expected >= 0")
-            return [(capsule(entry.radius, entry.length / 2), here)]
-        case HalfSpaceEntry():
-            return [(half_space(), here)]
-        case ConvexEntry():
-            return [(hull(np.array(entry.points, dtype=float), f"{where}.points"), here)]
-        case MeshEntry():
-            return _meshes(entry, f"{where}.file", path)
-        case PointCloudEntry():
-            return _cloud(entry, where, path, points)
-        case ObjectEntry():
-            try:
-                return object_solids(entry.object)
-            except (UnknownNameError, DescriptionError) as error:
-                raise DescriptionError(f"{where}.object: {error}") from error
-
-
-def _meshes(entry: MeshEntry, where: str, path: Path) -> list[tuple[Solid, Array]]:
-    names = [entry.file] if isinstance(entry.file, str) else entry.file
-    if not names:
-        raise DescriptionError(f"{where}: found none, expected at least one")
-    files = [_beside(path, name) for name in names]
-    if entry.parts:
-        return hulls(load_mesh_shape(files, entry.scale, where), where)
-    return [(hull(entry.scale * read_mesh(file, where)[0], where), np.eye(4)) for file in files]
-
-
-def _beside(path: Path, file: str) -> Path:
-    found = Path(file).expanduser()
-    return found if found.is_absolute() else path.parent / found
-
-
-def _cloud(
-    entry: PointCloudEntry, where: str, path: Path, points: np.ndarray | None
-) -> list[tuple[Solid, Array]]:
-    given = points is not None or bool(entry.points)
-    if given == bool(entry.file):
-        raise DescriptionError(f"{where}: expected a point cloud's file or its points")
-    if entry.file:
-        found = entry.scale * read_points(_beside(path, entry.file), f"{where}.file")
-    else:
-        array = np.array(entry.points, dtype=float) if points is None else points
-        found = finite_points(array, f"{where}.points")
-    if not 0 <= entry.voxel < math.inf:
-        raise DescriptionError(f"{where}.voxel: found {entry.voxel:g}, expected >= 0 m")
-    wider = 0.0
-    if entry.voxel > 0:
-        found, wider = thinned(found, entry.voxel)
-    if len(found) > MOST_BALLS:
-        raise DescriptionError(
-            f"{where}: found {len(found)} points, expected at most {MOST_BALLS} (see 'voxel')"
-        )
-    return cloud(found, entry.radius + wider)
 
 
 def _plain(value: Any) -> Any:

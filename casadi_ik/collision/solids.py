@@ -1,9 +1,9 @@
-"""Solids of a scene as numbers: what the distance kernel knows of a shape that stands about.
+"""Solids: one row of `ROWS` per kind, and what solids are made of.
 
-A solid lies in its own frame. A half-space is all below z = 0; a box, a cylinder (along z) and a
-capsule (along z) are about the origin; a convex body is all that is below its planes. Of what is
-round but no ball nor cylinder the planes touch it from outside, so that the body of the planes
-holds it: distances are never larger than the true ones. A cloud is balls about points.
+A solid lies in its own frame: a half-space is all below z = 0; a box, a cylinder (along z) and a
+capsule (along z) are about the origin; a convex body is all that is below its planes; a cloud is
+balls about points. The planes of a round body touch it from outside, so the body they bound holds
+it: distances are never larger than the true ones.
 """
 
 from __future__ import annotations
@@ -12,32 +12,35 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from importlib import import_module
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.grasps.shapes import BentCapsule, Box, Cylinder, EllipticCylinder, Shape, Sphere
-
-DIRECTIONS = 512
-"""Planes that round a convex body off, besides those of its faces: between two of them a corner
-stands out by at most 2 % of the distance from it."""
-
-STRIDE = 197
-"""Places along their spiral from one of them to the next; has no factor in common with them."""
+from casadi_ik.errors import DescriptionError, MissingExtraError
+from casadi_ik.grasps.objects import load_object
+from casadi_ik.grasps.shapes import (
+    BentCapsule,
+    Box,
+    Cylinder,
+    EllipticCylinder,
+    Mesh,
+    MeshShape,
+    Shape,
+    Sphere,
+    circle,
+    prism_mesh,
+    tube_mesh,
+)
 
 GROUP = 32
-"""Points of a cloud that are looked at together; as in the driver."""
-
-PART = 1024
-"""Points of a cloud that are one solid: far ones are passed over by one look each."""
-
-LINKS = 5
-"""Capsules that a bent one is made of."""
+"""Points of a cloud that share a bounding ball, as in ``drivers/clearance.c``."""
 
 
 class Kind(IntEnum):
-    """Which shape; the numbers are those of the driver."""
+    """The kinds; drivers know them by these names and numbers."""
 
     HALF_SPACE = 0
     CAPSULE = 1
@@ -49,15 +52,15 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A shape in its own frame.
+    """A solid in its own frame.
 
     Attributes:
-        kind: Which.
-        size: (3,) [m]: of a box half its edges; of a cylinder radius and half its length; of a
-            capsule radius and half its segment; of a cloud the radius of its balls; else nothing.
-        reach: Radius of the ball about the origin that holds it [m]; infinite for a half-space.
-        planes: (m, 4) outward unit normals and offsets [m] of a convex body; of a cloud, for every
-            group of its points, middle and radius of what holds them, then the points and 0 [m].
+        kind: Its kind.
+        size: (3,) [m]: half the edges of a box; radius and half the length of a cylinder; radius
+            and half the segment of a capsule; radius of a cloud's balls; else zero.
+        reach: Radius of a ball about the origin that holds it [m]; infinite for a half-space.
+        planes: (m, 4) outward unit normals and offsets [m] of a convex body. Of a cloud, for each
+            `GROUP` of points: centre and radius of a ball that holds them, then the points and 0.
     """
 
     kind: Kind
@@ -67,33 +70,132 @@ class Solid:
 
     @property
     def points(self) -> Array:
-        """(k, 3) points of a cloud; the last ones of a group may be there several times."""
+        """(k, 3) points of a cloud; the last of a group may be there several times."""
         return self.planes.reshape(-1, GROUP + 1, 4)[:, 1:, :3].reshape(-1, 3)
 
+    def distance(self, points: Array) -> Array:
+        """Signed distances (...) [m] of points (..., 3) in its frame; negative inside."""
+        return ROWS[self.kind].distance(self, points)
 
-NO_PLANES = np.zeros((0, 4))
+    def mesh(self) -> Mesh:
+        """Its surface: vertices (v, 3) [m] and triangles; of a half-space a plate at the origin."""
+        return (ROWS[self.kind].mesh or _seen_from_inside)(self)
+
+
+@dataclass(frozen=True)
+class Row:
+    """What the package knows of a kind besides its distance in ``drivers/clearance.c``.
+
+    Attributes:
+        distance: Signed distance of points (..., 3) from a solid. Exact or less; convex, except
+            for a cloud; grows no faster than the point moves.
+        mesh: Its surface; None: as seen from its origin, without sharp edges.
+        size: What the scene of an exported solver takes as its size, in words; None: it does not
+            take the kind. The first kinds are those that it takes.
+        factors: (3,) `Solid.size` by what is stated as the size; 0: not stated.
+    """
+
+    distance: Callable[[Solid, Array], Array]
+    mesh: Callable[[Solid], Mesh] | None = None
+    size: str | None = None
+    factors: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def _from_faces(beyond: Array) -> Array:
+    """Distances from faces at right angles, given how far (..., n) a point is beyond each."""
+    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+    return outside + np.minimum(beyond.max(axis=-1), 0.0)
+
+
+def _from_capsule(solid: Solid, p: Array) -> Array:
+    z = p[..., 2] - np.clip(p[..., 2], -solid.size[1], solid.size[1])
+    return np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2 + z * z) - solid.size[0]
+
+
+def _from_cylinder(solid: Solid, p: Array) -> Array:
+    across, along = np.hypot(p[..., 0], p[..., 1]), np.abs(p[..., 2])
+    return _from_faces(np.stack([across - solid.size[0], along - solid.size[1]], axis=-1))
+
+
+def _from_cloud(solid: Solid, p: Array) -> Array:
+    apart = np.linalg.norm(p[..., None, :] - solid.points, axis=-1)
+    return apart.min(axis=-1) - solid.size[0]
+
+
+ROWS: dict[Kind, Row] = {
+    Kind.HALF_SPACE: Row(
+        distance=lambda _, p: p[..., 2],
+        mesh=lambda _: box_mesh(np.array([0.7, 0.7, 5e-4]), np.array([0, 0, -5e-4])),
+        size="all below z = 0 of its pose",
+    ),
+    Kind.CAPSULE: Row(
+        distance=_from_capsule,
+        mesh=lambda s: capsule_mesh(s.size[0], s.size[1]),
+        size="along z; size: radius, length without the caps; a ball has length 0",
+        factors=(1.0, 0.5, 0.0),
+    ),
+    Kind.BOX: Row(
+        distance=lambda s, p: _from_faces(np.abs(p) - s.size),
+        mesh=lambda s: box_mesh(s.size),
+        size="size: its edges",
+        factors=(0.5, 0.5, 0.5),
+    ),
+    Kind.CYLINDER: Row(
+        distance=_from_cylinder,
+        mesh=lambda s: prism_mesh(s.size[0] * circle(48), 2 * s.size[1]),
+        size="along z; size: radius, length",
+        factors=(1.0, 0.5, 0.0),
+    ),
+    Kind.CONVEX: Row(
+        distance=lambda s, p: (p @ s.planes[:, :3].T - s.planes[:, 3]).max(axis=-1),
+    ),
+    Kind.CLOUD: Row(distance=_from_cloud, mesh=lambda s: _balls(s.points, s.size[0])),
+}
+"""The kinds: to add one, see docs/add_a_shape.md."""
+
+C_NAMES = {kind.name: int(kind) for kind in Kind}
+"""The kinds as the drivers' macros."""
+
+EXPORTED = {kind: row for kind, row in ROWS.items() if row.size is not None}
+"""The kinds that the scene of an exported solver takes."""
+
+
+def stated(solid: Solid, pose: Array) -> dict[str, Any]:
+    """A solid at a (4, 4) pose as an exported solver takes it: kind, size and 12 numbers."""
+    factors = np.array(ROWS[solid.kind].factors)
+    size = np.divide(solid.size, factors, out=np.zeros(3), where=factors > 0)
+    return {
+        "kind": int(solid.kind),
+        "size": size.tolist(),
+        "pose": [*pose[:3, :3].ravel().tolist(), *pose[:3, 3].tolist()],
+    }
+
+
+# Solids by their numbers.
 
 
 def half_space() -> Solid:
     """All below z = 0."""
-    return Solid(Kind.HALF_SPACE, np.zeros(3), math.inf, NO_PLANES)
+    return _solid(Kind.HALF_SPACE, (), math.inf)
 
 
 def capsule(radius: float, half: float) -> Solid:
     """All within a radius of a segment along z of twice that half; a ball if it is zero."""
-    return Solid(Kind.CAPSULE, np.array([radius, half, 0.0]), radius + half, NO_PLANES)
+    return _solid(Kind.CAPSULE, (radius, half), radius + half)
 
 
 def box(size: tuple[float, float, float]) -> Solid:
     """A box of these edges."""
-    half = np.array(size) / 2
-    return Solid(Kind.BOX, half, float(np.linalg.norm(half)), NO_PLANES)
+    return _solid(Kind.BOX, tuple(edge / 2 for edge in size), math.hypot(*size) / 2)
 
 
 def cylinder(radius: float, length: float) -> Solid:
     """A cylinder along z."""
-    half = length / 2
-    return Solid(Kind.CYLINDER, np.array([radius, half, 0.0]), math.hypot(radius, half), NO_PLANES)
+    return _solid(Kind.CYLINDER, (radius, length / 2), math.hypot(radius, length / 2))
+
+
+def _solid(kind: Kind, size: tuple[float, ...], reach: float) -> Solid:
+    return Solid(kind, np.array([*size, *[0.0] * (3 - len(size))]), reach, np.zeros((0, 4)))
 
 
 def convex(points: Array, normals: Array) -> Solid:
@@ -102,10 +204,31 @@ def convex(points: Array, normals: Array) -> Solid:
     return Solid(Kind.CONVEX, np.zeros(3), float(np.linalg.norm(points, axis=1).max()), planes)
 
 
-def cloud(points: Array, radius: float) -> list[tuple[Solid, Array]]:
-    """Balls of a radius about points (k, 3), as solids of some of them with their (4, 4) poses."""
+def _planes(normals: Array, support: Callable[[Array], Array], spread_out: int = 512) -> Array:
+    """(m, 4) planes that touch a body from outside: evenly spread ones, then its own faces.
+
+    Between two of 512 spread planes a corner stands out by at most 2 % of its distance. The driver
+    looks at the first few before all: a stride through their spiral spreads any first ones, too.
+    """
+    order = (np.arange(spread_out) * 197) % spread_out
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    _, first = np.unique(np.round(unit, 6), axis=0, return_index=True)
+    ways = np.concatenate([spread(spread_out)[order], unit[np.sort(first)]])
+    return np.column_stack([ways, support(ways)])
+
+
+def spread(count: int) -> Array:
+    """(count, 3) unit vectors spread evenly, along a spiral."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - math.sqrt(5)) * np.arange(count)
+    flat = np.sqrt(1 - z * z)
+    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+
+
+def cloud(points: Array, radius: float, most: int = 1024) -> list[tuple[Solid, Array]]:
+    """Balls of a radius about points (k, 3): solids of at most so many, with (4, 4) poses."""
     found = []
-    for part in _gathered(points, PART):
+    for part in _gathered(points, most):
         pose = np.eye(4)
         pose[:3, 3] = (part.min(axis=0) + part.max(axis=0)) / 2
         about, rows = part - pose[:3, 3], []
@@ -134,7 +257,7 @@ def _gathered(points: Array, most: int) -> Iterator[Array]:
 
 
 def thinned(points: Array, edge: float) -> tuple[Array, float]:
-    """One point for those in each cube of a grid, and how far one of them is from it at most.
+    """One point for all in each cube of a grid, and how far one of them is from it at most.
 
     Args:
         points: (k, 3) [m].
@@ -152,25 +275,100 @@ def thinned(points: Array, edge: float) -> tuple[Array, float]:
     return middles, float(np.linalg.norm(ordered - middles[of], axis=1).max())
 
 
+# Solids of meshes and objects.
+
+
+def hull(points: Array, where: str) -> Solid:
+    """The convex hull of points (k, 3) [m], by coal, which comes with pinocchio.
+
+    Args:
+        points: The points.
+        where: File and key, for the message.
+
+    Raises:
+        DescriptionError: The points are too few, not finite, or in a plane.
+        MissingExtraError: coal is not installed.
+    """
+    if points.ndim != 2 or len(points) < 4:
+        raise DescriptionError(f"{where}: found {len(points)} points, expected at least 4")
+    if not np.isfinite(points).all():
+        raise DescriptionError(f"{where}: holds NaN or infinity, expected finite numbers")
+    if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-9) < 3:
+        raise DescriptionError(f"{where}: all points are in a plane, expected a body")
+    try:
+        coal: Any = import_module("coal")
+    except ImportError as error:
+        raise MissingExtraError(f"{where}: convex hulls need coal: pip install pin") from error
+    model = coal.BVHModelOBBRSS()
+    model.beginModel(0, len(points))
+    model.addVertices(points)
+    model.endModel()
+    model.buildConvexHull(True, "Qt")
+    shape = model.convex
+    corners = np.array([shape.point(i) for i in range(shape.num_points)])
+    faces = [shape.polygons(i) for i in range(shape.num_polygons)]
+    a, b, c = (corners[[face[i] for face in faces]] for i in range(3))
+    normals, middles = np.cross(b - a, c - a), (a + b + c) / 3
+    kept = np.linalg.norm(normals, axis=1) > 1e-12
+    normals, middles = normals[kept], middles[kept]
+    # Whichever way a triangle winds, outward is away from the hull's middle.
+    outward = np.sum(normals * (middles - corners.mean(axis=0)), axis=1)
+    normals *= np.where(outward < 0, -1.0, 1.0)[:, None]
+    if float(np.abs(outward).sum()) < 1e-9:  # six times its volume [m^3]
+        raise DescriptionError(f"{where}: encloses no volume, expected a body")
+    return convex(points, normals)
+
+
+def hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
+    """The convex hulls of the pieces of a mesh, each with its (4, 4) pose in the mesh's frame.
+
+    Raises:
+        DescriptionError: A piece is flat.
+        MissingExtraError: coal is not installed.
+    """
+    found: list[tuple[Solid, Array]] = []
+    for number, (points, _) in enumerate(shape.pieces):
+        pose = np.eye(4)
+        pose[:3, 3] = points.mean(axis=0)
+        named = f"{where}: piece {number} of {len(shape.pieces)}"
+        found.append((hull(points - pose[:3, 3], named), pose))
+    return found
+
+
+def object_solids(name: str) -> list[tuple[Solid, Array]]:
+    """The solids that an object consists of, each with its (4, 4) pose in its frame.
+
+    Args:
+        name: As `load_object` takes it.
+
+    Raises:
+        UnknownNameError: No shipped object has that name.
+        DescriptionError: Its file is missing or malformed.
+        MissingExtraError: It is a mesh, and coal is not installed.
+    """
+    shape = load_object(name).shape
+    return hulls(shape, name) if isinstance(shape, MeshShape) else of_object(shape)
+
+
 def of_object(shape: Shape) -> list[tuple[Solid, Array]]:
-    """The solids that an object's shape consists of, each with its (4, 4) pose in its frame."""
+    """The solids that a primitive object consists of, each with its (4, 4) pose in its frame."""
     here = np.eye(4)
-    if isinstance(shape, Sphere):
-        return [(capsule(shape.diameter / 2, 0.0), here)]
-    if isinstance(shape, Cylinder):
-        return [(cylinder(shape.diameter / 2, shape.height), here)]
-    if isinstance(shape, Box):
-        return [(box(shape.size), here)]
-    if isinstance(shape, EllipticCylinder):
-        return [(_elliptic(shape), here)]
-    return _bent(shape)
+    match shape:
+        case Sphere():
+            return [(capsule(shape.diameter / 2, 0.0), here)]
+        case Cylinder():
+            return [(cylinder(shape.diameter / 2, shape.height), here)]
+        case Box():
+            return [(box(shape.size), here)]
+        case EllipticCylinder():
+            return [(_elliptic(shape), here)]
+        case BentCapsule():
+            return _bent(shape)
 
 
 def _elliptic(shape: EllipticCylinder) -> Solid:
     half = np.array([shape.width, shape.depth, shape.height]) / 2
-    turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    around = np.column_stack([np.cos(turns), np.sin(turns), np.zeros(64)])
-    faces = np.concatenate([around, [[0, 0, 1.0], [0, 0, -1.0]]])
+    faces = np.concatenate([circle(64), [[0, 0, 1.0], [0, 0, -1.0]]])
 
     def support(ways: Array) -> Array:
         return np.hypot(ways[:, 0] * half[0], ways[:, 1] * half[1]) + np.abs(ways[:, 2]) * half[2]
@@ -179,42 +377,66 @@ def _elliptic(shape: EllipticCylinder) -> Solid:
     return Solid(Kind.CONVEX, np.zeros(3), reach, _planes(faces, support))
 
 
-def _bent(shape: BentCapsule) -> list[tuple[Solid, Array]]:
+def _bent(shape: BentCapsule, links: int = 5) -> list[tuple[Solid, Array]]:
     """Straight capsules along the arc, each wider by how far its arc leaves its chord."""
-    angles = np.linspace(-shape.half_angle, shape.half_angle, LINKS + 1)
-    points = shape.centreline(angles)
-    sagitta = shape.radius * (1 - math.cos(shape.half_angle / LINKS))
+    points = shape.centreline(np.linspace(-shape.half_angle, shape.half_angle, links + 1))
+    sagitta = shape.radius * (1 - math.cos(shape.half_angle / links))
     found = []
     for one, other in pairwise(points):
         along = (other - one) / np.linalg.norm(other - one)
         side = np.array([0.0, 0.0, 1.0])
         pose = np.eye(4)
-        pose[:3, :3] = np.column_stack([side, np.cross(along, side), along])
-        pose[:3, 3] = (one + other) / 2
+        pose[:3] = np.column_stack([side, np.cross(along, side), along, (one + other) / 2])
         half = float(np.linalg.norm(other - one)) / 2
         found.append((capsule(shape.diameter / 2 + sagitta, half), pose))
     return found
 
 
-def _planes(normals: Array, support: Callable[[Array], Array]) -> Array:
-    """(m, 4) planes that touch a body, with evenly spread normals and with these.
-
-    Of the spread ones any that come first are spread, too: the driver looks at some before all.
-    """
-    order = (np.arange(DIRECTIONS) * STRIDE) % DIRECTIONS
-    ways = np.concatenate([spread(DIRECTIONS)[order], _distinct(normals)])
-    return np.column_stack([ways, support(ways)])
+# Surfaces.
 
 
-def _distinct(normals: Array) -> Array:
-    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    _, first = np.unique(np.round(unit, 6), axis=0, return_index=True)
-    return unit[np.sort(first)]
+def box_mesh(half: Array, middle: Array | float = 0.0) -> Mesh:
+    """A box by half its edges (3,) [m]."""
+    x, y, z = half
+    ring = np.array([[x, y, 0.0], [-x, y, 0.0], [-x, -y, 0.0], [x, -y, 0.0]])
+    points, triangles = prism_mesh(ring, 2 * z)
+    return points + middle, triangles
 
 
-def spread(count: int) -> Array:
-    """(count, 3) unit vectors spread evenly, along a spiral."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.pi * (3 - math.sqrt(5)) * np.arange(count)
-    flat = np.sqrt(1 - z * z)
-    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+def capsule_mesh(radius: float, half: float, around: int = 32) -> Mesh:
+    """A capsule along z, or a ball, by its radius and half its segment [m]."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)[1:-1]
+    rings = circle(around)[None] * (radius * np.cos(angles))[:, None, None]
+    rings[..., 2] = (radius * np.sin(angles) + np.where(angles < 0, -half, half))[:, None]
+    if half > 0:  # the equator twice, once at each end of the segment
+        below = rings[len(angles) // 2].copy()
+        below[..., 2] = -half
+        rings = np.insert(rings, len(angles) // 2, below, axis=0)
+    end = np.array([0.0, 0.0, radius + half])
+    return tube_mesh(rings, -end, end)
+
+
+def _seen_from_inside(solid: Solid) -> Mesh:
+    """The surface of a body about the origin, along the rays to the vertices of a ball."""
+    ways, triangles = capsule_mesh(1.0, 0.0, 48)
+    return along_rays(solid, ways), triangles
+
+
+def along_rays(solid: Solid, ways: Array) -> Array:
+    """(k, 3) where rays (k, 3) from inside a solid come out of it."""
+    low, high = np.zeros(len(ways)), np.full(len(ways), 1.01 * solid.reach)
+    for _ in range(50):
+        middle = (low + high) / 2
+        inside = solid.distance(middle[:, None] * ways) < 0
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    return high[:, None] * ways
+
+
+def _balls(points: Array, radius: float, most: int = 10_000) -> Mesh:
+    """Octahedra for the balls of a cloud, of no more than so many."""
+    corners = radius * np.concatenate([np.eye(3), -np.eye(3)])
+    kept = points[:: 1 + len(points) // most]
+    above = np.array([(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2)], dtype=np.int64)
+    faces = np.concatenate([above, above[:, [1, 0, 2]] + np.array([0, 0, 3])])
+    first = 6 * np.arange(len(kept))[:, None, None]
+    return (kept[:, None] + corners).reshape(-1, 3), (first + faces).reshape(-1, 3)

@@ -13,6 +13,7 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.model import CollisionModel, own_solids
 from casadi_ik.collision.scene import Scene
+from casadi_ik.collision.solids import C_NAMES, EXPORTED
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.exporting.single import ARM_ROUNDING, SinglePrecision
 from casadi_ik.exporting.template import filled
@@ -89,7 +90,7 @@ class SceneSources:
     def near(self) -> tuple[FunctionKernel, str, int]:
         """The placing of shapes, its constants, and the numbers that its driver works with."""
         n, capsules, own = len(self.robot.actuators), len(self.model.capsules), self._own
-        constants = define({"N_Q": n, "N_CAPSULES": capsules, "N_OWN": own})
+        constants = define({"N_Q": n, "N_CAPSULES": capsules, "N_OWN": own, **C_NAMES})
         room = n + 6 * capsules + 12 * (own + self.capacity)
         return self.check.kernel.placed, constants, room
 
@@ -172,6 +173,15 @@ class SceneSources:
             "N_LOOKED": str(self._rounds * candidates + 1),
             "LOOK_CONSTANTS": self._look_constants(),
             "MOST_PAIRS": str(max(self._most_pairs, 1)),
+            "KINDS_C": "\n".join(
+                f"  {self.prefix.upper()}_{kind.name} = {int(kind)}, /* {row.size} */"
+                for kind, row in EXPORTED.items()
+            ),
+            "KINDS_JS": ", ".join(f"{kind.name}: {int(kind)}" for kind in EXPORTED),
+            "KINDS_DTS": "\n".join(
+                f"  /** {row.size} */\n  readonly {kind.name}: {int(kind)};"
+                for kind, row in EXPORTED.items()
+            ),
             "LINK_NAMES": ", ".join(json.dumps(link, ensure_ascii=False) for link in self.links),
             "SHAPES_JSON": json.dumps(self.shapes()),
         }
@@ -312,6 +322,7 @@ class SceneSources:
             "PAIRS": pairs if len(pairs) else np.zeros((1, 2), dtype=int),
             "PAIR_MOVING": np.array(crossing or [0]),
             "OFFSETS": model.offsets if len(pairs) else np.zeros(1),
+            "SIZE_FACTORS": np.array([row.factors for row in EXPORTED.values()]),
             "OWN_KIND": np.array([int(one.kind) for one in own] or [0]),
             "OWN_SIZE": np.array([one.size for one in own] or [np.zeros(3)]),
             "OWN_REACH": np.array([one.reach for one in own] or [0.0]),
@@ -320,6 +331,7 @@ class SceneSources:
         whole = {
             "N_CAPSULES": len(capsules),
             "N_OWN": len(own),
+            "N_KINDS": len(EXPORTED),
             "N_PAIRS": len(pairs),
             "HAS_CLOSED_ARM": int(self.places is not None),
         }

@@ -11,7 +11,7 @@ import numpy as np
 from casadi_ik.api import Solver
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
-from casadi_ik.collision.solids import Kind
+from casadi_ik.collision.solids import stated
 from casadi_ik.errors import DescriptionError
 from casadi_ik.kernels.constants import number, numbers
 from casadi_ik.problem.clearance import SceneCheck
@@ -114,19 +114,7 @@ class SceneTargets:
         found = []
         for name, item in self.scene.items.items():
             (solid, place) = item.parts[0]
-            pose, size = item.pose @ place, solid.size.copy()
-            if solid.kind is Kind.BOX:
-                size *= 2
-            else:
-                size[1] *= 2
-            found.append(
-                {
-                    "kind": int(solid.kind),
-                    "size": size.tolist(),
-                    "pose": [*pose[:3, :3].ravel().tolist(), *pose[:3, 3].tolist()],
-                    "grasped": name == self.scene.grasped,
-                }
-            )
+            found.append(stated(solid, item.pose @ place) | {"grasped": name == self.scene.grasped})
         return found
 
     def header(self) -> str:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.distances import segment_distances
+from casadi_ik.collision.distances import between_segments
 from casadi_ik.importing.capsules import GRID, fitted
 from casadi_ik.importing.posture import Jointed, Postures
 from casadi_ik.importing.surfaces import Surface, link_surfaces
@@ -94,7 +94,7 @@ def may_touch(
         least = np.full(SAMPLES, np.inf)
         for i, (_, _, radius) in enumerate(capsules[one]):
             for j, (_, _, wide) in enumerate(capsules[other]):
-                apart = segment_distances(segments[one][:, i], segments[other][:, j])
+                apart, _ = between_segments(segments[one][:, i], segments[other][:, j])
                 least = np.minimum(least, apart - radius - wide)
         found += _verdict((one, other), least, meshes, poses)
     return found

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.distances import nearest
+from casadi_ik.collision.distances import Table, nearest
 from casadi_ik.collision.model import placed, size_of
-from casadi_ik.collision.table import Table
+from casadi_ik.collision.solids import C_NAMES
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
@@ -97,7 +97,7 @@ class ClearanceKernel:
             return None
         shapes = self._robot.shapes
         constants = {"N_Q": self._n, "N_CAPSULES": len(shapes.capsules)}
-        constants["N_OWN"] = len(shapes.solids)
+        constants |= {"N_OWN": len(shapes.solids), **C_NAMES}
         try:
             library = load_library(
                 f"{self._graph.name}_lanes{lanes}",
@@ -116,21 +116,6 @@ class ClearanceKernel:
     def placed(self) -> FunctionKernel:
         """Where the shapes are for q, see `collision.model.placed`."""
         return FunctionKernel(self._graph, self._compiled)
-
-    @cached_property
-    def pulled(self) -> FunctionKernel:
-        """(n,) what forces on the numbers of `placed` do to q: the Jacobian's transpose."""
-        n, size, robot = self._n, self._size, self._robot
-        name = ca.Function.fix_name(f"{robot.name}_shapes_pulled")
-
-        def build() -> ca.Function:
-            q, forces = ca.SX.sym("q", n), ca.SX.sym("forces", size)
-            back = ca.jtimes(placed(robot, q), q, forces, True)
-            return ca.Function(name, [q, forces], [ca.densify(back)], ["q", "forces"], ["pulled"])
-
-        inputs = {"q": (n, 1), "forces": (size, 1)}
-        graph = FunctionGraph(name, build, inputs, ((n, 1),), recipe(name, robot))
-        return FunctionKernel(graph, self._compiled)
 
     def least(
         self,
@@ -237,7 +222,7 @@ class ClearanceKernel:
             rows = slice(first, first + BLOCK)
             (where,) = self.placed(q[rows])
             places = poses[rows] if poses.ndim == 3 else poses
-            distance = nearest(where, places, table).distance
+            distance, _ = nearest(where, places, table)
             if every is not None:
                 every[rows] = distance
             which = distance.argmin(axis=1)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.table import Table
+from casadi_ik.collision.distances import Table
 from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.clearance_kernel import ClearanceKernel

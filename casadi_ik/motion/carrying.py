@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.collision.gaps import gaps
+from casadi_ik.collision.distances import gaps
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.motion.clear_between import least_clearance
 from casadi_ik.problem.clearance import SceneCheck, Surroundings

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.collision.distances import nearest
-from casadi_ik.collision.model import CollisionModel, collision_model
+from casadi_ik.collision.distances import Table
+from casadi_ik.collision.model import CollisionModel, check_base, collision_model, pair_table
 from casadi_ik.collision.scene import Item, Scene
-from casadi_ik.collision.scene_pairs import check_base, pair_table
-from casadi_ik.collision.table import Table
 from casadi_ik.kernels.clearance_kernel import ClearanceKernel
 from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.collision import Touching
@@ -124,69 +122,6 @@ class Surroundings:
         enough = self.margin - ROUNDING
         least, _ = self.kernel.least(q, self.poses, self.table, self.margin, enough)
         return (least >= enough) & np.isfinite(q).all(axis=1)
-
-    def gradient(self, q: Array) -> tuple[Array, Array]:
-        """The smallest room of configurations and how it grows.
-
-        Args:
-            q: (k, n).
-
-        Returns:
-            (k,) `Clearances.room` [m] and (k, n) its derivative [m per rad or m], that of the pair
-            which has least.
-        """
-        (where,) = self.kernel.placed(q)
-        found = nearest(where, self.poses, self.table)
-        rows, which = np.arange(len(q)), found.distance.argmin(axis=1)
-        first, second = self.table.pairs[which].T.astype(np.intp)
-        way, count = found.way[rows, which], len(self.table.radii)
-        forces = np.zeros_like(where)
-        _push(forces, rows, first, found.first[rows, which], way)
-        other = second < count
-        along = found.second[rows, which]
-        _push(forces, rows[other], second[other], along[other], -way[other])
-        own = ~other & (second < count + self.table.own)
-        if own.any():
-            point = _on_segment(where, rows[own], first[own], found.first[rows, which][own])
-            _carry(
-                forces, where, rows[own], 6 * count + 12 * (second[own] - count), point, way[own]
-            )
-        (pulled,) = self.kernel.pulled(q, forces)
-        return found.distance[rows, which] - self.margin, pulled
-
-
-def _push(
-    forces: Array, rows: NDArray[np.intp], capsules: NDArray[np.intp], along: Array, way: Array
-) -> None:
-    """Forces on middles and halves of capsules that pull a point of each one's segment."""
-    columns = 6 * capsules[:, None] + np.arange(3)
-    forces[rows[:, None], columns] += way
-    forces[rows[:, None], columns + 3] += along[:, None] * way
-
-
-def _on_segment(
-    where: Array, rows: NDArray[np.intp], capsules: NDArray[np.intp], along: Array
-) -> Array:
-    columns = 6 * capsules[:, None] + np.arange(3)
-    middle, half = where[rows[:, None], columns], where[rows[:, None], columns + 3]
-    return middle + along[:, None] * half
-
-
-def _carry(
-    forces: Array,
-    where: Array,
-    rows: NDArray[np.intp],
-    places: NDArray[np.intp],
-    point: Array,
-    way: Array,
-) -> None:
-    """Forces on the poses of the robot's solids that push the point they carry against `way`."""
-    turn = places[:, None] + np.arange(9)
-    rotation = where[rows[:, None], turn].reshape(-1, 3, 3)
-    origin = where[rows[:, None], places[:, None] + np.arange(9, 12)]
-    inside = np.einsum("kji,kj->ki", rotation, point - origin)
-    forces[rows[:, None], turn] -= (way[:, :, None] * inside[:, None]).reshape(-1, 9)
-    forces[rows[:, None], places[:, None] + np.arange(9, 12)] -= way
 
 
 class SceneCheck:

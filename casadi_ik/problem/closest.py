@@ -9,24 +9,9 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.collision.distances import nearest
+from casadi_ik.collision.distances import from_solid, pose_row
 from casadi_ik.collision.scene import Scene
-from casadi_ik.collision.solids import Solid
-from casadi_ik.collision.table import Table
-from casadi_ik.robots.collision import LinkCapsule
-
-
-@dataclass(frozen=True, eq=False)
-class Tube:
-    """A capsule of a link where it is.
-
-    Attributes:
-        segment: (6,) middle and half of its segment in the base frame [m].
-        radius: [m].
-    """
-
-    segment: Array
-    radius: float
+from casadi_ik.collision.solids import Solid, capsule
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +22,12 @@ class Closest:
         ends: (2, 3) the nearest points of the first and of the second shape, base frame [m]; where
             the shapes overlap, as far beyond each other as they do.
         distance: Between them [m], negative where shapes overlap.
-        first: The first shape.
-        second: The second: of the robot, or a solid of the scene and its (4, 4) pose.
+        shapes: The two, each with its (4, 4) pose in the base frame.
     """
 
     ends: Array
     distance: float
-    first: Tube
-    second: Tube | tuple[Solid, Array]
+    shapes: tuple[tuple[Solid, Array], tuple[Solid, Array]]
 
 
 def closest_points(robot: ArmHand, q: Array, scene: Scene, pair: tuple[str, str]) -> Closest | None:
@@ -59,40 +42,32 @@ def closest_points(robot: ArmHand, q: Array, scene: Scene, pair: tuple[str, str]
     Returns:
         None if one of them has no shape.
     """
-    links = robot.links(q)
-    mine, theirs = _capsules(robot, pair[0]), _capsules(robot, pair[1])
-    solids = [one for one in scene_solids(scene) if one[0] == pair[1]]
-    capsules = [*mine, *theirs]
-    others = range(len(mine), len(capsules) + (0 if theirs else len(solids)))
-    pairs = np.array([(i, j) for i in range(len(mine)) for j in others], dtype=np.int32)
-    if not len(pairs):
-        return None
-    where = np.concatenate([_segment(one, links[one.link]) for one in capsules])
-    table = Table(
-        np.array([one.radius for one in capsules]),
-        np.array([float(np.linalg.norm(one.half)) for one in capsules]),
-        pairs,
-        np.zeros(len(pairs)),
-        0,
-        tuple(solid for _, solid, _ in solids),
-        (),
-        (),
-        (pair,) * len(pairs),
-    )
-    poses = [np.append(pose[:3, :3].ravel(), pose[:3, 3]) for _, _, pose in solids]
-    found = nearest(where[None], np.array(poses).reshape(-1, 12), table)
-    which = int(found.distance[0].argmin())
-    i, j = pairs[which].tolist()
-    one, way = where[6 * i : 6 * i + 6], found.way[0, which]
-    distance = float(found.distance[0, which])
-    start = one[:3] + found.first[0, which] * one[3:] - table.radii[i] * way
-    end = start - distance * way
-    if j < len(capsules):
-        second = Tube(where[6 * j : 6 * j + 6], float(table.radii[j]))
-    else:
-        _, solid, pose = solids[j - len(capsules)]
-        second = solid, pose
-    return Closest(np.stack([start, end]), distance, Tube(one, float(table.radii[i])), second)
+    best: Closest | None = None
+    others = link_capsules(robot, q, pair[1]) or [
+        (solid, pose) for name, solid, pose in scene_solids(scene) if name == pair[1]
+    ]
+    for one, pose in link_capsules(robot, q, pair[0]):
+        radius, half = one.size[:2]
+        segment = np.append(pose[:3, 3], half * pose[:3, 2])
+        for solid, place in others:
+            found = from_solid(solid, segment[None, None], pose_row(place)[None])
+            apart, along = found[0].item() - radius, found[1].item()
+            if best is None or apart < best.distance:
+                nearest = segment[:3] + along * segment[3:]
+                way = _outward(solid, place, nearest)
+                start = nearest - radius * way
+                ends = np.stack([start, start - apart * way])
+                best = Closest(ends, apart, ((one, pose), (solid, place)))
+    return best
+
+
+def _outward(solid: Solid, pose: Array, point: Array) -> Array:
+    """(3,) the way in which the distance of a solid at a pose grows, at a point."""
+    steps = 1e-6 * np.concatenate([np.eye(3), -np.eye(3)])
+    local = (point + steps - pose[:3, 3]) @ pose[:3, :3]
+    ahead, behind = solid.distance(local).reshape(2, 3)
+    way = ahead - behind
+    return way / max(float(np.linalg.norm(way)), 1e-30)
 
 
 def scene_solids(scene: Scene) -> Iterator[tuple[str, Solid, Array]]:
@@ -102,10 +77,18 @@ def scene_solids(scene: Scene) -> Iterator[tuple[str, Solid, Array]]:
             yield name, solid, item.pose @ place
 
 
-def _capsules(robot: ArmHand, link: str) -> list[LinkCapsule]:
-    return [one for one in robot.description.shapes.capsules if one.link == link]
-
-
-def _segment(one: LinkCapsule, pose: Array) -> Array:
-    """(6,) its middle and half in the base frame."""
-    return np.append(pose[:3, :3] @ one.center + pose[:3, 3], pose[:3, :3] @ one.half)
+def link_capsules(robot: ArmHand, q: Array, link: str) -> list[tuple[Solid, Array]]:
+    """The capsules of a link, each along z at its (4, 4) pose in the base frame."""
+    found = []
+    for one in robot.description.shapes.capsules:
+        if one.link == link:
+            half = float(np.linalg.norm(one.half))
+            place = np.eye(4)
+            if half > 0:
+                z = one.half / half
+                x = np.cross(z, np.eye(3)[np.abs(z).argmin()])
+                x /= np.linalg.norm(x)
+                place[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+            place[:3, 3] = one.center
+            found.append((capsule(one.radius, half), robot.links(q)[link] @ place))
+    return found

@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.collision.gaps import surface
+from casadi_ik.collision.distances import surface_points as surface
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import Kind
 from casadi_ik.collision.solids import Solid as CollisionSolid
 from casadi_ik.grasps import Grasp
-from casadi_ik.problem.closest import Tube, closest_points
+from casadi_ik.problem.closest import closest_points
 from casadi_ik.problem.closest import scene_solids as solids_of
 from casadi_ik.views.captions import NEAREST_COLOR
 from casadi_ik.views.shapes import Solid, capsule, with_edges
@@ -68,19 +68,12 @@ def nearest_pair(
     if found is None:
         return [], []
     start, end = found.ends
-    shapes = [_tube(found.first)]
-    if isinstance(found.second, Tube):
-        shapes.append(_tube(found.second))
-    elif found.second[0].kind is not Kind.HALF_SPACE:
-        shapes.append(_mesh(*found.second, end))
+    shapes = [
+        _mesh(solid, pose, end) for solid, pose in found.shapes if solid.kind is not Kind.HALF_SPACE
+    ]
     marks = [capsule(start, end, ROD), *(capsule(p, p, 2 * ROD) for p in (start, end))]
     rod, held = ([(mesh, NEAREST_COLOR) for mesh in some] for some in (marks, shapes))
     return rod, held
-
-
-def _tube(one: Tube) -> pv.PolyData:
-    middle, half = one.segment[:3], one.segment[3:]
-    return capsule(middle - half, middle + half, one.radius + SKIN)
 
 
 def _mesh(solid: CollisionSolid, pose: Array, about: Array) -> pv.PolyData:

@@ -14,7 +14,7 @@ OF = {
     "couplings": "coupling",
     "load": "grasp",
     "candidates": "grasp",
-    "scene_file": "scene",
+    "scene": "scene",
     "objects": "object",
     "shapes": "object",
     "reading": "",

@@ -89,28 +89,6 @@ def test_the_virtual_machine_gives_the_same(robot, rng):
     np.testing.assert_array_equal(which, every[0].argmin(axis=1))
 
 
-def test_the_gradient_is_that_of_differences(robot, rng):
-    around = surroundings(robot, ik.Scene(SCENE))
-    q = robot.random(rng, 60)
-    room, slope = around.gradient(q)
-    np.testing.assert_allclose(room, around.check(q).room, atol=3e-7)
-    step = 1e-5
-    checked = 0
-    for column in range(q.shape[1]):
-        ahead, behind = q.copy(), q.copy()
-        ahead[:, column] += step
-        behind[:, column] -= step
-        one, other = around.check(ahead), around.check(behind)
-        same = (one.pairs == other.pairs) & (np.abs(room) > 1e-3)
-        differences = (one.room - other.room) / (2 * step)
-        smooth = same & (np.abs(differences - slope[:, column]) < 0.5)
-        # Where the nearest point jumps from an edge to another there is no gradient.
-        assert smooth[same].mean() > 0.9
-        np.testing.assert_allclose(slope[smooth, column], differences[smooth], atol=0.02)
-        checked += int(smooth.sum())
-    assert checked > 200
-
-
 def test_nan_is_not_free(robot):
     around = surroundings(robot, ik.Scene(SCENE))
     q = np.full((1, len(robot.actuators)), np.nan)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.collision.gaps import gaps
+from casadi_ik.collision.distances import gaps
 from casadi_ik.errors import DescriptionError
 
 

@@ -13,8 +13,6 @@ enum { DONE = 0, SLICE_OVER = 1, NO_MEMORY = -1 };
 
 @SCENE_CONSTANTS@
 @SWINGS@
-static double length3(const double *v) { return sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
-
 void @PREFIX@_scene_init(@PREFIX@_solver *solver) {
   int i, k;
   for (i = 0; i < N_OWN; ++i) {
@@ -29,23 +27,18 @@ void @PREFIX@_scene_init(@PREFIX@_solver *solver) {
 int @PREFIX@_set_solid(@PREFIX@_solver *solver, int number, int kind, const double *size,
                        const double *pose, int grasped) {
   @PREFIX@_solid *put;
+  int k;
   if (number < 0 || number >= @GUARD@_SCENE) return @GUARD@_BAD_INPUT;
-  if (kind < @GUARD@_NOTHING || kind > @GUARD@_CYLINDER) return @GUARD@_BAD_INPUT;
+  if (kind < @GUARD@_NOTHING || kind >= N_KINDS) return @GUARD@_BAD_INPUT;
   put = solver->scene.solids + N_OWN + number;
   put->kind = kind;
   solver->scene.grasped[number] = grasped;
   if (kind == @GUARD@_NOTHING) return 0;
   memcpy(solver->scene.poses + 12 * number, pose, 12 * sizeof(double));
-  memset(put->size, 0, sizeof put->size);
-  put->reach = 0;
-  if (kind == @GUARD@_BOX) {
-    int k;
-    for (k = 0; k < 3; ++k) put->size[k] = size[k] / 2;
-    put->reach = length3(put->size);
-  } else if (kind != @GUARD@_HALF_SPACE) {
-    put->size[0] = size[0];
-    put->size[1] = size[1] / 2;
-    put->reach = kind == @GUARD@_CAPSULE ? put->size[0] + put->size[1] : length3(put->size);
+  put->reach = 0; /* at most: no shape reaches farther than all its sizes together */
+  for (k = 0; k < 3; ++k) {
+    put->size[k] = SIZE_FACTORS[kind][k] > 0 ? SIZE_FACTORS[kind][k] * size[k] : 0;
+    put->reach += put->size[k];
   }
   return 0;
 }

@@ -2,11 +2,8 @@
 /* What may stand about: how many solids at most, and their kinds. */
 enum {
   @GUARD@_SCENE = @CAPACITY@,
-  @GUARD@_NOTHING = -1,
-  @GUARD@_HALF_SPACE = 0, /* all below z = 0 of its pose */
-  @GUARD@_CAPSULE = 1,    /* along z; size: radius, length without the caps; a ball has length 0 */
-  @GUARD@_BOX = 2,        /* size: its edges */
-  @GUARD@_CYLINDER = 3    /* along z; size: radius, length */
+@KINDS_C@
+  @GUARD@_NOTHING = -1
 };
 enum { @GUARD@_COLLISION = 6 /* contacts and limits are met, but something touches */ };
 

@@ -7,9 +7,8 @@
  * a convex solid is convex along the segment, and what is given is where two of its tangents meet.
  * From the balls of a cloud it is exact.
  *
- * Expects the macros N_Q, N_CAPSULES and N_OWN (solids of the robot).
+ * Expects the macros N_Q, N_CAPSULES, N_OWN (solids of the robot), and the kinds of solids.
  */
-enum { HALF_SPACE, CAPSULE, BOX, CYLINDER, CONVEX, CLOUD };
 enum { MOST_CUTS = 40 };
 
 /* So many planes of a convex solid, which are spread all around, tell whether it is far away. */

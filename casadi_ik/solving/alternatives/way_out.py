@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.collision.gaps import gaps
+from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Item, Scene
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.collision_report import WayOut

@@ -1,0 +1,82 @@
+"""One more kind of solid, the lines of docs/add_a_shape.md, in a copy of the package."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from capsule_arm import write_robot
+from toy_robots import replace
+
+ROOT = Path(__file__).parents[2]
+
+SCRIPT = """
+import sys
+import numpy as np
+import casadi_ik as ik
+
+robot = ik.load_robot(sys.argv[1])
+wall = {"kind": "slab", "thickness": 0.02, "xyz": [0.35, 0, 0], "rpy": [0, np.pi / 2, 0]}
+box = {"kind": "box", "size": [9.0, 9.0, 0.02], "xyz": [0.35, 0, 0], "rpy": [0, np.pi / 2, 0]}
+q = robot.random(np.random.default_rng(0), 200)
+points, normals = robot.contacts(robot.home)
+contacts = {name: ik.Contact(p, n) for name, p, n in zip(robot.fingers, points, normals)}
+found = []
+for solid in (wall, box):
+    for compiled in (True, False):
+        solver = ik.Solver(robot, scene=ik.Scene({"wall": solid}), compiled=compiled)
+        found.append(solver.check(q, ik.Grasp(contacts)).distance)
+for other in found[1:]:
+    np.testing.assert_allclose(found[0], other, atol=3e-7)
+assert (found[0] < 0).any() and (found[0] > 0).any()
+try:
+    ik.Scene({"wall": {**wall, "thickness": -1}})
+except ik.errors.DescriptionError as error:
+    assert "solids.wall.thickness: found -1" in str(error), error
+"""
+
+
+def package_with_the_page(folder: Path) -> None:
+    """A copy of the package with the page's blocks in their places."""
+    shutil.copytree(
+        ROOT / "casadi_ik", folder / "casadi_ik", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    (folder / "models").symlink_to(ROOT / "models")
+    text = (ROOT / "docs" / "add_a_shape.md").read_text(encoding="utf-8")
+    name, row, make, entry = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    distance, call = re.findall(r"```c\n(.*?)```", text, re.DOTALL)
+    solids = folder / "casadi_ik" / "collision" / "solids.py"
+    replace(solids, "    CLOUD = 5\n", f"    CLOUD = 5\n{name}")
+    replace(solids, '}\n"""The kinds:', f'{row}}}\n"""The kinds:')
+    replace(solids, "def half_space()", f"{make}\n\ndef half_space()")
+    driver = folder / "casadi_ik" / "kernels" / "drivers" / "clearance.c"
+    before = "static LANES_TARGET along from_solid("
+    replace(driver, before, f"{distance}\n{before}")
+    first = "  if (one->kind == BOX)"
+    replace(driver, first, f"{call}{first}")
+    scene = folder / "casadi_ik" / "collision" / "scene.py"
+    replace(
+        scene,
+        "SolidEntry = (\n    BoxEntry",
+        f"{entry}\n\nSolidEntry = (\n    SlabEntry | BoxEntry",
+    )
+    replace(scene, "    half_space,\n", "    half_space,\n    slab,\n")
+
+
+def test_a_kind_is_added_in_three_files(tmp_path: Path) -> None:
+    (tmp_path / "package").mkdir()
+    path = write_robot(tmp_path)
+    package_with_the_page(tmp_path / "package")
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(path)],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "package")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
