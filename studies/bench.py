@@ -123,7 +123,8 @@ def rows_of(
             paired = [one[name] / other for one, other in zip(mine, there, strict=False) if other]
             middle = sorted(paired)[len(paired) // 2] if paired else float("nan")
             ratio = here / least if least else float("nan")
-            cells += [_number(least), f"{ratio:.3f}", f"{middle:.3f}"]
+            shown = [f"{ratio:.3f}", f"{middle:.3f}"] if least or here else ["", ""]
+            cells += [_number(least), *shown]
         elif theirs:
             cells += ["", "", ""]
         yield cells

@@ -119,7 +119,7 @@ def test_from_the_command_line_with_a_log(tmp_path: Path, baxter: ik.ArmHand) ->
 
 def test_the_script_makes_the_shipped_file(tmp_path: Path) -> None:
     """To nine digits: the optimiser may differ in the last ones from machine to machine."""
-    script = Path(__file__).resolve().parents[2] / "studies" / "make_ar10_grasps.py"
+    script = Path(__file__).resolve().parents[2] / "tools" / "make_ar10_grasps.py"
     command = [sys.executable, str(script), "--only", "golf_ball", "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")

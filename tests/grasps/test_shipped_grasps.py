@@ -27,7 +27,7 @@ from casadi_ik.symbolic.kinematics import forward
 NAMES = shipped_grasps("kuka_lwr_barrett")
 FINGERS = ("thumb", "finger_2", "finger_3")
 SHARED = {"bh_finger_2_spread": "bh_spread", "bh_finger_3_spread": "bh_spread"}
-STUDIES = Path(__file__).resolve().parents[2] / "studies"
+TOOLS = Path(__file__).resolve().parents[2] / "tools"
 PALM_SURFACE = 0.080  # [m] in frame W
 
 
@@ -169,10 +169,10 @@ def kind(name: str) -> str:
 
 
 def test_the_script_agrees_and_refuses_a_broken_file(tmp_path: Path) -> None:
-    script = [sys.executable, str(STUDIES / "make_grasps.py"), "--check", "--only", "cup"]
+    script = [sys.executable, str(TOOLS / "make_grasps.py"), "--check", "--only", "cup"]
     done = subprocess.run(script, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "cup: good")
-    source = (STUDIES.parent / "models" / "grasps" / "cup.yaml").read_text()
+    source = (TOOLS.parent / "models" / "grasps" / "cup.yaml").read_text()
     spread = "bh_spread: 0.0"
     assert spread in source
     (tmp_path / "cup.yaml").write_text(source.replace(spread, "bh_spread: 0.1"))

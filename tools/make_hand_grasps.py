@@ -2,8 +2,8 @@
 
 Run it again whenever an object, a hand or the recipes change::
 
-    python studies/make_hand_grasps.py                                  # all into models/grasps
-    python studies/make_hand_grasps.py --only allegro_cup
+    python tools/make_hand_grasps.py                                  # all into models/grasps
+    python tools/make_hand_grasps.py --only allegro_cup
 
 The thumb presses against the two fingers after it. Where the object may be in the hand follows from
 the pads of the hand half closed: amid them, its y axis (that the thumb presses along) from the

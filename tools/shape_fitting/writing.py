@@ -20,7 +20,7 @@ def write(
     text = path.read_text(encoding="utf-8")
     text = text.split("\ncollision:", 1)[0].rstrip("\n") + "\n"
     source = (
-        f"  shapes: \"Fitted by studies/fit_shapes.py to the shapes of {names}: a link's mesh is "
+        f"  shapes: \"Fitted by tools/fit_shapes.py to the shapes of {names}: a link's mesh is "
         "held by its capsules, which stand out beyond it by at most what is called excess. "
         'Assumption: rounded up to 0.1 mm."\n'
     )

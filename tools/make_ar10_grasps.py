@@ -2,8 +2,8 @@
 
 Run it again whenever an object, the hand or the recipes change::
 
-    python studies/make_ar10_grasps.py               # all into models/grasps
-    python studies/make_ar10_grasps.py --only cup
+    python tools/make_ar10_grasps.py               # all into models/grasps
+    python tools/make_ar10_grasps.py --only cup
 
 A pad is a point with a normal, and the fingers do not spread: index and middle finger can only
 press on the same cylinder, and never exactly on the same ball. So cylinders are pinched by thumb,

@@ -45,7 +45,7 @@ def barrett_text(
 def made_by(script: str, seed: int, item: str, robot: str) -> str:
     """The first line of a file."""
     return (
-        f"Made by studies/{script} --seed {seed} from models/objects/{item}.yaml and "
+        f"Made by tools/{script} --seed {seed} from models/objects/{item}.yaml and "
         f"the robot {robot}. Rerun it instead of editing."
     )
 

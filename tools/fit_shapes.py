@@ -1,6 +1,6 @@
 """Capsules for a shipped arm or hand, fitted to somebody's meshes, written into its description.
 
-    python studies/fit_shapes.py KIND NAME FILE.urdf [--names "WHAT THE FILE IS"]
+    python tools/fit_shapes.py KIND NAME FILE.urdf [--names "WHAT THE FILE IS"]
 
 The file's joints are found again by their axes at zero, so its names and frames do not matter. The
 fit, and which links may touch, are those of `casadi-ik import`.

@@ -2,9 +2,9 @@
 
 Run it again whenever an object, the hand or the recipes change::
 
-    python studies/make_grasps.py                 # all twelve into models/grasps
-    python studies/make_grasps.py --only cup
-    python studies/make_grasps.py --check         # verify the files that are there
+    python tools/make_grasps.py                 # all twelve into models/grasps
+    python tools/make_grasps.py --only cup
+    python tools/make_grasps.py --check         # verify the files that are there
 
 The pinch is a nonlinear programme in hand posture and object pose (`grasp_synthesis.posture`), the
 place in front of the arm another (`grasp_synthesis.placement`); both take random starts from one

@@ -1,1 +1,0 @@
-"""How the shipped grasps are computed; run ``studies/make_grasps.py``."""

@@ -1,0 +1,1 @@
+"""How the shipped grasps are computed; run ``tools/make_grasps.py``."""
