@@ -9,6 +9,8 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from casadi_ik.answers.recorder import Recorder
+from casadi_ik.answers.solution import BatchSolution, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.errors import InputError
@@ -20,8 +22,6 @@ from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
-from casadi_ik.problem.recorder import Recorder
-from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.registry import METHODS, build_method, with_finger_step
 from casadi_ik.solving.choosing_solver import ChoosingSolver
 from casadi_ik.solving.engine import Engine

@@ -1,6 +1,8 @@
 """The public names of casadi_ik, where each of them is; `casadi_ik` looks here for them."""
 
 from casadi_ik import logs, papers
+from casadi_ik.answers.diagnosis import Diagnosis, Reason
+from casadi_ik.answers.solution import BatchSolution, Choice, CollisionReport, Ranking, Solution
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.collision.scene import Scene, load_scene
@@ -16,13 +18,9 @@ from casadi_ik.motion.path import Jump
 from casadi_ik.motion.reaching import Reach
 from casadi_ik.motion.retarget import Retargeter, load_retarget
 from casadi_ik.motion.tracking import Track
-from casadi_ik.problem.collision_report import CollisionReport
-from casadi_ik.problem.contact_verdict import ContactVerdict, PalmVerdict
-from casadi_ik.problem.diagnosis import Diagnosis, Reason
-from casadi_ik.problem.ranking import Choice, Ranking
-from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trajectory import Trajectory
+from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict
 from casadi_ik.registry import METHODS, register_method
 from casadi_ik.solving.alternatives.branches import ArmBranch
 from casadi_ik.solving.alternatives.finder import Alternative

@@ -21,8 +21,8 @@ from bench_report import Section
 from samplers import random_arm_targets
 
 import casadi_ik as ik
+from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.arrays import Array
-from casadi_ik.problem.recorder import SolveBlock
 
 METHODS: dict[str, dict[str, Any]] = {
     "hand-first": {},

@@ -45,7 +45,7 @@ from samplers import corners, near_limits, random_hands, singular_arms
 import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.problem.problems import Problems
-from casadi_ik.solving.diagnosis.prover import Prover
+from casadi_ik.proofs.prove import Prover
 
 ROBOTS = (*SHIPPED_AND_MADE, "ur5e+shadow")
 

@@ -24,7 +24,6 @@ from casadi_ik.datasets.conventions import Convention, load_convention
 from casadi_ik.datasets.postures import HandPoses
 from casadi_ik.files.reading import roll_pitch_yaw
 from casadi_ik.grasps.pose import inverse
-from casadi_ik.problem.hand_motors import finger_joints, hand_motors
 
 ROBOTS = {
     "allegro": "panda+allegro_right",
@@ -71,10 +70,10 @@ def made(name: str, folder: Path, seed: int = 0, robot: ik.ArmHand | None = None
     palms[:, :3, 3] = rng.uniform(-0.15, 0.15, (COUNT, 3))
     path = folder / f"{stem}.{kind or ('pt' if layout == 'multidex' else 'npy')}"
     if layout == "table":
-        motors = hand_motors(held.description)
+        motors = held.description.finger_motors
         values = q[:, [held.actuators.index(name) for name in motors]]
         if kind == "npz":
-            joints = tuple(n for n in finger_joints(held.description) if n not in motors)
+            joints = tuple(n for n in held.description.finger_joints if n not in motors)
             motors, values = (*motors, *joints), np.hstack([values, _joints(held, q, joints)])
         _table(path, palms, motors, values)
     else:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from casadi_ik.problem.diagnosis import Diagnosis
-from casadi_ik.problem.solution import BatchSolution
+from casadi_ik.answers.diagnosis import Diagnosis
+from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.problem.status import Status
 
 STATUS = np.dtype(f"<U{max(len(status.name) for status in Status)}")

@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from casadi_ik.answers.solution import Ranking
 from casadi_ik.api import Solver
 from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.outputs import check_outputs, write_output
@@ -26,7 +27,6 @@ from casadi_ik.cli.report import clearance, duration, files, headline, table
 from casadi_ik.cli.solve import as_json
 from casadi_ik.datasets import Candidates, load_candidates
 from casadi_ik.grasps.load import grasp_data
-from casadi_ik.problem.ranking import Ranking
 
 
 def choose(arguments: argparse.Namespace) -> Answer:

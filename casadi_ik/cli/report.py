@@ -12,12 +12,12 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from casadi_ik.answers.solution import Solution
 from casadi_ik.api import Solver
 from casadi_ik.cli.batch_totals import BatchTotals
 from casadi_ik.grasps import Tolerance
-from casadi_ik.problem.contact_verdict import PalmVerdict
-from casadi_ik.problem.solution import Solution
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.verdict import PalmVerdict
 
 AT_LIMIT = 1e-6
 """How near to a limit counts as at it [rad or m]."""

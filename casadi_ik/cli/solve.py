@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from casadi_ik.answers.diagnosis import Diagnosis
+from casadi_ik.answers.solution import Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.outputs import check_outputs, write_output
@@ -21,10 +23,8 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, MissingExtraError
 from casadi_ik.grasps import Grasp, load_object
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.diagnosis import Diagnosis
-from casadi_ik.problem.proof import Proof
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
-from casadi_ik.problem.solution import Solution
+from casadi_ik.proofs.proof import Proof
 
 Draw = Callable[..., object]
 

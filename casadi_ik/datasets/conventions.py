@@ -9,11 +9,12 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.datasets.postures import HandPoses, motion
+from casadi_ik.datasets.postures import HandPoses
 from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
 from casadi_ik.files.shipped import resolve, shipped_names
 from casadi_ik.grasps.pose import inverse
+from casadi_ik.robots.poses import motion
 
 
 class HandFrame(Struct, frozen=True):

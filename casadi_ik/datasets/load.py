@@ -33,7 +33,6 @@ from casadi_ik.grasps.load import load_grasp_files
 from casadi_ik.grasps.objects import is_mesh
 from casadi_ik.grasps.pose import rotations_of
 from casadi_ik.problem.contacts.arrays import NAMES
-from casadi_ik.problem.hand_motors import finger_joints, hand_motors
 from casadi_ik.problem.problems import DIRECTIONS
 
 Invalid = Literal["error", "drop", "clip"]
@@ -400,7 +399,7 @@ def _refuse_other_units(path: Path, grasps: Sequence[Grasp]) -> None:
 
 def _own(robot: ArmHand, names: tuple[str, ...]) -> Convention:
     """A table's joints are called as the robot's; those of the fingers' motors have to be there."""
-    motors = hand_motors(robot.description)
+    motors = robot.description.finger_motors
     return of_robot(robot, (*names, *(name for name in motors if name not in names)))
 
 
@@ -427,7 +426,7 @@ def _of_hand(
     _refuse_too_many(given.where, len(given.rows))
     joints = convention.positions(given)
     hands = None
-    if take == "palm" or not set(finger_joints(robot.description)) <= set(joints):
+    if take == "palm" or not set(robot.description.finger_joints) <= set(joints):
         hands = hand_postures(robot, given.where, joints)
         joints = hands.joints
     palms, points, normals = palms_of(robot, convention.link, convention.frames(given), joints)

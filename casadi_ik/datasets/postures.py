@@ -13,8 +13,8 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import DescriptionError
 from casadi_ik.grasps.pose import inverse
-from casadi_ik.problem.hand_motors import finger_joints, hand_motors
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.robots.poses import link_poses
 
 FAR = 5.0
 """A hand farther from its object than this [m] is one in millimetres."""
@@ -229,38 +229,6 @@ def of_two_columns(columns: Array) -> Array:
     return np.stack([first, second, np.cross(first, second)], axis=2)
 
 
-def link_poses(
-    robot: RobotDescription, joints: Mapping[str, Array], count: int
-) -> dict[str, Array]:
-    """Poses (k, 4, 4) of all links in the base frame.
-
-    Args:
-        robot: The robot.
-        joints: Positions (k,) by joint [rad or m]; the others are at zero.
-        count: k.
-    """
-    poses = {robot.root: np.tile(np.eye(4), (count, 1, 1))}
-    for joint in robot.joints:
-        pose = poses[joint.parent] @ joint.placement
-        if joint.name in joints:
-            pose = pose @ motion(joint.type, joint.axis, joints[joint.name])
-        poses[joint.child] = pose
-    return poses
-
-
-def motion(kind: str, axis: Array, positions: Array) -> Array:
-    """(k, 4, 4) what a joint does (Rodrigues)."""
-    moved = np.tile(np.eye(4), (len(positions), 1, 1))
-    if kind == "prismatic":
-        moved[:, :3, 3] = positions[:, None] * axis
-        return moved
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    s, c = np.sin(positions)[:, None, None], np.cos(positions)[:, None, None]
-    moved[:, :3, :3] += s * cross + (1 - c) * (cross @ cross)
-    return moved
-
-
 def palms_of(
     robot: ArmHand, link: str, frames: Array, joints: Mapping[str, Array]
 ) -> tuple[Array, Array, Array]:
@@ -277,8 +245,8 @@ def palms_of(
         in the frame in which the link's are given.
     """
     described = robot.description
-    poses = link_poses(described, joints, len(frames))
-    back = np.stack([inverse(pose) for pose in poses[link]])
+    poses = link_poses(described.root, described.joints, joints)
+    back = inverse(poses[link])
     moved = frames @ back
     palms = moved @ poses[described.palm_link] @ described.palm_placement
     pads = np.stack([moved @ poses[f.link] @ f.placement for f in described.fingers], axis=1)
@@ -342,7 +310,7 @@ def hand_postures(robot: ArmHand, where: str, joints: Mapping[str, Array]) -> Ha
         DescriptionError: A motor is not among the joints, nor follows from them.
     """
     described = robot.description
-    motors = hand_motors(described)
+    motors = described.finger_motors
     moved = _motors_of(described, joints)
     for name in motors:
         if name not in moved:
@@ -350,7 +318,7 @@ def hand_postures(robot: ArmHand, where: str, joints: Mapping[str, Array]) -> Ha
     columns = [robot.actuators.index(name) for name in motors]
     given = np.stack([moved[name] for name in motors], axis=1)
     found = np.clip(given, robot.lower[columns], robot.upper[columns])
-    said = {name: joints[name] for name in finger_joints(described) if name in joints}
+    said = {name: joints[name] for name in described.finger_joints if name in joints}
     whole = joints_at(robot, motors, found) | said
     wanted = _tips_of_joints(robot, whole)
     free = _free(robot, columns, said, joints_at(robot, motors, given))

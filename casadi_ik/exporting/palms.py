@@ -7,7 +7,6 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.exporting.template import filled
 from casadi_ik.kernels.constants import define_arrays, number
-from casadi_ik.problem.hand_motors import hand_motors
 from casadi_ik.problem.palm_targets import ROUNDING, touched
 
 MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")
@@ -15,7 +14,7 @@ MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")
 
 def palm_marks(robot: ArmHand, prefix: str) -> dict[str, str]:
     """What stands for the marks of palms; nothing without an arm, or if contacts leave it free."""
-    motors = hand_motors(robot.description)
+    motors = robot.description.finger_motors
     own = np.where(np.isin(robot.actuators, motors), robot.home, np.nan)
     home = robot.palm(robot.home)
     if not robot.description.arm_actuators or touched(robot, home[None], own[None])[2]:

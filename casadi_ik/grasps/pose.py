@@ -59,10 +59,10 @@ def rotations_of(quaternions: Array) -> Array:
 
 
 def inverse(pose: Array) -> Array:
-    """Of a pose (4, 4)."""
-    back = np.eye(4)
-    back[:3, :3] = pose[:3, :3].T
-    back[:3, 3] = -back[:3, :3] @ pose[:3, 3]
+    """Of poses (..., 4, 4)."""
+    back = np.zeros_like(pose) + np.eye(4)
+    back[..., :3, :3] = np.swapaxes(pose[..., :3, :3], -1, -2)
+    back[..., :3, 3] = -(back[..., :3, :3] @ pose[..., :3, 3, None])[..., 0]
     return back
 
 

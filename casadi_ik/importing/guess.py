@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.importing.posture import Postures, moved
+from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.robots.description import Joint, RobotDescription
+from casadi_ik.robots.poses import joint_positions, link_poses
 from casadi_ik.robots.robot_files.tree import RobotTree, TreeJoint
 
 WORDS = {
@@ -482,20 +483,9 @@ def _freedom(robot: RobotDescription, chain: tuple[Joint, ...], q: Array, arm: l
 
 
 def _palm(robot: RobotDescription, chain: tuple[Joint, ...], q: Array) -> Array:
-    values = {name: q[i : i + 1] for i, name in enumerate(robot.actuator_names)}
-    joints = {joint.name: joint for joint in robot.movable}
-
-    def value(name: str) -> Array:
-        coupling = None if name not in joints else joints[name].coupling
-        if coupling is None:
-            return values[name]
-        return coupling.followed(value(coupling.of))
-
-    pose = np.eye(4)
-    for joint in chain:
-        angle = 0.0 if joint.type == "fixed" else float(value(joint.name)[0])
-        pose = pose @ joint.placement @ moved(joint, angle)
-    return pose
+    values = joint_positions(robot.joints, dict(zip(robot.actuator_names, q, strict=True)))
+    positions = {name: float(value[0]) for name, value in values.items()}
+    return link_poses(robot.root, chain, positions)[robot.palm_link]
 
 
 def _round(q: Array, robot: RobotDescription) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.robots.description import Joint
-from casadi_ik.robots.robot_files.tree import turned
+from casadi_ik.robots.poses import link_poses
 
 
 class Jointed(Protocol):
@@ -53,11 +53,7 @@ class Postures:
 
     def poses(self, values: Mapping[str, float]) -> dict[str, Array]:
         """(4, 4) pose of every link in the root's frame."""
-        found = {self.part.root: np.eye(4)}
-        for joint in self.part.joints:
-            pose = found[joint.parent] @ joint.placement
-            found[joint.child] = pose @ moved(joint, values.get(joint.name, 0.0))
-        return found
+        return link_poses(self.part.root, self.part.joints, values)
 
     def chain(self, link: str, top: str) -> list[Joint]:
         """The joints that move a link against one above it, in order."""
@@ -82,12 +78,3 @@ class Postures:
         while link in self.by_child and self.by_child[link].type == "fixed":
             link = self.by_child[link].parent
         return link
-
-
-def moved(joint: Joint, value: float) -> Array:
-    """(4, 4) what a joint does at a position [rad or m]."""
-    if joint.type == "prismatic":
-        pose = np.eye(4)
-        pose[:3, 3] = joint.axis * value
-        return pose
-    return turned(joint.axis, value if joint.type == "revolute" else 0.0)

@@ -20,6 +20,7 @@ from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.robots.collision import Touching, capsules_of
 from casadi_ik.robots.description import Actuator, Joint, RobotDescription
 from casadi_ik.robots.parts import PREFIX
+from casadi_ik.robots.poses import joint_positions
 from casadi_ik.robots.robot_files.tree import RobotTree
 from casadi_ik.robots.schema import ShapeEntry
 
@@ -130,14 +131,8 @@ def _values(
 ) -> dict[str, float]:
     """Random positions of all joints, couplings minded where they are of one joint or motor."""
     drawn = {one.name: rng.uniform(one.lower, one.upper) for one in motors}
-
-    def value(name: str) -> float:
-        joint = joints.get(name)
-        if joint is None or joint.coupling is None:
-            return drawn[name]
-        return float(joint.coupling.followed(np.array([value(joint.coupling.of)]))[0])
-
-    return {name: value(name) for name, joint in joints.items() if joint.type != "fixed"}
+    found = joint_positions(joints.values(), drawn)
+    return {name: float(value[0]) for name, value in found.items()}
 
 
 def _segments(

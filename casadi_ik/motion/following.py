@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from casadi_ik.answers.solution import Pair
 from casadi_ik.arrays import Array
-from casadi_ik.problem.collision_report import Pair
 
 
 class FollowStatus(Enum):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from casadi_ik.answers.solution import Chosen
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
@@ -25,7 +26,6 @@ from casadi_ik.motion.walker import Walker
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
-from casadi_ik.problem.ranking import Chosen
 from casadi_ik.problem.verdict import LIMIT_SLACK, judge
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run

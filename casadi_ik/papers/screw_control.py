@@ -13,6 +13,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.answers.recorder import SolveBlock
+from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
@@ -22,8 +24,6 @@ from casadi_ik.logs import McapRecorder
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.papers.screw_tasks import ScrewControlStep, ScrewTask
 from casadi_ik.problem.problems import Problems, Tolerance
-from casadi_ik.problem.recorder import SolveBlock
-from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.problem.trajectory import Trajectory

@@ -11,7 +11,6 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.hand_motors import hand_motors
 from casadi_ik.problem.problems import Problems
 
 DETERMINED = 0.15
@@ -35,7 +34,7 @@ def hand_posture(robot: ArmHand, posture: Mapping[str, float], name: str = "post
         UnknownNameError: No such actuator.
         InputError: One that is missing or moves no finger, or not a number within limits.
     """
-    motors = hand_motors(robot.description)
+    motors = robot.description.finger_motors
     values = np.full(len(robot.actuators), np.nan)
     for key, value in posture.items():
         if key not in motors:
@@ -58,7 +57,7 @@ def hand_posture(robot: ArmHand, posture: Mapping[str, float], name: str = "post
 
 def postures_of(robot: ArmHand, postures: Sequence[Mapping[str, float]]) -> Array:
     """(k, n) as `hand_posture` gives them, of many that name the same motors."""
-    motors = hand_motors(robot.description)
+    motors = robot.description.finger_motors
     columns = [robot.actuators.index(name) for name in motors]
     found = np.full((len(postures), len(robot.actuators)), np.nan)
     try:
@@ -92,7 +91,7 @@ def hand_postures(
     """
     if not isinstance(postures, Mapping):
         every = robot.configuration(postures, "postures")
-        motors = [robot.actuators.index(name) for name in hand_motors(robot.description)]
+        motors = [robot.actuators.index(name) for name in robot.description.finger_motors]
         postures = {robot.actuators[i]: every[..., i] for i in motors}
     columns: dict[str, Array] = {}
     for name, value in postures.items():

@@ -1,8 +1,8 @@
 """Couplings as data: how a joint's position follows from an actuator or another joint.
 
 A kind of coupling is a class here, which knows its numbers and their checks, the stroke of what it
-follows and its map in plain numbers; and a row in `casadi_ik.symbolic.couplings`, its graphs.
-Everything else asks these two and names no kind.
+follows and its map in plain numbers; and a row in `casadi_ik.symbolic.couplings`, its graphs and
+bounds. Everything else asks these two and names no kind.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ class CouplingKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
         angles: Names of the numbers that are angles [rad]. Calibration estimates lengths and
             angles.
         monotone: Whether the joint moves to one side only while what it follows does.
+        periodic: Whether the joint does the same again with each turn of what it follows.
     """
 
     of: str
@@ -42,6 +43,7 @@ class CouplingKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
     lengths: ClassVar[tuple[str, ...]] = ()
     angles: ClassVar[tuple[str, ...]] = ()
     monotone: ClassVar[bool] = True
+    periodic: ClassVar[bool] = False
 
     def check(self, where: str) -> None:
         """Whether the numbers describe a mechanism.
@@ -191,6 +193,7 @@ class FourBar(CouplingKind, frozen=True, tag="four-bar"):
     lengths: ClassVar[tuple[str, ...]] = ("p", "q", "g", "h")
     angles: ClassVar[tuple[str, ...]] = ("phi_0", "theta_3_0")
     monotone: ClassVar[bool] = False
+    periodic: ClassVar[bool] = True
 
     def check(self, where: str) -> None:
         """Whether the lengths are above zero and the linkage closes in its known pose."""

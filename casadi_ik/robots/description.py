@@ -272,6 +272,18 @@ class RobotDescription:
         """
         return tuple(sorted(self._driving(self.finger(name).joints)))
 
+    @cached_property
+    def finger_motors(self) -> tuple[str, ...]:
+        """The actuators that move a finger relative to the palm, in the order of q."""
+        used = {i for name in self.finger_names for i in self.finger_actuators(name)}
+        return tuple(self.actuator_names[i] for i in sorted(used))
+
+    @cached_property
+    def finger_joints(self) -> tuple[str, ...]:
+        """All movable joints of the fingers, in the order of `joint_names`."""
+        used = {name for finger in self.fingers for name in finger.joints}
+        return tuple(name for name in self.joint_names if name in used)
+
     def links_moved(self, actuators: Collection[int]) -> frozenset[str]:
         """Links that one of some actuators (positions in q) moves."""
         moved: set[str] = set()

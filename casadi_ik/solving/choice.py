@@ -11,6 +11,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.answers.solution import Choice, Ranking, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
@@ -20,8 +21,6 @@ from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
-from casadi_ik.problem.ranking import Choice, Ranking
-from casadi_ik.problem.solution import Solution
 from casadi_ik.problem.status import Status
 from casadi_ik.solving.alternatives.choosing import Answers, Look, answers_of
 from casadi_ik.solving.alternatives.distinct import checked_distance

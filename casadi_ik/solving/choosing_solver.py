@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
 
+from casadi_ik.answers.solution import BatchSolution, Ranking
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import checked_pose
 from casadi_ik.problem.palm_targets import hand_postures
 from casadi_ik.problem.questions import Questions
-from casadi_ik.problem.ranking import Ranking
-from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.solving.alternatives.finder import APART, Alternative
 from casadi_ik.solving.choice import Judgement, choose
 from casadi_ik.solving.engine import Engine

@@ -12,6 +12,8 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from casadi_ik.answers.diagnosis import Diagnosis, Reason
+from casadi_ik.answers.solution import BatchSolution, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
@@ -22,11 +24,9 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.clearance import SceneCheck, Surroundings
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.contacts.kinds import Kinds, usual
-from casadi_ik.problem.diagnosis import Diagnosis, Reason
 from casadi_ik.problem.method import Method, Outcome, PreferringMethod, QuickMethod
 from casadi_ik.problem.preference import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.solution import BatchSolution, Solution
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder

@@ -10,13 +10,13 @@ from typing import Protocol
 
 import numpy as np
 
+from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arrays import Array
 from casadi_ik.problem.clearance import Clearances, Surroundings
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.alternatives.free import FreeFinder

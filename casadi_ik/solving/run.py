@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from casadi_ik.answers.recorder import Recorder
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
-from casadi_ik.problem.recorder import Recorder
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from casadi_ik.answers.recorder import Recorder, SolveBlock
+from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.recorder import Recorder, SolveBlock
-from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.problem.verdict import judge

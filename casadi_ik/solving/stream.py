@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.errors import InputError, RowError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from casadi_ik.answers.solution import Solution
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -14,12 +15,10 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.problem.closest import Closest, closest_points
-from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.problem.questions import Questions, tolerances_by_finger
-from casadi_ik.problem.solution import Solution
 from casadi_ik.problem.status import Status
-from casadi_ik.problem.verdict import judge
+from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.viewing.asked import Asked, Settings
 

@@ -13,7 +13,7 @@ import viser
 from casadi_ik import palette
 from casadi_ik.arrays import Array
 from casadi_ik.importing.surfaces import Surface, together
-from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.verdict import ContactVerdict
 from casadi_ik.viewing.asked import Asked, Held
 from casadi_ik.viewing.bodies import arrow, ball, tube
 from casadi_ik.viewing.frames import facing, pose_of, quaternion, usable

@@ -13,7 +13,7 @@ from casadi_ik.errors import LogError
 from casadi_ik.grasps import Contact, Grasp
 from casadi_ik.logs.explain.phrases import plain_name, told
 from casadi_ik.logs.read.one_solve import OneSolve, Stretch
-from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.verdict import ContactVerdict
 from casadi_ik.viewing.asked import Asked, asked_of
 
 SIGMA = "sigma_"

@@ -10,7 +10,7 @@ import numpy as np
 
 from casadi_ik import palette
 from casadi_ik.arrays import Array
-from casadi_ik.problem.contact_verdict import ContactVerdict
+from casadi_ik.problem.verdict import ContactVerdict
 from casadi_ik.viewing.answering import Answered
 
 AT_LIMIT = 0.01

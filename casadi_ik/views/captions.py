@@ -9,9 +9,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from casadi_ik import palette
+from casadi_ik.answers.solution import Solution
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Grasp
-from casadi_ik.problem.solution import Solution
 from casadi_ik.views.picture import LIGHT, Ground
 
 OBJECT_COLOR = palette.OBJECT

@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from casadi_ik import palette
+from casadi_ik.answers.solution import Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Grasp, load_object
-from casadi_ik.problem.solution import Solution
 from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.views.captions import (
     MET_COLOR,

@@ -12,7 +12,6 @@ from runner import markdown_table
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.problem.hand_motors import hand_motors
 
 CANDIDATES = 500
 RUNS = 5
@@ -92,7 +91,7 @@ def candidates(robot: ik.ArmHand) -> tuple[list[ik.Grasp], list[ik.Grasp]]:
     palms = np.tile(np.eye(4), (CANDIDATES, 1, 1))
     palms[:, :3, :3], palms[:, :3, 3] = turns, -_turned(turns, middle[:, None])[:, 0]
     points, normals = _turned(turns, points - middle[:, None]), _turned(turns, normals)
-    motors = hand_motors(robot.description)
+    motors = robot.description.finger_motors
     hands = q[:, [robot.actuators.index(name) for name in motors]]
     return (
         [

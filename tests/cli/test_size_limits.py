@@ -13,13 +13,12 @@ from torch_zip import write_torch
 
 import casadi_ik as ik
 from casadi_ik.cli.main import main
-from casadi_ik.problem.hand_motors import hand_motors
 
 ROBOT = "kuka_lwr_barrett"
 
 
 def _columns(robot: ik.ArmHand, count: int) -> dict[str, np.ndarray]:
-    names = ("x", "y", "z", "roll", "pitch", "yaw", *hand_motors(robot.description))
+    names = ("x", "y", "z", "roll", "pitch", "yaw", *robot.description.finger_motors)
     return {name: np.full(count, 0.1) for name in names}
 
 

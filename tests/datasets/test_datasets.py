@@ -16,10 +16,10 @@ import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.cli.report import reasons
 from casadi_ik.datasets.conventions import load_convention
-from casadi_ik.datasets.postures import HandPoses, link_poses
+from casadi_ik.datasets.postures import HandPoses
 from casadi_ik.errors import DescriptionError, UnknownNameError, UnsupportedError
 from casadi_ik.grasps import load_object
-from casadi_ik.problem.hand_motors import hand_motors
+from casadi_ik.robots.poses import link_poses
 
 PUBLISHED = json.loads((Path(__file__).parent / "published_hands.json").read_text())
 KUKA = "kuka_lwr_barrett"
@@ -31,7 +31,7 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
     if name.endswith(".parquet"):
         pytest.importorskip("polars")
     written = made(name, tmp_path)
-    robot, motors = written.robot, hand_motors(written.robot.description)
+    robot, motors = written.robot, written.robot.description.finger_motors
     columns = [robot.actuators.index(motor) for motor in motors]
     grasps = ik.load_candidates(written.path, robot)
     assert len(grasps) == len(written.q)
@@ -56,13 +56,14 @@ def test_conventions_agree_with_the_published_hands(name: str) -> None:
     described = ik.load_robot(ROBOTS.get(name.split("_")[1], KUKA)).description
     values = np.array([list(published["joints"].values())])
     given = HandPoses("", np.zeros((1, 3)), np.eye(3)[None], values, tuple(published["joints"]))
-    poses = link_poses(described, convention.positions(given), 1)
-    back = convention.frames(given)[0] @ np.linalg.inv(poses[convention.link][0])
+    positions = {name: float(value[0]) for name, value in convention.positions(given).items()}
+    poses = link_poses(described.root, described.joints, positions)
+    back = convention.frames(given)[0] @ np.linalg.inv(poses[convention.link])
     children = {joint.name: joint.child for joint in described.joints}
     # The little finger of DexGraspNet's model begins 1.7 mm beside the hand's.
     within = 2e-3 if name == "dexgraspnet_shadow" else 1.5e-4
     for theirs, place in published["last"].items():
-        ours = back @ poses[children[convention.joints[theirs][0]]][0]
+        ours = back @ poses[children[convention.joints[theirs][0]]]
         assert ours[:3, 3] == pytest.approx(place, abs=within), theirs
 
 
@@ -71,7 +72,7 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     robot = ik.load_robot(KUKA)
     solver = ik.Solver(robot)
     q = robot.random(np.random.default_rng(3), 6)
-    motors = hand_motors(robot.description)
+    motors = robot.description.finger_motors
     columns = [robot.actuators.index(motor) for motor in motors]
     grasps = [
         ik.Grasp(palm=pose, posture=dict(zip(motors, row[columns].tolist(), strict=True)))
@@ -122,7 +123,7 @@ def test_many_palms() -> None:
     robot = ik.load_robot(KUKA)
     solver = ik.Solver(robot)
     q = robot.random(np.random.default_rng(4), 60)
-    motors = hand_motors(robot.description)
+    motors = robot.description.finger_motors
     columns = [robot.actuators.index(motor) for motor in motors]
     hands = dict(zip(motors, q[:, columns].T, strict=True))
     batch = solver.solve_palms(robot.palm(q), hands)
@@ -169,7 +170,7 @@ def test_bad_palms(given: dict[str, Any], says: str) -> None:
 )
 def test_bad_postures(change: Any, says: str) -> None:
     robot = ik.load_robot(KUKA)
-    posture = dict.fromkeys(hand_motors(robot.description), 0.5)
+    posture = dict.fromkeys(robot.description.finger_motors, 0.5)
     change(posture)
     with pytest.raises(ik.CasadiIKError, match=says):
         ik.Solver(robot).solve(ik.Grasp(palm=np.eye(4), posture=posture))
@@ -179,7 +180,7 @@ def _table(tmp_path: Path, **changes: Any) -> Path:
     """A table of one grasp; a change of None leaves a column out."""
     robot = ik.load_robot(KUKA)
     columns: dict[str, Any] = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.1)
-    columns |= dict.fromkeys(hand_motors(robot.description), 0.5)
+    columns |= dict.fromkeys(robot.description.finger_motors, 0.5)
     columns |= changes
     kept = {name: value for name, value in columns.items() if value is not None}
     path = tmp_path / "grasps.csv"

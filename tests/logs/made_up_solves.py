@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 
+from casadi_ik.answers.recorder import SolveBlock
+from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.problem.problems import Problems, Tolerance
-from casadi_ik.problem.recorder import SolveBlock
-from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 

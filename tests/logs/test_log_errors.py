@@ -16,10 +16,10 @@ from made_up_solves import LABELS, T0, changed, make_block
 from mcap.writer import Writer
 
 import casadi_ik as ik
+from casadi_ik.answers.recorder import Recorder
 from casadi_ik.errors import InputError, LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs import EventRules, Keep, LogClock, McapRecorder
-from casadi_ik.problem.recorder import Recorder
 from casadi_ik.problem.trace import TraceFormat
 
 Write = Callable[..., Path]

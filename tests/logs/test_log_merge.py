@@ -11,12 +11,12 @@ from made_up_solves import LABELS, T0, make_block, make_rows
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.errors import LogError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs import LogClock
 from casadi_ik.logs import open as open_log
 from casadi_ik.logs.repair.merge import merge_logs
-from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.trace import TraceFormat
 
 Write = Callable[..., Path]

@@ -10,12 +10,12 @@ import pytest
 from made_up_solves import changed, make_block
 
 import casadi_ik as ik
+from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.logs import OneSolve, one_solve
 from casadi_ik.logs.write import recorder as writer
 from casadi_ik.logs.write.solve_rows import solve_format, solve_rows
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.trace import TraceFormat
 
 GRASP = ik.load_grasp("cup")

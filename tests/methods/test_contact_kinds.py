@@ -19,7 +19,7 @@ from casadi_ik.problem.contacts.conditions import CONDITIONS
 from casadi_ik.problem.contacts.kinds import ContactKind, usual
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
-from casadi_ik.solving.diagnosis.prover import Prover
+from casadi_ik.proofs.prove import Prover
 
 METHODS = ("hand-first", "thumb-first", "ipopt")
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")

@@ -17,10 +17,10 @@ from samplers import (
 from trace_checks import Kept, check_trace
 
 import casadi_ik as ik
+from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.logs import EventKind, detect_events
-from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.trace import (
     ACCEPTED,
     ACTIVE_MASK,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import casadi_ik as ik
-from casadi_ik.problem.recorder import SolveBlock
+from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import (
     ACCEPTED,

@@ -68,8 +68,8 @@ assert solution.success, solution
 
 far = {name: ik.Contact(c.point + [9.0, 0, 0], c.normal) for name, c in grasp.contacts.items()}
 missed = solver.solve(ik.Grasp(far))
-# Nothing bounds the new kind, so nothing is proved with it.
-assert missed.status is ik.Status.NOT_FOUND, missed.status
+assert missed.status is ik.Status.UNREACHABLE, missed.status
+assert missed.diagnosis.proof.check(robot)
 """
 
 

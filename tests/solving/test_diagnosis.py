@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import least_squares
 
 import casadi_ik as ik
+from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arrays import Array
-from casadi_ik.problem.solution import BatchSolution
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 

@@ -7,9 +7,9 @@ import pytest
 from robot_variants import derived_robot
 
 import casadi_ik as ik
+from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arrays import Array
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.solution import BatchSolution
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -11,18 +12,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robot_variants import derived_robot
+from toy_robots import replace as put
 from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.problem.arm_cones import arm_cones
-from casadi_ik.problem.contact_quantities import asked_quantities, kept_quantities
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.proof import Proof, ProofKind
-from casadi_ik.solving.diagnosis.box_contacts import box_contacts
-from casadi_ik.solving.diagnosis.pair_rows import pair_rows
-from casadi_ik.solving.diagnosis.prover import MOST, Prover
-from casadi_ik.solving.diagnosis.wrist_bound import Seen
+from casadi_ik.proofs.box_tests import Seen, pair_rows
+from casadi_ik.proofs.boxes import box_contacts
+from casadi_ik.proofs.premises import arm_cones
+from casadi_ik.proofs.proof import Proof, ProofKind
+from casadi_ik.proofs.prove import EFFORT, Prover
+from casadi_ik.proofs.quantities import asked_values, rigid_invariants
+from casadi_ik.robots.couplings import Polynomial
+from casadi_ik.symbolic.couplings import ROWS, Interval
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
@@ -151,6 +154,56 @@ def test_coupled_mechanisms_and_other_arms(tmp_path_factory: pytest.TempPathFact
         assert all(proof is not None and proof.check(robot) for proof in proofs)
 
 
+def polynomial_robot(folder: Path) -> ik.ArmHand:
+    path = write_coupled_robot(folder)
+    put(
+        folder / "parts" / "hand.yaml",
+        "coupling: {kind: linear, of: left_3, ratio: -0.5, offset: 0.05}",
+        "coupling: {kind: polynomial, of: left_3, coefficients: [0.05, -0.3, 0.4, -0.1]}",
+    )
+    return ik.load_robot(path)
+
+
+def test_a_polynomial_coupling_gets_proofs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Of hands bent by a cam, where the joint turns back within the motor's range."""
+    robot = polynomial_robot(tmp_path_factory.mktemp("cam"))
+    rng, prover = np.random.default_rng(5), Prover(robot.description)
+    q = robot.random(rng, 200)
+    q = q[robot.beyond_limits(q) <= 0][:16]
+    targets = robot.contacts(q)
+    for limits in (True, False):
+        assert wrongly(robot, prover, q, asked(targets, 1e-9, 1e-9, limits)) == 0
+    centre = targets[0].mean(axis=1, keepdims=True)
+    for points in (targets[0] + 5.0, centre + 9 * (targets[0] - centre)):
+        proofs = prover.prove(asked((points, targets[1]), 5e-3, 0.05, True))
+        assert all(proof is not None for proof in proofs)
+        assert proofs[0] is not None
+        assert proofs[0].check(robot)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    coefficients=st.lists(st.floats(-9, 9), min_size=2, max_size=6),
+    ends=st.lists(st.floats(-4, 4), min_size=2, max_size=2),
+)
+def test_bounds_of_polynomials_hold(coefficients: list[float], ends: list[float]) -> None:
+    """Both arithmetics, and as sharply as the interval is short."""
+    low, high = sorted(ends)
+    value = ROWS[Polynomial].bounds(
+        coupling := Polynomial("a", tuple(coefficients)), *map(np.atleast_1d, (low, high))
+    )
+    found = ROWS[Polynomial].interval(coupling, Interval(ca.SX(low), ca.SX(high)))
+    graph = [float(ca.evalf(end)) for end in (found.lower, found.upper)]
+    reached = coupling.followed(np.linspace(low, high, 101))
+    for least, most in (graph, (value[0][0], value[1][0])):
+        assert least <= reached.min()
+        assert reached.max() <= most
+    # The width of a monomial over the interval bounds what is lost.
+    size = sum(abs(c) * k * 4.0 ** (k - 1) for k, c in enumerate(coefficients))
+    for least, most in (graph, (value[0][0], value[1][0])):
+        assert most - least <= 4 * size * (high - low) + 1e-8
+
+
 def impossible(robot: ik.ArmHand) -> dict[str, tuple[Array, Array]]:
     points, normals = robot.contacts(robot.random(np.random.default_rng(6), 12))
     centre = points.mean(axis=1, keepdims=True)
@@ -254,8 +307,8 @@ def test_hands_keep_to_the_bounds_of_quantities(any_robot: ik.ArmHand, limits: b
         turning = np.array([a.unit == "rad" for a in any_robot.description.actuators])
         q[:, turning] = rng.uniform(-9, 9, (2000, turning.sum()))
     problems = asked(any_robot.contacts(q), 1e-12, 1e-12, limits)
-    kept = kept_quantities(any_robot.description, problems)
-    values, give = asked_quantities(any_robot.description, kept, problems)
+    kept = rigid_invariants(any_robot.description, problems)
+    values, give = asked_values(any_robot.description, kept, problems)
     lower, upper = (np.array([getattr(item, end) for item in kept]) for end in ("lower", "upper"))
     assert (values >= lower - give).all()
     assert (values <= upper + give).all()
@@ -306,11 +359,11 @@ def test_bounds_of_a_box_hold_for_what_is_in_it(robot: ik.ArmHand, prover: Prove
 
 def _bounds(prover: Prover) -> ca.Function:
     """Values and widths of the rows, and the ends of the distance of shoulder and wrist."""
-    h = len(prover.space.motors)
+    h = len(prover.space.coordinates)
     shapes = {"lower": (h, 1), "upper": (h, 1), "points": (3, 3), "normals": (3, 3)}
     shapes |= {"tolerance": (3, 2), "asked": (3, 2)}
     p = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
-    ranges = prover.space.ranges(p["lower"], p["upper"])
+    ranges = prover.space.intervals(p["lower"], p["upper"])
     contacts = box_contacts(prover.space, ranges, (p["upper"] - p["lower"]) / 2, p, True)
     rows = [row for a, b in combinations(contacts, 2) for row in pair_rows(a, b)]
     seen = Seen.point(contacts, ca.SX(ca.DM(prover._arm.shoulder)))
@@ -376,8 +429,8 @@ def test_what_is_missed_by_little_gets_few_boxes(
     solver.solve_batch(*moved((points, normals), rng, 1e-2, 0.11), diagnose=True)
     points[0, 0] += 0.2
     solver.solve_batch(points[:1], normals[:1], diagnose=True)
-    assert boxes[-1] == MOST
-    assert min(boxes) < MOST / 4
+    assert boxes[-1] == EFFORT.most
+    assert min(boxes) < EFFORT.most / 4
 
 
 def test_codes_of_the_log_stay() -> None:

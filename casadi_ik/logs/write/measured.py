@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.trace import CLEARANCE, TraceFormat
 
 BLOCK = 2048

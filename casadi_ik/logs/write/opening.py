@@ -7,10 +7,10 @@ from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
 from typing import Any, Protocol
 
+from casadi_ik.answers.recorder import Recorder
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.logs.write.keep import Keep
 from casadi_ik.logs.write.recorder import Compression, McapRecorder
-from casadi_ik.problem.recorder import Recorder
 
 
 class Described(Protocol):

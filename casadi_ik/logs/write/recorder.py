@@ -20,6 +20,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
 
+from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.errors import LogError
 from casadi_ik.logs.events.detect import detect_events
 from casadi_ik.logs.events.kinds import SINGULAR, EventKind, event_format
@@ -36,7 +37,6 @@ from casadi_ik.logs.write.measured import measured_format, measured_rows
 from casadi_ik.logs.write.provenance import log_metadata
 from casadi_ik.logs.write.solve_rows import solve_format, solve_rows
 from casadi_ik.logs.write.topic_messages import block_messages
-from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.trace import CLEARANCE, TraceFormat
 
 Compression = Literal["none", "lz4", "zstd"]

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.rows import opaque
 from casadi_ik.logs.events.kinds import EventKind, jacobian_names
 from casadi_ik.logs.events.traces import as_matrix, words_of
 from casadi_ik.problem.contacts.arrays import NAMES
 from casadi_ik.problem.preference import NO_PREFERENCE, PREFERENCES
-from casadi_ik.problem.recorder import SolveBlock
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import TraceFormat
 

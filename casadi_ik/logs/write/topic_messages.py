@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.logs.mcap.clock import LogClock
 from casadi_ik.logs.mcap.message_bytes import HEAD
-from casadi_ik.problem.recorder import SolveBlock
 
 
 @dataclass(frozen=True, eq=False)

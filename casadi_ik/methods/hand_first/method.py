@@ -38,13 +38,13 @@ from casadi_ik.methods.hand_first.restarts import VALLEYS, Restarts, first_rugge
 from casadi_ik.methods.hand_first.rounds import RoundsPlan
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
-from casadi_ik.problem.arm_span import ArmSpan, arm_span, palms_in_span
 from casadi_ik.problem.contacts.kinds import Kinds, usual
 from casadi_ik.problem.method import Quick
 from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
+from casadi_ik.proofs.premises import ArmSpan, arm_span, palms_in_span
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.closed_arms.held import held_arm
 from casadi_ik.symbolic.closed_arms.recognise import arm_form

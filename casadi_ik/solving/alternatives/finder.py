@@ -18,11 +18,10 @@ from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import Surroundings
-from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.palm_targets import free_palms
 from casadi_ik.problem.preference import CLEARANCE, preference
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.verdict import judge
+from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, Branches, best_arm
 from casadi_ik.solving.alternatives.distinct import checked_distance, distinct
 from casadi_ik.solving.alternatives.passing_branches import PassingBranches, branches_of

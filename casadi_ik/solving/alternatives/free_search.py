@@ -16,11 +16,11 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.solution import CollisionReport
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
-from casadi_ik.problem.collision_report import CollisionReport
 from casadi_ik.problem.palm_targets import free_palms
 from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.problem.problems import Problems

@@ -12,14 +12,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.solution import BatchSolution, SuggestedFix
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Item, Scene
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.collision_report import WayOut
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.solving.run import Run
 
 STEPS = (0.01, 0.02, 0.04, 0.08, 0.16)
@@ -83,7 +82,7 @@ def with_way_out(
         return engine.solve(asked, Run(start, seed)).success
 
     moved = _moved(known, _standing(check, known), free)
-    found = WayOut(moved, STEPS[-1], _fewer(known, engine.robot.fingers, free))
+    found = SuggestedFix(moved, STEPS[-1], _fewer(known, engine.robot.fingers, free))
     return replace(batch, collisions=(replace(report, way_out=found),))
 
 

@@ -9,11 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arrays import Array, Counts
-from casadi_ik.grasps import Tolerance
-from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.problem.diagnosis import (
+from casadi_ik.answers.diagnosis import (
     ArmReach,
     Diagnosis,
     HandFit,
@@ -22,12 +18,16 @@ from casadi_ik.problem.diagnosis import (
     Reason,
     Remedies,
 )
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array, Counts
+from casadi_ik.grasps import Tolerance
+from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.proof import Proof, ProofKind
 from casadi_ik.problem.verdict import Verdict, deviations, judge, judge_palms
+from casadi_ik.proofs.proof import Proof, ProofKind
+from casadi_ik.proofs.prove import EFFORT, Prover
 from casadi_ik.solving.diagnosis.minimax import Closest, closest
 from casadi_ik.solving.diagnosis.palm_free import HandFits, PalmFree
-from casadi_ik.solving.diagnosis.prover import MOST, Prover
 from casadi_ik.solving.diagnosis.remedies import RemedyFinder
 from casadi_ik.solving.trials import Descent, Rows, Trials
 
@@ -285,7 +285,7 @@ def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) 
 def _worth(ratio: Array) -> Counts:
     """(k,) boxes a proof may take of targets that are missed by a factor (k,)."""
     share = np.clip((ratio - 1) / (CLEARLY - 1), 0.0, 1.0)
-    return np.maximum(MOST * share, LEAST).astype(np.int64)
+    return np.maximum(EFFORT.most * share, LEAST).astype(np.int64)
 
 
 def _enough(problems: Problems, fair: Verdict) -> list[Tolerance]:

@@ -9,14 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.diagnosis import ArmReach, HandFit
 from casadi_ik.arrays import Array
 from casadi_ik.methods.common.contact_fit import fresh_fit
-from casadi_ik.problem.contact_verdict import ContactVerdict
 from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.diagnosis import ArmReach, HandFit
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
-from casadi_ik.problem.verdict import judge
+from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.trials import NEVER, Rows, Trials, allowed, smallest
 from casadi_ik.symbolic.srs_arm import SrsArm, reach
 

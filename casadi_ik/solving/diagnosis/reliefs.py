@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.diagnosis import Relief
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.problem.diagnosis import Relief
 from casadi_ik.problem.problems import Problems
 from casadi_ik.solving.trials import Bounds, Descent, Trials
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.diagnosis import Freed, Relief, Remedies
 from casadi_ik.arrays import Array
-from casadi_ik.problem.diagnosis import Freed, Relief, Remedies
 from casadi_ik.problem.problems import Problems
 from casadi_ik.solving.diagnosis.reliefs import Lift, lifts, relieve
 from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated

@@ -1,4 +1,4 @@
-"""Proves targets impossible: divides the box of all hands until every part of it is refuted."""
+"""The search for proofs: divides the box of all hands until every part of it is refuted."""
 
 from __future__ import annotations
 
@@ -11,46 +11,57 @@ import numpy as np
 
 from casadi_ik.arrays import Array, Bools, Counts, Rows
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.problem.arm_cones import NONE, ArmCones, arm_cones
-from casadi_ik.problem.arm_span import arm_span
-from casadi_ik.problem.contact_quantities import (
-    Kept,
-    asked_quantities,
-    kept_quantities,
-    quantities_of,
-)
 from casadi_ik.problem.contacts.conditions import CONDITIONS, PLACE
-from casadi_ik.problem.hand_motors import endless_fingers, joint_limits, motor_box
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.proof import Proof, ProofKind
+from casadi_ik.proofs.box_tests import BoxTest
+from casadi_ik.proofs.boxes import HandSpace
+from casadi_ik.proofs.premises import (
+    NO_CONE,
+    ArmCones,
+    arm_cones,
+    arm_span,
+    endless_fingers,
+    joint_limits,
+    motor_box,
+)
+from casadi_ik.proofs.proof import Proof, ProofKind
+from casadi_ik.proofs.quantities import (
+    RigidInvariant,
+    asked_values,
+    quantities_of,
+    rigid_invariants,
+)
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.solving.diagnosis.box_test import BoxTest
-from casadi_ik.solving.diagnosis.hand_space import HandSpace
-from casadi_ik.solving.diagnosis.wrist_bound import Wrist
-from casadi_ik.symbolic.joint_ranges import are_bounded
 
-FEW, SOME, MOST = 3000, 3000, 80_000
-"""Boxes of a target after which a search is given up: the first one with all fingers, those with
-some of them, and the last with all."""
 
-ALONE = 200
-"""Boxes of each finger of a fixed hand, before any has more."""
+@dataclass(frozen=True)
+class ProverEffort:
+    """How long the search for a proof goes on; chosen with ``studies/proofs.py``.
 
-SUBSET = 3
-"""Fingers of more are looked at by so many, too: fewer motors to divide."""
+    Attributes:
+        first: Boxes of a target after which its first search, with all fingers, is given up.
+        some: The same of searches with some of the fingers.
+        most: The same of the last search, again with all fingers.
+        alone: Boxes of each finger of a fixed hand, before any has more.
+        subset: Fingers of more are looked at by so many, too: fewer motors to divide.
+        chunk: Boxes that are looked at in one go: so many that calls cost little, few enough for
+            a cache.
+        together: Targets whose boxes are divided side by side.
+        part: A coordinate is not divided any more where less is left of it than this part of the
+            smallest tolerance [m].
+    """
 
-CHUNK = 4096
-"""Boxes that are looked at in one go: so many that calls cost little, few enough for a cache."""
+    first: int = 3000
+    some: int = 3000
+    most: int = 80_000
+    alone: int = 200
+    subset: int = 3
+    chunk: int = 4096
+    together: int = 256
+    part: float = 0.01
 
-KEPT = 16
-"""Limits and locked motors whose quantities are kept."""
 
-SAME = 1e-9
-"""How far apart two findings of the same point may be [m]."""
-
-TOGETHER = 256
-"""Targets whose boxes are divided side by side."""
-
+EFFORT = ProverEffort()
 
 SLIDING = {
     f"{name}s"
@@ -60,12 +71,6 @@ SLIDING = {
     if name != "point"
 }
 """Arrays that let a contact be elsewhere than at its point: no proof counts such a finger."""
-
-TINY = 1e-9
-"""A coordinate is not divided any more where less is left of it [rad or m]."""
-
-PART = 0.01
-"""Neither where less than so much of the smallest tolerance [m] is left."""
 
 Boxes = tuple[Rows, Array, Array]
 """Numbers of targets, lower and upper ends (h,) of a box each."""
@@ -83,10 +88,12 @@ class _Found:
 class _Stated:
     """What targets ask of a robot's quantities, and proofs with their numbers."""
 
-    def __init__(self, robot: RobotDescription, kept: tuple[Kept, ...], problems: Problems) -> None:
+    def __init__(
+        self, robot: RobotDescription, kept: tuple[RigidInvariant, ...], problems: Problems
+    ) -> None:
         self._robot, self._kept, self._problems = robot, kept, problems
         self._fixed = arm_span(robot) is None
-        self._asked, self._give = asked_quantities(robot, kept, problems)
+        self._asked, self._give = asked_values(robot, kept, problems)
 
     def decided(self, known: Bools) -> list[Proof | None]:
         """Proofs where a quantity decides by itself.
@@ -130,7 +137,7 @@ class Prover:
         self._compiled = compiled
         self.space = HandSpace(robot)
         self._arm = arm_span(robot)
-        self._known: dict[tuple[bool, bytes], tuple[Kept, ...]] = {}
+        self._known: dict[tuple[bool, bytes], tuple[RigidInvariant, ...]] = {}
 
     def prove(
         self, problems: Problems, holding: Array | None = None, most: Counts | None = None
@@ -146,13 +153,11 @@ class Prover:
                 whatever would be proved wrongly comes out, in a fraction of the time.
             most: (k,) boxes of a target after which it is given up, if not before.
         """
-        if not are_bounded(self._robot):
-            return [None] * len(problems)
         found: list[Proof | None] = []
-        for start in range(0, len(problems), TOGETHER):
-            some = slice(start, start + TOGETHER)
+        for start in range(0, len(problems), EFFORT.together):
+            some = slice(start, start + EFFORT.together)
             known = None if holding is None else holding[some]
-            bound = np.full(len(problems), MOST)[some] if most is None else most[some]
+            bound = np.full(len(problems), EFFORT.most)[some] if most is None else most[some]
             found += self._together(problems.rows(some), known, bound)
         return found
 
@@ -189,34 +194,33 @@ class Prover:
         fingers = list(range(len(self._robot.fingers)))
         if self._arm is None:
             # One that reaches its contact must not take all the time before the one that does not.
-            return [([i], most) for most in (ALONE, MOST) for i in fingers]
-        if len(fingers) <= SUBSET:
-            return [(fingers, MOST)]
-        subsets = [(list(some), SOME) for some in combinations(fingers, SUBSET)]
-        return [(fingers, FEW), *subsets, (fingers, MOST)]
+            return [([i], most) for most in (EFFORT.alone, EFFORT.most) for i in fingers]
+        if len(fingers) <= EFFORT.subset:
+            return [(fingers, EFFORT.most)]
+        subsets = [(list(some), EFFORT.some) for some in combinations(fingers, EFFORT.subset)]
+        return [(fingers, EFFORT.first), *subsets, (fingers, EFFORT.most)]
 
-    def _kept(self, problems: Problems) -> tuple[Kept, ...]:
+    def _kept(self, problems: Problems) -> tuple[RigidInvariant, ...]:
         """The robot's quantities; bounds are found once for limits and locked motors."""
         fixed = b"" if problems.fixed is None else problems.fixed.tobytes()
         key = problems.enforce_limits, fixed
         if key not in self._known:
-            if len(self._known) >= KEPT:
+            if len(self._known) >= 16:
                 self._known.clear()
-            self._known[key] = kept_quantities(self._robot, problems)
+            self._known[key] = rigid_invariants(self._robot, problems)
         return self._known[key]
 
     @cached_property
     def _test(self) -> FunctionKernel:
-        wrist = None if self._arm is None else Wrist(self._arm.shoulder, self._arm.wrist)
-        return FunctionKernel(BoxTest(self.space, wrist, self._cones).graph(), self._compiled)
+        return FunctionKernel(BoxTest(self.space, self._arm, self._cones).graph(), self._compiled)
 
     @cached_property
     def _cones(self) -> ArmCones | None:
         cones = arm_cones(self._robot)
         if cones is None or self._arm is None:
             return None
-        same = np.allclose(cones.shoulder, self._arm.shoulder, rtol=0, atol=SAME)
-        return cones if same and np.allclose(cones.wrist, self._arm.wrist, 0, SAME) else None
+        same = np.allclose(cones.shoulder, self._arm.shoulder, rtol=0, atol=1e-9)
+        return cones if same and np.allclose(cones.wrist, self._arm.wrist, 0, 1e-9) else None
 
     def _search(
         self, problems: Problems, fingers: Bools, most: Counts, holding: Array | None
@@ -235,11 +239,11 @@ class Prover:
         normals = np.where(faced[..., None], problems.normals, 0.0)
         asked = np.stack([fingers, faced], axis=2).astype(float)
         tolerance = np.stack([problems.position_tolerance, problems.angle_tolerance], axis=1)
-        finest = max(TINY, PART * float(problems.position_tolerance.min()))
+        finest = max(1e-9, EFFORT.part * float(problems.position_tolerance.min()))
         # A kernel's column is a vector: of a hand with one motor there is no second dimension.
         size, ends = self._test.input_shapes[0], self._test.input_shapes[2]
         limits = [np.reshape(end, ends) for end in joint_limits(self._robot, problems)]
-        arm = np.zeros(2), np.full(2, NONE)
+        arm = np.zeros(2), np.full(2, NO_CONE)
         if self._arm is not None:
             cosines = arm[1] if self._cones is None else self._cones.cosines(problems)
             arm = np.array(self._arm.span(problems)), cosines
@@ -291,6 +295,6 @@ def _halves(target: Rows, lower: Array, upper: Array, widest: Rows) -> Boxes:
 
 def _parts(target: Rows, lower: Array, upper: Array) -> Iterator[Boxes]:
     """Boxes in parts that are looked at together."""
-    for start in range(0, len(target), CHUNK):
-        some = slice(start, start + CHUNK)
+    for start in range(0, len(target), EFFORT.chunk):
+        some = slice(start, start + EFFORT.chunk)
         yield target[some], lower[some], upper[some]

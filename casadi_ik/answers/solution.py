@@ -1,22 +1,95 @@
-"""The answer: configuration, status, and a verdict on every contact."""
+"""The answer: configuration, status, a verdict on every contact; of many grasps which to take."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
-from typing import Any
+from typing import Any, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.diagnosis import Diagnosis
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
-from casadi_ik.grasps import Tolerance
-from casadi_ik.problem.collision_report import CollisionReport, Pair
-from casadi_ik.problem.contact_verdict import ContactVerdict, PalmVerdict
-from casadi_ik.problem.diagnosis import Diagnosis
+from casadi_ik.grasps import Grasp, Tolerance
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class SuggestedFix:
+    """What else would do where all answers touch something, as far as it was tried.
+
+    Attributes:
+        moved: Translation of what is grasped, with its contacts, for which there is a free answer,
+            base frame [m]: the shortest of those tried, at which the object itself stands free;
+            None: none of them has one.
+        farthest: How far it was moved at the most [m].
+        fewer: Fingers without whose contact there is a free answer.
+    """
+
+    moved: tuple[float, float, float] | None
+    farthest: float
+    fewer: tuple[str, ...]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The same in short lines."""
+        lines = [f"solvable without the contact of {name}" for name in self.fewer]
+        if self.moved is None:
+            far = f"{1e3 * self.farthest:.0f} mm"
+            return (*lines, f"the object moved by up to {far} in 26 directions does not help")
+        way = ", ".join(f"{1e3 * value + 0.0:.0f}" for value in self.moved)
+        length = 1e3 * math.hypot(*self.moved)
+        return (*lines, f"solvable with the object moved by {length:.0f} mm: ({way}) mm")
+
+
+@dataclass(frozen=True)
+class CollisionReport:
+    """Why no answer is free.
+
+    Attributes:
+        pair: The pair that is in the way in the best answer: two links, or a link and a solid.
+        short: By how much they are nearer than they have to be [m].
+        tried: Answers (hands, arms, elbows) that were looked at.
+        without_scene: Whether one of them is free of the robot itself, the scene left out; None if
+            that was not looked at: it is where a diagnosis is asked for.
+        without_self: Whether one of them is free of the scene, the robot itself left out, or None.
+        way_out: What else would do; None if that was not looked for: it is where one grasp is
+            solved and a diagnosis asked for.
+
+    Example:
+        >>> wall = {"kind": "box", "size": [3, 3, 3], "xyz": [-1.8, 0, 1.0]}  # the cup is inside
+        >>> blocked = ik.Solver(robot, scene=ik.Scene({"wall": wall})).solve(grasp)
+        >>> blocked.status.name, "wall" in blocked.collision.pair
+        ('COLLISION', True)
+    """
+
+    pair: Pair
+    short: float
+    tried: int
+    without_scene: bool | None
+    without_self: bool | None
+    way_out: SuggestedFix | None = None
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The same in short lines."""
+        answers = "the answer touches" if self.tried == 1 else f"all {self.tried} answers touch"
+        lines = [
+            f"contacts and limits are met, but {answers} something",
+            f"best answer: {self.pair[0]} and {self.pair[1]}, {1e3 * self.short:.3g} mm too near",
+        ]
+        if self.without_scene:
+            lines.append("solvable without the scene")
+        if self.without_self:
+            lines.append("solvable if the robot could pass through itself")
+        return tuple(lines) if self.way_out is None else (*lines, *self.way_out.lines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,3 +339,106 @@ class BatchSolution:
         if position is None or angle is None or ok is None:
             return None
         return PalmVerdict(float(position[row]), float(angle[row]), bool(ok[row]))
+
+
+class Chosen(Protocol):
+    """A posture that takes a grasp."""
+
+    @property
+    def grasp(self) -> Grasp:
+        """In the base frame."""
+        ...
+
+    @property
+    def q(self) -> Array:
+        """(n,) the posture [rad or m]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """One of the answers of a `Ranking`.
+
+    Attributes:
+        candidate: Number of the grasp among those that were given, from 0.
+        solution: How to take it.
+        score: What it was ranked by, higher is better: smallest distance of an actuator that is
+            not given from its limits as a part of half its range ("limits"); minus the distance
+            from q0, every actuator as a part of its range ("q0"); of the arm [m^3]
+            ("manipulability"); room beyond the margins of the scene [m] ("clearance"); or what the
+            given function says.
+        grasp: The grasp, where the object is (base frame).
+
+    Example:
+        >>> best = solver.choose([grasp], prefer="limits")[0]
+        >>> best.candidate, best.solution.success
+        (0, True)
+    """
+
+    candidate: int
+    solution: Solution
+    score: float
+    grasp: Grasp
+
+    @property
+    def q(self) -> Array:
+        """(n,) the posture: what `Solver.reach` goes to."""
+        return self.solution.q
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking(Sequence[Choice]):
+    """Answers to the question which of many grasps to take, best first.
+
+    Attributes:
+        entries: The answers; itself a sequence of them.
+        candidates: How many grasps there were.
+        answered: How many of them have an answer, in `entries` or not.
+        failures: How many have none, by reason: the name of a `Status`, and of a COLLISION the pair
+            that is in the way. Most frequent first.
+        prefer: What they were ranked by.
+
+    Example:
+        >>> ranked = solver.choose([grasp, ik.load_grasp("apple")], limit=2, prefer="limits")
+        >>> len(ranked), ranked.candidates, dict(ranked.failures)
+        (2, 2, {})
+        >>> print(ranked.lines[0])
+        2 of 2 candidates have an answer
+    """
+
+    entries: tuple[Choice, ...]
+    candidates: int
+    answered: int
+    failures: Mapping[str, int]
+    prefer: str
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __iter__(self) -> Iterator[Choice]:
+        return iter(self.entries)
+
+    @overload
+    def __getitem__(self, place: int) -> Choice: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> tuple[Choice, ...]: ...
+
+    def __getitem__(self, place: int | slice) -> Choice | tuple[Choice, ...]:
+        return self.entries[place]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The same in short lines."""
+        lines = [f"{self.answered} of {self.candidates} candidates have an answer"]
+        lines += [f"  {count} have none: {reason}" for reason, count in self.failures.items()]
+        if self.entries:
+            lines.append(f"best {len(self)} by {self.prefer}:")
+        for place, one in enumerate(self.entries, 1):
+            clear = one.solution.clearance
+            room = "" if clear is None else f", clearance {1e3 * clear:.1f} mm"
+            lines.append(f"  {place}. candidate {one.candidate}: {one.score:.4g}{room}")
+        return tuple(lines)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines)

@@ -15,33 +15,20 @@ from itertools import combinations
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.problem.arm_span import arm_span
-from casadi_ik.problem.contact_bounds import Balls, balls
-from casadi_ik.problem.hand_motors import endless_fingers, hand_motors, joint_limits, motor_box
 from casadi_ik.problem.problems import Problems
+from casadi_ik.proofs.numeric_bounds import Balls, angle_of, contact_balls, halved
+from casadi_ik.proofs.premises import arm_span, endless_fingers, joint_limits, motor_box
 from casadi_ik.robots.description import RobotDescription
-
-GAP = {"m": 0.01, "rad": 0.1}
-"""How near to what the hand can do a bound has to come before it is left as it is."""
-
-MOST = 1000
-"""Boxes after which a bound stays as far off as it is."""
 
 SLACK = 1e-8
 """What bounds are moved outwards by and tolerances widened by [m, rad]: for rounding."""
-
-RELATIVE = 1e-12
-"""The same as a part of how far away the contacts are."""
-
-SAME = 1e-9
-"""How far apart two findings of the same number may be [m, rad]."""
 
 Measure = Callable[[Balls], tuple[Array, Array]]
 """A quantity's value in the middle of boxes, and how far it can be from there."""
 
 
 @dataclass(frozen=True)
-class Kept:
+class RigidInvariant:
     """One quantity of a robot, whatever the target.
 
     Attributes:
@@ -93,21 +80,21 @@ class Quantity:
         if (self.name, self.unit, self.reach) != (other.name, other.unit, other.reach):
             return False
         return all(
-            abs(getattr(self, part) - getattr(other, part)) <= SAME
+            abs(getattr(self, part) - getattr(other, part)) <= 1e-9
             for part in ("asked", "give", "lower", "upper")
         )
 
 
-def kept_quantities(robot: RobotDescription, problems: Problems) -> tuple[Kept, ...]:
+def rigid_invariants(robot: RobotDescription, problems: Problems) -> tuple[RigidInvariant, ...]:
     """All quantities of a robot under the limits and locked motors of some problems.
 
     Takes some tenths of a second.
     """
-    return tuple(_kept(_Hand(robot, problems)))
+    return tuple(_invariants(_Hand(robot, problems)))
 
 
-def asked_quantities(
-    robot: RobotDescription, kept: tuple[Kept, ...], problems: Problems
+def asked_values(
+    robot: RobotDescription, invariants: tuple[RigidInvariant, ...], problems: Problems
 ) -> tuple[Array, Array]:
     """What k targets ask of the quantities, and by how much the tolerances let it differ.
 
@@ -117,11 +104,11 @@ def asked_quantities(
     position, angle = problems.position_tolerance, problems.angle_tolerance
     points, normals = problems.points, problems.normals
     span = arm_span(robot)
-    asked = np.full((len(problems), len(kept)), np.nan)
+    asked = np.full((len(problems), len(invariants)), np.nan)
     give = np.full_like(asked, np.nan)
-    for column, item in enumerate(kept):
+    for column, item in enumerate(invariants):
         first, last = points[:, item.fingers[0]], points[:, item.fingers[-1]]
-        far = SLACK + RELATIVE * (np.abs(first).sum(axis=1) + np.abs(last).sum(axis=1))
+        far = SLACK + 1e-12 * (np.abs(first).sum(axis=1) + np.abs(last).sum(axis=1))
         loose = position[list(item.fingers)].sum() + far
         if item.reach:
             assert span is not None
@@ -131,29 +118,26 @@ def asked_quantities(
         elif item.unit == "m":
             asked[:, column] = np.linalg.norm(last - first, axis=1)
         else:
-            a, b = (normals[:, i] for i in item.fingers)
-            asked[:, column] = 2 * np.arctan2(
-                np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1)
-            )
+            asked[:, column] = angle_of(*(normals[:, i] for i in item.fingers))
             loose = angle[list(item.fingers)].sum() + 2 * SLACK
         give[:, column] = loose
     return asked, np.where(np.isnan(asked), np.nan, give)
 
 
 def quantities_of(
-    kept: Sequence[Kept], asked: Array, give: Array, fingers: Collection[int]
+    invariants: Sequence[RigidInvariant], asked: Array, give: Array, fingers: Collection[int]
 ) -> tuple[Quantity, ...]:
     """What one target asks of some fingers alone.
 
     Args:
-        kept: The robot's quantities.
-        asked: (m,) of `asked_quantities`.
+        invariants: Of the robot.
+        asked: (m,) of `asked_values`.
         give: (m,) likewise.
         fingers: Their numbers.
     """
     return tuple(
         Quantity(item.name, item.unit, value, loose, item.lower, item.upper, item.reach)
-        for item, value, loose in zip(kept, asked.tolist(), give.tolist(), strict=True)
+        for item, value, loose in zip(invariants, asked.tolist(), give.tolist(), strict=True)
         if set(item.fingers) <= set(fingers) and value == value
     )
 
@@ -163,19 +147,34 @@ class _Hand:
 
     def __init__(self, robot: RobotDescription, problems: Problems) -> None:
         self.robot = robot
-        self.motors = hand_motors(robot)
+        self.motors = robot.finger_motors
         self.ends = motor_box(robot, problems)
         self.limits = joint_limits(robot, problems)
         self.endless = endless_fingers(robot, self.ends)
         self.arm = arm_span(robot)
         self.span = (0.0, 0.0) if self.arm is None else self.arm.span(problems)
 
-    def largest(self, fingers: tuple[int, ...], measure: Measure, sign: int, unit: str) -> float:
-        """An upper bound of `sign` times a measure over all postures."""
+    def largest(
+        self,
+        fingers: tuple[int, ...],
+        measure: Measure,
+        sign: int,
+        gap: float,
+        most_boxes: int = 1000,
+    ) -> float:
+        """An upper bound of `sign` times a measure over all postures.
+
+        Args:
+            fingers: Their numbers.
+            measure: The measure.
+            sign: 1 or -1.
+            gap: How near to what the hand can do the bound has to come.
+            most_boxes: After so many it stays as far off as it is.
+        """
         boxes, best, found, seen = self.ends[None], -np.inf, -np.inf, 0
         while len(boxes):
             seen += len(boxes)
-            ball = balls(
+            ball = contact_balls(
                 self.robot,
                 self.motors,
                 (boxes[:, 0], boxes[:, 1]),
@@ -188,49 +187,45 @@ class _Hand:
             value, most, boxes = sign * value[real], (sign * value + give)[real], boxes[real]
             effect = ball.effect[real]
             best = max(best, value.max(initial=-np.inf))
-            near = most <= best + GAP[unit]
-            if seen > MOST or not self.motors:
+            near = most <= best + gap
+            if seen > most_boxes or not self.motors:
                 near[:] = True
             found = max(found, most[near].max(initial=-np.inf))
             if near.all():
                 break
             boxes, widest = boxes[~near], effect[~near].argmax(axis=1)
-            rows = np.arange(len(boxes))
-            middle = boxes.mean(axis=1)[rows, widest]
-            low, high = boxes.copy(), boxes.copy()
-            low[rows, 1, widest], high[rows, 0, widest] = middle, middle
-            boxes = np.concatenate([low, high])
+            boxes = halved(boxes, widest)
         return float(found) + SLACK
 
     def range(self, fingers: tuple[int, ...], measure: Measure, unit: str) -> tuple[float, float]:
         """Guaranteed bounds of a measure over all postures."""
-        ends = (self.largest(fingers, measure, sign, unit) for sign in (-1, 1))
-        lower, upper = ends
+        gap = 0.01 if unit == "m" else 0.1
+        lower, upper = (self.largest(fingers, measure, sign, gap) for sign in (-1, 1))
         return -lower, upper
 
 
-def _kept(hand: _Hand) -> Iterator[Kept]:
+def _invariants(hand: _Hand) -> Iterator[RigidInvariant]:
     names = hand.robot.finger_names
     fingers = [i for i, endless in enumerate(hand.endless) if not endless]
     if hand.arm is None:
         for i in fingers:
             for axis, letter in enumerate("xyz"):
                 ends = hand.range((i,), _coordinate(axis), "m")
-                yield Kept(f"{letter} of {names[i]}", "m", (i,), False, *ends)
+                yield RigidInvariant(f"{letter} of {names[i]}", "m", (i,), False, *ends)
         return
     for i, j in combinations(fingers, 2):
         both, pair = f"{names[i]} and {names[j]}", (i, j)
         least, most = hand.range(pair, _distance, "m")
-        yield Kept(f"distance of {both}", "m", pair, False, max(least, 0.0), most)
+        yield RigidInvariant(f"distance of {both}", "m", pair, False, max(least, 0.0), most)
         least, most = hand.range(pair, _angle, "rad")
         angles = max(least, 0.0), min(most, np.pi)
-        yield Kept(f"angle of the normals of {both}", "rad", pair, False, *angles)
+        yield RigidInvariant(f"angle of the normals of {both}", "rad", pair, False, *angles)
     near, far = hand.span
     for i in fingers:
         least, most = hand.range((i,), _from(hand.arm.wrist), "m")
         # The contact is that far from the wrist, and the wrist that far from the shoulder.
         ends = max(least - far, near - most, 0.0), far + most
-        yield Kept(f"distance of {names[i]} from the shoulder", "m", (i,), True, *ends)
+        yield RigidInvariant(f"distance of {names[i]} from the shoulder", "m", (i,), True, *ends)
 
 
 def _coordinate(axis: int) -> Measure:
@@ -250,6 +245,4 @@ def _distance(found: Balls) -> tuple[Array, Array]:
 
 
 def _angle(found: Balls) -> tuple[Array, Array]:
-    a, b = found.normals[:, 0], found.normals[:, 1]
-    between = 2 * np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
-    return between, found.angle.sum(axis=1)
+    return angle_of(found.normals[:, 0], found.normals[:, 1]), found.angle.sum(axis=1)

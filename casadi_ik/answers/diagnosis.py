@@ -9,9 +9,9 @@ from enum import StrEnum
 from functools import cached_property
 
 from casadi_ik.arrays import Array
-from casadi_ik.problem.contact_verdict import ContactVerdict, PalmVerdict
 from casadi_ik.problem.problems import Tolerance
-from casadi_ik.problem.proof import Proof
+from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict
+from casadi_ik.proofs.proof import Proof
 
 Point = tuple[float, float, float]
 

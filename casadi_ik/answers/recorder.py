@@ -12,10 +12,10 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arrays import Array
 from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.solution import BatchSolution
 from casadi_ik.problem.trace import TraceFormat
 
 

@@ -1,58 +1,149 @@
-"""Checks a proof of impossibility: proves it again, in numpy, by simpler bounds and finer boxes."""
+"""A proof that a target is impossible: what was proved, of what, and its check by other means.
+
+The check shares with the search for proofs what a proof starts from (`proofs.premises`) and none of
+its bounds: it proves the target impossible again, in numpy, by simpler bounds and finer boxes.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import hashlib
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.problem.arm_cones import NONE, ArmCones, arm_cones
-from casadi_ik.problem.arm_span import arm_span
-from casadi_ik.problem.contact_bounds import Balls, balls
-from casadi_ik.problem.contact_quantities import (
-    Quantity,
-    asked_quantities,
-    kept_quantities,
-    quantities_of,
+from casadi_ik.grasps import Tolerance
+from casadi_ik.problem.problems import Problems
+from casadi_ik.proofs.numeric_bounds import (
+    Balls,
+    angle_of,
+    contact_balls,
+    halved,
+    seen_distances,
 )
-from casadi_ik.problem.hand_motors import (
+from casadi_ik.proofs.premises import (
+    NO_CONE,
     OUTWARDS,
+    ArmCones,
+    arm_cones,
+    arm_span,
     endless_fingers,
-    hand_motors,
     joint_limits,
     motor_box,
     motor_ends,
 )
-from casadi_ik.problem.palm_view import seen_distances
-from casadi_ik.problem.problems import Problems
+from casadi_ik.proofs.quantities import Quantity, asked_values, quantities_of, rigid_invariants
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.srs_arm import reach, srs_arm
-
-if TYPE_CHECKING:
-    from casadi_ik.problem.proof import Proof
 
 SLACK = 1e-8
 """Ten times the search's own slack for rounding [m, rad]."""
 
-MOST = 400_000
-"""Boxes after which a check gives up: the proof then counts as not confirmed."""
 
-TOGETHER = 512
-"""Boxes that are looked at in one go."""
+@dataclass(frozen=True)
+class CheckEffort:
+    """How long a check goes on.
 
-SWIVELS = 180
-"""Places of the elbow that are looked at."""
+    Attributes:
+        boxes: After so many the proof counts as not confirmed.
+        together: Boxes that are looked at in one go.
+        swivels: Places of the elbow that are looked at.
+        finest: A box is not divided any more where its contacts move by less [0.1 m, rad]: the
+            proof is not confirmed.
+    """
 
-FINEST = 1e-5
-"""A box is not divided any more where its contacts move by less [0.1 m, rad]: not confirmed."""
+    boxes: int = 400_000
+    together: int = 512
+    swivels: int = 180
+    finest: float = 1e-5
 
 
-def holds(proof: Proof, robot: RobotDescription, target: Problems | None) -> bool:
+class ProofKind(StrEnum):
+    """What contradicts what."""
+
+    FINGER = "a finger of the fixed hand comes nowhere near its contact"
+    HAND = "no posture of the hand fits the contacts, wherever the palm is"
+    REACH = "every posture of the hand that may fit puts the wrist out of the arm's reach"
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """A proof of impossibility by guaranteed bounds.
+
+    The hand's postures are covered by boxes, and in each of them a bound on what the contacts keep
+    (distances, angles, heights, their best rigid fit) or on where the wrist comes to lie excludes
+    the target, tolerances and rounding included.
+
+    Attributes:
+        kind: What contradicts what.
+        fingers: The fingers whose contacts contradict each other; the others play no part.
+        quantities: What these contacts keep, as asked and as possible at all; one whose `excess` is
+            > 0 decides by itself.
+        boxes: How many boxes cover the hand's postures, 1 if none had to be divided.
+        tolerance: Within which the target is impossible, by finger; at least those asked for.
+        target: The target that was proved impossible, one row.
+        seal: Of all the others, see `sealed`.
+    """
+
+    kind: ProofKind
+    fingers: tuple[str, ...]
+    quantities: tuple[Quantity, ...]
+    boxes: int
+    tolerance: tuple[Tolerance, ...]
+    target: Problems = field(repr=False)
+    seal: str = field(default="", repr=False)
+
+    def sealed(self) -> Proof:
+        """The same with a seal by which `check` sees whether something was changed since."""
+        return replace(self, seal=self._seal())
+
+    def _seal(self) -> str:
+        parts = (self.kind.name, self.fingers, self.quantities, self.boxes, self.tolerance)
+        digest = hashlib.sha256(repr(parts).encode())
+        for array in (self.target.points, self.target.normals):
+            digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
+        return digest.hexdigest()[:32]
+
+    @property
+    def deciding(self) -> tuple[Quantity, ...]:
+        """Quantities that exclude the target by themselves, the clearest first."""
+        found = [item for item in self.quantities if item.excess > 0]
+        return tuple(sorted(found, key=lambda item: -item.excess / item.give))
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What is proved, in short lines."""
+        who = ", ".join(self.fingers)
+        parts = "at once" if self.boxes == 1 else f"in each of {self.boxes} parts of its postures"
+        return (f"proved for {who} {parts}: {self.kind}",)
+
+    @property
+    def lines_of_palm(self) -> tuple[str, ...]:
+        """The same where a palm was asked for, with the hand as it is."""
+        if self.kind is ProofKind.REACH:
+            return ("proved: the palm has the wrist where the arm does not reach",)
+        return (f"proved: {self.kind}",)
+
+    def check(self, robot: ArmHand, target: Problems | None = None) -> bool:
+        """Prove it again by other means: whether the proof holds and says what it said.
+
+        The seal is compared, every quantity computed anew from the robot's description, and the
+        hand's postures are divided anew with another arithmetic, in numpy and not compiled, in
+        boxes as fine as it takes. Takes up to some seconds, of hard targets up to a minute.
+
+        Args:
+            robot: The robot.
+            target: One target that the proof has to be about; None: the one it names.
+        """
+        return self.seal == self._seal() and _holds(self, robot.description, target)
+
+
+def _holds(proof: Proof, robot: RobotDescription, target: Problems | None) -> bool:
     """Whether a proof is about a target, states it rightly, and can be proved again."""
     about = proof.target
     if len(about) != 1 or (target is not None and not _same(about, target)):
@@ -81,9 +172,9 @@ def _quantities(
     robot: RobotDescription, asked: Problems, fingers: list[int]
 ) -> tuple[Quantity, ...]:
     """What the fingers' contacts keep, found anew."""
-    kept = kept_quantities(robot, asked)
-    values, give = asked_quantities(robot, kept, asked)
-    return quantities_of(kept, values[0], give[0], fingers)
+    invariants = rigid_invariants(robot, asked)
+    values, give = asked_values(robot, invariants, asked)
+    return quantities_of(invariants, values[0], give[0], fingers)
 
 
 def _same(one: Problems, other: Problems) -> bool:
@@ -104,7 +195,8 @@ class _Search:
         self, robot: RobotDescription, asked: Problems, fingers: list[int], kind: str
     ) -> None:
         self.robot, self.asked, self.fingers, self.kind = robot, asked, fingers, kind
-        self.motors = hand_motors(robot)
+        self.motors = robot.finger_motors
+        self.effort = CheckEffort()
         self.in_palm = any(j.type != "fixed" for j in robot.chain(robot.palm_link))
         self.limits = joint_limits(robot, asked)
         self.points, self.normals = asked.points[0, fingers], asked.normals[0, fingers]
@@ -120,9 +212,9 @@ class _Search:
         while waiting:
             boxes = waiting.pop()
             seen += len(boxes)
-            if seen > MOST:
+            if seen > self.effort.boxes:
                 return False
-            found = balls(
+            found = contact_balls(
                 self.robot,
                 self.motors,
                 (boxes[:, 0], boxes[:, 1]),
@@ -133,14 +225,11 @@ class _Search:
             refuted, scores = self._refuted(found)
             left = np.flatnonzero(~(found.empty | refuted))
             boxes, scores = boxes[left], scores[left]
-            rows, widest = np.arange(len(left)), scores.argmax(axis=1)
-            if (found.effect[left][rows, widest] < FINEST).any():
+            widest = scores.argmax(axis=1)
+            if (found.effect[left][np.arange(len(left)), widest] < self.effort.finest).any():
                 return False
-            middle = boxes.mean(axis=1)[rows, widest]
-            low, high = boxes.copy(), boxes.copy()
-            low[rows, 1, widest], high[rows, 0, widest] = middle, middle
-            halves = np.concatenate([low, high])
-            waiting += [halves[i : i + TOGETHER] for i in range(0, len(halves), TOGETHER)]
+            halves, size = halved(boxes, widest), self.effort.together
+            waiting += [halves[i : i + size] for i in range(0, len(halves), size)]
         return True
 
     def _refuted(self, found: Balls) -> tuple[Bools, Array]:
@@ -148,7 +237,7 @@ class _Search:
         radius, angle = found.radius + self.loose, found.angle + self.turned
         if not self.in_palm:
             apart = np.linalg.norm(self.points - found.points, axis=2) > radius
-            facing = _angle(self.normals, found.normals) > angle
+            facing = angle_of(self.normals, found.normals) > angle
             return (apart | facing).any(axis=1), found.effect
         refuted, scores = self._pairs(found, radius, angle)
         refuted[~refuted] = self._rigid(found, radius, angle, ~refuted)
@@ -170,8 +259,8 @@ class _Search:
             far, length = np.linalg.norm(asked), np.linalg.norm(here, axis=1)
             moved = found.moved[:, i] + found.moved[:, j]
             tests = [(np.abs(length - far) - SLACK * far, give, moved)]
-            between = _angle(self.normals[i], self.normals[j])
-            now = _angle(found.normals[:, i], found.normals[:, j])
+            between = angle_of(self.normals[i], self.normals[j])
+            now = angle_of(found.normals[:, i], found.normals[:, j])
             swung = found.swung[:, i] + found.swung[:, j]
             tests.append((np.abs(now - between), angle[:, i] + angle[:, j], swung))
             # The line between the points turns by no more than asin(give / length).
@@ -179,7 +268,9 @@ class _Search:
                 tilt = np.arcsin(np.clip(give / far, 0.0, 1.0))
                 tilt[give >= far] = np.pi
                 for n in (i, j):
-                    off = np.abs(_angle(found.normals[:, n], here) - _angle(self.normals[n], asked))
+                    off = np.abs(
+                        angle_of(found.normals[:, n], here) - angle_of(self.normals[n], asked)
+                    )
                     shares = found.swung[:, n] + moved / far
                     tests.append((off, angle[:, n] + tilt, shares))
                 for off, width, shares in tests:
@@ -263,14 +354,14 @@ class _Search:
         side = np.eye(3)[np.abs(line).argmin(axis=1)]
         x = np.cross(line, side)
         x /= np.linalg.norm(x, axis=1, keepdims=True)
-        y, step = np.cross(line, x), 2 * np.pi / SWIVELS
+        y, step = np.cross(line, x), 2 * np.pi / self.effort.swivels
         left = np.zeros(len(rows), dtype=bool)
         (upper, wide), (fore, open_) = (
             _opening(one, other, least, most)
             for one, other in (cones.lengths, reversed(cones.lengths))
         )
         limits = self._cosines
-        for psi in step * np.arange(SWIVELS):
+        for psi in step * np.arange(self.effort.swivels):
             out = np.cos(psi) * x + np.sin(psi) * y
             arm = np.cos(upper)[:, None] * line + np.sin(upper)[:, None] * out
             hand = np.cos(fore)[:, None] * line - np.sin(fore)[:, None] * out
@@ -284,7 +375,7 @@ class _Search:
     @cached_property
     def _cones(self) -> ArmCones | None:
         cones = arm_cones(self.robot)
-        return None if cones is None or (cones.cosines(self.asked) == NONE).all() else cones
+        return None if cones is None or (cones.cosines(self.asked) == NO_CONE).all() else cones
 
     @cached_property
     def _cosines(self) -> Array:
@@ -315,13 +406,3 @@ def _opening(a: float, b: float, least: Array, most: Array) -> tuple[Array, Arra
     angles = [np.arccos(np.clip((c * c + a * a - b * b) / (2 * a * c), -1, 1)) for c in sides]
     low, high = np.min(angles, axis=0), np.max(angles, axis=0)
     return (low + high) / 2, (high - low) / 2 + SLACK
-
-
-def _angle(a: Array, b: Array) -> Array:
-    """Angles of vectors along the last axis [rad]; NaN where one is NaN."""
-    a, b = (
-        a / np.linalg.norm(a, axis=-1, keepdims=True),
-        b / np.linalg.norm(b, axis=-1, keepdims=True),
-    )
-    apart, together = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
-    return 2 * np.arctan2(apart, together)

@@ -1,4 +1,7 @@
-"""Where fingertips can be while motors are within boxes, in numpy: balls for a check of proofs."""
+"""Where fingertips can be while motors are within boxes, in numpy: the bounds of a check of proofs.
+
+They share nothing with `proofs.boxes`, the bounds of the search for proofs.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from casadi_ik.arrays import Array, Bools, Rows
-from casadi_ik.problem.hand_motors import finger_joints
-from casadi_ik.problem.joint_bounds import joint_bounds
-from casadi_ik.problem.joint_frames import link_frames, placed
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.robots.poses import link_poses
+from casadi_ik.symbolic.couplings import joint_bounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +57,7 @@ class Balls:
         return (self.moved / 0.1 + self.swung).max(axis=1)
 
 
-def balls(
+def contact_balls(
     robot: RobotDescription,
     motors: Sequence[str],
     box: tuple[Array, Array],
@@ -75,7 +77,7 @@ def balls(
     """
     count = len(box[0])
     ranges, empty = {}, np.zeros(count, dtype=bool)
-    names = finger_joints(robot)
+    names = robot.finger_joints
     used = {name for i in fingers for name in robot.fingers[i].joints}
     wanted = [name for name in names if name in used]
     for name, (low, high) in joint_bounds(robot, motors, *box, wanted).items():
@@ -87,21 +89,22 @@ def balls(
     chained = {joint.name for link in links for joint in robot.chain(link)}
     chain = [joint for joint in robot.joints if joint.name in chained]
     middles = {name: middle for name, (middle, _) in ranges.items()}
-    frames = link_frames(robot, middles, count, chain)
+    poses = link_poses(robot.root, chain, middles)
     kinds = {joint.name: joint for joint in robot.movable}
     points, normals, radius, angle, bend, curl = [], [], [], [], [], []
     carried = np.zeros((2, count, len(fingers), len(wanted), 3))
     shares = np.zeros((2, count, len(fingers), len(motors)))
     for place, i in enumerate(fingers):
         finger = robot.fingers[i]
-        rotation, point = placed(frames[finger.link], finger.placement)
-        normal = rotation @ finger.normal
+        pad = np.broadcast_to(poses[finger.link] @ finger.placement, (count, 4, 4))
+        point, normal = pad[:, :3, 3], pad[:, :3, :3] @ finger.normal
         far, turned, left_out = np.zeros(count), np.zeros(count), np.zeros(count)
         nearer = sum((ranges[name][1] for name in finger.joints), np.zeros(count))
         for name in reversed(finger.joints):
             joint, half = kinds[name], ranges[name][1]
-            frame, origin = frames[joint.child]
-            sine, axis = np.sin(np.minimum(half, np.pi) / 2), frame @ joint.axis
+            frame = poses[joint.child]
+            sine = np.sin(np.minimum(half, np.pi) / 2)
+            axis, origin = frame[..., :3, :3] @ joint.axis, frame[..., :3, 3]
             if joint.type == "prismatic":
                 slope, turn, lever = axis, np.zeros((count, 3)), np.ones(count)
                 moved, swung = half, np.zeros(count)
@@ -120,10 +123,11 @@ def balls(
             shares[0, :, place, k] += moved
             shares[1, :, place, k] += swung
         if in_palm:
-            palm, centre = placed(frames[robot.palm_link], robot.palm_placement)
-            point = np.einsum("kji,kj->ki", palm, point - centre)
-            normal = np.einsum("kji,kj->ki", palm, normal)
-            carried[:, :, place] = np.einsum("kji,akmj->akmi", palm, carried[:, :, place])
+            palm = poses[robot.palm_link] @ robot.palm_placement
+            turned_back = palm[:3, :3]
+            point = (point - palm[:3, 3]) @ turned_back
+            normal = normal @ turned_back
+            carried[:, :, place] = carried[:, :, place] @ turned_back
         points.append(point)
         normals.append(normal)
         radius.append(far)
@@ -142,6 +146,68 @@ def balls(
         curl=np.stack(curl, axis=1),
         empty=empty,
     )
+
+
+def seen_distances(
+    found: Balls, asked: tuple[Array, Array], loose: tuple[Array, Array], base: Array, palm: Array
+) -> tuple[Array, Array]:
+    """Smallest and largest distance (k,) of a point of the base from one of the palm [m].
+
+    In the palm frame the wrist stands still, and it is known which way a joint carries what is
+    seen.
+    The point of the base is a sum of what is asked for, with coefficients; the palm sees the same
+    sum of its contacts.
+
+    Args:
+        found: The contacts of k boxes, palm frame.
+        asked: Points and normals (f, 3), normals NaN where free.
+        loose: By how much contacts may be off: (f,) [m], and (f,) chords.
+        base: (3,) in the base frame [m].
+        palm: (3,) in the palm frame [m].
+    """
+    points, normals = asked
+    known = ~np.isnan(normals[:, 0])
+    radius = found.radius + loose[0]
+    chord = 2 * np.sin(np.minimum(found.angle, np.pi) / 2) + loose[1]
+    goals = np.concatenate([points[1:] - points[0], normals[known]])
+    each = np.concatenate([radius[:, 1:] + radius[:, :1], chord[:, known]], axis=1)
+    A, across = goals / each[:, :, None], base - points[0]
+    normal = np.einsum("kfi,kfj->kij", A, A)
+    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    solved = np.linalg.solve(normal, np.tile(across, (len(A), 1))[:, :, None])[:, :, 0]
+    share = np.einsum("kfi,ki->kf", A, solved) / each
+    n = len(points) - 1
+    p = np.concatenate([1 - share[:, :n].sum(axis=1, keepdims=True), share[:, :n]], axis=1)
+    b = np.zeros_like(p)
+    b[:, known] = share[:, n:]
+    centre = np.einsum("kf,kfi->ki", p, found.points) + np.einsum("kf,kfi->ki", b, found.normals)
+    slopes = np.einsum("kf,kfmi->kmi", p, found.slopes) + np.einsum("kf,kfmi->kmi", b, found.turns)
+    give = np.linalg.norm(across - share @ goals, axis=1)
+    give += (np.abs(p) * (found.bend + loose[0]) + np.abs(b) * (found.curl + loose[1])).sum(axis=1)
+    away = centre - palm
+    length = np.linalg.norm(away, axis=1)
+    line = away / np.maximum(length, 1e-300)[:, None]
+    along = np.einsum("kmi,ki->km", slopes, line)
+    aside = np.linalg.norm(slopes - along[:, :, None] * line[:, None], axis=2).sum(axis=1)
+    ahead = np.abs(along).sum(axis=1)
+    return length - ahead - give, np.hypot(length + ahead, aside) + give
+
+
+def halved(boxes: Array, widest: Rows) -> Array:
+    """Boxes (k, 2, h) cut in the middle of one motor each (k,): (2 k, 2, h)."""
+    rows = np.arange(len(boxes))
+    middle = boxes.mean(axis=1)[rows, widest]
+    low, high = boxes.copy(), boxes.copy()
+    low[rows, 1, widest], high[rows, 0, widest] = middle, middle
+    return np.concatenate([low, high])
+
+
+def angle_of(a: Array, b: Array) -> Array:
+    """Angles of vectors along the last axis [rad]; NaN where one is NaN."""
+    a = a / np.linalg.norm(a, axis=-1, keepdims=True)
+    b = b / np.linalg.norm(b, axis=-1, keepdims=True)
+    apart, together = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
+    return 2 * np.arctan2(apart, together)
 
 
 def _motor(robot: RobotDescription, name: str) -> str:

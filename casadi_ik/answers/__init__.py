@@ -1,0 +1,1 @@
+"""What a solver answers: solutions, diagnoses, rankings, and what is recorded of solves."""
