@@ -15,16 +15,14 @@ from casadi_ik.datasets.postures import (
     of_fixed_axes,
     of_two_columns,
 )
-from casadi_ik.datasets.unpickling import MOST, Packed, read_npy, read_torch
+from casadi_ik.datasets.unpickling import Packed, read_npy, read_torch
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.npz import refuse_giants
 from casadi_ik.grasps.pose import inverse, rotations_of
 
 STAGES = ("pregrasp", "grasp", "squeeze")
 """Of a grasp, in this order."""
-
-WIDEST = 200
-"""Numbers of a grasp, at most."""
 
 TRANSLATION, TURN = ("WRJTx", "WRJTy", "WRJTz"), ("WRJRx", "WRJRy", "WRJRz")
 """Where DexGraspNet has the pose of a hand among its joints."""
@@ -131,7 +129,8 @@ def multidex(path: Path, content: Any) -> HandPoses:
         if not isinstance(entry, (tuple, list)) or len(entry) < 2 or type(entry[1]) is not str:
             raise DescriptionError(f"{row}: expected q and the name of its object")
         q = numbers(row, {"q": entry[0]}, "q")
-        if q.ndim != 1 or not 9 < len(q) <= WIDEST or (rows and len(q) != len(rows[0])):
+        sound = q.ndim == 1 and 9 < len(q) <= LIMITS.grasp_numbers
+        if not sound or (rows and len(q) != len(rows[0])):
             expected = f"({len(rows[0])},)" if rows else "(9 + joints,)"
             raise DescriptionError(f"{row}: q: found shape {q.shape}, expected {expected}")
         rows.append(q)
@@ -202,7 +201,7 @@ def numbers(where: str, found: Mapping[str, Any], key: str) -> Array:
         value = value.value
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
         raise DescriptionError(f"{where}: {key}: expected an array of numbers")
-    refuse_giants(f"{where}: {key}", 8 * value.size, MOST)
+    refuse_giants(f"{where}: {key}", 8 * value.size, LIMITS.dataset_bytes)
     return value.astype(np.float64)
 
 

@@ -26,7 +26,7 @@ from casadi_ik.datasets.postures import (
     palms_of,
 )
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
-from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.npz import read_npz, refuse_giants
 from casadi_ik.grasps import Contact, Grasp, GraspObject, load_object
 from casadi_ik.grasps.load import load_grasp_files
@@ -153,9 +153,6 @@ PLACE = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ANGLES = ("roll", "pitch", "yaw")
 
-MOST = 2**26
-"""Bytes of a file, and of what is in it."""
-
 SUFFIXES = (".csv", ".npz", ".parquet")
 
 
@@ -170,7 +167,7 @@ def read_table(path: Path) -> HandPoses:
     readers = dict(zip(map(str, SUFFIXES), (_of_csv, _of_npz, _of_parquet), strict=True))
     try:
         if path.suffix.lower() == ".csv":
-            refuse_giants(str(path), path.stat().st_size, MOST)
+            refuse_giants(str(path), path.stat().st_size, LIMITS.table_bytes)
         columns = readers[path.suffix.lower()](path)
     except OSError as error:
         raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -218,7 +215,7 @@ def _of_csv(path: Path) -> dict[str, Array]:
 
 def _of_npz(path: Path) -> dict[str, Array]:
     columns: dict[str, Array] = {}
-    for name, array in read_npz(path, MOST).items():
+    for name, array in read_npz(path, LIMITS.table_bytes).items():
         if array.ndim != 1:
             raise DescriptionError(
                 f"{path}: {name}: found shape {array.shape}, expected a column of numbers"
@@ -240,7 +237,7 @@ def _of_parquet(path: Path) -> Mapping[str, Array]:
                     f"{path}: {name}: found values of type {kind}, expected numbers"
                 )
         count = int(scanned.select(pl.len()).collect().item())
-        refuse_giants(str(path), 8 * len(schema) * count, MOST)
+        refuse_giants(str(path), 8 * len(schema) * count, LIMITS.table_bytes)
         frame = scanned.select(pl.all().cast(pl.Float64).fill_null(np.nan)).collect()
     except (pl.exceptions.PolarsError, OSError) as error:
         raise DescriptionError(f"{path}: no Parquet file: {error}") from error
@@ -257,9 +254,6 @@ TABLE = "table"
 
 BLOCK = 4096
 """Rows of targets that are read at once."""
-
-MOST_CANDIDATES = 200_000
-"""Grasps of a file."""
 
 TOUCHING = 0.01
 """A pad that is nearer to the object than this [m] touches it."""
@@ -475,9 +469,9 @@ def _thing(
 
 
 def _refuse_too_many(where: str, count: int) -> None:
-    if count > limit(MOST_CANDIDATES):
+    if count > limit(LIMITS.candidates):
         raise DescriptionError(
-            f"{where}: found {count} grasps, expected at most {limit(MOST_CANDIDATES)} {RAISED}"
+            f"{where}: found {count} grasps, expected at most {limit(LIMITS.candidates)} {RAISED}"
         )
 
 

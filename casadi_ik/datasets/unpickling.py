@@ -21,10 +21,8 @@ from zipfile import BadZipFile, ZipFile, is_zipfile
 import numpy as np
 
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.npz import refuse_giants
-
-MOST = 2**29
-"""Bytes of a file."""
 
 TYPES = re.compile(r"^[<>|=]?([biufcSUO]\d{0,5}|b1|\?)$")
 """Element types that arrays may have."""
@@ -179,7 +177,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     """
     try:
         size = path.stat().st_size
-        refuse_giants(str(path), size, MOST)
+        refuse_giants(str(path), size, LIMITS.dataset_bytes)
         yield
     except OSError as error:
         raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -355,7 +353,7 @@ def read_torch(path: Path) -> Any:
             raise DescriptionError(f"{path}: found no zip, expected a file of torch.save")
         with ZipFile(path) as archive:
             size = sum(one.file_size for one in archive.infolist())
-            refuse_giants(str(path), size, MOST)
+            refuse_giants(str(path), size, LIMITS.dataset_bytes)
             held = [n for n in archive.namelist() if n.count("/") <= 1 and n.endswith("data.pkl")]
             if not held:
                 raise DescriptionError(f"{path}: data.pkl: missing, expected a file of torch.save")

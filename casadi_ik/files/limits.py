@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import dataclass
 
 from casadi_ik.errors import InputError
 
@@ -12,6 +13,67 @@ VARIABLE = "CASADI_IK_LIMITS"
 
 RAISED = f"(--size-limits 4, or {VARIABLE}=4 in the environment, allows four times as much)"
 """Said where a limit is met."""
+
+
+@dataclass(frozen=True)
+class FileLimits:
+    """How much of somebody else's file is read; SECURITY.md promises these numbers.
+
+    Sizes, counts, time and memory go through `limit`, so that `CASADI_IK_LIMITS` raises them.
+
+    Attributes:
+        yaml_text: Characters of one text or number.
+        yaml_depth: Lists and mappings inside one another.
+        yaml_values: Values in a file, those counted again that an alias repeats.
+        quantity_text: Characters of a number with a unit.
+        name_text: Characters of a name in a description.
+        mesh_bytes: Bytes of a mesh file.
+        mesh_faces: Triangles of a mesh.
+        mesh_coordinate: Largest coordinate of a corner [m, or what the file counts in].
+        object_pieces: Pieces of a grasped object.
+        robot_bytes: Bytes of a URDF, xacro or MJCF file.
+        robot_number: Largest length or angle of a robot [m or rad].
+        joint_limit: Largest limit of a joint [rad or m]; beyond it there is none, since some
+            programs write 1e16 for a joint without limits.
+        xml_depth: Elements inside one another.
+        links: Links of a robot's file.
+        moving_joints: Joints of a robot's file that move.
+        reader_seconds: Computing time of the process that reads macros and MJCF [s].
+        reader_patience: Times as long by the clock, since the machine may be busy.
+        reader_memory: Memory of that process [bytes].
+        reader_output: What it may hand back [bytes].
+        grasp_numbers: Numbers of a grasp of a data set.
+        dataset_bytes: Bytes of a file of a data set, unpacked.
+        table_bytes: Bytes of a table of grasps, unpacked.
+        candidates: Grasps of a file.
+    """
+
+    yaml_text: int = 10_000
+    yaml_depth: int = 50
+    yaml_values: int = 200_000
+    quantity_text: int = 64
+    name_text: int = 100
+    mesh_bytes: int = 64 * 2**20
+    mesh_faces: int = 2_000_000
+    mesh_coordinate: float = 1e6
+    object_pieces: int = 256
+    robot_bytes: int = 16 * 2**20
+    robot_number: float = 1e6
+    joint_limit: float = 1e3
+    xml_depth: int = 200
+    links: int = 1000
+    moving_joints: int = 200
+    reader_seconds: int = 20
+    reader_patience: int = 10
+    reader_memory: int = 3 * 2**30
+    reader_output: int = 256 * 2**20
+    grasp_numbers: int = 200
+    dataset_bytes: int = 2**29
+    table_bytes: int = 2**26
+    candidates: int = 200_000
+
+
+LIMITS = FileLimits()
 
 
 def limit(value: float) -> int:

@@ -16,16 +16,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.limits import RAISED, limit
-
-LARGEST_MESH = 64 * 2**20
-"""Bytes of a file."""
-
-MOST_FACES = 2_000_000
-"""Triangles of a mesh."""
-
-FARTHEST = 1e6
-"""No corner is farther from the origin [m, or what the file counts in]."""
+from casadi_ik.files.limits import LIMITS, RAISED, limit
 
 FORMATS = (".stl", ".obj", ".ply", ".dae", ".off", ".glb")
 """Names' ends of what is read."""
@@ -52,24 +43,25 @@ def read_mesh(path: Path, where: str) -> tuple[Array, NDArray[np.int64]]:
         raise DescriptionError(f"{where}: found {kind!r}, expected one of {', '.join(FORMATS)}")
     try:
         with path.open("rb") as stream:
-            data = stream.read(limit(LARGEST_MESH) + 1)
+            data = stream.read(limit(LIMITS.mesh_bytes) + 1)
     except OSError as error:
         raise DescriptionError(f"{where}: cannot be read: {error.strerror}") from error
-    if len(data) > limit(LARGEST_MESH):
-        most = f"{limit(LARGEST_MESH) / 2**20:.3g} MiB"
+    if len(data) > limit(LIMITS.mesh_bytes):
+        most = f"{limit(LIMITS.mesh_bytes) / 2**20:.3g} MiB"
         raise DescriptionError(f"{where}: cannot be read: is larger than {most} {RAISED}")
     try:
         points, triangles = _parsed(data, kind[1:])
     except Exception as error:  # whatever a broken file leads a reader into
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DescriptionError(f"{where}: cannot be read: {reason}") from error
-    if len(triangles) > limit(MOST_FACES):
-        most = f"at most {limit(MOST_FACES)} {RAISED}"
+    if len(triangles) > limit(LIMITS.mesh_faces):
+        most = f"at most {limit(LIMITS.mesh_faces)} {RAISED}"
         raise DescriptionError(f"{where}: found {len(triangles)} triangles, expected {most}")
     if not len(points):
         raise DescriptionError(f"{where}: is an empty mesh, expected triangles")
-    if not (np.abs(points) <= FARTHEST).all():
-        raise DescriptionError(f"{where}: has corners that are not finite, or beyond {FARTHEST:g}")
+    most = LIMITS.mesh_coordinate
+    if not (np.abs(points) <= most).all():
+        raise DescriptionError(f"{where}: has corners that are not finite, or beyond {most:g}")
     return points, triangles
 
 

@@ -18,6 +18,7 @@ from yaml.composer import ComposerError
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.units import (
     QUANTITY,
     UNITS,
@@ -32,15 +33,6 @@ from casadi_ik.files.units import (
 
 LARGEST_FILE = 4 * 2**20
 """Bytes of a file."""
-
-LONGEST_SCALAR = 10_000
-"""Characters of one text or number."""
-
-DEEPEST = 50
-"""Lists and mappings inside one another."""
-
-MOST_VALUES = 200_000
-"""Values in a file, those counted again that an alias repeats."""
 
 MERGE = "tag:yaml.org,2002:merge"
 
@@ -120,10 +112,10 @@ def _check_events(text: str) -> None:
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         problem = ""
-        if depth > DEEPEST:
-            problem = f"nested more than {DEEPEST} deep"
-        elif isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_SCALAR:
-            problem = f"a text of more than {LONGEST_SCALAR} characters"
+        if depth > LIMITS.yaml_depth:
+            problem = f"nested more than {LIMITS.yaml_depth} deep"
+        elif isinstance(event, yaml.ScalarEvent) and len(event.value) > LIMITS.yaml_text:
+            problem = f"a text of more than {LIMITS.yaml_text} characters"
         elif isinstance(event, yaml.ScalarEvent) and not _readable(event.value):
             problem = "a text with control characters"
         if problem:
@@ -141,9 +133,9 @@ def _count(value: Any, count: int, depth: int) -> int:
         ValueError: Too many, or too deep.
     """
     count += 1
-    if count > MOST_VALUES:
-        raise ValueError(f"holds more than {MOST_VALUES} values")
-    if depth > DEEPEST:
+    if count > LIMITS.yaml_values:
+        raise ValueError(f"holds more than {LIMITS.yaml_values} values")
+    if depth > LIMITS.yaml_depth:
         raise ValueError("nested too deeply, or holds itself")
     if isinstance(value, dict):
         for item in value.values():

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import msgspec
 
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.limits import LIMITS
 
 UNITS = {
     "": 1.0,
@@ -32,9 +33,6 @@ UNITS = {
 }
 
 QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z/]*)\s*$")
-
-LONGEST_QUANTITY = 64
-"""Characters; a longer text is no quantity."""
 
 DIMENSIONS = {"deg": "rad", "cm": "m", "mm": "m", "deg/s": "rad/s", "mm/s": "m/s"}
 """The SI unit of a unit, where that is another."""
@@ -60,7 +58,7 @@ AnyValue = Annotated[float, Dimension("rad m")]
 
 def quantity(text: Any) -> tuple[float, str] | None:
     """The number in SI of a text with a known unit, and the unit; None if it is something else."""
-    if not isinstance(text, str) or len(text) > LONGEST_QUANTITY:
+    if not isinstance(text, str) or len(text) > LIMITS.quantity_text:
         return None
     match = QUANTITY.match(text)
     if match is None or match[2] not in UNITS:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.mesh_file import read_mesh
 from casadi_ik.files.units import Length
 
@@ -338,9 +338,6 @@ def _bisect(function: Callable[[Array], Array], low: Array, high: Array) -> Arra
     return 0.5 * (low + high)
 
 
-MOST_PIECES = 256
-"""Of an object."""
-
 AT_ONCE = 2_000_000
 """Pairs of a point and a triangle that are looked at together."""
 
@@ -431,8 +428,8 @@ def load_mesh_shape(files: Sequence[Path], scale: float, where: str) -> MeshShap
     for file in files:
         points, triangles = read_mesh(file, where)
         pieces += pieces_of(scale * points, triangles)
-    if len(pieces) > limit(MOST_PIECES):
-        most = f"at most {limit(MOST_PIECES)} {RAISED}"
+    if len(pieces) > limit(LIMITS.object_pieces):
+        most = f"at most {limit(LIMITS.object_pieces)} {RAISED}"
         raise DescriptionError(f"{where}: found {len(pieces)} pieces, expected {most}")
     return MeshShape(tuple(pieces))
 

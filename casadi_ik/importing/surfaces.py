@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.mesh_file import FARTHEST, read_mesh
+from casadi_ik.files.limits import LIMITS
+from casadi_ik.files.mesh_file import read_mesh
 from casadi_ik.robots.robot_files.foreign import package_folders
 from casadi_ik.robots.robot_files.tree import Element, RobotTree, pose_of, simple_shape, values_of
 
@@ -196,7 +197,7 @@ def _of_mesh(element: Element, missing: Missing) -> Surface | None:
         return None
     if len(triangles) > MOST_TRIANGLES:
         triangles = triangles[:0]
-    if len(scale) != 3 or max(map(abs, scale)) > FARTHEST:
+    if len(scale) != 3 or max(map(abs, scale)) > LIMITS.mesh_coordinate:
         missing.broken(f"{missing.path.name}: mesh {name!r}: scale: expected three finite numbers")
         return None
     return Surface(points * scale, triangles)

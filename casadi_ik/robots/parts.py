@@ -12,6 +12,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.robots.collision import NO_SHAPES, Shapes, link_shapes
 from casadi_ik.robots.description import Actuator, Joint, frozen
@@ -23,9 +24,6 @@ from casadi_ik.robots.schema import (
     JointEntry,
     PadEntry,
 )
-
-LONGEST_NAME = 100
-"""Characters of a name."""
 
 
 def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: Path) -> None:
@@ -102,9 +100,9 @@ def unique(names: Iterable[str], where: str) -> None:
 
 def usable(name: str, where: str) -> None:
     """Refuse a name that is empty, or too long to be read in a table or a file's name."""
-    if not 0 < len(name) <= LONGEST_NAME:
+    if not 0 < len(name) <= LIMITS.name_text:
         raise DescriptionError(
-            f"{where}: found a name of {len(name)} characters, expected 1 to {LONGEST_NAME}"
+            f"{where}: found a name of {len(name)} characters, expected 1 to {LIMITS.name_text}"
         )
 
 

@@ -10,20 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from casadi_ik.errors import DescriptionError, MissingExtraError
-from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.robots.robot_files import foreign
-
-SECONDS = 20
-"""Of computing."""
-
-PATIENCE = 10
-"""Times as long by the clock: the machine may be busy."""
-
-MEMORY = 3 * 2**30
-"""Bytes."""
-
-OUTPUT = 256 * 2**20
-"""Bytes that may come out."""
 
 MACROS = "xacro"
 MODEL = "mujoco"
@@ -43,8 +31,8 @@ def confined(what: str, path: Path) -> bytes:
     if find_spec(what) is None:
         noun = "has xacro macros" if what == MACROS else "is MJCF"
         raise MissingExtraError(f"{path}: {noun}; to read it: pip install casadi-ik[{what}]")
-    seconds, doing = limit(SECONDS), "expand" if what == MACROS else "read"
-    limits = (seconds, limit(MEMORY), limit(OUTPUT))
+    seconds, doing = limit(LIMITS.reader_seconds), "expand" if what == MACROS else "read"
+    limits = (seconds, limit(LIMITS.reader_memory), limit(LIMITS.reader_output))
     # Not the script's folder, whose modules are called as some of others are.
     script, place = Path(foreign.__file__).resolve(), path.resolve()
     command = [sys.executable, "-P", str(script), what, str(place), *map(str, limits)]
@@ -58,7 +46,7 @@ def confined(what: str, path: Path) -> bytes:
                 stderr=subprocess.DEVNULL,
                 cwd=folder,
                 env=os.environ | {"PYTHONPATH": known},
-                timeout=PATIENCE * seconds,
+                timeout=LIMITS.reader_patience * seconds,
                 check=False,
             )
     except subprocess.TimeoutExpired:

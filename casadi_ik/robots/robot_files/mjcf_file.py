@@ -10,10 +10,10 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
+from casadi_ik.files.limits import LIMITS
 from casadi_ik.robots.couplings import Coupling, Linear, Polynomial
 from casadi_ik.robots.robot_files.confined import MODEL, confined
 from casadi_ik.robots.robot_files.tree import (
-    FURTHEST,
     RobotTree,
     TreeJoint,
     check_size,
@@ -102,7 +102,7 @@ def _of_body(
         anchor[:3, 3] = model.jnt_pos[joint]
         child = names[body] if last else f"{names[body]}:{name}"
         limits = None
-        if model.jnt_limited[joint] and np.abs(model.jnt_range[joint]).max() <= FURTHEST:
+        if model.jnt_limited[joint] and np.abs(model.jnt_range[joint]).max() <= LIMITS.joint_limit:
             limits = (float(model.jnt_range[joint, 0]), float(model.jnt_range[joint, 1]))
         elif kind == "revolute":
             kind = "continuous"
@@ -176,7 +176,7 @@ def _tendons(
         ratios = [ratio for _, ratio in pulls if ratio]
         ranges = [model.jnt_range[joint] for joint in joints]
         limited = all(
-            model.jnt_limited[joint] and -FURTHEST <= low < high <= FURTHEST
+            model.jnt_limited[joint] and -LIMITS.joint_limit <= low < high <= LIMITS.joint_limit
             for joint, (low, high) in zip(joints, ranges, strict=True)
         )
         taken = any(joint_name(model, joint) in couplings for joint in joints)

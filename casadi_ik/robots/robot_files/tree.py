@@ -15,28 +15,10 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError
-from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.reading import Frame, frame_matrix, roll_pitch_yaw
 from casadi_ik.robots.couplings import Coupling
 from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, CylinderEntry, ShapeEntry, SphereEntry
-
-LARGEST = 1e6
-"""No length or angle of a robot is larger [m or rad]."""
-
-FURTHEST = 1e3
-"""A limit beyond it [rad or m] is none: some programs write 1e16 for a joint without."""
-
-LARGEST_FILE = 16 * 2**20
-"""Bytes of a file."""
-
-DEEPEST = 200
-"""Elements inside one another."""
-
-MOST_LINKS = 1000
-"""Of a file."""
-
-MOST_JOINTS = 200
-"""Of a file, that move."""
 
 Element = ElementTree.Element
 
@@ -53,12 +35,12 @@ def read_text(path: Path) -> str:
     """
     try:
         with path.open("rb") as stream:
-            data = stream.read(limit(LARGEST_FILE) + 1)
+            data = stream.read(limit(LIMITS.robot_bytes) + 1)
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise DescriptionError(f"{path}: cannot be read: {reason}") from error
-    if len(data) > limit(LARGEST_FILE):
-        most = f"{limit(LARGEST_FILE) / 2**20:.3g} MiB"
+    if len(data) > limit(LIMITS.robot_bytes):
+        most = f"{limit(LIMITS.robot_bytes) / 2**20:.3g} MiB"
         raise DescriptionError(f"{path}: cannot be read: is larger than {most} {RAISED}")
     try:
         return data.decode("utf-8-sig")
@@ -93,8 +75,8 @@ def _look_through(text: str) -> None:
     def start(*_: object) -> None:
         nonlocal depth
         depth += 1
-        if depth > DEEPEST:
-            raise _ForbiddenError(f"elements nested more than {DEEPEST} deep")
+        if depth > LIMITS.xml_depth:
+            raise _ForbiddenError(f"elements nested more than {LIMITS.xml_depth} deep")
 
     def end(_: str) -> None:
         nonlocal depth
@@ -127,14 +109,17 @@ def check_size(links: int, moving: int, path: Path) -> None:
     Raises:
         DescriptionError: It has too many links or joints that move.
     """
-    for noun, count, most in (("links", links, MOST_LINKS), ("moving joints", moving, MOST_JOINTS)):
+    counts = ("links", links, LIMITS.links), ("moving joints", moving, LIMITS.moving_joints)
+    for noun, count, most in counts:
         if count > limit(most):
             raise DescriptionError(
                 f"{path}: found {count} {noun}, expected at most {limit(most)} {RAISED}"
             )
 
 
-def number(element: Element | None, name: str, where: str, most: float = LARGEST) -> float | None:
+def number(
+    element: Element | None, name: str, where: str, most: float = LIMITS.robot_number
+) -> float | None:
     """A number of an element; None if it is not there.
 
     Raises:
@@ -171,9 +156,10 @@ def check_vector(element: Element | None, name: str, where: str) -> None:
         values = [float(word) for word in text.split()]
     except ValueError:
         values = []
-    if len(values) != 3 or not all(abs(one) <= LARGEST for one in values):
+    most = LIMITS.robot_number
+    if len(values) != 3 or not all(abs(one) <= most for one in values):
         raise DescriptionError(
-            f"{where}: {name}: found {text!r}, expected three finite numbers{_to(LARGEST)}"
+            f"{where}: {name}: found {text!r}, expected three finite numbers{_to(most)}"
         )
 
 
@@ -301,7 +287,7 @@ def values_of(text: str) -> list[float]:
         values = [float(word) for word in text.split()]
     except ValueError:
         return []
-    return values if all(abs(one) <= LARGEST for one in values) else []
+    return values if all(abs(one) <= LIMITS.robot_number for one in values) else []
 
 
 def _told(entries: dict[str, list[ShapeEntry]], meshes: set[str]) -> FileShapes:

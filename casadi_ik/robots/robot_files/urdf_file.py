@@ -21,9 +21,9 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import DescriptionError, MissingExtraError
+from casadi_ik.files.limits import LIMITS
 from casadi_ik.robots.couplings import Coupling, Linear
 from casadi_ik.robots.robot_files.tree import (
-    FURTHEST,
     Element,
     RobotTree,
     TreeJoint,
@@ -222,7 +222,7 @@ def _axis(joint: Any, model: Any) -> Array:
 def _limits(limit: Element | None, where: str) -> tuple[float, float] | None:
     """The range that is stated; an end that is left out is zero in URDF if the other is there."""
     ends = _ends(limit, where)
-    if ends == [None, None] or max(abs(end or 0.0) for end in ends) > FURTHEST:
+    if ends == [None, None] or max(abs(end or 0.0) for end in ends) > LIMITS.joint_limit:
         return None
     return ends[0] or 0.0, ends[1] or 0.0
 
