@@ -17,7 +17,7 @@ from shape_fitting.writing import write
 
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
-from casadi_ik.importing.capsules import LEAST_SAVING, MOST, fitted, worst
+from casadi_ik.importing.capsules import FIT, fitted, worst
 from casadi_ik.importing.posture import Postures
 from casadi_ik.importing.robot_shapes import may_touch
 from casadi_ik.importing.surfaces import Surface, together
@@ -32,8 +32,8 @@ def main() -> None:
     parser.add_argument("name")
     parser.add_argument("file", type=Path)
     parser.add_argument("--names", default="")
-    parser.add_argument("--most", type=int, default=MOST)
-    parser.add_argument("--saving", type=float, default=LEAST_SAVING)
+    parser.add_argument("--most", type=int, default=FIT.most)
+    parser.add_argument("--saving", type=float, default=FIT.saving)
     parser.add_argument(
         "--apart", nargs="*", default=[], help="our links that hold several of the file: each alone"
     )

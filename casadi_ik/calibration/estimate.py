@@ -77,8 +77,26 @@ LOSSES = {
 NORMAL_95 = 1.959964
 """95 % of a normal variable lie within so many standard deviations."""
 
-UNKNOWN = 1e-6
-"""Singular value, relative to the largest, below which the data say nothing at all."""
+
+@dataclass(frozen=True)
+class EstimateSettings:
+    """How the estimate is found.
+
+    Attributes:
+        unknown: Singular value, relative to the largest, below which the data say nothing at all.
+        fewest: Measured numbers beyond those that the parameters can explain, so that noise can be
+            seen.
+        max_iterations: ?
+        smallest_step: Step at which the iteration ends, in prior standard deviations.
+    """
+
+    unknown: float = 1e-6
+    fewest: int = 12
+    max_iterations: int = 60
+    smallest_step: float = 1e-7
+
+
+SETTINGS = EstimateSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,18 +174,11 @@ class Calibration:
     @property
     def unknown_directions(self) -> int:
         """How many directions the data say nothing at all about."""
-        return int(np.sum(self.singular_values < UNKNOWN * self.singular_values[0]))
+        return int(np.sum(self.singular_values < SETTINGS.unknown * self.singular_values[0]))
 
 
 CHI_SQUARE_MEDIAN = 2.366
 """Median of the chi-square distribution of 3 degrees of freedom."""
-
-FEWEST = 12
-"""Measured numbers beyond those that the parameters can explain, so that noise can be seen."""
-
-MAX_ITERATIONS = 60
-SMALLEST_STEP = 1e-7
-"""Step at which the iteration ends, in prior standard deviations."""
 
 
 def calibrate(
@@ -203,11 +214,11 @@ def calibrate(
     before, _ = fit.misfit(x)
     estimated = fit.enough()
     converged, steps = False, 0
-    while not converged and steps < MAX_ITERATIONS:
+    while not converged and steps < SETTINGS.max_iterations:
         step = fit.step(x, noise)
         x, last = x + step, noise
         noise = fit.noise(x, last) if estimated else last
-        converged = bool(np.abs(step).max() < SMALLEST_STEP)
+        converged = bool(np.abs(step).max() < SETTINGS.smallest_step)
         converged = converged and bool(np.allclose(noise, last, rtol=1e-4))
         steps += 1
     return fit.result(x, noise, estimated, before, steps, converged)
@@ -264,7 +275,10 @@ class _Fit:
         """Whether there are rows enough beyond what the parameters can explain."""
         _, jacobians = self.misfit(np.zeros(len(self.model.parameters)))
         rows = jacobians.reshape(-1, jacobians.shape[2])
-        return self._rows() - int(np.linalg.matrix_rank(rows, rtol=UNKNOWN)) >= FEWEST
+        return (
+            self._rows() - int(np.linalg.matrix_rank(rows, rtol=SETTINGS.unknown))
+            >= SETTINGS.fewest
+        )
 
     def noise(self, x: Array, noise: Array) -> Array:
         """Standard deviations from the medians of the misfits, which outliers hardly move."""

@@ -18,7 +18,7 @@ from casadi_ik.batches.target_table import polars_module
 from casadi_ik.datasets.conventions import Convention, convention_for, of_robot
 from casadi_ik.datasets.layouts import LAYOUTS, READERS, read_layout
 from casadi_ik.datasets.postures import (
-    FAR,
+    FIT,
     HandPoses,
     HandPostures,
     hand_postures,
@@ -40,8 +40,23 @@ Invalid = Literal["error", "drop", "clip"]
 
 INVALIDS = ("error", "drop", "clip")
 
-NOTICED = 1e-4
-"""A fingertip that was shifted less than this [m] counts as where it was."""
+
+@dataclass(frozen=True)
+class Reading:
+    """How candidates are read.
+
+    Attributes:
+        noticed: A fingertip that was shifted less than this [m] counts as where it was.
+        block: Rows of targets that are read at once.
+        touching: A pad that is nearer to the object than this [m] touches it.
+    """
+
+    noticed: float = 1e-4
+    block: int = 4096
+    touching: float = 0.01
+
+
+READING = Reading()
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +119,7 @@ class Candidates(Sequence[Grasp]):
             found.append(f"{self.dropped} of {whole} rows left out: invalid")
         if self.clipped:
             found.append(f"{self.clipped} of {whole} rows have joints put at their limits")
-        moved = 1e3 * self.shift[self.shift > NOTICED]
+        moved = 1e3 * self.shift[self.shift > READING.noticed]
         if len(moved):
             found.append(
                 f"fingertips of {len(moved)} candidates shifted, as the hand's joints are limited "
@@ -252,12 +267,6 @@ TAKES = ("palm", "contacts")
 TABLE = "table"
 """The layout of files with named columns."""
 
-BLOCK = 4096
-"""Rows of targets that are read at once."""
-
-TOUCHING = 0.01
-"""A pad that is nearer to the object than this [m] touches it."""
-
 
 def load_candidates(
     path: str | Path,
@@ -384,10 +393,10 @@ def _refuse_other_units(path: Path, grasps: Sequence[Grasp]) -> None:
     for grasp in grasps:
         for finger, contact in grasp.contacts.items():
             away = 0.0 if contact.point is None else float(np.linalg.norm(contact.point))
-            if away > FAR:
+            if away > FIT.far:
                 raise DescriptionError(
                     f"{path}: {grasp.name}: {finger}: point: found {away:.4g} m away, expected at "
-                    f"most {FAR:g} m (numbers in mm?)"
+                    f"most {FIT.far:g} m (numbers in mm?)"
                 )
 
 
@@ -496,7 +505,7 @@ def _contacts(
         rows = zip(robot.fingers, points, normals, strict=True)
         return {finger: Contact(point, normal) for finger, point, normal in rows}
     off = thing.signed_distance(points)
-    near = np.flatnonzero(np.abs(off) <= TOUCHING)
+    near = np.flatnonzero(np.abs(off) <= READING.touching)
     outward = thing.normal(points[near])
     surface = points[near] - off[near, None] * outward
     found = {
@@ -504,8 +513,8 @@ def _contacts(
     }
     if not found:
         raise DescriptionError(
-            f"no pad is within {1e3 * TOUCHING:g} mm of {thing.name}'s surface: the nearest is "
-            f"{1e3 * float(np.abs(off).min()):.1f} mm away"
+            f"no pad is within {1e3 * READING.touching:g} mm of {thing.name}'s surface: the "
+            f"nearest is {1e3 * float(np.abs(off).min()):.1f} mm away"
         )
     return found
 
@@ -514,7 +523,7 @@ def _of_targets(path: Path, fingers: tuple[str, ...]) -> list[Grasp]:
     found: list[Grasp] = []
     file = TargetFile(path, len(fingers))
     _refuse_too_many(str(path), file.rows())
-    for block in file.blocks(lambda: BLOCK):
+    for block in file.blocks(lambda: READING.block):
         for row in range(len(block["points"])):
             try:
                 given = {name: rows[row] for name, rows in block.items()}

@@ -16,14 +16,37 @@ from casadi_ik.grasps.pose import inverse
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.robots.poses import link_poses
 
-FAR = 5.0
-"""A hand farther from its object than this [m] is one in millimetres."""
+
+@dataclass(frozen=True)
+class PostureFit:
+    """How postures of data sets become what a robot's motors can take.
+
+    Attributes:
+        far: A hand farther from its object than this [m] is one in millimetres.
+        skew: How far a rotation may be from one: data sets keep four bytes a number.
+        beyond: A joint may be so far beyond its limits [rad or m]; it is then at the limit.
+        apart: How far a joint may be from where its coupling puts it [rad or m].
+        steps: Of the search for the nearest posture, at most.
+        difference: A motor moves so far for a derivative [rad or m].
+        stay: Squared metres at a fingertip that a radian of a motor counts as: what decides between
+            postures whose fingertips are as near.
+        settled: Steps are over when no motor moves farther [rad or m].
+    """
+
+    far: float = 5.0
+    skew: float = 2e-3
+    beyond: float = 0.02
+    apart: float = 0.02
+    steps: int = 40
+    difference: float = 1e-7
+    stay: float = 1e-6
+    settled: float = 1e-6
+
+
+FIT = PostureFit()
 
 LARGE = 4 * np.pi
 """A joint that is turned farther than this [rad] is one in degrees."""
-
-SKEW = 2e-3
-"""How far a rotation may be from one: data sets keep four bytes a number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +186,9 @@ class HandPoses:
             note(np.asarray(~finite), lambda _, text=text: text)
         away = np.linalg.norm(self.position, axis=1)
         note(
-            away > FAR,
+            away > FIT.far,
             lambda i: (
-                f"position: found {away[i]:.4g} m from the object, expected at most {FAR:g} m "
+                f"position: found {away[i]:.4g} m from the object, expected at most {FIT.far:g} m "
                 "(numbers in mm?)"
             ),
         )
@@ -181,7 +204,7 @@ class HandPoses:
         exact = left @ right
         off = np.abs(exact - rotation).reshape(len(exact), -1).max(axis=1)
         note(
-            (off > SKEW) | (np.linalg.det(exact) < 0),
+            (off > FIT.skew) | (np.linalg.det(exact) < 0),
             lambda _: "rotation: its columns are no rotation, expected a rigid pose",
         )
         whole = np.array([row not in found for row in self.rows])
@@ -252,26 +275,6 @@ def palms_of(
     pads = np.stack([moved @ poses[f.link] @ f.placement for f in described.fingers], axis=1)
     normals = [pads[:, i, :3, :3] @ f.normal for i, f in enumerate(described.fingers)]
     return palms, pads[:, :, :3, 3], np.stack(normals, axis=1)
-
-
-BEYOND = 0.02
-"""A joint may be so far beyond its limits [rad or m]; it is then at the limit."""
-
-APART = 0.02
-"""How far a joint may be from where its coupling puts it [rad or m]."""
-
-STEPS = 40
-"""Of the search for the nearest posture, at most."""
-
-SMALL = 1e-7
-"""A motor moves so far for a derivative [rad or m]."""
-
-STAY = 1e-6
-"""Squared metres at a fingertip that a radian of a motor counts as: what decides between postures
-whose fingertips are as near."""
-
-SETTLED = 1e-6
-"""Steps are over when no motor moves farther [rad or m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,7 +375,7 @@ def _beyond(
             row
         ): f"{names[i]}: found {values[row, i]:.4g}, expected {lower[i]:.4g} to {upper[i]:.4g}"
         for row, i in enumerate(worst)
-        if excess[row, i] > BEYOND
+        if excess[row, i] > FIT.beyond
     }
 
 
@@ -386,7 +389,7 @@ def _free(
         mine = np.isin(columns, described.finger_actuators(finger.name))
         for name in finger.joints:
             if name in said:
-                free |= (np.abs(said[name] - reached[name]) > APART)[:, None] & mine
+                free |= (np.abs(said[name] - reached[name]) > FIT.apart)[:, None] & mine
     return free
 
 
@@ -424,19 +427,19 @@ def _nearest(robot: ArmHand, columns: list[int], start: Array, free: Bools, want
         return (wanted - _tips(robot, columns, x)).reshape(count, -1)
 
     def cost(x: Array, miss: Array) -> Array:
-        return (miss**2).sum(axis=1) + STAY * ((x - start) ** 2).sum(axis=1)
+        return (miss**2).sum(axis=1) + FIT.stay * ((x - start) ** 2).sum(axis=1)
 
     x, miss = start.copy(), off(start)
     least, damping = cost(x, miss), np.full(count, 1e-4)
-    for _ in range(STEPS):
-        slopes = [miss - off(x + SMALL * one) for one in np.eye(m)]
-        jacobian = np.stack(slopes, axis=2) / SMALL
-        pull = np.einsum("krm,kr->km", jacobian, miss) - STAY * (x - start)
+    for _ in range(FIT.steps):
+        slopes = [miss - off(x + FIT.difference * one) for one in np.eye(m)]
+        jacobian = np.stack(slopes, axis=2) / FIT.difference
+        pull = np.einsum("krm,kr->km", jacobian, miss) - FIT.stay * (x - start)
         held = ~free | ((x <= lower) & (pull < 0)) | ((x >= upper) & (pull > 0))
         jacobian = np.where(held[:, None], 0.0, jacobian)
-        square = np.swapaxes(jacobian, 1, 2) @ jacobian + (damping + STAY)[:, None, None] * np.eye(
-            m
-        )
+        square = np.swapaxes(jacobian, 1, 2) @ jacobian + (damping + FIT.stay)[
+            :, None, None
+        ] * np.eye(m)
         step = np.linalg.solve(square, np.where(held, 0.0, pull)[..., None])[..., 0]
         tried = np.clip(np.asarray(x + step, dtype=np.float64), lower, upper)
         new = off(tried)
@@ -446,6 +449,6 @@ def _nearest(robot: ArmHand, columns: list[int], start: Array, free: Bools, want
         x, miss = np.where(better[:, None], tried, x), np.where(better[:, None], new, miss)
         least = np.where(better, value, least)
         damping = np.where(better, damping / 10, damping * 10)
-        if (moved < SETTLED).all():
+        if (moved < FIT.settled).all():
             break
     return x

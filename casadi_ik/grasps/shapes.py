@@ -338,17 +338,25 @@ def _bisect(function: Callable[[Array], Array], low: Array, high: Array) -> Arra
     return 0.5 * (low + high)
 
 
-AT_ONCE = 2_000_000
-"""Pairs of a point and a triangle that are looked at together."""
+@dataclass(frozen=True)
+class MeshDistance:
+    """How distances to meshes are found.
 
-ROUNDED = 1e-6
-"""How far a distance may be off that says only which triangles are near [m]."""
+    Attributes:
+        at_once: Pairs of a point and a triangle that are looked at together.
+        rounded: How far a distance may be off that says only which triangles are near [m].
+        beside: A triangle is inside another piece if what is so far before it is [m].
+    """
+
+    at_once: int = 2_000_000
+    rounded: float = 1e-6
+    beside: float = 1e-6
+
+
+MESHES = MeshDistance()
 
 RAYS = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3, 3)))[0]
 """(3, 3, 3) axes of whose third a ray goes."""
-
-BESIDE = 1e-6
-"""A triangle is inside another piece if what is so far before it is [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,7 +397,7 @@ class MeshShape:
         kept = []
         for i, (points, faces) in enumerate(self.pieces):
             corners = points[faces]
-            before = corners.mean(axis=1) + BESIDE * _normals(corners)
+            before = corners.mean(axis=1) + MESHES.beside * _normals(corners)
             hidden = np.zeros(len(corners), dtype=bool)
             for j, (others, planes) in enumerate(self.pieces):
                 if i != j:
@@ -400,7 +408,7 @@ class MeshShape:
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         distance, normal = np.empty(len(points)), np.empty((len(points), 3))
-        size = max(1, AT_ONCE // len(self._triangles))
+        size = max(1, MESHES.at_once // len(self._triangles))
         for start in range(0, len(points), size):
             some = slice(start, start + size)
             away, face = _to_triangles(points[some], self._outside)
@@ -485,7 +493,7 @@ def _in_convex(corners: Array, points: Array) -> Bools:
     found = np.zeros(len(points), dtype=bool)
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     near = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
-    size = max(1, AT_ONCE // len(corners))
+    size = max(1, MESHES.at_once // len(corners))
     for start in range(0, len(near), size):
         some = near[start : start + size]
         found[some] = (points[some] @ ways.T < offsets).all(axis=1)
@@ -527,7 +535,7 @@ def _to_triangles(points: Array, corners: Array) -> tuple[Array, Array]:
     to_middle = np.sqrt(np.maximum(squares - 2 * points @ middles.T, 0.0))
     away, face = np.empty((len(points), 3)), np.empty((len(points), 3))
     for i, point in enumerate(points):
-        near = np.flatnonzero(to_middle[i] - radii <= to_middle[i].min() + ROUNDED)
+        near = np.flatnonzero(to_middle[i] - radii <= to_middle[i].min() + MESHES.rounded)
         off = point - _nearest_points(point, corners[near])
         best = int(np.argmin(np.einsum("ti,ti->t", off, off)))
         away[i] = off[best]

@@ -20,26 +20,47 @@ from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, ShapeEntry, SphereEn
 
 Rows = NDArray[np.intp]
 
-LEAST_SAVING = 0.04
-"""Part of the volume that another capsule has to save, unless told."""
 
-INSIDE = 1500
-"""Points that volumes are counted by."""
+@dataclass(frozen=True)
+class ShapeFit:
+    """How links become capsules and boxes.
 
-TURNS = 5
-"""Rounds of random turns by which a capsule's axis is bettered."""
+    Attributes:
+        saving: Part of the volume that another capsule has to save, unless told.
+        inside: Points that volumes are counted by.
+        rounds: Rounds of random turns by which a capsule's axis is bettered.
+        turns: Turns of a round.
+        corners: Corners of a part that directions pick, to look for a capsule; all of them are held
+            at last.
+        pieces: Triangles are cut until no edge is longer than this part of the mesh.
+        box_saving: Part of the volume that another box has to save.
+        box_points: Points along an edge of a box's skin.
+        grid: What is fitted is rounded up to a tenth of a millimetre.
+        large: Links longer than this [m] may have more capsules than `most_of_small`.
+        most: Capsules of a large link, unless more are asked for.
+        most_of_small: Capsules of a small link, at the most.
+        least: What is smaller than this [m] is no shape.
+    """
 
-TOGETHER = 12
-"""Turns of a round."""
+    saving: float = 0.04
+    inside: int = 1500
+    rounds: int = 5
+    turns: int = 12
+    corners: int = 160
+    pieces: int = 12
+    box_saving: float = 0.12
+    box_points: int = 24
+    grid: float = 1e4
+    large: float = 0.13
+    most: int = 4
+    most_of_small: int = 2
+    least: float = 1e-4
+
+
+FIT = ShapeFit()
 
 WIDER = np.array([1.0, 1.02, 1.05, 1.1, 1.2, 1.35, 1.5])
 """Radii that are tried, as parts of the least."""
-
-CORNERS = 160
-"""Corners of a part that directions pick, to look for a capsule; all of them are held at last."""
-
-PIECES = 12
-"""Triangles are cut until no edge is longer than this part of the mesh."""
 
 
 BLOCK, SOME = 64, 16
@@ -93,7 +114,7 @@ class FittedCapsule:
 
 
 def fit(
-    triangles: Array, most: int = 4, saving: float = LEAST_SAVING
+    triangles: Array, most: int = 4, saving: float = FIT.saving
 ) -> tuple[list[FittedCapsule], float]:
     """Capsules that hold a mesh.
 
@@ -164,12 +185,12 @@ def around(points: Array, apart: Array) -> FittedCapsule:
     middle = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
     rng = np.random.default_rng(0)
-    ways = rng.normal(size=(CORNERS, 3))
+    ways = rng.normal(size=(FIT.corners, 3))
     picked = apart[np.unique((ways @ np.ascontiguousarray(apart.T)).argmax(axis=1))]
     best, axis = _along(picked, axes)
     spread = 0.3
-    for _ in range(TURNS):
-        tried = axis + spread * rng.normal(size=(TOGETHER, 3))
+    for _ in range(FIT.rounds):
+        tried = axis + spread * rng.normal(size=(FIT.turns, 3))
         one, way = _along(picked, tried / np.linalg.norm(tried, axis=1, keepdims=True))
         if one.volume < best.volume:
             best, axis = one, way
@@ -211,8 +232,8 @@ def _inside(capsule: FittedCapsule) -> Array:
     rng = np.random.default_rng(0)
     ends = np.stack([capsule.first, capsule.last])
     low, high = ends.min(axis=0) - capsule.radius, ends.max(axis=0) + capsule.radius
-    points = rng.uniform(low, high, (3 * INSIDE, 3))
-    return points[capsule.beyond(points) <= 0][:INSIDE]
+    points = rng.uniform(low, high, (3 * FIT.inside, 3))
+    return points[capsule.beyond(points) <= 0][: FIT.inside]
 
 
 def halves(part: Array) -> list[NDArray[np.bool_]]:
@@ -231,7 +252,7 @@ def halves(part: Array) -> list[NDArray[np.bool_]]:
 
 def cut(triangles: Array) -> Array:
     """The same surface in triangles without long edges."""
-    reach = float(np.ptp(triangles.reshape(-1, 3), axis=0).max()) / PIECES
+    reach = float(np.ptp(triangles.reshape(-1, 3), axis=0).max()) / FIT.pieces
     done: list[Array] = []
     while len(triangles):
         edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
@@ -284,13 +305,6 @@ def _squared(samples: Array, points: Array, squares: Array) -> Array:
     return np.maximum(least, 0)
 
 
-LEAST_SAVING_OF_BOXES = 0.12
-"""Part of the volume that another box has to save."""
-
-SPREAD = 24
-"""Points along an edge of a box's skin."""
-
-
 @dataclass(frozen=True, eq=False)
 class FittedBox:
     """A box.
@@ -317,7 +331,7 @@ class FittedBox:
 
     def skin(self) -> Array:
         """(k, 3) points of its surface."""
-        line = np.linspace(-0.5, 0.5, SPREAD)
+        line = np.linspace(-0.5, 0.5, FIT.box_points)
         u, v = (one.ravel() for one in np.meshgrid(line, line))
         faces = []
         for axis in range(3):
@@ -343,7 +357,7 @@ def fit_boxes(triangles: Array, most: int = 3) -> list[FittedBox]:
         if not options:
             break
         saved, i, two, pair = max(options, key=lambda option: option[0])
-        if saved < LEAST_SAVING_OF_BOXES * sum(one.volume for one in found):
+        if saved < FIT.box_saving * sum(one.volume for one in found):
             break
         parts[i : i + 1], found[i : i + 1] = two, pair
     return found
@@ -363,28 +377,12 @@ def box_around(points: Array) -> FittedBox:
     return found[1] if found[1].volume < 0.9 * found[0].volume else found[0]
 
 
-GRID = 1e4
-"""What is fitted is rounded up to a tenth of a millimetre."""
-
-LARGE = 0.13
-"""Links longer than this [m] may have more capsules than `SMALL`."""
-
-MOST = 4
-"""Capsules of a large link, unless more are asked for."""
-
-SMALL = 2
-"""Capsules of a small link, at the most."""
-
-LEAST = 1e-4
-"""What is smaller than this [m] is no shape."""
-
-
 def fitted(
     surfaces: Mapping[str, Surface],
     flat: Collection[str],
     known: Mapping[str, Sequence[ShapeEntry]] | None = None,
-    most: int = MOST,
-    saving: float = LEAST_SAVING,
+    most: int = FIT.most,
+    saving: float = FIT.saving,
 ) -> dict[str, list[ShapeEntry]]:
     """Shapes that hold links.
 
@@ -399,10 +397,12 @@ def fitted(
     for link, surface in surfaces.items():
         if known and link in known:
             found[link] = list(known[link])
-        elif len(surface.triangles) and float(np.ptp(surface.points, axis=0).max()) > LEAST:
-            large = float(np.ptp(surface.points, axis=0).max()) > LARGE
+        elif len(surface.triangles) and float(np.ptp(surface.points, axis=0).max()) > FIT.least:
+            large = float(np.ptp(surface.points, axis=0).max()) > FIT.large
             triangles = surface.points[surface.triangles]
-            found[link] = _held(triangles, most if large else SMALL, link in flat, saving)
+            found[link] = _held(
+                triangles, most if large else FIT.most_of_small, link in flat, saving
+            )
     return found
 
 
@@ -419,24 +419,24 @@ def _held(triangles: Array, most: int, flat: bool, saving: float) -> list[ShapeE
 
 def _capsule(one: FittedCapsule, beyond: float) -> ShapeEntry:
     first, last = (_rounded(end) for end in (one.first, one.last))
-    radius = math.ceil(one.radius * GRID + 0.9) / GRID
+    radius = math.ceil(one.radius * FIT.grid + 0.9) / FIT.grid
     if first == last:
         return SphereEntry(radius=radius, center=first, excess=beyond)
     return CapsuleEntry(ends=(first, last), radius=radius, excess=beyond)
 
 
 def _box(one: FittedBox, beyond: float) -> ShapeEntry:
-    size = np.ceil(one.size * GRID + 1.1) / GRID
+    size = np.ceil(one.size * FIT.grid + 1.1) / FIT.grid
     rpy = np.round(roll_pitch_yaw(one.rotation), 4)
     if np.any(rpy):  # what rounding may turn it by
-        size = np.ceil((size + 1e-4 * np.linalg.norm(size)) * GRID) / GRID
+        size = np.ceil((size + 1e-4 * np.linalg.norm(size)) * FIT.grid) / FIT.grid
     x, y, z = size.tolist()
     roll, pitch, yaw = (rpy + 0.0).tolist()
     return BoxEntry(size=(x, y, z), xyz=_rounded(one.center), rpy=(roll, pitch, yaw), excess=beyond)
 
 
 def _rounded(point: Array) -> tuple[float, float, float]:
-    x, y, z = (np.round(point * GRID) / GRID + 0.0).tolist()
+    x, y, z = (np.round(point * FIT.grid) / FIT.grid + 0.0).tolist()
     return x, y, z
 
 

@@ -24,8 +24,34 @@ WORDS = {
 }
 """What the fingers' names look like; a middle phalanx must not make a finger the middle one."""
 
-LONG_CHAIN = 6
-"""So many joints in a row are an arm, not a finger."""
+
+@dataclass(frozen=True)
+class GuessParameters:
+    """How fingers, thumb, pads and home are guessed.
+
+    Attributes:
+        arm_joints: So many joints in a row are an arm, not a finger.
+        postures: At random, over which opposition is averaged.
+        clear: By how much the thumb has to be more opposed than the next finger, of 2, to be called
+            clear.
+        parallel: Cosine above which two joints of a finger bend it the same way.
+        sure: Relative difference of distances above which they say which way a finger closes.
+        home_samples: Postures of the arm that are compared, if it has at most `usual_joints`.
+        usual_joints: Joints of an arm.
+        step: Of the differences that a Jacobian is made of [rad or m].
+    """
+
+    arm_joints: int = 6
+    postures: int = 64
+    clear: float = 0.15
+    parallel: float = 0.7
+    sure: float = 0.05
+    home_samples: int = 300
+    usual_joints: int = 12
+    step: float = 1e-6
+
+
+GUESS = GuessParameters()
 
 
 @dataclass(frozen=True)
@@ -54,7 +80,9 @@ def palms(tree: RobotTree) -> list[str]:
 
 def holds_arms(tree: RobotTree, palm: str) -> bool:
     """Whether what hangs on a link is rather arms than fingers."""
-    return any(_depth(tree, joint.child) + 1 >= LONG_CHAIN for joint in moving_below(tree, palm))
+    return any(
+        _depth(tree, joint.child) + 1 >= GUESS.arm_joints for joint in moving_below(tree, palm)
+    )
 
 
 def moving_below(tree: RobotTree, link: str) -> list[TreeJoint]:
@@ -174,13 +202,6 @@ def _stem(links: tuple[str, ...]) -> str:
     return re.sub(r"[^a-z0-9_]+", "_", common).strip("_")
 
 
-POSTURES = 64
-"""At random, over which opposition is averaged."""
-
-CLEAR = 0.15
-"""By how much the thumb has to be more opposed than the next finger, of 2, to be called clear."""
-
-
 def guess_thumb(postures: Postures, branches: list[Branch], pads: list[Pad]) -> tuple[int, str]:
     """The thumb's place among the fingers, and how it was found."""
     named = [i for i, branch in enumerate(branches) if branch.named and branch.name == "thumb"]
@@ -190,7 +211,7 @@ def guess_thumb(postures: Postures, branches: list[Branch], pads: list[Pad]) -> 
         return 0, "the only finger"
     rng = np.random.default_rng(0)
     opposed = np.zeros(len(branches))
-    for _ in range(POSTURES):
+    for _ in range(GUESS.postures):
         poses = postures.poses(postures.random(rng))
         normals = np.array([poses[pad.link][:3, :3] @ pad.normal for pad in pads])
         # Bent fingers all face the palm: what counts is how they face each other across it.
@@ -202,9 +223,9 @@ def guess_thumb(postures: Postures, branches: list[Branch], pads: list[Pad]) -> 
         normals -= np.outer(normals @ z, z)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         cosines = normals @ normals.T
-        opposed -= (cosines.sum(axis=1) - 1) / (len(branches) - 1) / POSTURES
+        opposed -= (cosines.sum(axis=1) - 1) / (len(branches) - 1) / GUESS.postures
     best, second = np.argsort(-opposed)[:2]
-    if opposed[best] - opposed[second] < CLEAR:
+    if opposed[best] - opposed[second] < GUESS.clear:
         lengths = [len(branch.chain) for branch in branches]
         if lengths.count(min(lengths)) == 1:  # the one that does not spread
             return lengths.index(min(lengths)), "none opposes the others most: the simplest finger"
@@ -245,14 +266,8 @@ def _unit(vector: Array, otherwise: Array) -> Array:
     return chosen / np.linalg.norm(chosen)
 
 
-PARALLEL = 0.7
-"""Cosine above which two joints of a finger bend it the same way."""
-
 TILT = np.cos(np.deg2rad(45.0))
 """The skin may be tilted so far from where the finger bends to."""
-
-SURE = 0.05
-"""Relative difference of distances above which they say which way a finger closes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,7 +413,7 @@ def _closing(
     for one in branch.chain[: index + 1]:
         if one.type == joint.type:
             cosine = float(poses[one.child][:3, :3] @ one.axis @ axis)
-            if abs(cosine) > PARALLEL:
+            if abs(cosine) > GUESS.parallel:
                 bending[one.name] = np.sign(cosine)
     base = next(one for one in branch.chain if one.name in bending)
 
@@ -413,7 +428,7 @@ def _closing(
     (plus, root), (minus, _) = tip(1.0), tip(-1.0)
     if len(bending) > 1:
         lengths = float(np.linalg.norm(plus - root)), float(np.linalg.norm(minus - root))
-        if abs(lengths[0] - lengths[1]) > SURE * max(lengths):
+        if abs(lengths[0] - lengths[1]) > GUESS.sure * max(lengths):
             return (1.0 if lengths[0] < lengths[1] else -1.0), "faces the way the finger bends"
     here = poses[joint.child]
     place = _apply(here, end)
@@ -435,17 +450,8 @@ def _any_across(axis: Array) -> Array:
     return _unit(across, axis)
 
 
-SAMPLES = 300
-"""Postures of the arm that are compared, if it has no more joints than `USUAL`."""
-
-USUAL = 12
-"""Joints of an arm."""
-
 TURN = np.pi / 2
 """A joint is not turned further than this from the middle of its range, however wide it is."""
-
-STEP = 1e-6
-"""Of the differences that a Jacobian is made of [rad or m]."""
 
 
 def guess_home(robot: RobotDescription) -> Array:
@@ -459,7 +465,9 @@ def guess_home(robot: RobotDescription) -> Array:
     half = np.minimum((robot.upper - robot.lower)[arm] / 4, TURN)
     best, found = -1.0, middle
     # What a posture takes grows with the square of the joints.
-    for i in range(max(1, int(SAMPLES * min(1.0, (USUAL / len(arm)) ** 2)))):
+    for i in range(
+        max(1, int(GUESS.home_samples * min(1.0, (GUESS.usual_joints / len(arm)) ** 2)))
+    ):
         q = middle.copy()
         if i:
             q[arm] += half * rng.uniform(-1, 1, len(arm))
@@ -475,8 +483,8 @@ def _freedom(robot: RobotDescription, chain: tuple[Joint, ...], q: Array, arm: l
     columns = []
     for i in arm:
         other = q.copy()
-        other[i] += STEP
-        change = (_palm(robot, chain, other) - pose) @ np.linalg.inv(pose) / STEP
+        other[i] += GUESS.step
+        change = (_palm(robot, chain, other) - pose) @ np.linalg.inv(pose) / GUESS.step
         columns.append([*change[:3, 3], change[2, 1], change[0, 2], change[1, 0]])
     values = np.linalg.svd(np.array(columns).T, compute_uv=False)
     return float(values[: min(6, len(arm))].min())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, Protocol
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import between_segments
-from casadi_ik.importing.capsules import GRID, fitted
+from casadi_ik.importing.capsules import FIT, fitted
 from casadi_ik.importing.posture import Jointed, Postures
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.robots.collision import Touching, capsules_of
@@ -35,23 +36,29 @@ def hand_links(robot: RobotDescription) -> frozenset[str]:
     return frozenset(found)
 
 
-SAMPLES = 2000
-"""Random configurations, seed 0."""
+@dataclass(frozen=True)
+class ContactSampling:
+    """How it is told whether links whose shapes touch may touch.
 
-ENOUGH = 100
-"""Configurations in which shapes touch that are enough to say that meshes never do."""
+    Attributes:
+        samples: Random configurations, seed 0.
+        enough: Configurations in which shapes touch that are enough to say that meshes never do.
+        looked_at: Of those, in so many the meshes are looked at.
+        nested: Meshes that meet in a larger part of the configurations are built into each other.
+        told_apart: Part of the configurations without contact that an allowed overlap has to leave
+            free.
+        depth: Part of the depth at which meshes meet that shapes may overlap.
+    """
 
-LOOKED_AT = 300
-"""Of those, in so many the meshes are looked at."""
+    samples: int = 2000
+    enough: int = 100
+    looked_at: int = 300
+    nested: float = 0.5
+    told_apart: float = 0.5
+    depth: float = 0.9
 
-NESTED = 0.5
-"""Meshes that meet in a larger part of the configurations are built into each other."""
 
-TOLD_APART = 0.5
-"""Part of the configurations without contact that an allowed overlap has to leave free."""
-
-LESS = 0.9
-"""Part of the depth at which meshes meet that shapes may overlap."""
+SAMPLING = ContactSampling()
 
 
 class Moved(Jointed, Protocol):
@@ -76,7 +83,7 @@ def may_touch(
     postures, rng = Postures(part), np.random.default_rng(0)
     joints = {joint.name: joint for joint in part.joints}
     motors = list(part.actuators)
-    poses = [postures.poses(_values(joints, motors, rng)) for _ in range(SAMPLES)]
+    poses = [postures.poses(_values(joints, motors, rng)) for _ in range(SAMPLING.samples)]
     bodies = {part.root: part.root}
     neighbours = set()
     for joint in part.joints:
@@ -92,7 +99,7 @@ def may_touch(
     for one, other in combinations(shapes, 2):
         if bodies[one] == bodies[other] or frozenset((bodies[one], bodies[other])) in neighbours:
             continue
-        least = np.full(SAMPLES, np.inf)
+        least = np.full(SAMPLING.samples, np.inf)
         for i, (_, _, radius) in enumerate(capsules[one]):
             for j, (_, _, wide) in enumerate(capsules[other]):
                 apart, _ = between_segments(segments[one][:, i], segments[other][:, j])
@@ -106,10 +113,10 @@ def _verdict(
 ) -> list[Touching]:
     """What is to be said of two links whose shapes are `least` (k,) [m] apart."""
     hit = np.flatnonzero(least < 0)
-    if len(hit) < ENOUGH:
+    if len(hit) < SAMPLING.enough:
         return []
-    looked, always = hit[:LOOKED_AT], len(hit) == SAMPLES
-    said = f"their shapes touch in {len(hit)} of {SAMPLES} random configurations, seed 0, "
+    looked, always = hit[: SAMPLING.looked_at], len(hit) == SAMPLING.samples
+    said = f"their shapes touch in {len(hit)} of {SAMPLING.samples} random configurations, seed 0, "
     if not meshes.known:
         return [Touching(links, said + "their meshes were not looked at")] if always else []
     if not any(meshes.touch(poses[row], *links) for row in looked.tolist()):
@@ -120,8 +127,8 @@ def _verdict(
     said += f"their meshes in {meet.sum()} of {len(looked)}"
     # As deep as where the meshes meet they may not be, if that tells the two apart.
     depths = -least[looked]
-    depth = math.floor(LESS * float(depths[meet].min()) * GRID) / GRID
-    if meet.mean() > NESTED or (depths[~meet] < depth).mean() < TOLD_APART:
+    depth = math.floor(SAMPLING.depth * float(depths[meet].min()) * FIT.grid) / FIT.grid
+    if meet.mean() > SAMPLING.nested or (depths[~meet] < depth).mean() < SAMPLING.told_apart:
         return [Touching(links, said + ", which these shapes cannot tell")]
     return [Touching(links, said + ", all deeper", depth)]
 

@@ -8,6 +8,7 @@ turns where rod and ground align), and their ends by bisection.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,20 +19,28 @@ from casadi_ik.errors import DescriptionError
 if TYPE_CHECKING:
     from casadi_ik.robots.description import Actuator, Joint
 
-GRID = 1025
-"""Positions of a motor's range that are looked at first."""
 
-ZOOMS = 2
-"""How often the surroundings of the worst positions are looked at once more, as finely."""
+@dataclass(frozen=True)
+class RangeSearch:
+    """How the ranges of motors are found that keep all joints within limits.
 
-ZOOMED = 8
-"""Positions about which the grid is made finer."""
+    Attributes:
+        grid: Positions of a motor's range that are looked at first.
+        zooms: How often the surroundings of the worst positions are looked at once more, as finely.
+        zoomed: Positions about which the grid is made finer.
+        rounding: By how much a joint may be beyond a limit [rad or m] by the arithmetic of its
+            coupling.
+        halvings: Bisections of an interval of the grid: down to neighbouring numbers.
+    """
 
-ROUNDING = 1e-12
-"""By how much a joint may be beyond a limit [rad or m] by the arithmetic of its coupling."""
+    grid: int = 1025
+    zooms: int = 2
+    zoomed: int = 8
+    rounding: float = 1e-12
+    halvings: int = 80
 
-HALVINGS = 80
-"""Bisections of an interval of the grid: down to neighbouring numbers."""
+
+SEARCH = RangeSearch()
 
 
 def motor_ranges(
@@ -112,13 +121,13 @@ def _narrowed(moved: list[Follower], actuator: Actuator, near: float) -> tuple[f
             np.maximum(joint.lower - position(q), position(q) - joint.upper)
             for joint, position in followers
         ]
-        worst: Array = np.max(beyond, axis=0) - ROUNDING
+        worst: Array = np.max(beyond, axis=0) - SEARCH.rounding
         return worst
 
     inside = min(max(near, actuator.lower), actuator.upper)
-    grid: Array = np.append(np.linspace(actuator.lower, actuator.upper, GRID), inside)
+    grid: Array = np.append(np.linspace(actuator.lower, actuator.upper, SEARCH.grid), inside)
     grid.sort()
-    for _ in range(ZOOMS):
+    for _ in range(SEARCH.zooms):
         grid = _finer(grid, excess(grid))
     edges = np.flatnonzero(np.diff(excess(grid) <= 0, prepend=False, append=False)).tolist()
     runs = [(first, last - 1) for first, last in zip(edges[::2], edges[1::2], strict=True)]
@@ -137,14 +146,14 @@ def _finer(q: Array, excess: Array) -> Array:
     """The grid with more positions about the local extremes of the excess."""
     before, here, after = excess[:-2], excess[1:-1], excess[2:]
     extreme = np.flatnonzero((here - before) * (after - here) <= 0) + 1
-    worst = extreme[np.argsort(np.abs(excess[extreme]), kind="stable")[:ZOOMED]]
-    more = [np.linspace(q[i - 1], q[i + 1], GRID) for i in worst.tolist()]
+    worst = extreme[np.argsort(np.abs(excess[extreme]), kind="stable")[: SEARCH.zoomed]]
+    more = [np.linspace(q[i - 1], q[i + 1], SEARCH.grid) for i in worst.tolist()]
     return np.unique(np.concatenate([q, *more]))
 
 
 def _edge(excess: Callable[[Array], Array], outside: float, inside: float) -> float:
     """The last position inside, by bisection."""
-    for _ in range(HALVINGS):
+    for _ in range(SEARCH.halvings):
         middle = (outside + inside) / 2
         if excess(np.array([middle]))[0] <= 0:
             inside = middle
