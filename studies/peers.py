@@ -24,7 +24,7 @@ from samplers import random_arm_targets
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.methods.common.even_spread import evenly
+from casadi_ik.symbolic.even_spread import evenly
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 

@@ -12,6 +12,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arms.recognise import family_in_words, is_searched
 from casadi_ik.cli.answer import Answer, Exit
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.question import located
@@ -24,7 +25,6 @@ from casadi_ik.importing.check import largest_difference
 from casadi_ik.importing.imported import Imported
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.robots.parts import PREFIX
-from casadi_ik.symbolic.closed_arms.in_words import form_in_words, is_searched
 
 SAMPLES = 20
 """Postures in which kinematics are compared."""
@@ -176,7 +176,7 @@ def _report(robot: ArmHand, found: Imported, differences: dict[str, float]) -> l
         pairs["mount"] = lines.mount_how
     pairs["palm"] = f"{lines.hand.end}: {lines.hand.how}"
     if arm:
-        pairs["closed form"] = form_in_words(description)
+        pairs["closed form"] = family_in_words(description)
     pairs["thumb"] = f"{lines.thumb[0]}: {lines.thumb[1]}"
     for line in filter(None, (lines.arm, lines.hand)):
         if line.limits:

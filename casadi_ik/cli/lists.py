@@ -6,6 +6,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from casadi_ik.arms.recognise import family_in_words
 from casadi_ik.cli.answer import Answer
 from casadi_ik.cli.report import fields, table
 from casadi_ik.files.reading import convert, read_yaml
@@ -14,7 +15,6 @@ from casadi_ik.grasps.load import GraspFile
 from casadi_ik.registry import METHODS, method_summary
 from casadi_ik.robots import load_description
 from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile
-from casadi_ik.symbolic.closed_arms.in_words import form_in_words
 
 
 def robots() -> Answer:
@@ -34,7 +34,7 @@ def robots() -> Answer:
             "actuators": f"{len(robot.actuators)}: {', '.join(robot.actuator_names)}",
         }
         if robot.arm_actuators:
-            pairs["arm"] = f"closed form: {form_in_words(robot)}"
+            pairs["arm"] = f"closed form: {family_in_words(robot)}"
         description = convert(read_yaml(path), ArmHandFile, path).description
         parts += [Text(name, "bold"), Text(f"  {description}"), fields(pairs)]
     return Answer(Group(*parts, *_catalogue()))
@@ -48,7 +48,7 @@ def _catalogue() -> list[RenderableType]:
         path = resolve(name, "arms")
         arm = convert(read_yaml(path), ArmFile, path)
         count = sum(joint.type != "fixed" for joint in arm.joints)
-        form = form_in_words(load_description(f"{name}+{some_hand}"))
+        form = family_in_words(load_description(f"{name}+{some_hand}"))
         arms.add_row(name, str(count), form, _short(arm.description))
     hands = table("hand", "motors", "fingers", "what it is", right=("motors", "fingers"))
     for name in shipped_names("hands"):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arms.search import arms_graph
 from casadi_ik.collision.model import CollisionModel, own_solids
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import C_NAMES, EXPORTED
@@ -23,13 +24,12 @@ from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.kernels.swing_kernel import ArmPlaces
-from casadi_ik.methods.common.arm_branches import arms_graph
-from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import ROUNDING, SceneCheck
 from casadi_ik.solving.alternatives.arm_places import arm_places
 from casadi_ik.solving.alternatives.free_search import ALIKE, LEAST_RANGE, ROUNDS
 from casadi_ik.solving.alternatives.idle_fingers import CLOSER, NEAR, PARTS, PLACES
+from casadi_ik.symbolic.even_spread import even_steps
 
 MOST = 1000
 """The largest capacity: each solid costs kilobytes."""
@@ -83,7 +83,7 @@ class SceneSources:
     @cached_property
     def places(self) -> ArmPlaces | None:
         """Where arms are looked at; None where they have no closed form."""
-        arm = self.method.step.placed
+        arm = self.method.step.arm
         return None if arm is None else arm_places(self.robot, arm)
 
     @property
@@ -97,7 +97,7 @@ class SceneSources:
     @property
     def arms(self) -> FunctionGraph | None:
         """All arms of a palm; None where they have no closed form."""
-        arm = self.method.step.placed
+        arm = self.method.step.arm
         return None if arm is None else arms_graph(arm, "all_arms", "")
 
     @property

@@ -105,9 +105,7 @@ class ArmPlaces:
     @property
     def branches(self) -> int:
         """How many branches there are."""
-        # As in C: of places of several numbers the sign of the first tells branches apart.
-        signs = len(np.unique(self.levels[0][:, 0] < 0)) if self.levels[0].shape[1] > 1 else 1
-        return signs * self.sides
+        return self.sides
 
 
 @dataclass(frozen=True, eq=False)

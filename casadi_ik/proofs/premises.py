@@ -11,13 +11,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arms.family import Sphere
+from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.arrays import Array
-from casadi_ik.errors import UnsupportedError
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.robots.poses import link_poses
-from casadi_ik.symbolic.srs_arm import Spherical, srs_arm
 
 OUTWARDS = 2 * LIMIT_SLACK
 """Limits are taken so much wider [rad or m], since the verdict allows half of it."""
@@ -284,12 +284,11 @@ class ArmCones:
 
 def arm_cones(robot: RobotDescription) -> ArmCones | None:
     """The cones of an arm of that kind, else None."""
-    try:
-        arm = srs_arm(robot)
-    except UnsupportedError:
+    arm = srs_arm(robot)
+    if arm is None:
         return None
 
-    def third(joints: Spherical) -> Array:
+    def third(joints: Sphere) -> Array:
         return joints.frame @ [np.sin(joints.offset), 0.0, np.cos(joints.offset)]
 
     upper, fore = (float(np.linalg.norm(link)) for link in (arm.upper_arm, arm.forearm))
@@ -301,7 +300,7 @@ def arm_cones(robot: RobotDescription) -> ArmCones | None:
         shoulder=arm.shoulder,
         wrist=arm.wrist_in_palm,
         first=along * arm.shoulder_joints.frame[:, 2],
-        last=ahead * (arm.palm_rotation.T @ third(arm.wrist_joints)),
+        last=ahead * (arm.screws.rotation.T @ third(arm.wrist_joints)),
         lengths=(upper, fore),
         offsets=(arm.shoulder_joints.offset, arm.wrist_joints.offset),
     )

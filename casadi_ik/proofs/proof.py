@@ -15,8 +15,8 @@ from itertools import combinations
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.arrays import Array, Bools
-from casadi_ik.errors import UnsupportedError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.problem.problems import Problems
 from casadi_ik.proofs.numeric_bounds import (
@@ -39,7 +39,6 @@ from casadi_ik.proofs.premises import (
 )
 from casadi_ik.proofs.quantities import Quantity, asked_values, quantities_of, rigid_invariants
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.srs_arm import reach, srs_arm
 
 SLACK = 1e-8
 """Ten times the search's own slack for rounding [m, rad]."""
@@ -385,15 +384,14 @@ class _Search:
     @cached_property
     def _arm(self) -> tuple[Array, Array, float, float]:
         """Shoulder, wrist in the palm, and what their distance can be [m]."""
-        try:
-            arm = srs_arm(self.robot)
-        except UnsupportedError:
+        arm = srs_arm(self.robot)
+        if arm is None:
             general = arm_span(self.robot)
             assert general is not None
             return general.shoulder, general.wrist, *general.span(self.asked)
         elbow = self.robot.arm_actuators[3]
         lower, upper = (np.clip(end, -1e3, 1e3) for end in motor_ends(self.robot, self.asked))
-        ends = reach(arm, lower[elbow] - OUTWARDS, upper[elbow] + OUTWARDS)
+        ends = arm.reach(lower[elbow] - OUTWARDS, upper[elbow] + OUTWARDS)
         near, far = (float(end) for end in ends)
         return arm.shoulder, arm.wrist_in_palm, near - SLACK, far + SLACK
 

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import casadi_ik as ik
+from casadi_ik.arms.recognise import srs_arm
+from casadi_ik.arms.search import PARAMETERS, ArmSearch, Farthest
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, place_arm
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.closed_chain import closed_chain, split
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.srs_arm import reach, srs_arm
 
 LENGTH = 0.1
 """Unit of the constraint's linear rows [m]: about the size of a hand."""
@@ -46,10 +46,12 @@ class HeldThumb:
         rotation, origin, trial = ca.MX.sym("R", 3, 3), ca.MX.sym("p", 3), ca.MX.sym("trial")
         palm: Any = Pose(cast(Any, rotation), cast(Any, origin))
         lower, upper = (ca.MX(ca.DM(x[self.arm].tolist())) for x in (robot.lower, robot.upper))
-        self._srs = arm = srs_arm(robot.description)
-        elbow = self.arm[3]
-        self._reach = [float(x) for x in reach(arm, robot.lower[elbow], robot.upper[elbow])]
-        _, margin = place_arm(arm, palm, lower, upper, trial)
+        arm, elbow = srs_arm(robot.description), self.arm[3]
+        assert arm is not None
+        self._srs, self._search = arm, ArmSearch(arm, Farthest())
+        self._reach = [float(x) for x in arm.reach(robot.lower[elbow], robot.upper[elbow])]
+        best = lower, trial
+        _, margin, _ = self._search.trial(palm, (lower, upper), trial, best, trial)
         self._margin = FunctionKernel(ca.Function("margin", [rotation, origin, trial], [margin]))
 
     def palms(self, q: Array, contact: tuple[Array, Array], turn: Array) -> tuple[Array, Array]:
@@ -75,11 +77,11 @@ class HeldThumb:
     def followed(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:
         """(k,) whether some arm configuration within limits has its palm there."""
         found = np.zeros(len(origin), dtype=bool)
-        for trial in range(ITERATIONS):
+        for trial in range(self._search.trials):
             rest = np.flatnonzero(~found)
             if len(rest):
                 (margin,) = self._margin(rotation[rest], origin[rest], float(trial))
-                found[rest] = margin >= ALLOWED
+                found[rest] = margin >= PARAMETERS.allowed
         return found
 
     def in_reach(self, rotation: Array, origin: Array) -> NDArray[np.bool_]:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.methods.common.arm_branches import arms_graph
+from casadi_ik.arms.recognise import arm_family
+from casadi_ik.arms.search import arms_graph
 from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.solving.alternatives.arm_places import arm_places
 from casadi_ik.solving.alternatives.swings import ArmSwings
-from casadi_ik.symbolic.closed_arms.held import held_arm
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_the_first_hand_of_a_target_with_an_arm_is_enough(swings, robot, hands, 
 def test_an_arm_with_a_wrist_is_seen_with_the_wrist_anywhere(name, sides):
     """All arms at the wrist of a posture have its palm; one of them is the posture's own."""
     robot = ik.load_robot(name)
-    arm = held_arm(robot.description)
+    arm = arm_family(robot.description)
     assert arm is not None
     assert len(arm.held) == 2
     at = arms_graph(arm, "arms_of_wrist", "").function

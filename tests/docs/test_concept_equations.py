@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import expm, logm
 
 import casadi_ik as ik
+from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.methods.common.palm_fit import HandContacts, best_palm
 from casadi_ik.papers.qiu import tasks
 from casadi_ik.papers.qiu.tasks import MILLIMETRE, Task, combine, palm_motion
@@ -22,7 +23,6 @@ from casadi_ik.symbolic.closed_chain import closed_chain, split
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times, weighted_damped_pinv_times
 from casadi_ik.symbolic.planar_finger import planar_finger
-from casadi_ik.symbolic.srs_arm import srs_arm, swivel
 
 
 def number(expression: Any) -> np.ndarray:
@@ -164,12 +164,14 @@ def test_elbow_and_swivel(robot: ik.ArmHand, rng: np.random.Generator) -> None:
     """Hand first: the elbow from the law of cosines, the swivel affine in cosine and sine."""
     q = robot.random(rng, 1)[0]
     arm, pose = srs_arm(robot.description), robot.palm(q)
-    found = swivel(arm, Pose(ca.SX(pose[:3, :3]), ca.SX(pose[:3, 3])), ca.SX(np.sign(q[3])))
+    assert arm is not None
+    palm = Pose(ca.SX(pose[:3, :3]), ca.SX(pose[:3, 3]))
+    (found,) = arm.bends(palm, ca.SX(0.0), (ca.SX(np.sign(q[3])),))
     line = pose[:3, 3] + pose[:3, :3] @ arm.wrist_in_palm - arm.shoulder
     a, b = np.linalg.norm(arm.upper_arm), np.linalg.norm(arm.forearm)
     cosine = (line @ line - a**2 - b**2) / (2 * a * b)
     expected = np.sign(q[3]) * np.arctan2(np.sqrt(1 - cosine**2), cosine) - arm.bent
-    assert number(found.elbow) == pytest.approx(expected)
+    assert number(found.joints[3]) == pytest.approx(expected)
     assert expected == pytest.approx(q[3])
     u, psi = line / np.linalg.norm(line), 0.7
     rotated = np.outer(u, u) + np.cos(psi) * (np.eye(3) - np.outer(u, u)) + np.sin(psi) * skew(u)

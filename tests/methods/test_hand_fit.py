@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.methods.common.numeric_arm import (
     STARTS,
     TABLE,
@@ -28,7 +29,6 @@ from casadi_ik.problem.contacts.kinds import usual
 from casadi_ik.problem.contacts.rows import ContactRows, chord, within_tolerance
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import compose, exp_se3
-from casadi_ik.symbolic.srs_arm import srs_arm
 
 ARM, HAND = 7, 7
 ROWS = ContactRows(usual(3))

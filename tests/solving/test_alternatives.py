@@ -7,10 +7,10 @@ import pytest
 from robot_variants import derived_robot
 
 import casadi_ik as ik
+from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.solving.alternatives.branches import ArmBranches
 from casadi_ik.solving.alternatives.finder import APART, DISTINCT
-from casadi_ik.symbolic.srs_arm import srs_arm
 
 ARM = slice(0, 7)
 

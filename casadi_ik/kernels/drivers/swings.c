@@ -217,10 +217,9 @@ static int look(const swings_job *job, scratch *space, int64_t hand, pool *to, i
   if (code != DONE) return code;
   for (s = 0; s < count; ++s) {
     const double *slack = to->found + s * size + job->n_sides * job->n_arm;
-    const int64_t bent = job->n_free > 1 && space->samples[s * wide + PALM] < 0;
     for (k = 0; k < job->n_sides; ++k) {
       if ((side < 0 || k == side) && slack[k] >= 0) {
-        add(job, hand, to, s * size + k * job->n_arm, s, bent * job->n_sides + k);
+        add(job, hand, to, s * size + k * job->n_arm, s, k);
       }
     }
   }
@@ -306,7 +305,7 @@ static int refine(const swings_job *job, scratch *space, int64_t hand, const dou
     memcpy(freedom, place, (size_t) job->n_free * sizeof(double));
     freedom[job->n_free - 1] += job->closer[i];
   }
-  code = look(job, space, hand, &space->near, job->n_closer, group % job->n_sides);
+  code = look(job, space, hand, &space->near, job->n_closer, group);
   if (code == DONE) code = measured(job, space, hand, &space->near);
   if (code == DONE) code = pick(job, space, hand, &space->near, group, better, &chosen);
   if (code == DONE && chosen >= 0) {

@@ -13,7 +13,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import LookupKernel
 from casadi_ik.methods.common.contact_shape import contact_shape
-from casadi_ik.methods.common.even_spread import evenly
+from casadi_ik.symbolic.even_spread import evenly
 
 
 class PostureTable:

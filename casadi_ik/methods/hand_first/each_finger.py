@@ -16,12 +16,12 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.recipe import recipe
-from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.methods.hand_first.going_on import MANY
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.alignment import align
+from casadi_ik.symbolic.even_spread import evenly
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
 

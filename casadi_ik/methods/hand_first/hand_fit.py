@@ -11,19 +11,17 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from casadi_ik.arms.family import ArmFamily
 from casadi_ik.methods.common.bounded_step import clip, damped_step
 from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.methods.common.palm_fit import HandContacts, hand_contacts
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.problem.contacts.conditions import LENGTH, Vectors
 from casadi_ik.problem.contacts.rows import ContactRows
-from casadi_ik.symbolic.closed_arms.form import ClosedForm
-from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import compose, exp_se3
-from casadi_ik.symbolic.smooth import Expr, safe_norm
+from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.so3 import skew
-from casadi_ik.symbolic.srs_arm import SrsArm, reach
 
 PASSES = 2
 """Corrections of the active set in a step."""
@@ -82,39 +80,26 @@ def _seen(goals: list[Vectors], x: PalmAndHand) -> list[Vectors]:
 
 
 def reach_row(
-    arm: ArmForm, columns: Sequence[int], x: PalmAndHand, p: dict[str, Expr]
-) -> tuple[Expr, Expr]:
-    """How far the wrist is out of the arm's reach, by `LENGTH`, and its slope (1, 6).
+    arm: ArmFamily, columns: Sequence[int], x: PalmAndHand, p: dict[str, Expr]
+) -> tuple[Expr, Expr] | None:
+    """How far the palm is out of the arm's reach, by `LENGTH`, and its slope (1, 6).
 
     Where contacts leave the hand a freedom (three parallel fingers), it is spent on bringing the
-    wrist where the elbow can follow. Zero, with slope zero, within reach.
+    wrist where the elbow can follow. Zero, with slope zero, within reach. None: nothing is known.
     """
-    if not isinstance(arm, SrsArm):
-        return _form_row(arm, columns, x, p)
-    near, far = reach(arm, p["lower"][columns[3]], p["upper"][columns[3]])
-    wrist = ca.DM(arm.wrist_in_palm)
-    line = x.origin + x.rotation @ wrist - ca.DM(arm.shoulder)
-    distance = safe_norm(line)
-    beyond = distance - ca.fmin(ca.fmax(distance, near), far)
-    along = x.rotation.T @ line / distance
-    slope = ca.horzcat(along.T, ca.cross(wrist, along).T) * (ca.fabs(beyond) > 0)
-    return p["reach"] * beyond / LENGTH, p["reach"] * slope / LENGTH
-
-
-def _form_row(
-    form: ClosedForm, columns: Sequence[int], x: PalmAndHand, p: dict[str, Expr]
-) -> tuple[Expr, Expr]:
-    """The same for other arms in closed form."""
     shift, turn = ca.SX.sym("shift", 3), ca.SX.sym("turn", 3)
     moved = Pose(
         x.rotation @ (ca.SX.eye(3) + skew(turn)),
         x.origin + x.rotation @ shift,
     )
     bounds = p["lower"][list(columns)], p["upper"][list(columns)]
-    beyond = form.beyond(moved, *bounds)
-    if not form.exact:
-        # What the ideal arm cannot reach by so little the real one may.
-        beyond -= ca.fmin(ca.fmax(beyond, -form.off), form.off)
+    beyond = arm.beyond(moved, *bounds)
+    if beyond is None:
+        return None
+    if not arm.exact:
+        # What the nominal arm cannot reach by so little the real one may.
+        error = arm.model_error
+        beyond -= ca.fmin(ca.fmax(beyond, -error), error)
     motion = ca.vertcat(shift, turn)
     slope = ca.jacobian(beyond, motion)
     here = ca.substitute([beyond, slope], [motion], [ca.SX.zeros(6, 1)])
@@ -123,7 +108,7 @@ def _form_row(
 
 def fit_step(
     layouts: HandFirstLayouts,
-    arm: ArmForm | None,
+    arm: ArmFamily | None,
     x: PalmAndHand,
     damping: Expr,
     p: dict[str, Expr],
@@ -155,14 +140,15 @@ def fit_step(
 
 
 def _rows(
-    layouts: HandFirstLayouts, arm: ArmForm | None, x: PalmAndHand, p: dict[str, Expr]
+    layouts: HandFirstLayouts, arm: ArmFamily | None, x: PalmAndHand, p: dict[str, Expr]
 ) -> tuple[Expr, Expr]:
     """Residual and Jacobian of contacts and reach."""
     contacts = hand_contacts(layouts.robot, x.hand, layouts.robot.hand_actuators)
     asked = contacts, layouts.contacts, x, p
     residual, jacobian = fit_residual(*asked), fit_jacobian(*asked)
-    if arm is None:
+    row = None if arm is None else reach_row(arm, layouts.robot.arm_actuators, x, p)
+    if row is None:
         return residual, jacobian
-    beyond, slope = reach_row(arm, layouts.robot.arm_actuators, x, p)
+    beyond, slope = row
     slope = ca.horzcat(slope, ca.SX(1, len(layouts.robot.hand_actuators)))
     return ca.vertcat(residual, beyond), ca.vertcat(jacobian, slope)

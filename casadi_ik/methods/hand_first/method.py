@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.arms.recognise import arm_family
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
 from casadi_ik.kernels.robot_kernels import RobotKernels
@@ -46,8 +47,6 @@ from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.proofs.premises import ArmSpan, arm_span, palms_in_span
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.closed_arms.held import held_arm
-from casadi_ik.symbolic.closed_arms.recognise import arm_form
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
@@ -88,9 +87,7 @@ class HandFirstMethod(LoopedMethod):
         self.rounds = min(every, options.max_rounds or every)
         self._near, self._returns = near_cost(motors), most_returns(motors)
         self._kinds = kinds or usual(len(robot.fingers))
-        self.step = HandFirstStep(
-            robot, arm_form(robot) or held_arm(robot), options.candidates, self._kinds
-        )
+        self.step = HandFirstStep(robot, arm_family(robot), options.candidates, self._kinds)
         self._alone = OneByOne(self.step.layouts, self.rounds_plan)
         self._kept: tuple[Any, Array] | None = None
 

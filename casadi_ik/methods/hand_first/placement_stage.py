@@ -1,89 +1,59 @@
-"""Arm placement: arms in closed form are tried, and the one farthest from its limits is kept."""
+"""Arm placement: arms of a family are tried, and the one farthest from its limits is kept."""
 
 from __future__ import annotations
 
 import casadi as ca
 
-from casadi_ik.methods.common.arm_placement import ALLOWED, ITERATIONS, NO_MARGIN, place_arm
-from casadi_ik.methods.common.form_search import (
-    PLACEMENT,
-    THOROUGH,
-    WINDOWS,
-    beginnings,
-    place_form,
-    trials,
-)
-from casadi_ik.methods.common.held_search import holds, place_held
-from casadi_ik.methods.common.nearly_closed import brought_to
+from casadi_ik.arms.family import ArmFamily
+from casadi_ik.arms.search import PARAMETERS, ArmSearch, Farthest
+from casadi_ik.methods.common.numeric_arm import newton_polish
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.symbolic.closed_arms.held import HeldArm
-from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.srs_arm import SrsArm
 from casadi_ik.symbolic.subexpressions import shared
 
 
-def placement_stage(layouts: HandFirstLayouts, form: ArmForm | HeldArm) -> ca.Function:
+def placement_stage(layouts: HandFirstLayouts, family: ArmFamily) -> ca.Function:
     """A trial of the stage; after the last one the least violating arm is refined."""
     state = ca.MX.sym("state", layouts.state.size)
     parameters = ca.MX.sym("parameters", layouts.parameters.size)
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
     columns = list(layouts.robot.arm_actuators)
-    palm = Pose(s["palm_rotation"], s["palm_origin"])
+    pose = s["palm_rotation"], s["palm_origin"]
     bounds = p["lower"][columns], p["upper"][columns]
-    hits, swivel = ca.MX(1), s["swivel"]
-    if isinstance(form, SrsArm):
-        arm, margin = place_arm(form, palm, *bounds, s["spent"])
-        most = ITERATIONS, ITERATIONS
-    elif isinstance(form, HeldArm):
-        candidate = s["candidate"] + s["earlier"]
-        found = place_held(form, palm, bounds, s["spent"], s["arm"], s["swivel"], candidate)
-        arm, margin, swivel = found
-        most = len(holds(form)), len(holds(form))
-    else:
-        window = ca.fmod(s["candidate"] + s["earlier"] / layouts.candidates, WINDOWS)
-        arm, margin, swivel = place_form(form, palm, *bounds, s["spent"], s["swivel"], window)
-        most = trials(form, PLACEMENT), trials(form, THOROUGH)
-    exact = True
-    if not isinstance(form, SrsArm) and not form.exact:
-        exact = False
-        arm, hits = brought_to(layouts.robot, arm, palm, p["lower"], p["upper"], form.off)
-    place = _placed(layouts, most, exact)
-    outputs = place(state, parameters, arm, margin, swivel, hits)
+    search = ArmSearch(family, Farthest())
+    visit = s["candidate"] + s["earlier"]
+    best = s["arm"], s["swivel"]
+    arm, margin, swivel = search.trial(Pose(*pose), bounds, s["spent"], best, visit)
+    hits = ca.MX(1)
+    if not family.exact:
+        polish = newton_polish(layouts.robot, family.model_error)
+        arm, hits = polish(arm, *pose, p["lower"], p["upper"])
+    outputs = _placed(layouts, search)(state, parameters, arm, margin, swivel, hits)
     return ca.Function("placement", [state, parameters], list(outputs))
 
 
-def _placed(layouts: HandFirstLayouts, most: tuple[int, int], exact: bool) -> ca.Function:
+def _placed(layouts: HandFirstLayouts, search: ArmSearch) -> ca.Function:
     """Keep the best arm so far; take it if it is within limits.
 
-    Args:
-        layouts: Of the robot.
-        most: Trials of the stage, in the first round and in those after it.
-        exact: Whether the arm brings the palm where it was asked for in any case; else the last
-            input says it.
+    The last input says whether a nominal arm brings the palm where it was asked for.
     """
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
     columns = layouts.robot.arm_actuators
     arm, margin, swivel = ca.SX.sym("arm", len(columns)), ca.SX.sym("margin"), ca.SX.sym("swivel")
     # What is looked for in a part of the range is not compared with what was found before.
-    former = s["margin"]
-    if most[0] < most[1]:
-        begins = sum((s["spent"] == trial for trial in beginnings(THOROUGH)), ca.SX(0))
-        former = ca.if_else(begins > 0, NO_MARGIN, former)
-    hits = ca.SX.sym("hits")
+    former = ca.if_else(search.begins(s["spent"]), PARAMETERS.no_margin, s["margin"])
+    hits, exact = ca.SX.sym("hits"), search.family.exact
     better = margin > former
     best_margin = ca.fmax(margin, former)
-    allowed = best_margin >= ALLOWED
+    allowed = best_margin >= PARAMETERS.allowed
     if not exact:
-        # Newton's steps keep within limits, whether or not the ideal arm did.
+        # Newton's steps keep within limits, whether or not the nominal arm did.
         better, allowed = ca.logic_or(better, hits), ca.logic_or(allowed, hits)
     best = ca.if_else(better, arm, s["arm"])
     spent = s["spent"] + 1
-    over = spent >= (
-        most[0] if most[0] == most[1] else ca.if_else(s["earlier"] > 0, most[1], most[0])
-    )
+    over = spent >= ca.if_else(s["earlier"] > 0, search.all_trials, search.trials)
     q = with_rows(s["q"], columns, best)
     q = ca.fmin(ca.fmax(q, p["lower"]), p["upper"])
     # The last candidate is placed even if its hand does not fit.

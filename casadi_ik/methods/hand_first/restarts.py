@@ -21,7 +21,6 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.methods.common.even_spread import evenly
 from casadi_ik.methods.common.posture_table import PostureTable, differing
 from casadi_ik.methods.hand_first.each_finger import each_finger, mends
 from casadi_ik.methods.hand_first.going_on import MANY, VARIED, rugged
@@ -30,6 +29,7 @@ from casadi_ik.methods.hand_first.valley import valley
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.even_spread import evenly
 
 USUAL_FINGERS, FEWER_ROWS = 3, 3 / 8
 """Part of the first table's rows that a hand with few motors and more fingers is compared with: the

@@ -17,7 +17,6 @@ from casadi_ik.kernels.codegen import define
 from casadi_ik.kernels.constants import define_arrays, number
 from casadi_ik.kernels.driver_code import SLICE
 from casadi_ik.methods.common.contact_fit import fresh_fit
-from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.methods.hand_first import going_on, restarts
 from casadi_ik.methods.hand_first.beginning import terms
 from casadi_ik.methods.hand_first.each_finger import mends
@@ -27,6 +26,7 @@ from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts
 from casadi_ik.problem.contacts.conditions import LENGTH
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
+from casadi_ik.symbolic.even_spread import even_steps
 
 DIMENSIONS = (
     *("N_FINGERS", "N_MOTORS", "N_HAND", "N_TERMS", "N_STATE", "N_PARAMETERS"),

@@ -19,9 +19,10 @@ from __future__ import annotations
 
 import casadi as ca
 
+from casadi_ik.arms.family import ArmFamily
+from casadi_ik.arms.search import PARAMETERS
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
-from casadi_ik.methods.common.arm_placement import NO_MARGIN
 from casadi_ik.methods.common.balance import differs, near_tolerance
 from casadi_ik.methods.common.contact_fit import (
     Judged,
@@ -29,7 +30,6 @@ from casadi_ik.methods.common.contact_fit import (
     fresh_fit,
     judge_contacts,
 )
-from casadi_ik.methods.common.nearly_closed import is_searched_later
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.common.whole_contacts import WholeStep
 from casadi_ik.methods.hand_first.balance_stage import balance_stage
@@ -42,9 +42,6 @@ from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_ro
 from casadi_ik.problem.contacts.kinds import Kinds, suffix
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.closed_arms.held import HeldArm
-from casadi_ik.symbolic.closed_arms.passing import PassingArm
-from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
 
@@ -61,14 +58,13 @@ class HandFirstStep:
 
     Attributes:
         layouts: State, parameters and record.
-        placed: The arm as it is placed.
-        arm: The same if no joint of it has to be held, else None.
+        arm: The family of the robot's arm, or None: then it is searched.
     """
 
     def __init__(
         self,
         robot: RobotDescription,
-        arm: ArmForm | HeldArm | None,
+        arm: ArmFamily | None,
         candidates: int,
         kinds: Kinds,
     ) -> None:
@@ -76,13 +72,12 @@ class HandFirstStep:
 
         Args:
             robot: The description.
-            arm: Its arm in closed form, some joints held if need be, or None: then it is searched.
+            arm: The family of its arm, or None: then it is searched.
             candidates: Hand postures a solve may start from.
             kinds: Of the contacts, by finger.
         """
         self.robot = robot
-        self.placed = arm
-        self.arm = None if isinstance(arm, HeldArm) else arm
+        self.arm = arm
         self.layouts = HandFirstLayouts(robot, candidates, kinds)
 
     def graph(self) -> StepGraph:
@@ -114,8 +109,8 @@ class HandFirstStep:
         if self.robot.arm_actuators:
             stages[Phase.HAND_FIT] = self._hand_fit()
             stages[Phase.ARM_PLACEMENT] = self._placement()
-        if self.placed is not None and not self._searched_if_near:
-            stages[Phase.ARM_CHOICE] = choice_stage(layouts, self.placed)
+        if self.arm is not None and not self._searched_if_near:
+            stages[Phase.ARM_CHOICE] = choice_stage(layouts, self.arm)
         phases = [phase for phase in STAGES if phase in stages]
         cases = [stages[phase] for phase in phases]
         choose = ca.Function.conditional("stage", cases[:-1], cases[-1])
@@ -125,20 +120,21 @@ class HandFirstStep:
         return ca.Function(self._name, [state, parameters], list(outputs))
 
     def _placement(self) -> ca.Function:
-        layouts, placed = self.layouts, self.placed
-        if placed is None:
+        layouts, arm = self.layouts, self.arm
+        if arm is None:
             return numeric_stage(layouts)
-        if not is_searched_later(placed):
-            return placement_stage(layouts, placed)
-        # What no place of the held joints brought within limits is searched in later rounds, and
-        # so is what Newton's steps did not lead to from the ideal arm.
+        if arm.complete:
+            return placement_stage(layouts, arm)
+        # What no place of the locked joints brought within limits is searched in later rounds, and
+        # so is what Newton's steps did not lead to from the nominal arm: near a singularity they
+        # lead nowhere near.
         state = ca.MX.sym("state", layouts.state.size)
         parameters = ca.MX.sym("parameters", layouts.parameters.size)
         later = layouts.state.unpack(state)["earlier"] > 0
         if self._searched_if_near:
             later = ca.logic_or(later, layouts.parameters.unpack(parameters)["nearest"])
-        stages = numeric_stage(layouts), placement_stage(layouts, placed)
-        outputs = ca.Function.if_else("held_or_searched", *stages)(later, state, parameters)
+        stages = numeric_stage(layouts), placement_stage(layouts, arm)
+        outputs = ca.Function.if_else("placed_or_searched", *stages)(later, state, parameters)
         return ca.Function("placement", [state, parameters], list(outputs))
 
     def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:
@@ -172,7 +168,7 @@ class HandFirstStep:
                 "palm_origin": origin,
                 "phase": float(self._after_candidate),
                 "cost": 0.0,
-                "margin": NO_MARGIN,
+                "margin": PARAMETERS.no_margin,
                 "starts": 0.0,
             }
             | fresh_fit()
@@ -242,11 +238,10 @@ class HandFirstStep:
     @property
     def _searched_if_near(self) -> bool:
         """Whether what is near is searched from there: a search over two joints passes it by."""
-        placed = self.placed
-        return placed.passes if isinstance(placed, HeldArm) else isinstance(placed, PassingArm)
+        return self.arm is not None and self.arm.is_iterative
 
     def _arm_stage(self, p: dict[str, Expr]) -> Expr:
-        if self.placed is None or self._searched_if_near:
+        if self.arm is None or self._searched_if_near:
             return ca.SX(float(Phase.ARM_PLACEMENT))
         return ca.if_else(p["nearest"], float(Phase.ARM_CHOICE), float(Phase.ARM_PLACEMENT))
 

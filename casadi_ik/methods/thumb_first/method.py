@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arms.recognise import arm_family
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.kernels import StepGraph
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
@@ -20,7 +21,6 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.target import target_values
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.closed_arms.recognise import arm_form
 
 UNBOUNDED = 1e3
 """Bounds [rad or m] where limits are ignored."""
@@ -58,7 +58,7 @@ class ThumbFirstMethod(LoopedMethod):
         self.options: ThumbFirstParameters = options
         self.rounds = 1 if options.starts == 1 else 2
         self._kinds = kinds or usual(len(robot.fingers))
-        self.step = ThumbFirstStep(robot, options, self._kinds, arm_form(robot))
+        self.step = ThumbFirstStep(robot, options, self._kinds, arm_family(robot))
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""

@@ -22,6 +22,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from casadi_ik.arms.family import ArmFamily
+from casadi_ik.arms.search import ArmSearch, Farthest, Nearest
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.methods.common.balance import NEAR, differs
@@ -29,7 +31,6 @@ from casadi_ik.methods.common.contact_fit import DAMPING_START, fresh_fit, judge
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.methods.common.numeric_arm import nearest_start, pose_step
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
-from casadi_ik.methods.thumb_first.arm_start import arm_start
 from casadi_ik.methods.thumb_first.balance_stage import balance_stage
 from casadi_ik.methods.thumb_first.closed_chain_step import (
     STEP_SOLVERS,
@@ -43,7 +44,6 @@ from casadi_ik.problem.contacts.kinds import suffix
 from casadi_ik.problem.contacts.rows import within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.actuated import motor_scales
-from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.smooth import Expr
 from casadi_ik.symbolic.subexpressions import shared
@@ -70,10 +70,10 @@ class ThumbFirstStep(ThumbFirstLayouts):
     Without an arm the palm is fixed: the same step then moves the fingers alone.
 
     Attributes:
-        arm: The arm in closed form, or None: then its start is found numerically.
+        arm: The family of the arm, or None: then its start is found numerically.
     """
 
-    arm: ArmForm | None
+    arm: ArmFamily | None
 
     def graph(self) -> StepGraph:
         """The whole iteration; compilable unless the step is ProxQP's."""
@@ -125,12 +125,35 @@ class ThumbFirstStep(ThumbFirstLayouts):
         arm, passed = s["q"][columns], s["passed"]
         if self.arm is not None:
             given = (p[name][columns] for name in ("here", "lower", "upper"))
-            arm = arm_start(self.robot, self.arm)(p["nearest"], rotation, origin, *given)
+            arm = self._arm_start(self.arm)(p["nearest"], rotation, origin, *given)
         elif columns:
             # Another start gets another arm as well: the next nearest of the table.
             arm, passed = nearest_start(self.robot)(rotation, origin, passed)
         outputs = self._begin()(state, parameters, hand, rotation, origin, arm, passed)
         return ca.Function("candidate", [state, parameters], list(outputs))
+
+    def _arm_start(self, family: ArmFamily) -> ca.Function:
+        """The arm farthest from its limits, or the one nearest to where the robot is.
+
+        The steps that follow move it anyway: the first arms looked at are close enough.
+
+        Returns:
+            ``(nearest, rotation, origin, here, lower, upper) -> arm``, (n, 1) each but the palm's
+            pose and whether it is to be the nearest.
+        """
+        # A pose is of either kind of symbols, which its annotations do not say.
+        rotation: Expr = ca.MX.sym("rotation", 3, 3)
+        origin: Expr = ca.MX.sym("origin", 3)
+        columns, first = list(self.robot.arm_actuators), ca.MX(0)
+        here, lower, upper = (ca.MX.sym(name, len(columns)) for name in ("here", "lower", "upper"))
+        palm, best = Pose(rotation, origin), (here, first)
+        ranges = (self.robot.upper - self.robot.lower)[columns]
+        inputs, cases = [rotation, origin, here, lower, upper], []
+        for score in (Nearest.by_ranges(ranges), Farthest()):
+            search = ArmSearch(family, score)
+            arm, *_ = search.trial(palm, (lower, upper), first, best, first, here)
+            cases.append(ca.Function("near_or_far", inputs, [arm]))
+        return ca.Function.if_else("arm_start", *cases)
 
     def _guess(self) -> ca.Function:
         """Hand posture of this start and the palm pose that brings it closest to the contacts."""

@@ -22,13 +22,11 @@ from casadi_ik.problem.palm_targets import free_palms
 from casadi_ik.problem.preference import CLEARANCE, preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import ContactVerdict, judge
-from casadi_ik.solving.alternatives.branches import ArmBranch, Branches, best_arm
+from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
 from casadi_ik.solving.alternatives.distinct import checked_distance, distinct
-from casadi_ik.solving.alternatives.passing_branches import PassingBranches, branches_of
 from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.measures import manipulability
-from casadi_ik.symbolic.srs_arm import SrsArm
 
 PALMS = np.array([0.1, 0.1, 0.1, 2.0])
 """What turns [rad] and shifts [m] of a palm that is free count as, beside parts of ranges."""
@@ -108,9 +106,10 @@ class AlternativeFinder:
         self.hand = list(robot.description.hand_actuators)
 
     @cached_property
-    def _branches(self) -> Branches | None:
+    def _branches(self) -> ArmBranches | None:
+        """None where locked joints leave more than stretches to enumerate."""
         arm = self.trials.method.step.arm
-        return None if arm is None else branches_of(arm, self._compiled)
+        return None if arm is None or arm.locked else ArmBranches(arm, self._compiled)
 
     @cached_property
     def manipulability(self) -> FunctionKernel:
@@ -251,20 +250,15 @@ class AlternativeFinder:
             return self._valued(with_arm(arms), q0, prefer, around, True)
 
         found = []
-        if isinstance(self._branches, PassingBranches):
-            best = self._branches.best(palm, lower, upper, valued)
-            found = [
-                _Found(with_arm(arm[None])[0], posture, branch, place)
-                for arm, branch, place in best
-            ]
+        for branch in self._branches.find(palm, lower, upper):
+            stop_if_cancelled()
+            arm, swivel = self._branches.best(palm, branch, (lower, upper), valued)
+            found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
+        if self._branches.family.is_iterative:
             # A stretch may be shorter than the positions are apart.
             found += [_Found(arm, posture) for arm in self._searched(problems, q, seed)]
             parts = self._parts(np.stack([item.q for item in found]), self._arm)
             return [found[i] for i in distinct(parts, DISTINCT)]
-        for branch in self._branches.find(palm, lower, upper):
-            stop_if_cancelled()
-            arm, swivel = best_arm(self._branches, palm, branch, valued)
-            found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
         return self._exact(problems, found) or [_Found(q, posture)]
 
     def _seen_by_form(self, end: Array, limits: Bounds) -> Array:
@@ -276,8 +270,8 @@ class AlternativeFinder:
 
     def _exact(self, problems: Problems, found: list[_Found]) -> list[_Found]:
         """Arms that are only nearly of their form are brought to the contacts."""
-        form = self.trials.method.step.arm
-        if not found or form is None or isinstance(form, SrsArm) or form.exact:
+        family = self.trials.method.step.arm
+        if not found or family is None or family.exact:
             return found
         starts = np.stack([item.q for item in found])
         ends = Descent(self.trials, problems).run(np.zeros(len(found), np.intp), starts)

@@ -40,7 +40,7 @@ class FreeFinder:
     @cached_property
     def swings(self) -> ArmSwings | None:
         """All arms of hands; None for an arm without a closed form, and without an arm."""
-        arm = self.trials.method.step.placed
+        arm = self.trials.method.step.arm
         if arm is None:
             return None
         return ArmSwings(self.robot, arm, lambda: self._finder.manipulability, self._compiled)

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from casadi_ik.answers.solution import CollisionReport
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
 from casadi_ik.problem.palm_targets import free_palms
 from casadi_ik.problem.preference import CLEARANCE
@@ -29,6 +28,7 @@ from casadi_ik.solving.alternatives.idle_fingers import IdleFingers
 from casadi_ik.solving.alternatives.of_each import Different, best_of_each, first_of_each
 from casadi_ik.solving.alternatives.swings import ArmSwings, Preference
 from casadi_ik.solving.trials import Descent
+from casadi_ik.symbolic.even_spread import even_steps
 
 STARTS = 24
 """Random arms that a target is solved from, where the arm has no closed form."""

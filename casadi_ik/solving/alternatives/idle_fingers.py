@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
-from casadi_ik.methods.common.even_spread import even_steps
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
 from casadi_ik.problem.problems import Problems
+from casadi_ik.symbolic.even_spread import even_steps
 
 PLACES = 48
 """Postures of the idle fingers that are looked at, evenly spread over their limits."""

@@ -11,17 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arms.family import ArmFamily
+from casadi_ik.arms.search import arms_graph
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.measure_kernel import MeasureKernel
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.swing_kernel import Checked, Order, SwingKernel
-from casadi_ik.methods.common.arm_branches import arms_graph
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
 from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.solving.alternatives.arm_places import arm_places
-from casadi_ik.symbolic.closed_arms.held import HeldArm
-from casadi_ik.symbolic.closed_arms.recognise import ArmForm
 
 TURN = 2 * np.pi
 
@@ -61,7 +60,7 @@ class ArmSwings:
     def __init__(
         self,
         robot: ArmHand,
-        arm: ArmForm | HeldArm,
+        arm: ArmFamily,
         measure: Callable[[], FunctionKernel],
         compiled: bool = True,
     ) -> None:
@@ -237,8 +236,7 @@ class _Slow:
         rows, side = np.nonzero((margin >= self.places.allowed) & reached)
         found = self.q[owner[rows]]
         found[:, columns] = np.clip(arms[rows, side], lower, upper)
-        bent = (places[rows, 0] < 0) if places.shape[1] > 1 else np.zeros(len(rows), dtype=bool)
-        return [owner[rows], found, places[rows], bent * self.places.sides + side]
+        return [owner[rows], found, places[rows], side]
 
     def _turned(self, arms: Array, starts: Array) -> Array:
         """Arms in the turn that is nearest to the start, where that is preferred, or held in."""

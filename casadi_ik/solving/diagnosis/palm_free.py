@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.answers.diagnosis import ArmReach, HandFit
+from casadi_ik.arms.recognise import srs_arm
+from casadi_ik.arms.srs import SrsArm
 from casadi_ik.arrays import Array
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.problem.contacts.conditions import LENGTH
@@ -17,7 +19,6 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.trials import NEVER, Rows, Trials, allowed, smallest
-from casadi_ik.symbolic.srs_arm import SrsArm, reach
 
 FIRST = 4
 """Hand postures tried for every target; where none of them fits, two rounds of them."""
@@ -83,8 +84,7 @@ class PalmFree:
     def __init__(self, trials: Trials) -> None:
         """Ask the loop's hand stage."""
         self._trials = trials
-        arm = trials.method.step.arm
-        self._arm = arm if isinstance(arm, SrsArm) else None
+        self._arm = srs_arm(trials.robot.description)
 
     @cached_property
     def _palm(self) -> Array:
@@ -215,5 +215,5 @@ class PalmFree:
         """Smallest and largest distance of the wrist from the shoulder [m]."""
         limits = self._trials.limits(problems)
         elbow = self._trials.robot.description.arm_actuators[3]
-        near, far = reach(arm, limits.lower[elbow], limits.upper[elbow])
+        near, far = arm.reach(limits.lower[elbow], limits.upper[elbow])
         return float(near), float(far)

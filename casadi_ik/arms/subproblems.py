@@ -1,7 +1,7 @@
 """Turns about constant axes that bring a point to a height, or one direction to another.
 
-The canonical subproblems of Paden and Kahan (Murray, Li, Sastry 1994, section 3.2), with turns as
-cosine and sine so that what follows from them needs no more of either. Out of reach the nearest
+The subproblems 1 and 4 of Paden and Kahan, as IK-Geo numbers them (Elias and Wen 2022), with turns
+as cosine and sine so that what follows from them needs no more of either. Out of reach the nearest
 turn is given, and where an axis passes through the point, none: nothing is ever NaN.
 """
 
@@ -47,6 +47,13 @@ class Turn:
             self.sine * other.cosine + self.cosine * other.sine,
         )
 
+    def or_other(self, first: Expr, other: Turn) -> Turn:
+        """This one where a condition holds, else another."""
+        if isinstance(first, bool):
+            return self if first else other
+        cosine = ca.if_else(first, self.cosine, other.cosine)
+        return Turn(cosine, ca.if_else(first, self.sine, other.sine))
+
     def about(self, axis: Array) -> Expr:
         """As a rotation (3, 3) about a constant unit axis (3,)."""
         outer = np.outer(axis, axis)
@@ -67,7 +74,7 @@ def turn(cosine: Expr, sine: Expr) -> Turn:
     return Turn(ca.if_else(known, cosine * scale, 1.0), ca.if_else(known, sine * scale, 0.0))
 
 
-def turns_to_height(cosine: Expr, sine: Expr, height: Expr) -> tuple[Turn, Turn, Expr]:
+def subproblem_4(cosine: Expr, sine: Expr, height: Expr) -> tuple[Turn, Turn, Expr]:
     """Both turns t with ``cosine cos(t) + sine sin(t) = height``.
 
     Returns:
@@ -92,7 +99,7 @@ def turns_to_height(cosine: Expr, sine: Expr, height: Expr) -> tuple[Turn, Turn,
     return found[0], found[1], slack
 
 
-def turn_between(axis: Array, start: Expr, end: Expr) -> Turn:
+def subproblem_1(axis: Array, start: Expr, end: Expr) -> Turn:
     """The turn about a constant unit axis that brings one vector nearest to another."""
     a = ca.DM(axis)
     along = ca.dot(a, start) * ca.dot(a, end)

@@ -14,6 +14,9 @@ from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import Pose, forward, number
 from casadi_ik.symbolic.smooth import Expr
 
+WHOLE_TURN = 2 * np.pi - 1e-6
+"""Range [rad] from which on a joint may stand the same way at several angles."""
+
 
 @dataclass(frozen=True, eq=False)
 class Screws:
@@ -45,6 +48,12 @@ class Screws:
 
     def __len__(self) -> int:
         return len(self.joints)
+
+    @property
+    def turning(self) -> frozenset[int]:
+        """Numbers of the joints that turn all around, and so may stand the same way twice."""
+        wide = self.upper - self.lower >= WHOLE_TURN
+        return frozenset(i for i, around in zip(self.joints, wide, strict=True) if around)
 
     def reversed(self) -> Screws:
         """The same arm seen from its other end."""
