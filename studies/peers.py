@@ -24,9 +24,9 @@ from samplers import random_arm_targets
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.symbolic.even_spread import evenly
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
+from casadi_ik.symbolic.even_spread import evenly
 
 Targets = tuple[Array, Array]
 

@@ -18,8 +18,8 @@ from peer_qp import Mink
 import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.collision.solids import Kind
-from casadi_ik.symbolic.even_spread import evenly
 from casadi_ik.problem.clearance import SceneCheck, Surroundings
+from casadi_ik.symbolic.even_spread import evenly
 from collision_study.search import Piece, grasps_at, surroundings
 
 STARTS, STEPS, CAP, WAIT, STALL = 25, 60, 0.5, 8, 0.98

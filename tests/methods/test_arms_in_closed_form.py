@@ -7,16 +7,15 @@ import pytest
 from samplers import near_limits
 
 import casadi_ik as ik
+from casadi_ik.arms.recognise import arm_family
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.problems import Problems, target_arrays
 from casadi_ik.problem.status import Phase
-from casadi_ik.solving.alternatives.form_branches import FormBranches
-from casadi_ik.solving.alternatives.passing_branches import branches_of
+from casadi_ik.solving.alternatives.branches import ArmBranches
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
-from casadi_ik.symbolic.closed_arms.recognise import closed_form
 
 EXACT = ik.Tolerance(1e-6, 1e-6)
 
@@ -163,11 +162,11 @@ def test_all_its_stages_go_side_by_side(arm, alone):
 def test_the_stretches_of_the_swept_joint_are_all_that_is_allowed(arm):
     """Against a scan of the whole range, a branch at a time."""
     robot = robot_of(arm)
-    form = closed_form(robot.description)
-    branches = FormBranches(form, compiled=False)
+    form = arm_family(robot.description)
+    branches = ArmBranches(form, compiled=False)
     columns = list(robot.description.arm_actuators)
     lower, upper = robot.lower[columns], robot.upper[columns]
-    joint = form.swept_joint
+    joint = form.redundancy[0].joint
     middle = (lower + upper)[joint] / 2
     half = min((upper - lower)[joint] / 2, np.pi)
     scan = np.linspace(middle - half, middle + half, 500)[1:-1]
@@ -193,7 +192,7 @@ def test_the_stretches_of_the_swept_joint_are_all_that_is_allowed(arm):
 @pytest.mark.parametrize("arm", SINGLE)
 def test_an_arm_of_six_joints_has_single_branches(arm):
     robot = robot_of(arm)
-    branches = FormBranches(closed_form(robot.description), compiled=False)
+    branches = ArmBranches(arm_family(robot.description), compiled=False)
     columns = list(robot.description.arm_actuators)
     for q in robot.random(np.random.default_rng(2), 5):
         palm = robot.palm(q)
@@ -207,8 +206,8 @@ def test_an_arm_of_six_joints_has_single_branches(arm):
 def test_an_arm_off_its_sphere_has_its_arms_listed():
     """An xArm 6: the arm that a palm pose was made with, turned by whole turns, is among them."""
     robot = robot_of("xarm6")
-    form = closed_form(robot.description)
-    branches = branches_of(form, compiled=False)
+    form = arm_family(robot.description)
+    branches = ArmBranches(form, compiled=False)
     columns = list(robot.description.arm_actuators)
     lower, upper = robot.lower[columns], robot.upper[columns]
     for q in robot.random(np.random.default_rng(2), 10):

@@ -1,0 +1,413 @@
+"""Families of arms: recognised from their screws, every arm found, finite at singular poses."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+import toy_robots
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robot_variants import derived_robot
+from samplers import near_limits
+from scipy.optimize import brentq, least_squares
+from scipy.spatial.transform import Rotation
+
+import casadi_ik as ik
+from casadi_ik.arms.family import SIGNS, ArmFamily
+from casadi_ik.arms.offset_wrist import OffsetWristArm
+from casadi_ik.arms.recognise import arm_family, family_in_words, family_of, srs_arm
+from casadi_ik.arms.screws import Screws, arm_screws
+from casadi_ik.arrays import Array
+from casadi_ik.symbolic.kinematics import Pose
+
+KINDS = {
+    "kuka_lwr4": "spherical shoulder and wrist",
+    "iiwa7": "spherical shoulder and wrist",
+    "panda": "spherical shoulder, joint 7 swept",
+    "fr3": "spherical shoulder, joint 7 swept",
+    "xarm7": "spherical shoulder, joint 7 swept",
+    "kinova_gen3": "nearly spherical wrist, joint 1 swept",
+    "baxter_left": "nearly spherical wrist, joint 1 swept",
+    "baxter_right": "nearly spherical wrist, joint 1 swept",
+    "puma560": "spherical wrist",
+    "viperx_300s": "spherical wrist",
+    "jaco2": "spherical wrist",
+    "irb140": "spherical wrist",
+    **{f"ur{name}": "three parallel axes" for name in ("3e", "5e", "10e", "16e", "5", "10")},
+    "sawyer": "spherical wrist, joint 1 swept, joint 7 off it",
+    "xarm6": "spherical wrist, joint 6 off it",
+}
+"""What the arms of the catalogue are, by their makers' drawings."""
+
+SOLVED = ("kuka_lwr4", "panda", "xarm7", "kinova_gen3", "puma560", "irb140", "ur5e")
+OFFSET = {"sawyer": 0.1363, "xarm6": 0.076}
+"""How far [m] the last axis passes by."""
+ALL = (*SOLVED, *OFFSET)
+"""One of each kind."""
+
+MODEL_ERROR = {"kinova_gen3": 2e-3, "baxter_left": 3e-2, "baxter_right": 3e-2}
+"""Poses [m] of arms that are solved as the nominal arm beside them."""
+
+
+@cache
+def robot_of(name: str) -> ik.ArmHand:
+    return ik.load_robot(f"{name}+barrett_bh8_280")
+
+
+@cache
+def family(name: str) -> ArmFamily:
+    found = arm_family(robot_of(name).description)
+    assert found is not None
+    return found
+
+
+@cache
+def function(found: ArmFamily) -> ca.Function:
+    return found.arms()
+
+
+def arms(found: ArmFamily, palm: Array, arm: Array, edge: float = 0.0) -> Array:
+    """All arms (k, n) in reach, a swept joint where a given arm has it; the swivel anywhere."""
+    values = [0.4 if one.joint is None else arm[one.joint] for one in found.redundancy] or [0.0]
+    rows, slack = (np.array(part) for part in function(found)(palm[:3, :3], palm[:3, 3], values))
+    assert np.isfinite(rows).all()
+    return rows[slack.ravel() >= -edge]
+
+
+def moved_by(screws: Screws, angles: Array) -> Array:
+    """The palm's pose by the product of exponentials: no formula of the package."""
+    pose, zero = np.eye(4), np.eye(4)
+    for axis, point, angle in zip(screws.axes, screws.points, angles, strict=True):
+        step = np.eye(4)
+        step[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
+        step[:3, 3] = point - step[:3, :3] @ point
+        pose = pose @ step
+    zero[:3, :3], zero[:3, 3] = screws.rotation, screws.origin
+    return pose @ zero
+
+
+def apart(one: Array, other: Array) -> Array:
+    """Largest difference of angles, whole turns aside."""
+    return np.abs(np.angle(np.exp(1j * (one - other)))).max(axis=-1, initial=0.0)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_an_arm_is_recognised_by_its_axes(name):
+    assert family_in_words(robot_of(name).description) == KINDS[name]
+    assert family(name).exact == (name not in MODEL_ERROR and name not in OFFSET)
+
+
+@pytest.mark.parametrize(
+    "name", ["panda+shadow", "ur5e+shadow", "kuka_lwr4+shadow", "sawyer+shadow", "xarm6+shadow"]
+)
+def test_a_wrist_is_locked_where_there_is_a_family_without_it(name, rng):
+    robot = ik.load_robot(name)
+    found = arm_family(robot.description)
+    assert found is not None
+    count = len(found.screws)
+    assert found.locked == (count - 2, count - 1)
+    assert found.kind == f"{KINDS[name.split('+')[0]]}, joints {count - 1}, {count} held"
+    for q in robot.random(rng, 3):
+        arm = q[:count]
+        for each in arms(found, robot.palm(q), arm):
+            np.testing.assert_allclose(each[-2:], arm[-2:])
+            np.testing.assert_allclose(moved_by(found.screws, each), robot.palm(q), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_arm_brings_the_palm_there_and_one_is_that_it_was_made_with(name):
+    """Random poses and poses near limits.
+
+    At the edge of reach one arm of two may be missed by an offset wrist; of a swept one the edge is
+    that at a position of the swept joint: it is found at another.
+    """
+    robot, found, rng = robot_of(name), family(name), np.random.default_rng(1)
+    screws, error, own = arm_screws(robot.description), MODEL_ERROR.get(name, 0.0), []
+    for q in [*robot.random(rng, 30), *near_limits(robot, rng, 30)]:
+        arm = q[: len(screws)]
+        palm = moved_by(screws, arm)
+        rows = arms(found, palm, arm, edge=1e-9)
+        for each in rows:
+            np.testing.assert_allclose(moved_by(screws, each), palm, atol=1e-7 + error)
+        own.append(len(rows) > 0 and apart(rows, arm).min() < 1e-5)
+    wanted = {"sawyer": 0.85, "xarm6": 0.99, "kinova_gen3": 0, "kuka_lwr4": 0}
+    assert np.mean(own) >= wanted.get(name, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "straight"), [("ur5e", 0.0), ("ur10e", np.pi), ("puma560", 0.0), ("irb140", 0.0)]
+)
+def test_next_to_a_singular_wrist_every_arm_brings_the_palm_there(name, straight):
+    """However near: what the directions of two short vectors say is not taken for nothing."""
+    robot, screws, rng = robot_of(name), family(name).screws, np.random.default_rng(3)
+    for power in range(3, 13):
+        for q in robot.random(rng, 5):
+            q[4] = straight + 10.0**-power
+            rows = arms(family(name), robot.palm(q), q)
+            assert len(rows)
+            for each in rows:
+                whole = np.concatenate([each, q[len(screws) :]])
+                np.testing.assert_allclose(robot.palm(whole), robot.palm(q), atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_nothing_is_lost_at_singular_poses(name):
+    """Wrist aligned, elbow straight, wrist over the shoulder: finite, and the palm still there."""
+    screws, rng = arm_screws(robot_of(name).description), np.random.default_rng(2)
+    count, error = len(screws), MODEL_ERROR.get(name, 0.0)
+    poses = [np.zeros(count), np.full(count, 1e-13)]
+    for joint in range(count):
+        for value in (0.0, 1e-13, 1e-9, np.pi / 2, -np.pi / 2):
+            poses.append(rng.uniform(-1, 1, count))
+            poses[-1][joint] = value
+    for arm in poses:
+        palm = moved_by(screws, arm)
+        rows = arms(family(name), palm, arm, edge=1e-9)
+        # Stretched out, a nominal arm or an offset wrist may be a little short.
+        assert len(rows) or error or name in OFFSET, arm
+        for each in rows:
+            assert np.abs(moved_by(screws, each) - palm).max() < 1e-4 + error
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_what_is_in_reach_is_never_said_to_be_beyond_and_far_away_nothing_is_in_reach(name):
+    robot, found = robot_of(name), family(name)
+    rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
+    lower, upper = (ca.DM(end[: len(found.screws)]) for end in (robot.lower, robot.upper))
+    beyond = found.beyond(Pose(rotation, origin), lower, upper)
+    asked = ca.Function("beyond", [rotation, origin], [beyond])
+    q = robot.random(np.random.default_rng(3), 300)
+    palm = robot.palm(q)
+    slack = 1e-9 + MODEL_ERROR.get(name, 0.0)
+    assert all(abs(float(asked(each[:3, :3], each[:3, 3]))) < slack for each in palm)
+    palm[:, :3, 3] += [4.0, 0.0, 0.0]
+    assert all(float(asked(each[:3, :3], each[:3, 3])) > 0.1 for each in palm)
+    assert not len(arms(found, palm[0], q[0]))
+
+
+def moved_screws(screws: Screws, rng: np.random.Generator) -> Screws:
+    """The same arm on another base, with another zero and other points of its axes."""
+    turn, shift = Rotation.random(random_state=rng.integers(1000)).as_matrix(), rng.normal(size=3)
+    axes, points = screws.axes @ turn.T, screws.points @ turn.T + shift
+    for i, angle in enumerate(rng.uniform(-3, 3, len(screws))):
+        bent = Rotation.from_rotvec(angle * axes[i]).as_matrix()
+        axes[i + 1 :] = axes[i + 1 :] @ bent.T
+        points[i + 1 :] = (points[i + 1 :] - points[i]) @ bent.T + points[i]
+    along = rng.normal(size=(len(screws), 1))
+    return replace(screws, axes=axes, points=points + along * axes)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_neither_base_nor_zero_nor_the_names_of_points_matter(name):
+    screws = arm_screws(robot_of(name).description)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        moved = moved_screws(screws, rng)
+        found = family_of(moved)
+        assert found is not None
+        # Of two that both are exact, either may come first where a link is along an axis.
+        assert len(found.redundancy) == len(family(name).redundancy)
+        assert found.model_error == pytest.approx(family(name).model_error, abs=1e-9)
+        angles = rng.uniform(-2, 2, len(screws))
+        palm = moved_by(moved, angles)
+        for each in arms(found, palm, angles):
+            np.testing.assert_allclose(
+                moved_by(moved, each), palm, atol=1e-6 + MODEL_ERROR.get(name, 0.0)
+            )
+
+
+def test_what_is_nearly_of_a_family_is_solved_as_that_and_what_is_not_is_not():
+    screws = arm_screws(robot_of("puma560").description)
+    for size, known in ((5e-4, True), (1e-2, True), (4e-2, False)):
+        points = screws.points.copy()
+        points[4] += size * np.cross(screws.axes[3], screws.axes[4])
+        found = family_of(replace(screws, points=points))
+        assert (found is not None and not found.is_iterative) == known
+        assert found is None or 1e-9 < found.model_error < 1e-2
+    points = screws.points.copy()
+    points[3] += 0.05 * np.cross(screws.axes[3], screws.axes[4])
+    points[5] += 0.07 * np.cross(screws.axes[5], screws.axes[4])
+    assert family_of(replace(screws, points=points)) is None
+
+
+@pytest.mark.parametrize("name", ["panda", "puma560", "irb140", "ur5e", "xarm6"])
+def test_a_search_from_many_starts_finds_no_other_arm(name):
+    """Least squares of SciPy on the product of exponentials, a swept joint held."""
+    screws, rng, seen, total = (
+        arm_screws(robot_of(name).description),
+        np.random.default_rng(4),
+        0,
+        0,
+    )
+    swept = [one.joint for one in family(name).redundancy]
+    free = [i for i in range(len(screws)) if i not in swept]
+    for q in robot_of(name).random(rng, 2):
+        arm = q[: len(screws)]
+        palm = moved_by(screws, arm)
+        rows = arms(family(name), palm, arm)
+
+        def left(x: Array, arm: Array = arm, palm: Array = palm) -> Array:
+            whole = arm.copy()
+            whole[free] = x
+            return (moved_by(screws, whole) - palm)[:3].ravel()
+
+        for start in rng.uniform(-np.pi, np.pi, (25, len(free))):
+            ended = least_squares(left, start, xtol=1e-15)
+            if np.abs(ended.fun).max() < 1e-9:
+                total += 1
+                found = np.insert(ended.x, swept, arm[swept]) if swept else ended.x
+                seen += apart(rows, found).min() < 1e-4
+    assert total > 15
+    assert seen == total
+
+
+@pytest.mark.parametrize("name", SOLVED[1:])
+def test_every_arm_of_another_library_is_among_ours(name):
+    """EAIK (Ostermeier et al. 2024), by subproblems of its own."""
+    eaik = pytest.importorskip("eaik.IK_HP")
+    robot, screws = robot_of(name), family(name).screws
+    screws = screws.reversed() if screws.reverse else screws
+    swept = [one.joint for one in family(name).redundancy]
+    offsets = np.diff([np.zeros(3), *screws.points, screws.origin], axis=0)
+    count = 0
+    for q in robot.random(np.random.default_rng(5), 30):
+        arm = q[: len(screws)]
+        other = eaik.HPRobot(screws.axes, offsets, [(j, float(arm[j])) for j in swept])
+        target = robot.palm(q)
+        target[:3, :3] = target[:3, :3] @ screws.rotation.T
+        answer = other.IK(target)
+        theirs = np.asarray(answer.Q)[~np.asarray(answer.is_LS, dtype=bool)]
+        if swept and theirs.size and theirs.shape[1] == len(arm) - 1:
+            theirs = np.insert(theirs, swept, arm[swept], axis=1)
+        rows = arms(family(name), robot.palm(q), arm, edge=1e-9)
+        count += len(theirs)
+        assert all(apart(rows, each).min() < 1e-5 for each in theirs)
+    assert count > 60
+
+
+@pytest.mark.parametrize("name", OFFSET)
+def test_no_root_of_an_offset_wrist_is_lost(name):
+    """Against Brent's method between the signs of a scan of 720 turns, branch by branch."""
+    robot, found = robot_of(name), family(name)
+    assert isinstance(found, OffsetWristArm)
+    assert np.linalg.norm(found.offset) == pytest.approx(OFFSET[name])
+    turns, condition = np.linspace(-np.pi, np.pi, 721), found._branch()
+    lost = total = 0
+    for q in robot.random(np.random.default_rng(8), 8):
+        palm, arm = robot.palm(q), q[: len(found.screws)]
+        rows = arms(found, palm, arm)
+        swept = arm[0] if found.redundancy else 0.0
+        rotation, origin, *_ = found._begin()(swept, palm[:3, :3], palm[:3, 3])
+        for signs in SIGNS:
+
+            def left(t: float, given: tuple = (rotation, origin), signs: tuple = signs) -> float:
+                return float(condition(*given, t, *signs)[2])
+
+            values = condition.map(len(turns))(rotation, origin, turns, *signs)[2]
+            values = np.array(values).ravel()
+            crossed = (values[1:] * values[:-1] < 0) & (np.abs(np.diff(values)) < 1)
+            for i in np.flatnonzero(crossed):
+                t = brentq(left, turns[i], turns[i + 1], xtol=1e-14)
+                six, slack, rest = condition(rotation, origin, t, *signs)
+                # Two arms near each other at the edge of reach may both be missed.
+                if float(slack) < 0.05 or abs(float(rest)) > 1e-9:
+                    continue
+                whole = np.array(found._whole()(six, swept)).ravel()
+                total += 1
+                lost += not len(rows) or apart(rows, whole).min() > 1e-6
+    assert total > 15
+    assert lost == 0
+
+
+def srs_numbers(robot: ik.ArmHand):
+    """(palm, elbow sign, bounds (7,)) -> breakpoints (24,) of an S-R-S arm."""
+    arm = srs_arm(robot.description)
+    assert arm is not None
+    rotation, origin, sign = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("sign")
+    lower, upper = ca.SX.sym("lower", 7), ca.SX.sym("upper", 7)
+    found = arm.breakpoints(Pose(rotation, origin), (sign,), lower, upper)
+    asked = ca.Function("breakpoints", [rotation, origin, sign, lower, upper], [found])
+    return lambda palm, sign, *bounds: np.array(
+        asked(palm[:3, :3], palm[:3, 3], sign, *bounds)
+    ).ravel()
+
+
+def at_swivels(robot: ik.ArmHand, palm: Array, swivels: Array) -> Array:
+    """(8 k, 7) all arms of an S-R-S arm at swivels (k,)."""
+    found = arm_family(robot.description)
+    assert found is not None
+    rows = [function(found)(palm[:3, :3], palm[:3, 3], psi)[0] for psi in swivels]
+    return np.concatenate([np.array(each) for each in rows])
+
+
+def test_an_srs_arm_is_found_again_at_the_swivel_where_a_joint_has_its_value(robot, rng):
+    """And where a bound is met at all, a joint stands at it at a breakpoint."""
+    asked, tested = srs_numbers(robot), 0
+    for q in robot.random(rng, 10):
+        palm, sign, arm = robot.palm(q), np.sign(q[3]), q[:7]
+        for swivels in asked(palm, sign, arm, arm).reshape(6, 4):
+            assert apart(at_swivels(robot, palm, swivels), arm).min() < 1e-7
+        ends = robot.lower[:7], robot.upper[:7]
+        swivels = asked(palm, sign, *ends).reshape(6, 2, 2)
+        for joint, of_joint in zip((0, 1, 2, 4, 5, 6), swivels, strict=True):
+            for end, at in zip(ends, of_joint, strict=True):
+                angles = at_swivels(robot, palm, at)[:, joint]
+                off = np.abs(np.sin((angles - end[joint]) / 2)).min()
+                # A bound that no swivel meets gives the closest approach instead.
+                assert off < 1e-9 or off > 1e-6
+                tested += off < 1e-9
+    assert tested > 20
+
+
+def test_reach_follows_the_bounds_of_an_srs_elbow(robot):
+    arm = srs_arm(robot.description)
+    assert arm is not None
+    for lower, upper in ((-2.0, 2.0), (0.3, 2.0), (-2.0, -0.4), (0.7, 0.7), (-1e3, 1e3)):
+        near, far = (float(value) for value in arm.reach(ca.SX(lower), ca.SX(upper)))
+        bends = np.linspace(max(lower, -np.pi), min(upper, np.pi), 2001)
+        distance = np.linalg.norm([0.4 + 0.39 * np.cos(bends), 0.39 * np.sin(bends)], axis=0)
+        np.testing.assert_allclose([near, far], [distance.min(), distance.max()], atol=1e-6)
+
+
+@settings(max_examples=12)
+@given(
+    heights=st.fixed_dictionaries({number: st.floats(0.05, 0.4) for number in "1234567"}),
+    shift=st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3),
+    turn=st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3),
+    seed=st.integers(0, 2**16),
+)
+def test_srs_arms_with_other_links_and_mounts(heights, shift, turn, seed):
+    with tempfile.TemporaryDirectory() as folder:
+        robot = derived_robot(Path(folder), heights, (shift, turn))
+    rng = np.random.default_rng(seed)
+    q = robot.random(rng, 1)[0]
+    # At a straight elbow half the digits are lost, in any method.
+    q[3] = np.copysign(max(abs(q[3]), 0.05), q[3])
+    found = at_swivels(robot, robot.palm(q), rng.uniform(-3, 3, 2))
+    whole = np.hstack([found, np.tile(q[7:], (len(found), 1))])
+    assert len(np.unique(np.round(found, 6), axis=0)) == len(found)
+    expected = np.broadcast_to(robot.palm(q), (len(found), 4, 4))
+    np.testing.assert_allclose(robot.palm(whole), expected, atol=1e-10)
+
+
+def test_what_is_no_srs_arm_is_not_taken_for_one(tmp_path, own_robot, coupled_robot):
+    """An elbow off the links, a shoulder apart, a skew axis, no arm at all."""
+    (tmp_path / "elbow").mkdir()
+    assert srs_arm(derived_robot(tmp_path / "elbow", elbow_offset=0.045).description) is None
+    assert srs_arm(coupled_robot.description) is None
+    arm = own_robot.parent / "arm.yaml"
+    text = arm.read_text()
+    assert srs_arm(ik.load_robot(own_robot).description) is not None
+    for old, new in (
+        ("[0, 0, 200.5 mm]", "[30 mm, 0, 200.5 mm]"),
+        ("lwr_link_6, axis: [0, -1, 0]", "lwr_link_6, axis: [0, -1, 0.2]"),
+    ):
+        arm.write_text(text)
+        toy_robots.replace(arm, old, new)
+        assert srs_arm(ik.load_robot(own_robot).description) is None
