@@ -24,7 +24,7 @@ from drag_latency.hand import browser_tools
 from drag_latency.probes import COMMON
 
 from casadi_ik.cli.main import main as command
-from casadi_ik.cli.parser import build_parser
+from casadi_ik.cli.table import parse
 from casadi_ik.cli.view import opened
 from casadi_ik.files.shipped import resolve
 from casadi_ik.viewing.grasp_page import GraspPage
@@ -50,7 +50,7 @@ Use = Callable[[Any, Any], None]
 
 def taken(browser: Any, words: list[str], path: Path, use: Use) -> None:
     """Open what `casadi-ik view` opens, use it, save what is seen."""
-    viewer = opened(build_parser().parse_args(["view", *words]))
+    viewer = opened(parse(["view", *words])[1])
     page = browser.open("about:blank", *WINDOW)
     page.call("Page.addScriptToEvaluateOnNewDocument", source=COMMON)
     page.go(viewer.url)

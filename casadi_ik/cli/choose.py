@@ -1,75 +1,178 @@
-"""`casadi-ik choose`."""
+"""`casadi-ik choose`, and the file of ranked answers that it writes and that others read."""
 
 from __future__ import annotations
 
-import argparse
-import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from casadi_ik.answers.solution import Ranking
 from casadi_ik.api import Solver
-from casadi_ik.cli.answer import Answer, Exit
-from casadi_ik.cli.outputs import check_outputs, write_output
-from casadi_ik.cli.question import (
-    located,
-    the_object_pose,
-    the_options,
-    the_robot,
-    the_scene,
-    the_start,
-    the_tolerance,
+from casadi_ik.arrays import Array
+from casadi_ik.cli.inputs import located, the_object_pose, the_robot, the_solver, the_start
+from casadi_ik.cli.options import (
+    MAX_ROUNDS,
+    OBJECT_POSE,
+    PREFER,
+    Q0,
+    ROBOT,
+    SCENE,
+    SEED,
+    SIZE_LIMITS,
+    TOLERANCES,
+    Option,
+    needed,
+    one_of,
+    out,
+    positive,
+    whole,
 )
-from casadi_ik.cli.report import clearance, duration, files, headline, table
-from casadi_ik.cli.solve import as_json
-from casadi_ik.datasets import Candidates, load_candidates
-from casadi_ik.grasps.load import grasp_data
+from casadi_ik.cli.outputs import check_outputs
+from casadi_ik.cli.report import (
+    as_json,
+    clearance,
+    duration,
+    files,
+    headline,
+    table,
+    write_json,
+)
+from casadi_ik.cli.table import Answer, Said, command
+from casadi_ik.datasets import LAYOUTS, Candidates, load_candidates
+from casadi_ik.errors import DescriptionError, InputError
+from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.grasps import Grasp
+from casadi_ik.grasps.load import GraspFile, grasp_data, grasp_of
+from casadi_ik.problem.ranking import Ranking
+
+MOST_BYTES = 2**26
+"""Of a file of ranked answers: ten thousand answers take a third of it."""
 
 
-def choose(arguments: argparse.Namespace) -> Answer:
-    """Rank the answers to many grasps.
+@command(
+    Option("candidates", "CANDIDATES", "the grasps, see below"),
+    needed(ROBOT),
+    OBJECT_POSE,
+    Option(
+        "--layout",
+        "L",
+        f"of the file: {', '.join(LAYOUTS)}, table",
+        one_of(*LAYOUTS, "table"),
+        otherwise="told from it",
+    ),
+    Option(
+        "--hand",
+        "FILE",
+        "what the file calls the hand's joints and where it has the hand's frame: a shipped name "
+        "or a YAML file",
+        otherwise="the shipped one that fits the robot",
+    ),
+    Option(
+        "--take",
+        "palm|contacts",
+        "what a palm and a posture of a data set or table are taken for",
+        one_of("palm", "contacts"),
+        default="palm",
+    ),
+    Option(
+        "--object",
+        "NAME",
+        "what a data set or table grasps: a shipped name, a YAML file or a mesh (in convex pieces; "
+        "as large as the data say); of --take contacts only the pads that touch it count",
+    ),
+    Option(
+        "--of",
+        "NAME",
+        "of which object's grasps, by the file's own name, where it has those of several",
+    ),
+    Option(
+        "--scale",
+        "S",
+        "of which size of the object, by the file's own scale, where it has several",
+        positive,
+    ),
+    Option(
+        "--invalid",
+        "error|drop|clip",
+        "what becomes of rows of a data set or table with joints beyond their limits or with no "
+        "grasp in them: the file is refused, they are left out, or joints are put at their limits",
+        one_of("error", "drop", "clip"),
+        default="error",
+    ),
+    SCENE,
+    PREFER,
+    Q0,
+    Option("--limit", "N", "answers at most", whole(1), default=10),
+    Option("--per-candidate", "N", "answers of one candidate at most", whole(1), default=1),
+    SEED,
+    *TOLERANCES,
+    MAX_ROUNDS,
+    out("RANKED.json", "write the answers", Path),
+    SIZE_LIMITS,
+)
+def choose(said: Said) -> Answer:
+    r"""Of many grasps find those that are best to take, and how.
 
-    Raises:
-        CasadiIKError: Bad input, or an output that cannot be written.
+    Examples:
+      casadi-ik choose candidates.yaml --robot panda+allegro_right --scene table \
+          --out ranked.json
+      casadi-ik choose grasps/ --robot R --object-pose 0.5 0 0.1 0 0 1.57 \
+          --prefer q0 --out ranked.json
+
+    CANDIDATES is one of
+      a YAML file with a list of grasps, each as a grasp file has it:
+        candidates:
+          - contacts: {thumb: {point: [0.02, 0.1, 0], normal: [0, -1, 0]}, ...}
+          - contacts: ...
+      a folder of grasp files
+      an npz file with points and normals (k, f, 3), as for `casadi-ik batch`
+      an npy file of getagrip, dexgraspnet, bodex, dexgraspbench or dexonomy: palms
+        and hands are as they are there, only the arm is looked for (--take
+        contacts: only the fingertips are)
+      a pt file of multidex, the same; --of says of which of its objects
+      a table (.csv, .npz, .parquet) with columns x y z, qw qx qy qz or roll pitch
+        yaw (where the robot's palm frame is to be) and the hand's joints by name
+    Nothing in a file is run. docs/choosing.md says what is in them.
+
+    RANKED.json holds the answers, best first, each with the number of its candidate
+    and its score, and how many candidates have none, by reason.
+
+    exit codes: 0 at least one found, 1 none (the report counts the reasons),
+    2 bad input
     """
-    path, out = Path(arguments.candidates), arguments.out
-    robot = the_robot(arguments.robot)
-    q0, pose = the_start(arguments, robot), the_object_pose(arguments)
+    path = Path(said.candidates)
+    robot = the_robot(said.robot)
+    q0, pose = the_start(said, robot), the_object_pose(said)
     grasps = load_candidates(
         path,
         robot,
-        arguments.layout,
-        arguments.hand,
-        take=arguments.take,
-        grasped=arguments.object,
-        of=arguments.of,
-        scale=arguments.scale,
-        invalid=arguments.invalid,
+        said.layout,
+        said.hand,
+        take=said.take,
+        grasped=said.object,
+        of=said.of,
+        scale=said.scale,
+        invalid=said.invalid,
     )
-    check_outputs([("--out", out)], inputs=[path])
-    solver = Solver(
-        robot,
-        tolerance=the_tolerance(arguments),
-        options=the_options(arguments),
-        scene=the_scene(arguments),
-    )
+    check_outputs({"--out": said.out}, inputs=[path])
+    solver = the_solver(said, robot)
     with located(str(path)):
         ranking = solver.choose(
             grasps,
             pose,
             q0,
-            arguments.limit,
-            arguments.prefer,
-            arguments.seed,
-            per_candidate=arguments.per_candidate,
+            said.limit,
+            said.prefer,
+            said.seed,
+            per_candidate=said.per_candidate,
         )
-    text = json.dumps(_ranked(ranking, grasps), indent=2, allow_nan=False) + "\n"
-    write_output(out, "--out", lambda part: part.write_text(text, encoding="utf-8"))
-    report = _report(path.name, solver, ranking, grasps, out)
-    return Answer(report, Exit.DONE if ranking.entries else Exit.NOT_SOLVED)
+    write_json(said.out, _ranked(ranking, grasps))
+    report = _report(path.name, solver, ranking, grasps)
+    return Answer.solved(bool(ranking.entries), Group(*report, *files({"--out": said.out})))
 
 
 def _ranked(ranking: Ranking, grasps: Candidates) -> dict[str, Any]:
@@ -94,22 +197,128 @@ def _ranked(ranking: Ranking, grasps: Candidates) -> dict[str, Any]:
 
 
 def _report(
-    name: str, solver: Solver, ranking: Ranking, grasps: Candidates, out: Path
-) -> RenderableType:
+    name: str, solver: Solver, ranking: Ranking, grasps: Candidates
+) -> list[RenderableType]:
     found = f"{ranking.answered} of {ranking.candidates} candidates of {name} have an answer"
-    seconds = sum(one.solution.time for one in ranking.entries[:1]) * ranking.candidates
     parts: list[RenderableType] = [
         headline(bool(ranking.entries), "FOUND" if ranking.entries else "NONE FOUND", found),
         *(Text(f"  {note}") for note in grasps.notes),
     ]
     if ranking.entries:
+        seconds = ranking.entries[0].solution.time * ranking.candidates
         best = table("candidate", "name", "score", "clearance", right=("score",))
         for one in ranking:
-            clear = clearance(one.solution) if one.solution.clearance is not None else "not checked"
-            label = grasps[one.candidate].name
-            best.add_row(str(one.candidate), label, f"{one.score:.4g}", clear)
+            clear = clearance(one.solution).removeprefix("collision ")
+            best.add_row(str(one.candidate), grasps[one.candidate].name, f"{one.score:.4g}", clear)
         parts += [Text(f"  by {ranking.prefer}, in {duration(seconds)}"), best]
     if solver.scene is None:
         parts.append(Text("  collision not checked"))
-    parts += [Text(f"  {count} have none: {reason}") for reason, count in ranking.failures.items()]
-    return Group(*parts, *files([("out", out)]))
+    return parts + [Text(f"  {n} have none: {why}") for why, n in ranking.failures.items()]
+
+
+class RankedSolution(msgspec.Struct, frozen=True):
+    """What is needed of an answer.
+
+    Attributes:
+        robot: Whose it is.
+        q: A number per actuator [rad or m].
+    """
+
+    robot: str
+    q: list[float]
+
+
+class RankedEntry(msgspec.Struct, frozen=True):
+    """One of the answers.
+
+    Attributes:
+        candidate: Number of its grasp among the candidates.
+        score: What it was ranked by.
+        solution: How to take it.
+        name: Of its grasp.
+        grasp: The grasp, where the object is; None in older files.
+        pregrasp: The same hand before it, if the candidate said it.
+    """
+
+    candidate: int
+    score: float
+    solution: RankedSolution
+    name: str = ""
+    grasp: GraspFile | None = None
+    pregrasp: GraspFile | None = None
+
+    @property
+    def label(self) -> str:
+        """It in a few words."""
+        return f"{self.name or 'candidate'} ({self.candidate}), score {self.score:.4g}"
+
+
+class _RankedFile(msgspec.Struct, frozen=True):
+    ranked: list[RankedEntry]
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenPosture:
+    """One of the answers, to be reached.
+
+    Attributes:
+        grasp: The grasp, base frame.
+        q: (n,) the posture [rad or m].
+        robot: Name of the robot.
+    """
+
+    grasp: Grasp
+    q: Array
+    robot: str
+
+
+def chosen_posture(path: Path, rank: int) -> ChosenPosture:
+    """One of the answers of a file.
+
+    Args:
+        path: What ``casadi-ik choose --out`` wrote.
+        rank: Which, from 1.
+
+    Raises:
+        InputError: As for `read_ranked`, or there are fewer.
+        DescriptionError: Its grasp is missing or malformed.
+    """
+    found = read_ranked(path)
+    if rank > len(found):
+        raise InputError(f"--rank: found {rank}, but {path} has {len(found)} answers")
+    one, where = found[rank - 1], f"ranked[{rank - 1}]."
+    if one.grasp is None:
+        raise DescriptionError(
+            f"{path}: {where}grasp: missing, expected what `casadi-ik choose` writes now"
+        )
+    name = one.name or f"{path.stem}[{rank - 1}]"
+    grasp = grasp_of(one.grasp, path, name, f"{where}grasp.")
+    if one.pregrasp is not None:
+        before = grasp_of(one.pregrasp, path, name, f"{where}pregrasp.")
+        grasp = replace(grasp, pregrasp=before)
+    return ChosenPosture(grasp, np.array(one.solution.q), one.solution.robot)
+
+
+def read_ranked(path: Path) -> list[RankedEntry]:
+    """The answers of a file, best first, at least one.
+
+    Args:
+        path: What ``casadi-ik choose --out`` wrote.
+
+    Raises:
+        InputError: It cannot be read, is too large, is none of that kind, or has no answers; the
+            message names file and key.
+    """
+    try:
+        size, most = path.stat().st_size, limit(MOST_BYTES)
+        if size > most:
+            raise InputError(f"{path}: found {size} bytes, expected at most {most} {RAISED}")
+        found = msgspec.json.decode(path.read_bytes(), type=_RankedFile).ranked
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        text = str(error).replace("`$.", "`")
+        raise InputError(f"{path}: expected what `casadi-ik choose` writes: {text}") from error
+    if not found:
+        raise InputError(f"{path}: ranked: found none, expected at least one answer")
+    return found

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import time
+from pathlib import Path
 
 from rich.console import Group
 from rich.text import Text
 
 from casadi_ik.arm_hand import load_robot
-from casadi_ik.cli.answer import Answer
-from casadi_ik.cli.report import fields, headline
-from casadi_ik.cli.say import say
+from casadi_ik.cli.options import Option, each, one_of, out, whole
+from casadi_ik.cli.outputs import say
+from casadi_ik.cli.report import counted, fields, headline
+from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.exporting.ahead import uses
 from casadi_ik.exporting.project import (
@@ -26,55 +27,101 @@ from casadi_ik.kernels import cache_directory
 from casadi_ik.kernels.compiler import find_compiler
 
 
-def export(arguments: argparse.Namespace) -> Answer:
-    """Write a solver as source code.
+@command(
+    Option("robot", "ROBOT", "a shipped name or a YAML file"),
+    out("DIR", "folder to write", Path),
+    Option("--method", "M", "hand-first is the only one that can be", default="hand-first"),
+    Option("--prefix", "NAME", "what all names begin with", otherwise="the robot's name"),
+    Option(
+        "--target",
+        "c|wasm",
+        "plain C, or a WebAssembly module for JavaScript (needs casadi-ik[compiler])",
+        one_of("c", "wasm"),
+        default="c",
+    ),
+    Option(
+        "--scene",
+        "CAPACITY",
+        "collisions are checked: the robot with itself, and with so many solids at most",
+        whole(1),
+    ),
+    Option("--single", "", "in single precision, for controllers that have no other (--target c)"),
+    Option(
+        "--follow",
+        "",
+        "with a follower of moving contacts that keeps velocities and accelerations",
+    ),
+)
+def export(said: Said) -> Answer:
+    """Write a robot's solver as source code that needs this package no more.
 
-    Raises:
-        CasadiIKError: Bad input, or a folder that cannot be written.
+    Examples:
+      casadi-ik export kuka_lwr_barrett --out solver && make -C solver test
+      casadi-ik export kuka_lwr_barrett --out solver --single && make -C solver test
+      casadi-ik export kuka_lwr_barrett --out solver --follow && make -C solver test
+      casadi-ik export my_robot.yaml --out page --target wasm
+
+    DIR becomes a project that needs nothing but a C compiler (--target wasm: a
+    browser or node): library, header, example, a test of 1,000 stored targets, a
+    benchmark, README. It solves one target at a time, in doubles; its answers are
+    bit for bit those of this package. With --single, for controllers without a unit
+    for doubles, all of it is in single precision: an answer is one in double
+    precision, too, if another than here. An earlier export in DIR is replaced; any
+    other folder that is not empty is refused. With --scene, being solved includes
+    that nothing touches; where the answer does, the other ways are looked at in
+    which the arm can hold the hand, and then other hands.
+
+    exit codes: 0 written, 2 bad input (nothing is written)
     """
-    check_method(arguments.method)
-    check_folder(arguments.out)
-    if arguments.single and arguments.target == "wasm":
+    check_method(said.method)
+    check_folder(said.out)
+    if said.single and said.target == "wasm":
         raise UnsupportedError(
             "--single: WebAssembly computes as fast in double precision; expected --target c"
         )
-    robot = load_robot(arguments.robot)
-    prefix = checked_prefix(arguments.prefix, robot.name)
-    if arguments.target == "wasm":
-        files = wasm_project(robot, prefix, arguments.scene, arguments.follow)
+    robot = load_robot(said.robot)
+    prefix = checked_prefix(said.prefix, robot.name)
+    if said.target == "wasm":
+        found = wasm_project(robot, prefix, said.scene, said.follow)
     else:
-        files = c_project(robot, prefix, arguments.scene, arguments.single, arguments.follow)
-    write_folder(arguments.out, files)
-    size = sum(len(content) for content in files.values())
+        found = c_project(robot, prefix, said.scene, said.single, said.follow)
+    write_folder(said.out, found)
     pairs = {
         "names": f"{prefix}_...",
-        "files": f"{len(files)}, {size / 1e6:.1f} MB",
-        "next": f"see {arguments.out / 'README.md'}",
+        "files": f"{len(found)}, {sum(map(len, found.values())) / 1e6:.1f} MB",
+        "next": f"see {said.out / 'README.md'}",
     }
-    return Answer(
-        Group(headline(True, "EXPORTED", f"{robot.name} to {arguments.out}"), fields(pairs))
-    )
+    return Answer(Group(headline(True, "EXPORTED", f"{robot.name} to {said.out}"), fields(pairs)))
 
 
-def compile_ahead(arguments: argparse.Namespace) -> Answer:
-    """Compile what solving, batches and logs of robots need.
+@command(
+    Option("robots", "ROBOT", "a shipped name, ARM+HAND, or a YAML file", each(str), "+"),
+)
+def compile_ahead(said: Said) -> Answer:
+    """Compile what solving, batches and logs of robots need, ahead of use.
 
-    Raises:
-        CasadiIKError: Bad input, or a compiler that refuses.
+    Example:
+      casadi-ik compile kuka_lwr_barrett panda+allegro_right
+
+    Makes what solving, batches and logs of a robot compile when first used, so that
+    nothing has to be compiled later; also for a machine without a compiler that
+    shares CASADI_IK_CACHE.
+
+    exit codes: 0 done, 2 bad input
     """
-    robots = [load_robot(name) for name in arguments.robots]
+    robots = [load_robot(name) for name in said.robots]
     if find_compiler() is None:
         raise UnsupportedError(
             "compile: there is no C compiler; pip install 'casadi-ik[compiler]' brings one"
         )
     lines = []
     for robot in robots:
-        whole, parts = time.perf_counter(), list(uses(robot))
+        whole_time, parts = time.perf_counter(), list(uses(robot))
         for i, (what, use) in enumerate(parts, start=1):
-            begun = time.perf_counter()
+            began = time.perf_counter()
             use()
-            spent = time.perf_counter() - begun
+            spent = time.perf_counter() - began
             say("compiled", f"{robot.name} {i}/{len(parts)}: {what} ({spent:.1f} s)")
-        lines.append(Text(f"  {robot.name}: {time.perf_counter() - whole:.1f} s"))
-    what = f"{len(robots)} robot{'s' * (len(robots) > 1)} in {cache_directory()}"
+        lines.append(Text(f"  {robot.name}: {time.perf_counter() - whole_time:.1f} s"))
+    what = f"{counted(len(robots), 'robot')} in {cache_directory()}"
     return Answer(Group(headline(True, "COMPILED", what), *lines))

@@ -1,28 +1,67 @@
-"""`casadi-ik robots`, `methods` and `grasps`: what there is."""
+"""`casadi-ik robots`, `methods`, `grasps` and `schemas`: what there is, and how files have it."""
 
 from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from casadi_ik.arms.recognise import family_in_words
-from casadi_ik.cli.answer import Answer
-from casadi_ik.cli.report import fields, table
+from casadi_ik.cli.options import out
+from casadi_ik.cli.outputs import writing
+from casadi_ik.cli.report import fields, headline, table
+from casadi_ik.cli.table import Answer, Said, command
+from casadi_ik.collision.scene import SceneFile
+from casadi_ik.datasets.conventions import ConventionFile
+from casadi_ik.files.json_schema import json_schema
 from casadi_ik.files.reading import convert, read_yaml
 from casadi_ik.files.shipped import resolve, shipped_names
-from casadi_ik.grasps.load import GraspFile
+from casadi_ik.files.writing import written_whole
+from casadi_ik.grasps.load import CandidatesFile, GraspFile
+from casadi_ik.grasps.objects import ObjectFile
+from casadi_ik.motion.retarget import Retarget
 from casadi_ik.registry import METHODS, method_summary
 from casadi_ik.robots import load_description
-from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile
+from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile, ImportedFile
+from casadi_ik.symbolic.closed_arms.in_words import form_in_words
+
+FILES: dict[str, tuple[Any, str]] = {
+    "robot": (ArmHandFile | ImportedFile, "A robot: an arm, a hand, and what joins them"),
+    "arm": (ArmFile, "An arm, described in full"),
+    "hand": (HandFile, "A hand, described in full"),
+    "grasp": (GraspFile, "A grasp: a contact per finger, or a palm and a posture"),
+    "candidates": (CandidatesFile, "Grasps, of which one is to be chosen"),
+    "scene": (SceneFile, "A scene: what answers must not touch"),
+    "object": (ObjectFile, "An object to be grasped"),
+    "retarget": (Retarget, "How a person's hand moves a robot's"),
+    "dataset": (ConventionFile, "How a data set has a hand: its joints and its frame"),
+}
+"""By kind of file its type, and a title."""
+
+IN_A_FILE: dict[str, Any] = {
+    "anyOf": [
+        {"required": ["robot"]},
+        {"required": ["hand"], "properties": {"hand": {"type": "object", "required": ["file"]}}},
+    ]
+}
+"""Of which robots the hand is in somebody's file: those that are read as `ImportedFile`."""
 
 
-def robots() -> Answer:
-    """The shipped robots.
+def schema_of(kind: str) -> dict[str, Any]:
+    """The JSON Schema of a kind of `FILES`."""
+    schema = json_schema(*FILES[kind])
+    if kind == "robot":
+        described, imported = schema.pop("anyOf")
+        schema |= {"if": IN_A_FILE, "then": imported, "else": described}
+    return schema
 
-    Raises:
-        DescriptionError: A shipped file is damaged.
-    """
+
+@command()
+def robots(_: Said) -> Answer:
+    """List the shipped robots: fingers and actuators."""
     parts: list[RenderableType] = []
     for name in shipped_names("arm_hands"):
         path = resolve(name, "arm_hands")
@@ -34,7 +73,7 @@ def robots() -> Answer:
             "actuators": f"{len(robot.actuators)}: {', '.join(robot.actuator_names)}",
         }
         if robot.arm_actuators:
-            pairs["arm"] = f"closed form: {family_in_words(robot)}"
+            pairs["arm"] = f"closed form: {form_in_words(robot)}"
         description = convert(read_yaml(path), ArmHandFile, path).description
         parts += [Text(name, "bold"), Text(f"  {description}"), fields(pairs)]
     return Answer(Group(*parts, *_catalogue()))
@@ -48,7 +87,7 @@ def _catalogue() -> list[RenderableType]:
         path = resolve(name, "arms")
         arm = convert(read_yaml(path), ArmFile, path)
         count = sum(joint.type != "fixed" for joint in arm.joints)
-        form = family_in_words(load_description(f"{name}+{some_hand}"))
+        form = form_in_words(load_description(f"{name}+{some_hand}"))
         arms.add_row(name, str(count), form, _short(arm.description))
     hands = table("hand", "motors", "fingers", "what it is", right=("motors", "fingers"))
     for name in shipped_names("hands"):
@@ -67,8 +106,9 @@ def _short(description: str) -> str:
     return description.split(". ")[0].rstrip(".\n")
 
 
-def methods() -> Answer:
-    """The methods, the default first."""
+@command()
+def methods(_: Said) -> Answer:
+    """List the methods, the default first."""
     rows = table("method", "what it does")
     for name in METHODS:
         default = " (default)" if name == METHODS[0] else ""
@@ -76,12 +116,9 @@ def methods() -> Answer:
     return Answer(rows)
 
 
-def grasps() -> Answer:
-    """The shipped grasps.
-
-    Raises:
-        DescriptionError: A shipped file is damaged.
-    """
+@command()
+def grasps(_: Said) -> Answer:
+    """List the shipped grasps."""
     by_robot: dict[str, Table] = {}
     for name in shipped_names("grasps"):
         path = resolve(name, "grasps")
@@ -92,3 +129,27 @@ def grasps() -> Answer:
     for robot, rows in by_robot.items():
         parts += [Text.assemble("robot ", (robot or "any", "bold")), rows]
     return Answer(Group(*parts))
+
+
+@command(out("DIR", "folder to write", Path))
+def schemas(said: Said) -> Answer:
+    """Write JSON Schemas of the files that people write, with which editors complete keys.
+
+    Example:
+      casadi-ik schemas --out .schemas
+
+    Then an editor with a YAML language server completes and checks a file whose
+    first line is, say,
+      # yaml-language-server: $schema=.schemas/grasp.json
+
+    exit codes: 0 written, 2 bad input
+    """
+    lines = []
+    for kind, (_, title) in FILES.items():
+        path = said.out / f"{kind}.json"
+        with writing(path, "--out"):
+            said.out.mkdir(parents=True, exist_ok=True)
+            with written_whole(path) as part:
+                part.write_text(json.dumps(schema_of(kind), indent=1) + "\n", encoding="utf-8")
+        lines.append(Text(f"  {path}  {title}"))
+    return Answer(Group(headline(True, "WRITTEN", f"{len(FILES)} schemas"), *lines))

@@ -1,13 +1,13 @@
-"""`casadi-ik log info`, `solves` and `events`: what is in logs, as tables."""
+"""`casadi-ik log ...`: logs as tables, in words, as pictures, as other files."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby, islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,35 +16,72 @@ from rich.table import Table
 from rich.text import Text
 
 from casadi_ik import logs
-from casadi_ik.cli.answer import Answer
-from casadi_ik.cli.report import duration, fields, table
-from casadi_ik.errors import printable
+from casadi_ik.arm_hand import load_robot
+from casadi_ik.cli.inputs import located
+from casadi_ik.cli.options import Option, each, file_name, one_of, out, whole
+from casadi_ik.cli.outputs import check_outputs, write_output
+from casadi_ik.cli.report import (
+    counted,
+    duration,
+    fields,
+    files,
+    headline,
+    indented,
+    table,
+)
+from casadi_ik.cli.table import Answer, Said, command
+from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
+from casadi_ik.logs.explain.compare import Matched, matched, side_by_side
 from casadi_ik.logs.explain.phrases import SERIOUS, plain_name, told
-from casadi_ik.logs.read.one_solve import happening
+from casadi_ik.logs.explain.why import explain
+from casadi_ik.logs.mcap.data_section import NothingWrittenError
+from casadi_ik.logs.read.files import log_files
+from casadi_ik.logs.read.one_solve import OneSolve, happening, one_solve
+from casadi_ik.logs.read.same_robot import check_robot
+from casadi_ik.logs.repair.finish import finish_log
+from casadi_ik.logs.repair.merge import merge_logs
+
+SHOWN = 12
+"""How many of a list of names or numbers are shown."""
+
+USUAL_EVENTS = ("PHASE_CHANGE", "LIMIT_LEFT", "RELEASED")
+"""What happens in every solve and so is not told of each."""
+
+LOGS = Option("files", "FILE", "logs, or folders of logs", each(str), "+")
+LOG = Option("file", "FILE", "a log, or a folder of shards")
+SOLVE = Option("--solve", "N", "number of the solve", whole(0))
+ONE_SOLVE = Option(SOLVE.name, "N", SOLVE.help, whole(0), otherwise="the only one")
+METHOD = Option("--method", "M", "method", otherwise="the only one")
+FILTERS = (
+    Option("--method", "M", "of the solve"),
+    SOLVE,
+    Option("--status", "S", "of the solve, e.g. STALLED"),
+    Option("--event", "E", "solves in which one happened, and those events, e.g. NEAR_SINGULAR"),
+    Option("--phase", "P", "solves, iterations and events in it, e.g. hand-alignment"),
+)
+MOST = Option("--most", "N", "rows shown", whole(1), default=40)
+KINDS = {".mcap": "viewer", ".parquet": "parquet", ".csv": "csv"}
+"""What `log export` writes, by the name's end."""
 
 
-def info(arguments: argparse.Namespace) -> Answer:
-    """What logs hold.
-
-    Raises:
-        LogError: A file is missing, damaged or no log of casadi_ik.
-    """
+@command(LOGS)
+def info(said: Said) -> Answer:
+    """Tell what logs hold: methods, solves, iterations, events, size and origin."""
     parts: list[RenderableType] = []
-    for name in arguments.files:
-        parts += _report(logs.open(name), name)
+    for name in said.files:
+        log = logs.open(name)
+        about = log.info()
+        parts += [_title(name), fields(_container(log, about)), _methods(log, about)]
+        parts.append(fields(_origin(about)))
     return Answer(Group(*parts))
 
 
-def solves(arguments: argparse.Namespace) -> Answer:
-    """The solves of logs, as one.
-
-    Raises:
-        LogError: A file is missing, damaged or no log of casadi_ik.
-        UnknownNameError: A filter names what there is not.
-    """
-    found = logs.open(arguments.files).solves(**filters(arguments))
+@command(LOGS, *FILTERS, MOST)
+def solves(said: Said) -> Answer:
+    """List solves and how they ended."""
+    found = logs.open(said.files).solves(**_filters(said))
     parts: list[RenderableType] = []
-    left = arguments.most
+    left = said.most
     for part in found.parts:
         shown = islice(logs.Table("solve", (part,)).records(), left)
         if len(part) and left:
@@ -53,42 +90,311 @@ def solves(arguments: argparse.Namespace) -> Answer:
                 of_shard = [] if shard is None else [Text(f"  from {shard}", "dim")]
                 parts += [*of_shard, _solve_rows(part, records)]
             left -= min(left, len(part))
-    return Answer(Group(*parts, _count(len(found), arguments.most, "solves")))
+    return Answer(Group(*parts, _count(len(found), said.most, "solve")))
 
 
-def events(arguments: argparse.Namespace) -> Answer:
-    """The events of logs, as one.
+@command(LOGS, *FILTERS, MOST)
+def events(said: Said) -> Answer:
+    """List events: singularities, limits, stalls, ..."""
+    found = logs.open(said.files).events(**_filters(said))
+    numbers = ("solve", "iteration")
+    rows = table(*numbers, "method", "phase", "what happened", right=numbers)
+    for record in islice(found.records() if len(found) else (), said.most):
+        event = happening(record)
+        text = Text(told(event), "yellow" if event.kind in SERIOUS else "")
+        solve = str(record["solve_id"])
+        rows.add_row(solve, str(event.iteration), record["method"], event.phase, text)
+    return Answer(Group(_only_last_wraps(rows), _count(len(found), said.most, "event")))
+
+
+@command(
+    LOG,
+    Option("solve", "SOLVE", ONE_SOLVE.help, whole(0), "?", otherwise=ONE_SOLVE.otherwise),
+    METHOD,
+)
+def why(said: Said) -> Answer:
+    """Explain one solve in words."""
+    solve = _the_solve(said, logs.open(said.file))
+    found = explain(solve)
+    parts: list[RenderableType] = [headline(solve.success, solve.status, found.headline)]
+    if solve.shard:
+        parts.append(Text(f"  solve {solve.number} of {solve.shard}"))
+    for title, lines in (
+        ("phases", found.phases),
+        ("fingers", found.fingers),
+        ("met on its way", found.met),
+        ("verdict", found.verdict),
+    ):
+        if lines:
+            parts.append(Text(f"  {title}", "bold"))
+            parts += [indented(line, by=4) for line in lines]
+    return Answer(Group(*parts))
+
+
+@command(
+    LOG,
+    ONE_SOLVE,
+    METHOD,
+    Option(
+        "--out",
+        "FILE.png",
+        "where to",
+        file_name(".png"),
+        otherwise="named after log, method and solve, in this folder",
+    ),
+    Option(
+        "--range",
+        "FIRST LAST",
+        "iterations drawn; long runs hide what happens at their beginning",
+        each(whole(0)),
+        2,
+        otherwise="all",
+    ),
+)
+def plot(said: Said) -> Answer:
+    """Draw how one solve went (needs casadi-ik[plots])."""
+    with located("log plot", (MissingExtraError,)):
+        from casadi_ik.views import draw_convergence
+    log = logs.open(said.file)
+    solve = _the_solve(said, log)
+    named = Path(f"{Path(said.file).stem}-{solve.method}-{solve.solve_id}.png")
+    file = said.out or named
+    check_outputs({"--out": file}, inputs=[Path(said.file)])
+    chosen = {"method": solve.method, "solve": solve.solve_id}
+    with located(f"{said.file}: solve {solve.solve_id}"):
+        draw_convergence(
+            log.iterations(**chosen),
+            file,
+            events=log.events(**chosen),
+            tolerance=min(solve.tolerances, key=lambda each: each.position),
+            span=tuple(said.range) if said.range else None,
+            title=f"{solve.method} · solve {solve.solve_id} · {solve.iterations} iterations"
+            f" · {solve.status}",
+        )
+    return Answer(Group(*files({"plot": file})))
+
+
+@command(
+    LOGS,
+    Option("--solve", "N", "one solve, by its number with the first method", whole(0)),
+    Option(
+        "--methods",
+        "M M",
+        "which two; last on the line",
+        each(str),
+        2,
+        otherwise="the only two",
+    ),
+)
+def compare(said: Said) -> Answer:
+    """Compare two methods on the same targets: one side by side, many in numbers."""
+    opened = [logs.open(name) for name in said.files]
+    first, second = _two_methods(opened, said.methods)
+    pairs = matched(opened, first, second)
+    if said.solve is not None:
+        pairs = pairs.of_first(said.solve)
+    if len(pairs) == 0:
+        asked = "" if said.solve is None else f" of solve {said.solve}"
+        where = ", ".join(said.files)
+        raise InputError(f"{where}: {first} and {second}: no target{asked} in common")
+    if len(pairs) > 1:
+        return Answer(_many_compared(pairs))
+    (pair,) = pairs.pairs
+    both = [one_solve(each.log, each.solve_id, each.method) for each in pair]
+    rows = table("", *(f"{each.method}, solve {each.solve_id}" for each in both))
+    for line in side_by_side(*both):
+        rows.add_row(line.what, line.first, line.second)
+    return Answer(rows)
+
+
+@command(
+    LOG,
+    out("REPORT.html", "where to"),
+    Option("--title", "TEXT", "of the page", otherwise="what the log is called"),
+    Option("--most", "N", "solves that can be opened", whole(1), default=200),
+)
+def report(said: Said) -> Answer:
+    """Write a study as a page that needs nothing but a browser (needs casadi-ik[plots]).
+
+    It has success, time and iterations by method and targets, where solves fail or
+    meet singularities, and the hardest with their stories.
+    """
+    with located("log report", (MissingExtraError,)):
+        from casadi_ik.views.report import study_page
+    path = Path(said.file)
+    log = logs.open(path)
+    check_outputs({"--out": said.out}, inputs=[path])
+    page = study_page(log, said.title or path.stem, said.most)
+    write_output(said.out, "--out", lambda part: part.write_text(page, encoding="utf-8"))
+    count = counted(sum(len(part) for part in log.solves().parts), "solve")
+    return Answer(Group(Text(f"  {count}"), *files({"page": said.out})))
+
+
+@command(
+    LOG,
+    *FILTERS,
+    Option(
+        "--what",
+        "iterations|solves|events",
+        "rows of a table",
+        one_of("iterations", "solves", "events"),
+        default="iterations",
+    ),
+    Option(
+        "--to",
+        "viewer|parquet|csv",
+        "kind of file",
+        one_of(*KINDS.values()),
+        otherwise=f"what --out ends in: {', '.join(KINDS)}",
+    ),
+    Option(
+        "--robot",
+        "R",
+        "for a viewer: a shipped name or a YAML file",
+        otherwise="the log's",
+    ),
+    out("FILE", "where to", file_name()),
+)
+def export(said: Said) -> Answer:
+    """Write tables, or a file for a viewer.
+
+    VIEW.mcap, for Foxglove (app.foxglove.dev) and Lichtblick: one solve with the
+    robot, its frames, joints, contacts, phases and events, 10 ms an iteration; needs
+    casadi-ik[viewer]. Beside it VIEW.layout.json is written, a layout to import
+    there.
+    TABLE.parquet or TABLE.csv: rows of numbers, needs casadi-ik[dataframes].
+    """
+    kind = said.to or KINDS.get(said.out.suffix.lower())
+    if kind is None:
+        raise InputError(
+            f"--out: found {str(said.out)!r}, expected {', '.join(KINDS)}, or say --to"
+        )
+    if kind == "viewer":
+        return _exported_view(said, said.out)
+    check_outputs({"--out": said.out}, inputs=[Path(said.file)])
+    log = logs.open(said.file)
+    with located("log export", (MissingExtraError,)):
+        frame = getattr(log, said.what)(**_filters(said)).frame()
+    write = frame.write_parquet if kind == "parquet" else frame.write_csv
+    write_output(said.out, "--out", write)
+    about = {"rows": f"{frame.height} {said.what}", "columns": str(frame.width)}
+    return Answer(Group(fields(about), *files({kind: said.out})))
+
+
+@command(LOGS)
+def finish(said: Said) -> Answer:
+    """Repair logs in place whose writer was killed.
+
+    In a folder those in which nothing is whole are named and left as they are.
+    """
+    parts: list[RenderableType] = []
+    for path, _ in (found := log_files(said.files)):
+        try:
+            done = finish_log(path)
+        except NothingWrittenError:
+            if len(found) == 1:
+                raise
+            about = {"done": "left as it is: nothing in it is whole"}
+        else:
+            cut = f"finished, {_size(done.cut)} of a torn tail cut"
+            about = {
+                "done": cut if done.changed else "whole already",
+                "holds": f"{counted(done.chunks, 'chunk')}, {counted(done.messages, 'message')}",
+            }
+        parts += [_title(str(path)), fields(about)]
+    return Answer(Group(*parts))
+
+
+@command(LOGS, out("FILE.mcap", "the log that has all of it"))
+def merge(said: Said) -> Answer:
+    """Join the shards of a study, without recompressing."""
+    check_outputs({"--out": said.out}, inputs=[path for path, _ in log_files(said.files)])
+    done = merge_logs(said.files, said.out)
+    about = {
+        "shards": str(done.shards),
+        "solves": ", ".join(f"{count} of {name}" for name, count in done.solves.items()) or "none",
+        "messages": str(done.messages),
+        "size": _size(done.size),
+        "left out": _named(done.left_out, "nothing in it is whole"),
+    }
+    return Answer(Group(fields(about), *files({"log": said.out})))
+
+
+def _exported_view(said: Said, file: Path) -> Answer:
+    with located("log export", (MissingExtraError,)):
+        from casadi_ik.logs.viewer.export import write_view
+    from casadi_ik.logs.viewer.layout import layout_of, write_layout
+
+    layout = file.with_suffix(".layout.json")
+    check_outputs({"--out": file, "the layout": layout}, inputs=[Path(said.file)])
+    log = logs.open(said.file)
+    solve = _the_solve(said, log)
+    with located(f"{said.file}: robot (say --robot)", (UnknownNameError,)):
+        robot = load_robot(said.robot or solve.robot)
+    check_robot(robot, log.attachment("robot.urdf").decode(), said.file)
+    write_view(file, solve, robot)
+    write_layout(layout, layout_of(solve, robot))
+    return Answer(Group(*files({"viewer": file, "layout": layout})))
+
+
+def _the_solve(said: Said, log: logs.Log) -> OneSolve:
+    """The solve that was asked for.
 
     Raises:
-        LogError: A file is missing, damaged or no log of casadi_ik.
-        UnknownNameError: A filter names what there is not.
+        LogError: The log is damaged.
+        UnknownNameError: There is no such solve, or several; the message names the file.
     """
-    found = logs.open(arguments.files).events(**filters(arguments))
-    rows = table("solve", "iteration", "method", "phase", "what happened", right=_NUMBERS)
-    for record in islice(found.records() if len(found) else (), arguments.most):
-        event = happening(record)
-        rows.add_row(
-            str(record["solve_id"]),
-            str(event.iteration),
-            record["method"],
-            event.phase,
-            Text(told(event), "yellow" if event.kind in SERIOUS else ""),
-        )
-    return Answer(Group(_kept_whole(rows), _count(len(found), arguments.most, "events")))
+    try:
+        return one_solve(log, said.solve, said.method)
+    except UnknownNameError as error:
+        where = "" if said.file in str(error) else f"{said.file}: "
+        raise UnknownNameError(f"{where}{error}") from error
 
 
-def filters(arguments: argparse.Namespace) -> dict[str, Any]:
+def _filters(said: Said) -> dict[str, Any]:
     """The filters of a command as `Log` takes them."""
-    return {
-        name: getattr(arguments, name) for name in ("method", "solve", "status", "event", "phase")
-    }
+    return {option.key: getattr(said, option.key) for option in FILTERS}
+
+
+def _title(name: str) -> Text:
+    return Text(name, "bold", no_wrap=True, overflow="ignore")
+
+
+def _only_last_wraps(rows: Table) -> Table:
+    for column in rows.columns[:-1]:
+        column.no_wrap = True
+    return rows
+
+
+def _count(count: int, most: int, thing: str) -> RenderableType:
+    if count <= most:
+        return Text(f"  {counted(count, thing)}")
+    return Text(f"  the first {most} of {counted(count, thing)} (--most shows more)")
+
+
+def _named(items: Sequence[Any], why_named: str = "") -> str:
+    """How many there are, the first few, and why they are named; "" if there are none."""
+    if not items:
+        return ""
+    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
+    count = f"{len(items)}: " if len(items) > 1 else ""
+    text = f"{count}{', '.join(map(str, items[:SHOWN]))}{more}"
+    return f"{text}: {why_named}" if why_named else text
+
+
+def _size(count: int) -> str:
+    """Bytes in the unit that suits them."""
+    for unit, scale in (("MB", 1e6), ("kB", 1e3)):
+        if count >= scale:
+            return f"{count / scale:.3g} {unit}"
+    return f"{count} bytes"
 
 
 def _solve_rows(part: logs.MethodRows, records: Iterable[Mapping[str, Any]]) -> Table:
     """A row per solve of one method; restarts only if there are any."""
     restarts = ["restarts"] if part.rows["restarts"].any() else []
-    heads = ["solve", "status", "iterations", *restarts, "mm off", "deg off", "time", "events"]
-    rows = table(*heads, right=_NUMBERS)
+    numbers = ("iterations", *restarts, "mm off", "deg off", "time")
+    rows = table("solve", "status", *numbers, "events", right=("solve", *numbers))
     for record in records:
         rows.add_row(
             str(record["solve_id"]),
@@ -100,29 +406,7 @@ def _solve_rows(part: logs.MethodRows, records: Iterable[Mapping[str, Any]]) -> 
             duration(record["time"]),
             _tally(part.labels["events"], record) + ("" if record["kept"] else " (totals only)"),
         )
-    return _kept_whole(rows)
-
-
-SHOWN = 4
-"""How many files, or values in which shards differ, are named."""
-
-SHORT, LONG = 60, 2000
-"""Characters of a name and of a text of the metadata that are shown."""
-
-_NUMBERS = ("solve", "iteration", "iterations", "restarts", "mm off", "deg off", "time")
-
-
-def _kept_whole(rows: Table) -> Table:
-    """Only the last column wraps."""
-    for column in rows.columns[:-1]:
-        column.no_wrap = True
-    return rows
-
-
-def _count(count: int, most: int, what: str) -> RenderableType:
-    if count <= most:
-        return Text(f"  {count or 'no'} {what}")
-    return Text(f"  the first {most} of {count} {what} (--most shows more)")
+    return _only_last_wraps(rows)
 
 
 def _worst(values: Any, factor: float) -> str:
@@ -132,96 +416,60 @@ def _worst(values: Any, factor: float) -> str:
 
 
 def _tally(kinds: Sequence[str], record: Mapping[str, Any]) -> str:
-    """How often what happened in a solve, but for what happens in every one; what was held."""
+    """How often what happened in a solve, by the names of `--event`; what was held."""
     counts = zip(kinds, np.ravel(record["events"]).tolist(), strict=True)
-    usual = ("PHASE_CHANGE", "LIMIT_LEFT", "RELEASED")
-    found = [f"{count} {plain_name(k.lower())}" for k, count in counts if count and k not in usual]
-    found += [f"{name} held" for name in record.get("fixed_mask", ())]
-    return ", ".join(found)
+    found = [f"{count} {kind}" for kind, count in counts if count and kind not in USUAL_EVENTS]
+    return ", ".join(found + [f"{name} held" for name in record.get("fixed_mask", ())])
 
 
-def _report(log: logs.Log, name: str) -> list[RenderableType]:
-    about = log.info()
+def _container(log: logs.Log, about: logs.LogInfo) -> dict[str, str]:
+    """Robot, size and what is wrong with files."""
     iterations = sum(counts["iteration"] for counts in about.counts.values())
-    each = f", {about.size / iterations:.0f} bytes/iteration" if iterations else ""
+    each_takes = f", {about.size / iterations:.0f} bytes/iteration" if iterations else ""
     packed = f"{about.chunks}, compression {about.compression}"
     if about.compressed:
         packed += f" ({about.uncompressed / about.compressed:.1f} times smaller)"
-    attached = (f"{name} ({size(length)})" for name, length in about.attachments.items())
+    attached = (f"{name} ({_size(length)})" for name, length in about.attachments.items())
     sources = log.sources.names
-    shards = {"shards": named(sources, "")} if len(sources) > 1 else {}
-    return [
-        Text(name, "bold", no_wrap=True, overflow="ignore"),
-        fields(
-            {
-                "robot": about.robot,
-                **shards,
-                "size": f"{size(about.size)}{each}",
-                "chunks": packed,
-                "attached": ", ".join(attached) or "nothing",
-                **_unfinished(about),
-            }
+    return {
+        "robot": about.robot,
+        "shards": _named(sources) if len(sources) > 1 else "",
+        "size": f"{_size(about.size)}{each_takes}",
+        "chunks": packed,
+        "attached": ", ".join(attached) or "nothing",
+        "unfinished": _named(
+            about.unfinished, "killed while writing, or still at it (casadi-ik log finish)"
         ),
-        _methods(log),
-        fields(_origin(about)),
-    ]
+        "left out": _named(about.left_out, "nothing in it is whole"),
+    }
 
 
-def _unfinished(about: logs.LogInfo) -> dict[str, str]:
-    """Files without an end and files without anything, if there are any."""
-    found = {}
-    if about.unfinished:
-        why = "killed while writing, or still at it (casadi-ik log finish)"
-        found["unfinished"] = named(about.unfinished, why)
-    if about.left_out:
-        found["left out"] = named(about.left_out, "nothing in it is whole")
-    return found
-
-
-def named(items: Sequence[Any], why: str) -> str:
-    """How many there are, the first few, and why they are named."""
-    first = ", ".join(map(str, items[:SHOWN]))
-    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
-    count = f"{len(items)}: " if len(items) > 1 else ""
-    return f"{count}{first}{more}" + (f": {why}" if why else "")
-
-
-def _methods(log: logs.Log) -> RenderableType:
+def _methods(log: logs.Log, about: logs.LogInfo) -> RenderableType:
     right = ("solves", "iterations")
     rows = table("method", *right, "status", "smallest sigma", "events", right=right)
-    for method, counts in log.info().counts.items():
-        statuses = _counter(log.solves(method=method), "status")
-        kinds = _counter(log.events(method=method), "kind")
-        rows.add_row(
-            method,
-            str(counts["solve"]),
-            str(counts["iteration"]),
-            _counted(statuses),
-            _smallest(log.solves(method=method)),
-            _counted(kinds),
-        )
+    for method, counts in about.counts.items():
+        found = log.solves(method=method)
+        tallies = []
+        for records, field in ((found, "status"), (log.events(method=method), "kind")):
+            tally = Counter(record[field] for record in records.records())
+            lines = (f"{count} {name}" for name, count in tally.most_common())
+            tallies.append("\n".join(lines) or "none")
+        numbers = str(counts["solve"]), str(counts["iteration"])
+        rows.add_row(method, *numbers, tallies[0], _smallest(found), tallies[1])
     return rows
 
 
-def _smallest(solves: logs.Table) -> str:
+def _smallest(found: logs.Table) -> str:
     """Smallest singular value of every Jacobian over all solves, or that it was not measured."""
     field = "lowest_sigma"
-    if field not in solves.names:
+    if field not in found.names:
         return "not measured"
-    values = np.concatenate([[np.full(solves.rows[field].shape[1], np.nan)], solves.rows[field]])
+    values = np.concatenate([[np.full(found.rows[field].shape[1], np.nan)], found.rows[field]])
     lowest = np.fmin.reduce(values, axis=0).tolist()
     return "\n".join(
         f"{plain_name(name)} {'not measured' if math.isnan(value) else f'{value:.2g}'}"
-        for name, value in zip(solves.labels[field], lowest, strict=True)
+        for name, value in zip(found.labels[field], lowest, strict=True)
     )
-
-
-def _counter(table: logs.Table, field: str) -> Counter[str]:
-    return Counter(record[field] for record in table.records())
-
-
-def _counted(counter: Counter[str]) -> str:
-    return "\n".join(f"{count} {name}" for name, count in counter.most_common()) or "none"
 
 
 def _origin(about: logs.LogInfo) -> dict[str, str]:
@@ -244,13 +492,13 @@ def _origin(about: logs.LogInfo) -> dict[str, str]:
             for name in dict.fromkeys(name for each in values for name in each):
                 own = list(dict.fromkeys(_flat(each.get(name)) for each in values))
                 if len(own) > 1:
-                    pairs[name.replace("_", " ")] = _several(own)
+                    pairs[name.replace("_", " ")] = _by_shard(own)
         elif key in pairs and key != "created":
-            pairs[key] = _several([_flat(value) for value in values])
-    return {printable(name, SHORT): printable(text, LONG) for name, text in pairs.items()}
+            pairs[key] = _by_shard([_flat(value) for value in values])
+    return {printable(name, 60): printable(text, 2000) for name, text in pairs.items()}
 
 
-def _several(texts: Sequence[str]) -> str:
+def _by_shard(texts: Sequence[str]) -> str:
     """What shards differ in."""
     more = f" | {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
     return " | ".join(texts[:SHOWN]) + more + " (by shard)"
@@ -260,12 +508,38 @@ def _flat(value: Any) -> str:
     """JSON on one line, a mapping as "name value, ..."."""
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_flat(item)}" for key, item in value.items()) or "none"
+    if isinstance(value, float):
+        return f"{value:.6g}"
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def size(count: int) -> str:
-    """Bytes in the unit that suits them."""
-    for unit, scale in (("MB", 1e6), ("kB", 1e3)):
-        if count >= scale:
-            return f"{count / scale:.3g} {unit}"
-    return f"{count} bytes"
+def _two_methods(opened: list[logs.Log], asked: list[str] | None) -> tuple[str, str]:
+    held = list(dict.fromkeys(method for log in opened for method in log.methods))
+    for method in asked or ():
+        if method not in held:
+            raise InputError(f"--methods: found {method!r}, the logs hold {', '.join(held)}")
+    both = asked or held
+    if len(both) != 2:
+        raise InputError(
+            f"the logs hold {', '.join(held) or 'no method'}, expected two methods (say --methods)"
+        )
+    return both[0], both[1]
+
+
+def _many_compared(pairs: Matched) -> RenderableType:
+    success = np.array([[each.success for each in pair] for pair in pairs.pairs])
+    iterations = np.array([[each.iterations for each in pair] for pair in pairs.pairs])
+    times = np.array([[each.time for each in pair] for pair in pairs.pairs])
+    rows = table("method", "solved", "iterations where both", "time where both", right=("solved",))
+    both = success.all(axis=1)
+    lines = [f"solved by both {both.sum()}, by neither {(~success.any(axis=1)).sum()}"]
+    for i, name in enumerate((pairs.first, pairs.second)):
+        means = ("-", "-")
+        if both.any():
+            means = (f"{iterations[both, i].mean():.1f}", f"{1e3 * times[both, i].mean():.3g} ms")
+        rows.add_row(name, f"{success[:, i].sum()} of {len(success)}", *means)
+        only = np.flatnonzero(success[:, i] & ~success[:, 1 - i]).tolist()
+        numbers = _named([pairs.pairs[j][0].solve_id for j in only]).partition(": ")
+        named = f" (solve {numbers[2] or numbers[0]})" if only else ""
+        lines.append(f"only by {name}: {len(only)}{named}")
+    return Group(rows, *(Text(f"  {line}") for line in lines))

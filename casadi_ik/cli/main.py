@@ -12,10 +12,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from casadi_ik.cli.answer import Exit
-from casadi_ik.cli.outputs import OutputError
-from casadi_ik.cli.parser import build_parser
-from casadi_ik.cli.say import say
+from casadi_ik.cli.outputs import OutputError, say
+from casadi_ik.cli.table import Exit, parse
 from casadi_ik.errors import CasadiIKError, printable
 from casadi_ik.files.limits import VARIABLE
 
@@ -34,10 +32,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         130 interrupted, 143 terminated, 141 the reader of stdout went away. What no one foresaw is
         raised.
     """
-    with warnings.catch_warnings(), _terminated_like_interrupted():
+    with warnings.catch_warnings(), _stoppable(whole_process=argv is None):
         warnings.showwarning = _show_warning
         try:
-            return _run(argv)
+            run, said = parse(sys.argv[1:] if argv is None else argv)
+            with _size_limits(getattr(said, "size_limits", None)):
+                answer = run(said)
+            _show(answer.report)
+            return answer.exit
         except CasadiIKError as error:
             say("error", str(error))
             return Exit.BAD_INPUT
@@ -48,7 +50,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             say("error", "interrupted")
             return Exit.INTERRUPTED
         except BrokenPipeError:
-            _abandon_stdout()
             return Exit.BROKEN_PIPE
 
 
@@ -57,64 +58,59 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """Raise `Terminated` on SIGTERM inside the block, unless the program around us handles it."""
+def _stoppable(whole_process: bool) -> Iterator[None]:
+    """Ctrl-C and SIGTERM raise in the block, once: what then tidies up is not disturbed again.
 
-    def terminate(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough
-        raise Terminated
+    A signal that the program around us handles or ignores is left alone.
 
-    ours = (
-        threading.current_thread() is threading.main_thread()
-        and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    )
-    if ours:
-        signal.signal(signal.SIGTERM, terminate)
+    Args:
+        whole_process: Whether nothing comes after the block but the end of the process, which is
+            not disturbed either.
+    """
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    main_thread = threading.current_thread() is threading.main_thread()
+    ours = [one for one in usual if main_thread and signal.getsignal(one) is usual[one]]
+
+    def stop(number: int, _: object) -> None:
+        for one in ours:
+            signal.signal(one, signal.SIG_IGN)
+        raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+
+    for one in ours:
+        signal.signal(one, stop)
     try:
         yield
     finally:
-        if ours:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for one in ours if not whole_process else ():
+            signal.signal(one, usual[one])
 
 
-def _run(argv: Sequence[str] | None) -> Exit:
+def _show(report: RenderableType) -> None:
+    """Print a report; plain and 80 columns wide where stdout is no terminal.
+
+    Raises:
+        OutputError: It cannot be printed.
+        BrokenPipeError: Whoever read it went away.
+    """
+    if sys.stdout is None:  # closed by the shell: >&-
+        return
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
     try:
-        arguments = build_parser().parse_args(argv)
-    except SystemExit:  # --help and --version have been printed
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        raise
-    with _limits(getattr(arguments, "size_limits", None)):
-        answer = arguments.run(arguments)
-    try:
-        _show(answer.report)
+        if isinstance(report, str):
+            sys.stdout.write(report)
+        else:
+            _render(report)
+        sys.stdout.flush()
     except BrokenPipeError:
+        _abandon_stdout()
         raise
     except OSError as error:
         _abandon_stdout()
         raise OutputError(f"<stdout>: cannot be written: {error.strerror}") from error
-    return answer.exit
 
 
-@contextmanager
-def _limits(factor: float | None) -> Iterator[None]:
-    """All limits of files times a factor meanwhile, in what is started as well."""
-    before = os.environ.get(VARIABLE)
-    if factor is not None:
-        os.environ[VARIABLE] = repr(factor)
-    try:
-        yield
-    finally:
-        if factor is not None:
-            del os.environ[VARIABLE]
-        if before is not None:
-            os.environ[VARIABLE] = before
-
-
-def _show(report: RenderableType) -> None:
-    """Print a report; plain and 80 columns wide where stdout is no terminal."""
-    if sys.stdout is None:  # closed by the shell: >&-
-        return
+def _render(report: RenderableType) -> None:
     from rich.console import Console, ConsoleOptions
     from rich.segment import Segment
 
@@ -129,16 +125,7 @@ def _show(report: RenderableType) -> None:
             for segment in super().render(renderable, options):
                 yield segment if segment.control else segment._replace(text=printable(segment.text))
 
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")
-    console = Terminal(markup=False, emoji=False, highlight=False)
-    console.print(report, crop=False)
-    sys.stdout.flush()
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """A warning as one line, without the place in the code that Python adds."""
-    say("warning", str(message))
+    Terminal(markup=False, emoji=False, highlight=False).print(report, crop=False)
 
 
 def _abandon_stdout() -> None:
@@ -146,3 +133,23 @@ def _abandon_stdout() -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)
+
+
+@contextmanager
+def _size_limits(factor: float | None) -> Iterator[None]:
+    """All limits of files times a factor meanwhile, in what is started as well."""
+    before = os.environ.get(VARIABLE)
+    if factor is not None:
+        os.environ[VARIABLE] = repr(factor)
+    try:
+        yield
+    finally:
+        if factor is not None:
+            del os.environ[VARIABLE]
+        if before is not None:
+            os.environ[VARIABLE] = before
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """A warning as one line, without the place in the code that Python adds."""
+    say("warning", str(message))

@@ -1,14 +1,16 @@
-"""Files a command writes: found unwritable before the work starts, complete or not there at all."""
+"""What a command puts out: lines on stderr, and files that are complete or not there at all."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import stat
-from collections.abc import Callable, Iterable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from casadi_ik.errors import CasadiIKError
+from casadi_ik.cli.options import PROGRAM
+from casadi_ik.errors import CasadiIKError, shortened
 from casadi_ik.files.writing import part_of, target_of, written_whole
 
 
@@ -16,11 +18,21 @@ class OutputError(CasadiIKError):
     """An output cannot be written."""
 
 
-def check_outputs(outputs: Iterable[tuple[str, Path | None]], inputs: Iterable[Path] = ()) -> None:
+def say(kind: str, text: str) -> None:
+    """Print one line on stderr behind the program's name.
+
+    Args:
+        kind: What it is about: "error", "warning".
+        text: The rest; line breaks in it become spaces, and it is cut to a few hundred characters.
+    """
+    print(f"{PROGRAM}: {kind}: {shortened(' '.join(text.split()))}", file=sys.stderr)  # noqa: T201
+
+
+def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ()) -> None:
     """See to it that outputs can be written and overwrite neither each other nor an input.
 
     Args:
-        outputs: Option and path of each; None if it was not asked for.
+        outputs: The path of each by option; None if it was not asked for.
         inputs: Files that are read.
 
     Raises:
@@ -30,7 +42,7 @@ def check_outputs(outputs: Iterable[tuple[str, Path | None]], inputs: Iterable[P
     for path in inputs:
         with contextlib.suppress(OSError):
             taken |= dict.fromkeys(_identities(target_of(path)), "the input")
-    for option, path in outputs:
+    for option, path in outputs.items():
         if path is None:
             continue
         where = f"{path}: {option}"

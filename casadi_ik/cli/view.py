@@ -2,46 +2,113 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rich.text import Text
+import numpy as np
 
+from casadi_ik import logs
 from casadi_ik.arm_hand import ArmHand, load_robot
-from casadi_ik.cli.answer import Answer
-from casadi_ik.cli.question import located, the_grasp, the_robot, the_scene, the_tolerance
-from casadi_ik.cli.view_candidates import candidates_of, ranked_of
-from casadi_ik.cli.view_log import the_logs
+from casadi_ik.arrays import Array
+from casadi_ik.cli.choose import read_ranked
+from casadi_ik.cli.inputs import (
+    located,
+    the_grasp,
+    the_method,
+    the_object_pose,
+    the_robot,
+    the_scene,
+    the_tolerance,
+)
+from casadi_ik.cli.options import (
+    LIMITS,
+    METHOD,
+    OBJECT_POSE,
+    ROBOT,
+    SCENE,
+    SIZE_LIMITS,
+    TOLERANCES,
+    Option,
+    each,
+    whole,
+)
+from casadi_ik.cli.table import Answer, Said, command
+from casadi_ik.collision.scene import Scene
+from casadi_ik.datasets import load_candidates
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.registry import METHODS
+from casadi_ik.logs.read.one_solve import OneSolve, one_solve
+from casadi_ik.logs.read.same_robot import check_robot
 
 if TYPE_CHECKING:
     from casadi_ik.viewing import Viewer
-    from casadi_ik.viewing.asked import Settings
+    from casadi_ik.viewing.asked import Asked, Settings
 
-SHOWN = "cup"
-"""What is shown if nothing is said."""
+    Choices = dict[str, Callable[[], tuple[Asked, Array]]]
 
 
-def view(arguments: argparse.Namespace) -> Answer:
-    """Serve a page until somebody interrupts.
+@command(
+    Option(
+        "what",
+        "GRASP|ROBOT|LOG|CHOICES",
+        "a shipped name or a file; of logs one or two",
+        each(str),
+        "*",
+        default=["cup"],
+        otherwise="cup",
+    ),
+    ROBOT,
+    SCENE,
+    METHOD,
+    LIMITS,
+    *TOLERANCES,
+    OBJECT_POSE,
+    Option(
+        "--solve", "N", "which solve of each log", each(whole(0)), "+", otherwise="the only one"
+    ),
+    Option("--pads", "", "correct the pads of a robot's file"),
+    Option("--meshes", "", "draw the meshes of the robot's files"),
+    Option(
+        "--host",
+        "ADDRESS",
+        "where it is served; 0.0.0.0: to everybody",
+        default="127.0.0.1",
+        otherwise="127.0.0.1, this machine only",
+    ),
+    Option(
+        "--port", "N", "where it is served", whole(1, 65535), otherwise="the first free from 8080"
+    ),
+    SIZE_LIMITS,
+)
+def view(said: Said) -> Answer:
+    """Show a grasp, a robot, answers or a solve in the browser (needs casadi-ik[view]).
 
-    Raises:
-        CasadiIKError: Bad input, or nothing can be served.
+    Examples:
+      casadi-ik view cup --scene table          drag contacts, the cup, the table
+      casadi-ik view panda+allegro_right        a robot as it stands at home
+      casadi-ik view ranked.json                answers of `casadi-ik choose`
+      casadi-ik view candidates.yaml --robot R  each solved when it is chosen
+      casadi-ik view cup.mcap                   play a solve; of two logs side by side
+      casadi-ik view my_robot.yaml --pads       correct guessed pads by hand
+
+    The page stays until Ctrl-C. Only this machine can open it unless --host says
+    otherwise; whoever can open it can move what is on it, and all browsers see the
+    same.
+
+    exit codes: 0 closed, 2 bad input
     """
-    viewer = opened(arguments)
+    viewer = opened(said)
     sys.stdout.write(f"{viewer.url}   (Ctrl-C ends it)\n")
     sys.stdout.flush()
     viewer.wait()
-    return Answer(Text("closed"))
+    return Answer("closed\n")
 
 
-def opened(arguments: argparse.Namespace) -> Viewer:
+def opened(said: Said) -> Viewer:
     """The page that was asked for, running.
 
     Raises:
@@ -49,41 +116,38 @@ def opened(arguments: argparse.Namespace) -> Viewer:
     """
     with located("view", (MissingExtraError,)):
         from casadi_ik import viewing
-    what = arguments.what or [SHOWN]
-    served = {"host": arguments.host, "port": arguments.port}
-    if all(_is_log(Path(one)) for one in what):
+    from casadi_ik.viewing.asked import Settings
+
+    served: dict[str, Any] = {"host": said.host, "port": said.port}
+    if all(_is_log(Path(one)) for one in said.what):
         with located("view"):
-            return viewing.view_log(
-                *the_logs(what, arguments), scene=the_scene(arguments), **served
-            )
-    if len(what) > 1:
-        raise InputError(f"view: found {len(what)} names, expected one (or two logs)")
-    arguments.grasp = name = what[0]
+            return viewing.view_log(*_the_logs(said), scene=the_scene(said), **served)
+    if len(said.what) > 1:
+        raise InputError(f"view: found {len(said.what)} names, expected one (or two logs)")
+    said.grasp = name = said.what[0]
     path, kind = Path(name), _kind(name)
-    if arguments.pads:
+    if said.pads:
         if kind != "robot" or not path.is_file():
             raise InputError(f"{name}: --pads: expected the YAML file of a robot")
         return viewing.view_pads(path, **served)
-    settings, scene = _settings(arguments), the_scene(arguments)
+    settings = Settings(the_method(said), the_tolerance(said), said.limits)
+    scene = the_scene(said)
+    more = {"scene": scene, "settings": settings, **served}
     if kind == "robot":
         robot = load_robot(path if path.is_file() else name)
-        return viewing.view_grasp(
-            robot, scene=scene, settings=settings, meshes=_meshes(robot, path, arguments), **served
-        )
+        return viewing.view_grasp(robot, meshes=_meshes(robot, path, said), **more)
     if kind == "grasp":
-        path, grasp = the_grasp(arguments)
-        robot = the_robot(arguments.robot, path, grasp)
-        meshes = _meshes(robot, Path(arguments.robot or grasp.robot), arguments)
+        path, grasp = the_grasp(said)
+        robot = the_robot(said.robot, path, grasp)
+        meshes = _meshes(robot, Path(said.robot or grasp.robot), said)
         with located(str(path)):
             grasp.arrays(robot.fingers)
-        return viewing.view_grasp(
-            robot, grasp, scene=scene, settings=settings, meshes=meshes, **served
-        )
+        return viewing.view_grasp(robot, grasp, meshes=meshes, **more)
     ranked = path.suffix == ".json"
-    robot, choices = (ranked_of if ranked else candidates_of)(path, arguments, scene, settings)
+    robot, choices = (_ranked if ranked else _candidates)(path, said, scene, settings)
     first, q = next(iter(choices.values()))()
-    more = {"scene": scene, "settings": settings, "candidates": choices, **served}
-    return viewing.view_grasp(robot, first.grasp, q=q if ranked else None, **more)
+    q = q if ranked else None
+    return viewing.view_grasp(robot, first.grasp, q=q, candidates=choices, **more)
 
 
 def _is_log(path: Path) -> bool:
@@ -123,21 +187,82 @@ def _kind(name: str) -> str:
     )
 
 
-def _settings(arguments: argparse.Namespace) -> Settings:
-    from casadi_ik.viewing.asked import Settings
-
-    method = arguments.method or METHODS[0]
-    if method not in METHODS:
-        raise UnknownNameError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
-    return Settings(method, the_tolerance(arguments), arguments.limits)
-
-
-def _meshes(robot: ArmHand, path: Path, arguments: argparse.Namespace) -> dict[str, Surface] | None:
+def _meshes(robot: ArmHand, path: Path, said: Said) -> dict[str, Surface] | None:
     """What the robot's files show, if that is asked for."""
-    if not arguments.meshes:
+    if not said.meshes:
         return None
     from casadi_ik.viewing.meshes import robot_meshes
 
     if not path.is_file():
         raise InputError(f"--meshes: {robot.name} has no files of its own, expected a YAML file")
     return robot_meshes(robot, path)
+
+
+def _the_logs(said: Said) -> list[tuple[OneSolve, ArmHand]]:
+    """A solve of each log, and its robot.
+
+    Raises:
+        LogError: A log is missing or damaged, or was written for another robot.
+        UnknownNameError: There is no such solve, or several and none is named.
+        InputError: More solves are named than there are logs.
+    """
+    numbers = said.solve or []
+    if len(numbers) > len(said.what):
+        raise InputError(f"--solve: found {len(numbers)}, expected one for each log")
+    found: list[tuple[OneSolve, ArmHand]] = []
+    for i, file in enumerate(said.what):
+        log = logs.open(file)
+        with located(f"{file} (say --solve, --method)", (UnknownNameError,)):
+            solve = one_solve(log, numbers[i] if i < len(numbers) else None, said.method)
+        with located(f"{file}: robot (say --robot)", (UnknownNameError,)):
+            robot = load_robot(said.robot or solve.robot)
+        check_robot(robot, log.attachment("robot.urdf").decode(), file)
+        found.append((solve, robot))
+    return found
+
+
+def _candidates(
+    path: Path, said: Said, scene: Scene | None, settings: Settings
+) -> tuple[ArmHand, Choices]:
+    """The grasps of a file of candidates, and their robot.
+
+    Raises:
+        InputError: The file is malformed, or no robot is said.
+    """
+    from casadi_ik.viewing.asked import asked_of
+
+    robot, pose = the_robot(said.robot, path), the_object_pose(said)
+    choices: Choices = {}
+    for number, grasp in enumerate(load_candidates(path, robot)):
+        placed = grasp if pose is None else grasp.in_object_frame().at(pose)
+
+        def ask(placed: Any = placed) -> tuple[Asked, Array]:
+            return asked_of(robot, placed, None, scene, settings), robot.home
+
+        choices[f"{number}: {grasp.name}" if grasp.name else str(number)] = ask
+    return robot, choices
+
+
+def _ranked(
+    path: Path, said: Said, scene: Scene | None, settings: Settings
+) -> tuple[ArmHand, Choices]:
+    """The answers of `casadi-ik choose`: the contacts that each one reaches are what is asked.
+
+    Raises:
+        InputError: The file is none of that kind, or has no answers.
+    """
+    from casadi_ik.viewing.asked import asked_of
+
+    found = read_ranked(path)
+    with located(f"{path}: ranked[0].solution.robot"):
+        robot = the_robot(said.robot or found[0].solution.robot)
+    choices: Choices = {}
+    for place, one in enumerate(found, 1):
+        with located(f"{path}: ranked[{place - 1}].solution.q"):
+            q = robot.configuration(np.array([one.solution.q]))[0]
+
+        def ask(q: Array = q) -> tuple[Asked, Array]:
+            return asked_of(robot, None, q, scene, settings), q
+
+        choices[f"{place}. {one.label}"] = ask
+    return robot, choices

@@ -182,14 +182,13 @@ def test_bad_option(
 @pytest.mark.parametrize(
     ("words", "fragment"),
     [
-        ("", "COMMAND"),
-        ("slove cup", "found 'slove', expected one of 'solve', 'batch'"),
+        ("slove cup", "COMMAND: found 'slove', did you mean 'solve'?"),
+        ("paint cup", "COMMAND: found 'paint', expected one of solve, batch, "),
         ("solve", "GRASP"),
         ("solve cup apple", "apple"),
         ("batch targets.npz --out o.npz", "--robot"),
         ("batch targets.npz --robot kuka_lwr_barrett", "--out"),
-        ("log", "ACTION"),
-        ("log dump", "found 'dump', expected one of 'info'"),
+        ("log dump", "found 'dump', expected one of info, "),
         ("log info", "FILE"),
         ("log info nowhere.mcap", "nowhere.mcap: "),
         ("log info .", ".: "),

@@ -47,7 +47,7 @@ def test_solves_as_a_table(run_process: Command, folder: Path) -> None:
 
 def test_solves_that_are_asked_for(run: Command, folder: Path) -> None:
     log = folder / "hand-first.mcap"
-    assert "1 solves" in run("log", "solves", log, "--most", "2", "--solve", "1").out
+    assert "1 solve\n" in run("log", "solves", log, "--most", "2", "--solve", "1").out
     assert "the first 2 of 4 solves" in run("log", "solves", log, "--most", "2").out
     assert "3 solves" in run("log", "solves", log, "--status", "SOLVED").out
 
@@ -179,7 +179,7 @@ def test_finish_and_merge(run: Command, folder: Path, tmp_path: Path) -> None:
         ("merge {log} {log} --out {folder}/all.mcap", "{log}: solve 0 of enhanced-dls is in {log}"),
         ("merge {log} --out {log}", "{log}: --out: found the file of the input"),
         ("merge {log}", "the following arguments are required: --out"),
-        ("wonder {log}", "ACTION: found 'wonder', expected one of 'info', 'solves'"),
+        ("wonder {log}", "COMMAND: found 'wonder', expected one of info, solves"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(

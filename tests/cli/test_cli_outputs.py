@@ -114,7 +114,7 @@ def test_disk_full_on_the_output(
 def test_links_are_followed(tmp_path: Path) -> None:
     target, link = tmp_path / "target", tmp_path / "link"
     link.symlink_to(target)
-    check_outputs([("--out", link)])
+    check_outputs({"--out": link})
     write_output(link, "--out", lambda part: part.write_text("new"))
     assert link.is_symlink()
     assert target.read_text() == "new"

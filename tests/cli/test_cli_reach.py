@@ -137,6 +137,6 @@ def test_what_ranked_files_are_refused(run: Command, ranked: Path, tmp_path: Pat
     assert "Expected `float`" in says(lambda data: first(data)["solution"].update(q=["a"] * 14))
     assert "has 3 answers" in says(lambda data: None, "--rank", "4")
     assert "--object-pose" in says(lambda data: None, "--object-pose", "0 0 0 0 0 0")
-    assert "--direction: found [1.0]" in says(lambda data: None, "--direction", "1")
+    assert "--direction: found 1 numbers, expected 3" in says(lambda data: None, "--direction", "1")
     done = run("reach", "cup", "--rank", "2", "--out", out)
     assert (done.exit, "--rank: expected it with" in done.error) == (2, True)

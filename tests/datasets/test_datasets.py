@@ -110,7 +110,6 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     said = reasons(solver, missed)
     assert "the arm does not reach where the palm is asked" in said
     assert "proved: the palm has the wrist where the arm does not reach" in said
-    assert any(line.startswith("the palm misses its place by ") for line in said)
     assert not any(finger in line for line in said for finger in (*robot.fingers, "contact"))
     assert far.palm is not None
     (again,) = solver.solve_palms(far.palm[None], far.posture, diagnose=True).diagnoses

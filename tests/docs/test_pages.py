@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import re
 import shlex
 from collections.abc import Iterator
@@ -14,8 +13,8 @@ import pytest
 import yaml
 
 import casadi_ik as ik
-from casadi_ik.cli.parser import build_parser
-from casadi_ik.cli.schemas import schema_of
+from casadi_ik.cli.lists import schema_of
+from casadi_ik.cli.table import COMMANDS, GROUPS, load
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -32,24 +31,18 @@ def commands(text: str) -> Iterator[str]:
     yield from INDENTED.findall(BLOCK.sub("", text))
 
 
-def parsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            return action.choices
-    return {}
-
-
 def fault(line: str) -> str:
     """What is wrong with a command, or ""."""
-    words = shlex.split(line, comments=True)[1:]
-    parser: argparse.ArgumentParser = build_parser()
-    while words and (below := parsers(parser)):
+    words, name = shlex.split(line, comments=True)[1:], ""
+    while words and name in GROUPS:
         if words[0] == "COMMAND":
             return ""
-        if words[0] not in below:
+        name = f"{name} {words[0]}".strip()
+        if name not in COMMANDS:
             return f"no command {words[0]!r}"
-        parser = below[words.pop(0)]
-    known = {option for action in parser._actions for option in action.option_strings}
+        words.pop(0)
+    options = () if name in GROUPS else load(name).options
+    known = {"--help", "--version", "--no-diagnose", *(option.name for option in options)}
     unknown = [word for word in words if re.match(r"--[a-z]", word) and word not in known]
     return f"no option {unknown[0]}" if unknown else ""
 

@@ -121,7 +121,7 @@ def test_an_output_that_is_the_input_by_another_name(tmp_path: Path) -> None:
     source.write_text("")
     link.hardlink_to(source)
     with pytest.raises(OutputError, match="found the file of the input"):
-        check_outputs([("--log", link)], inputs=[source])
+        check_outputs({"--log": link}, inputs=[source])
 
 
 def npz(path: Path, shape: tuple[int, ...], data: bytes) -> Path:

@@ -14,8 +14,8 @@ import pytest
 import yaml
 
 import casadi_ik as ik
+from casadi_ik.cli.lists import FILES, schema_of
 from casadi_ik.cli.main import main
-from casadi_ik.cli.schemas import FILES, schema_of
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import convert
 from casadi_ik.files.units import check_units, in_si

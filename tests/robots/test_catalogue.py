@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 import casadi_ik as ik
-from casadi_ik.cli.question import the_robot
+from casadi_ik.cli.inputs import the_robot
 from casadi_ik.errors import DescriptionError, UnknownNameError
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve

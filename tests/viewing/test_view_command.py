@@ -11,8 +11,8 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.cli.main import main
-from casadi_ik.cli.parser import build_parser
-from casadi_ik.cli.solve import as_json
+from casadi_ik.cli.report import as_json
+from casadi_ik.cli.table import parse
 from casadi_ik.cli.view import opened
 from casadi_ik.viewing import Viewer
 
@@ -29,7 +29,7 @@ def view() -> Iterator[object]:
     running: list[Viewer] = []
 
     def open_page(*words: str) -> Viewer:
-        running.append(opened(build_parser().parse_args(["view", *words])))
+        running.append(opened(parse(["view", *words])[1]))
         return running[-1]
 
     yield open_page
@@ -122,6 +122,7 @@ def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None
         (["nothing.mcap"], "nothing.mcap"),
         (["nothing.json"], "nothing.json: cannot be read"),
         (["cup", "--host", "192.0.2.1"], "host: found '192.0.2.1'"),
+        (["cup", "--port", "99999"], "--port: found '99999', expected a whole number from 1 to"),
     ],
 )
 def test_bad_words_are_one_line(

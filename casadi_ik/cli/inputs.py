@@ -1,16 +1,15 @@
-"""The words of `solve` and `batch` as the question they ask."""
+"""What was said, as robots, grasps, scenes and solvers."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
+from casadi_ik.cli.table import Said
 from casadi_ik.collision.scene import Scene, load_scene
 from casadi_ik.errors import (
     CasadiIKError,
@@ -21,8 +20,8 @@ from casadi_ik.errors import (
 )
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.files.shipped import resolve, resolve_robot
-from casadi_ik.grasps import Grasp, load_grasp
-from casadi_ik.problem.problems import Tolerance, fixed_array
+from casadi_ik.grasps import Grasp, Tolerance, load_grasp
+from casadi_ik.problem.problems import fixed_array
 from casadi_ik.registry import METHODS
 
 
@@ -43,15 +42,14 @@ def located(
         raise
 
 
-def the_grasp(arguments: argparse.Namespace) -> tuple[Path, Grasp]:
-    """The grasp and the file it is from.
+def the_grasp(said: Said) -> tuple[Path, Grasp]:
+    """The grasp, moved with its object, and the file it is from.
 
     Raises:
         UnknownNameError: No shipped grasp has that name.
         DescriptionError: The file is missing or malformed.
-        InputError: The object's pose is none.
     """
-    path, pose = resolve(arguments.grasp, "grasps"), the_object_pose(arguments)
+    path, pose = resolve(said.grasp, "grasps"), the_object_pose(said)
     grasp = load_grasp(path)
     return path, grasp if pose is None else grasp.in_object_frame().at(pose)
 
@@ -74,94 +72,91 @@ def the_robot(name: str | None, path: Path | None = None, grasp: Grasp | None = 
     return load_robot(grasp.robot if isinstance(found, tuple) else found)
 
 
-def the_solver(arguments: argparse.Namespace, robot: ArmHand) -> Solver:
-    """The solver for a robot.
+def the_method(said: Said) -> str:
+    """The method.
 
     Raises:
         UnknownNameError: No such method.
-        UnsupportedError: The method cannot take the robot.
     """
-    method = METHODS[0] if arguments.method is None else arguments.method
+    method = said.method or METHODS[0]
     if method not in METHODS:
         raise UnknownNameError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
-    scene = the_scene(arguments)
-    about = "--finger-step" if arguments.max_rounds is None else "--max-rounds"
+    return method
+
+
+def the_solver(said: Said, robot: ArmHand) -> Solver:
+    """The solver for a robot; what a command has no option for is as usual.
+
+    Raises:
+        UnknownNameError: No such method, or no such scene.
+        UnsupportedError: The method cannot take the robot.
+        DescriptionError: The scene's file is missing or malformed.
+    """
+    scene = the_scene(said)
+    if "method" not in said:
+        return Solver(robot, tolerance=the_tolerance(said), options=_options(said), scene=scene)
+    method = the_method(said)
+    about = "--finger-step" if said.max_rounds is None else "--max-rounds"
     with located(f"--method {method}", (UnsupportedError,)), located(about):
         return Solver(
             robot,
             method,
-            the_tolerance(arguments),
-            arguments.limits,
-            arguments.finger_step,
-            options=the_options(arguments),
+            the_tolerance(said),
+            said.limits,
+            said.finger_step,
+            options=_options(said),
             scene=scene,
         )
 
 
-def the_options(arguments: argparse.Namespace) -> dict[str, int]:
+def _options(said: Said) -> dict[str, int]:
     """What was said of the method's own parameters."""
-    return {} if arguments.max_rounds is None else {"max_rounds": arguments.max_rounds}
+    rounds = getattr(said, "max_rounds", None)
+    return {} if rounds is None else {"max_rounds": rounds}
 
 
-def the_tolerance(arguments: argparse.Namespace) -> Tolerance:
+def the_tolerance(said: Said) -> Tolerance:
     """When contacts count as reached."""
-    tolerance = Tolerance()
-    if arguments.tolerance_position is not None:
-        tolerance = replace(tolerance, position=arguments.tolerance_position)
-    if arguments.tolerance_angle is not None:
-        tolerance = replace(tolerance, angle=arguments.tolerance_angle)
-    return tolerance
+    usual = Tolerance()
+    return Tolerance(said.tolerance_position or usual.position, said.tolerance_angle or usual.angle)
 
 
-def the_scene(arguments: argparse.Namespace) -> Scene | None:
+def the_scene(said: Said) -> Scene | None:
     """The scene that was asked for; None: nothing is checked.
 
     Raises:
         UnknownNameError: No shipped scene has that name.
         DescriptionError: The file is missing or malformed.
     """
-    if arguments.scene is None:
+    if said.scene is None:
         return None
     with located("--scene", (UnknownNameError, DescriptionError)):
-        return load_scene(arguments.scene)
+        return load_scene(said.scene)
 
 
-def the_object_pose(arguments: argparse.Namespace) -> Array | None:
-    """(4, 4) where the object is in whose frame targets are; None: they are in the base frame.
-
-    Raises:
-        InputError: Other than six numbers.
-    """
-    if arguments.object_pose is None:
+def the_object_pose(said: Said) -> Array | None:
+    """(4, 4) where the object is in whose frame targets are; None: they are in the base frame."""
+    if said.object_pose is None:
         return None
-    values = [value for group in arguments.object_pose for value in group]
-    if len(values) != 6:
-        raise InputError(
-            f"--object-pose: found {len(values)} numbers, expected six: x y z [m], "
-            "roll pitch yaw [rad]"
-        )
-    x, y, z, roll, pitch, yaw = values
+    x, y, z, roll, pitch, yaw = said.object_pose
     return frame_matrix(Frame((x, y, z), (roll, pitch, yaw)))
 
 
-def the_start(arguments: argparse.Namespace, robot: ArmHand) -> list[float] | None:
+def the_start(said: Said, robot: ArmHand) -> list[float] | None:
     """The start, a number per actuator; None for home.
 
     Raises:
         InputError: As many numbers as actuators were expected.
     """
-    if arguments.q0 is None:
-        return None
-    values = [value for group in arguments.q0 for value in group]
-    if len(values) != len(robot.actuators):
+    if said.q0 is not None and len(said.q0) != len(robot.actuators):
         raise InputError(
-            f"--q0: found {len(values)} numbers, expected {len(robot.actuators)}: "
+            f"--q0: found {len(said.q0)} numbers, expected {len(robot.actuators)}: "
             + ", ".join(robot.actuators)
         )
-    return values
+    return said.q0
 
 
-def the_fixed(arguments: argparse.Namespace, robot: ArmHand) -> dict[str, float]:
+def the_fixed(said: Said, robot: ArmHand) -> dict[str, float]:
     """The actuators that are not to move.
 
     Raises:
@@ -169,7 +164,7 @@ def the_fixed(arguments: argparse.Namespace, robot: ArmHand) -> dict[str, float]
         UnknownNameError: No such actuator.
     """
     fixed: dict[str, float] = {}
-    for name, value in arguments.fixed:
+    for name, value in said.fixed:
         if name in fixed:
             raise InputError(f"--fixed: {name} appears twice")
         fixed[name] = value

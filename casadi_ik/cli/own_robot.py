@@ -1,0 +1,342 @@
+"""`casadi-ik import` and `casadi-ik calibrate`: descriptions of robots that are yours."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from casadi_ik import calibration
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.cli.inputs import located, the_robot
+from casadi_ik.cli.options import (
+    POSE,
+    PROGRAM,
+    ROBOT,
+    SIZE_LIMITS,
+    Option,
+    each,
+    file_name,
+    needed,
+    one_of,
+    out,
+    picture,
+    positive,
+)
+from casadi_ik.cli.outputs import check_outputs, write_output
+from casadi_ik.cli.report import UNITS, fields, files, headline, table
+from casadi_ik.cli.table import Answer, Said, command
+from casadi_ik.errors import InputError, MissingExtraError
+from casadi_ik.importing import imported
+from casadi_ik.importing.capsules import worst
+from casadi_ik.importing.check import largest_difference
+from casadi_ik.importing.imported import Imported
+from casadi_ik.importing.surfaces import Surface
+from casadi_ik.robots.parts import PREFIX
+from casadi_ik.symbolic.closed_arms.in_words import form_in_words, is_searched
+
+SAME = 1e-9
+"""Poses that differ by no more [m, or in their axes] are the same."""
+
+
+@command(
+    Option("first", "ARM|ROBOT", "file of the arm, or of everything"),
+    Option("hand", "HAND", "file of the hand", count="?"),
+    Option(
+        "--out",
+        "ROBOT.yaml",
+        "write the description (needed unless one is given to be drawn again)",
+        file_name(".yaml", ".yml"),
+    ),
+    Option("--tip", "LINK", "link of the arm that carries the hand"),
+    Option("--palm", "LINK", "link that the fingers hang on"),
+    Option(
+        "--mount",
+        "V",
+        "the hand's base on the tip: x y z [m] roll pitch yaw [rad]",
+        POSE,
+        "+",
+        otherwise="on it",
+    ),
+    Option("--srdf", "FILE.srdf", "links that may touch, beside those that are found to"),
+    Option("--xacro", "", "expand the macros of files that are not called .xacro"),
+    picture("--picture", "draw the hand and the guessed pads"),
+    Option("--check", "", "compare the kinematics with pinocchio's (MuJoCo's) of the files"),
+    SIZE_LIMITS,
+)
+def import_robot(said: Said) -> Answer:
+    """Describe your robot from the files of an arm and a hand, or of both in one.
+
+    Examples:
+      casadi-ik import arm.urdf hand.urdf --out my_robot.yaml --picture my_robot.png
+      casadi-ik import arm.urdf hand.xml --mount 0 0 0.05 0 0 1.57 --out mine.yaml
+      casadi-ik import whole_robot.urdf --palm left_palm --out my_robot.yaml
+      casadi-ik import my_robot.yaml --picture my_robot.png    a guess was corrected
+      casadi-ik solve my_grasp.yaml --robot my_robot.yaml
+
+    Files are URDF, xacro (needs casadi-ik[xacro]) or MJCF (needs casadi-ik[mujoco]).
+    What no file says (fingertips, where a pad is and which way it faces, the thumb,
+    palm, home) is guessed; each guess is marked in the description, and --picture
+    shows them. The description points to the files.
+
+    exit codes: 0 written, 1 --check found a difference, 2 bad input (nothing is
+    written)
+    """
+    first, hand = Path(said.first), said.hand and Path(said.hand)
+    arm, hand = (first, hand) if hand else (None, first)
+    if first.suffix in (".yaml", ".yml"):
+        return _drawn_again(first, said)
+    if said.out is None:
+        raise InputError("--out: missing, expected the name of the description to be written")
+    srdf = said.srdf and Path(said.srdf)
+    outputs = {"--out": said.out, "--picture": said.picture}
+    check_outputs(outputs, inputs=[one for one in (arm, hand, srdf) if one])
+    draw = _drawing() if said.picture is not None else None
+    found = imported.import_robot(
+        arm,
+        hand,
+        said.out,
+        command=_command(said),
+        tip=said.tip,
+        palm=said.palm,
+        mount=said.mount,
+        shapes=draw is not None,
+        xacro=said.xacro,
+    )
+    robots: list[ArmHand] = []
+    differences: dict[str, float] = {}
+
+    def write(part: Path) -> None:
+        nonlocal found
+        part.write_text(found.written.text(), encoding="utf-8")
+        found = found.at_home(part)
+        part.write_text(found.written.text(), encoding="utf-8")
+        found = found.with_shapes(part, srdf)
+        part.write_text(found.written.text(), encoding="utf-8")
+        robots.append(imported.loaded(part))
+        if said.check:
+            differences.update(_differences(robots[0], found))
+        if draw is not None:
+            draw(robots[0], found.surfaces, said.picture)
+
+    write_output(said.out, "--out", write)
+    same = all(value <= SAME for value in differences.values())
+    report = _import_report(robots[0], found, differences)
+    return Answer.solved(same, Group(*report, *files(outputs)))
+
+
+def _drawn_again(path: Path, said: Said) -> Answer:
+    """The pads of a description as it stands now; nothing else is written."""
+    if said.hand or said.out is not None or said.picture is None:
+        raise InputError(f"{path}: is a description already, expected --picture and no --out")
+    outputs = {"--picture": said.picture}
+    check_outputs(outputs, inputs=[path])
+    draw, robot = _drawing(), imported.loaded(path)
+    draw(robot, imported.described_surfaces(path), said.picture)
+    what = f"{robot.name}: {len(robot.fingers)} pads"
+    return Answer(Group(headline(True, "DRAWN", what), *files(outputs)))
+
+
+def _command(said: Said) -> str:
+    """The command line, as it stands in the description."""
+    words = [PROGRAM, "import", said.first, *filter(None, [said.hand]), "--out", str(said.out)]
+    for option in ("tip", "palm", "srdf"):
+        if getattr(said, option) is not None:
+            words += [f"--{option}", getattr(said, option)]
+    words += ["--xacro"] if said.xacro else []
+    words += ["--mount", *(f"{value:g}" for value in said.mount)] if said.mount else []
+    return shlex.join(words)
+
+
+def _drawing() -> Callable[[ArmHand, dict[str, Surface], Path], object]:
+    """The function that draws the pads, after making sure that it can."""
+    with located("--picture", (MissingExtraError,)):
+        from casadi_ik.views import draw_pads
+
+    def draw(robot: ArmHand, surfaces: dict[str, Surface], path: Path) -> object:
+        links = robot.description.links
+        named = {PREFIX + link if PREFIX + link in links else link: link for link in surfaces}
+        return draw_pads(robot, {ours: surfaces[link] for ours, link in named.items()}, path)
+
+    return draw
+
+
+def _differences(robot: ArmHand, found: Imported) -> dict[str, float]:
+    """The largest difference from the file's own library, by file."""
+    q = robot.random(np.random.default_rng(0), 20)
+    arm, hand = found.files
+    lines = found.written
+    values: dict[str, float] = {}
+    if arm is not None and lines.arm is not None:
+        difference = largest_difference(robot, arm, q, lines.arm.locked, carried=hand)
+        values[str(arm.path) if arm.path.name == hand.path.name else arm.path.name] = difference
+    values[hand.path.name] = largest_difference(robot, hand, q, lines.hand.locked, arm)
+    return values
+
+
+def _import_report(
+    robot: ArmHand, found: Imported, differences: dict[str, float]
+) -> list[RenderableType]:
+    description, lines = robot.description, found.written
+    arm = len(description.arm_actuators)
+    count = len(description.actuators)
+    what = (
+        f"{lines.name}: {count} motors ({arm} arm, {count - arm} hand), {len(found.pads)} fingers"
+    )
+    pairs = {}
+    if lines.arm is not None:
+        pairs["tip"] = f"{lines.arm.end}: {lines.arm.how}"
+        pairs["mount"] = lines.mount_how
+    pairs["palm"] = f"{lines.hand.end}: {lines.hand.how}"
+    pairs["closed form"] = form_in_words(description) if arm else ""
+    pairs["thumb"] = f"{lines.thumb[0]}: {lines.thumb[1]}"
+    for line in filter(None, (lines.arm, lines.hand)):
+        if line.limits:
+            pairs["limits"] = f"assumed, since {Path(line.file).name} states none: " + ", ".join(
+                line.limits
+            )
+    if lines.hand.spinning:
+        still = ", ".join(sorted(lines.hand.spinning))
+        pairs["locked"] = f"{still}: turns without end, so it is no finger and stands still"
+    for name, value in differences.items():
+        verdict = "as its own library has it" if value <= SAME else "NOT as its own library has it"
+        pairs[f"check {name}"] = f"{verdict}: poses differ by at most {value:.1e}"
+    if lines.shapes:
+        shapes = sum(map(len, lines.shapes.values()))
+        pairs["shapes"] = (
+            f"{shapes} on {len(lines.shapes)} links, at most {1e3 * worst(lines.shapes):.0f} mm "
+            f"beyond their meshes; {len(lines.touching)} pairs may touch"
+        )
+    rows = table("finger", "pad on link", "joints", "point [mm]", "normal", right=("joints",))
+    for branch, pad in zip(found.branches, found.pads, strict=True):
+        # What is rounded to -0.0 is zero.
+        point = " ".join(f"{round(1e3 * value, 1) + 0.0:.1f}" for value in pad.point)
+        normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal.tolist())
+        rows.add_row(branch.name, pad.link, str(len(branch.chain)), point, normal)
+    notes = list(lines.notes)
+    if is_searched(description):
+        notes.append(
+            "the arm has no known closed form: it is searched, and a solve takes several times "
+            "as long"
+        )
+    if not lines.shapes:
+        notes.append(
+            "the files have no shapes of links: a scene needs `collision:` in the description"
+        )
+    notes.append(
+        "pads, thumb, palm and home are guesses (delete the line of a finger that is none): see "
+        "the lines marked GUESS"
+    )
+    yellow = [Text(f"  {note}", "yellow") for note in notes]
+    return [headline(True, "IMPORTED", what), fields(pairs), rows, *yellow]
+
+
+@command(
+    Option("data", "DATA.csv", "measured poses, see below"),
+    needed(ROBOT),
+    Option(
+        "--estimate",
+        "GROUP",
+        "which numbers: linkage, axes, tips",
+        each(one_of("linkage", "axes", "tips")),
+        "+",
+        default=("linkage", "axes", "tips"),
+        otherwise="all three",
+    ),
+    Option(
+        "--loss",
+        "cauchy|huber|squares",
+        "how outliers count; squares takes them in full",
+        one_of("cauchy", "huber", "squares"),
+        default="cauchy",
+    ),
+    Option(
+        "--noise-position",
+        "METRES",
+        "standard deviation of a measured coordinate, as long as the data are too few to show it",
+        positive,
+        default=0.5e-3,
+    ),
+    Option(
+        "--noise-angle",
+        "RADIANS",
+        "the same of a measured angle",
+        positive,
+        default=math.radians(1.0),
+        otherwise="0.0175, 1 deg",
+    ),
+    out("CALIBRATED.yaml", "write the robot with its estimated numbers"),
+)
+def calibrate(said: Said) -> Answer:
+    """Estimate linkage dimensions, joint axes and contact frames of a robot's hand.
+
+    Example:
+      casadi-ik calibrate poses.csv --robot ar10 --out my_ar10.yaml
+      casadi-ik solve my_grasp.yaml --robot my_ar10.yaml
+
+    DATA.csv has a header and a row per measured fingertip pose, in the robot's base
+    frame:
+      finger,index_proximal_slider,index_middle_slider,x,y,z,qw,qx,qy,qz
+      index,0.0485,0.0512,-0.0462,0.0896,0.1447,0.7065,0.0282,-0.7065,-0.0282
+    the actuators that move the finger [rad or m], the contact point [m] and, if
+    measured, the contact frame as a unit quaternion (its four columns may be left
+    out, or empty in a row)
+
+    exit codes: 0 written, 1 no estimate was found, 2 bad input
+    """
+    data, outputs = Path(said.data), {"--out": said.out}
+    robot = the_robot(said.robot).description
+    measurements = calibration.read_measurements(data, robot)
+    check_outputs(outputs, inputs=[data])
+    parameters = calibration.hand_parameters(robot, measurements.measured_fingers, said.estimate)
+    found = calibration.calibrate(
+        calibration.HandModel(robot, parameters),
+        measurements,
+        loss=said.loss,
+        sigma_position=said.noise_position,
+        sigma_angle=said.noise_angle,
+    )
+    if found.converged:
+
+        def write(part: Path) -> None:
+            calibration.write_description(found, said.robot, part, data.name)
+
+        write_output(said.out, "--out", write)
+    written = files(outputs) if found.converged else []
+    return Answer.solved(found.converged, Group(*_calibration_report(found), *written))
+
+
+def _calibration_report(found: calibration.Calibration) -> list[RenderableType]:
+    count = f"{len(found.parameters)} numbers from {len(found.weights)} poses"
+    status = "ESTIMATED" if found.converged else "NOT CONVERGED"
+    noise = f"{1e3 * found.noise[0]:.3f} mm"
+    if math.isfinite(found.noise[1]):
+        noise += f", {math.degrees(found.noise[1]):.3f} deg"
+    weak = found.unidentified()
+    lines = {
+        "tip misses, median": f"{1e3 * np.median(found.before[:, 0]):.3f} mm described, "
+        f"{1e3 * np.median(found.after[:, 0]):.3f} mm estimated",
+        "noise found" if found.noise_estimated else "noise assumed": noise,
+        "outliers": f"{len(found.outliers)} poses count less than a quarter",
+        "directions": f"{len(found.parameters)}, of which the data say less than the priors about "
+        f"{len(weak)}, and nothing about {found.unknown_directions}",
+    }
+    right = ("described", "estimated", "±95%", "learned")
+    rows = table("number", "described", "estimated", "±95%", "unit", "learned", right=right)
+    numbers = np.stack([found.values, found.interval, found.learned], axis=1).tolist()
+    for parameter, (value, interval, learned) in zip(found.parameters, numbers, strict=True):
+        scale, unit = UNITS[parameter.unit]
+        shown = (f"{scale * one:.3f}" for one in (parameter.nominal, value, interval))
+        rows.add_row(parameter.name, *shown, unit, f"{100 * learned:.0f} %")
+    parts: list[RenderableType] = [headline(found.converged, status, count), fields(lines), rows]
+    if weak:
+        parts.append(Text("  what the data cannot tell apart, the weakest first:"))
+    for value, names in weak[:5]:
+        together = ", ".join(f"{part:+.2f} {name}" for name, part in list(names.items())[:4])
+        parts.append(Text(f"  {value:8.1e}  {together}"))
+    return parts

@@ -1,0 +1,312 @@
+"""The table of commands: parser, help and the page of the documentation are made from it.
+
+To add a command, write its function with its options in a module of this folder, new or not::
+
+    @command(GRASP, ROBOT, Option("--colour", "C", "what it is drawn in", default="red"))
+    def paint(said: Said) -> Answer:
+        \"\"\"Paint a grasp.
+
+        Examples, formats of files and exit codes: what `--help` says below the options.
+        \"\"\"
+        return Answer(f"{said.grasp} in {said.colour}")
+
+and give it a row in `COMMANDS`. Its module is imported when it is called. Its value is read by the
+option's `read`, errors of which become one line on stderr that begins with the option's name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import inspect
+import re
+import textwrap
+from argparse import Namespace as Said
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from casadi_ik.cli.options import PROGRAM, Option
+from casadi_ik.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+COMMANDS = {
+    "solve": ("solve.solve", "solve one grasp"),
+    "batch": ("batch.batch", "solve many targets of one robot"),
+    "follow": ("motion.follow", "follow a moving hand, or moving contacts"),
+    "reach": ("motion.reach", "find the timed motion from where the robot is to a grasp"),
+    "choose": ("choose.choose", "find the best of many grasps of one object"),
+    "import": ("own_robot.import_robot", "describe your robot from its URDF or MJCF files"),
+    "export": ("export.export", "write a robot's solver as plain C or WebAssembly"),
+    "compile": ("export.compile_ahead", "compile robots' kernels ahead of use"),
+    "schemas": ("lists.schemas", "write JSON Schemas of robot, grasp and other files"),
+    "calibrate": ("own_robot.calibrate", "estimate a hand's dimensions from measured poses"),
+    "robots": ("lists.robots", "list the shipped robots: fingers and actuators"),
+    "methods": ("lists.methods", "list the methods"),
+    "grasps": ("lists.grasps", "list the shipped grasps"),
+    "log": ("", "look into logs"),
+    "log info": ("log.info", "what logs hold"),
+    "log solves": ("log.solves", "list solves and how they ended"),
+    "log events": ("log.events", "list events: singularities, limits, stalls, ..."),
+    "log why": ("log.why", "explain one solve in words"),
+    "log plot": ("log.plot", "draw how one solve went"),
+    "log compare": ("log.compare", "compare two methods on the same targets"),
+    "log report": ("log.report", "write a study as one page"),
+    "log export": ("log.export", "write tables, or a file for a viewer"),
+    "log finish": ("log.finish", "repair logs in place whose writer was killed"),
+    "log merge": ("log.merge", "join the shards of a study, without recompressing"),
+    "view": ("view.view", "drag contacts in the browser, arm and hand follow; play a log"),
+}
+"""What is said: module and function in this folder, and what it does, in a few words."""
+
+GROUPS = {
+    "": """\
+Where must every motor of an arm and its hand stand, so that each fingertip
+touches a given point and faces a given way?
+
+Examples:
+  casadi-ik grasps                      list the shipped grasps
+  casadi-ik solve cup                   solve one of them
+  casadi-ik solve my.yaml --log my.mcap your own, with a log of every iteration
+  casadi-ik log info my.mcap            what the log holds
+
+exit codes: 0 solved (or done), 1 a valid problem not solved, 2 bad input
+""",
+    "log": """\
+Look into logs that `--log` has written.
+
+Examples:
+  casadi-ik log info cup.mcap                        what it holds
+  casadi-ik log solves study/ --status STALLED       those that stalled
+  casadi-ik log events cup.mcap --event NEAR_SINGULAR
+  casadi-ik log why cup.mcap 3                       solve 3 in words
+  casadi-ik log plot cup.mcap --solve 3 --out 3.png
+  casadi-ik log compare ours.mcap paper.mcap         two methods
+  casadi-ik log report study/ --out report.html      success, times, the hardest
+  casadi-ik log export cup.mcap --solve 3 --out view.mcap      for Foxglove
+  casadi-ik log export study/ --what solves --out solves.parquet
+  casadi-ik log finish torn.mcap                     repair a torn log
+  casadi-ik log merge a.mcap b.mcap --out all.mcap
+
+A folder stands for all logs in it.
+""",
+}
+"""What is said of the program, and of commands that have commands of their own."""
+
+WIDTH = 78
+"""Columns of help."""
+
+
+class Exit(IntEnum):
+    """Exit codes of the program."""
+
+    DONE = 0
+    """Done; for `solve` and `batch`: everything is solved."""
+    NOT_SOLVED = 1
+    """A valid problem that is not solved; the report says why."""
+    BAD_INPUT = 2
+    """One line on stderr says where, what was found and what was expected."""
+    INTERRUPTED = 130
+    """Ctrl-C (128 + SIGINT, as shells count)."""
+    BROKEN_PIPE = 141
+    """Whoever read the report went away (128 + SIGPIPE)."""
+    TERMINATED = 143
+    """SIGTERM (128 + 15): what is finished is kept as after Ctrl-C."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The end of a command; by now all files are written.
+
+    Attributes:
+        report: What to show on stdout; a text is printed as it is.
+        exit: The exit code.
+    """
+
+    report: RenderableType
+    exit: Exit = Exit.DONE
+
+    @staticmethod
+    def solved(solved: bool, report: RenderableType) -> Answer:
+        """The end of a command that has something to solve."""
+        return Answer(report, Exit.DONE if solved else Exit.NOT_SOLVED)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the table.
+
+    Attributes:
+        run: Does it.
+        options: What can be said behind it.
+    """
+
+    run: Callable[[Said], Answer]
+    options: tuple[Option, ...]
+
+    @property
+    def text(self) -> tuple[str, str, str]:
+        """What it does, and the rest of what is to be known: its function's docstring, parted."""
+        return (inspect.getdoc(self.run) or "").partition("\n\n")
+
+
+def command(*options: Option) -> Callable[[Callable[[Said], Answer]], Command]:
+    """Make a command of a function that takes what was said."""
+    return lambda run: Command(run, options)
+
+
+def load(name: str) -> Command:
+    """A command of the table, its module imported."""
+    module, function = COMMANDS[name][0].split(".")
+    return getattr(import_module(f"casadi_ik.cli.{module}"), function)
+
+
+def names(group: str = "") -> list[str]:
+    """The commands of a group, "": those behind the program's name."""
+    return [name for name in COMMANDS if name.rpartition(" ")[0] == group]
+
+
+def parse(words: Sequence[str]) -> tuple[Callable[[Said], Answer], Said]:
+    """What to do, and what was said about it.
+
+    Raises:
+        InputError: No such command or option, or a value that is none.
+    """
+    if list(words) == ["--version"]:
+        return lambda _: _version(), Said()
+    name, rest = "", list(words)
+    while name in GROUPS:
+        if not rest or rest[0] in ("-h", "--help"):
+            break
+        name, rest = _next(name, rest[0]), rest[1:]
+    if name in GROUPS or {"-h", "--help"}.intersection(rest):
+        return lambda _: Answer(help_of(name)), Said()
+    found = load(name)
+    return found.run, _Parser(name, found).values(rest)
+
+
+def help_of(name: str) -> str:
+    """The help of a command, of a group of them, or of the program ("")."""
+    if name not in GROUPS:
+        return _Parser(name, load(name)).format_help()
+    first, _, rest = GROUPS[name].partition("\n\n")
+    rows = {one.removeprefix(name).strip(): COMMANDS[one][1] for one in names(name)}
+    width = max(map(len, rows)) + 2
+    listed = "\n".join(f"  {one:<{width}}{summary}" for one, summary in rows.items())
+    words = " ".join(filter(None, (PROGRAM, name, "COMMAND ...")))
+    more = "--help behind a command says what it takes"
+    return f"usage: {words}\n\n{_filled(first)}\n\ncommands: ({more})\n{listed}\n\n{rest}"
+
+
+def usage(name: str, what: Command) -> str:
+    """How a command is called: what has to be said."""
+    words = [PROGRAM, name]
+    for option in what.options:
+        value = f"{option.metavar} ..." if option.count in ("+", "*") else option.metavar
+        if not option.dashed:
+            words.append(f"[{value}]" if option.count in ("?", "*") else value)
+        elif option.needed:
+            words.append(f"{option.name} {value}")
+    return " ".join([*words, "[OPTIONS]"] if any(one.dashed for one in what.options) else words)
+
+
+def _filled(text: str) -> str:
+    """Prose to the width of help; a paragraph in which a line is indented stays as it is."""
+    parts = []
+    for part in text.split("\n\n"):
+        plain = not any(line.startswith(" ") for line in part.splitlines())
+        parts.append(textwrap.fill(part, WIDTH, break_on_hyphens=False) if plain else part)
+    return "\n\n".join(parts)
+
+
+def _next(group: str, word: str) -> str:
+    """The command that a word means.
+
+    Raises:
+        InputError: None.
+    """
+    known = {one.rpartition(" ")[2]: one for one in names(group)}
+    if word in known:
+        return known[word]
+    program = f"{PROGRAM} {group}".strip()
+    near = difflib.get_close_matches(word, known, 1)
+    expected = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
+    raise InputError(f"COMMAND: found {word!r}, {expected} (see {program} --help)")
+
+
+def _version() -> Answer:
+    from importlib.metadata import version
+
+    return Answer(f"{PROGRAM} {version('casadi-ik')}\n")
+
+
+class _Parser(argparse.ArgumentParser):
+    """The parser of one command; its errors are one line like all others."""
+
+    def __init__(self, name: str, what: Command) -> None:
+        description, _, rest = what.text
+        super().__init__(
+            prog=f"{PROGRAM} {name}",
+            usage=usage(name, what),
+            description=_filled(description),
+            epilog=_filled(rest),
+            formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, width=WIDTH),
+            allow_abbrev=False,
+        )
+        # So that `--q0 -1e-3,0.2` reads as numbers and not as an option.
+        self._negative_number_matcher = re.compile(r"-(\d|\.\d|inf|nan)", re.IGNORECASE)
+        self._options = what.options
+        for option in what.options:
+            self.add_argument(option.name, **_argument(option))
+
+    def values(self, words: Sequence[str]) -> Said:
+        """What was said, every option by its key.
+
+        Raises:
+            InputError: A word that has no place, one that is missing, or a value that is none.
+        """
+        said, rest = self.parse_known_args(words)
+        if rest:
+            self.error(self._unknown(rest[0]))
+        for option in self._options:
+            raw = getattr(said, option.key)
+            if raw is None or raw == []:
+                setattr(said, option.key, option.default)
+            elif option.metavar:
+                try:
+                    setattr(said, option.key, option.read(raw))
+                except ValueError as error:
+                    self.error(f"{option.name if option.dashed else option.metavar}: {error}")
+        return said
+
+    def _unknown(self, word: str) -> str:
+        if not word.startswith("-"):
+            places = " ".join(one.metavar for one in self._options if not one.dashed)
+            return f"found {word!r}, expected nothing behind {places or self.prog}"
+        near = difflib.get_close_matches(word, [one.name for one in self._options], 1)
+        return f"{word}: no such option" + (f", did you mean {near[0]}?" if near else "")
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse the command line.
+
+        Raises:
+            InputError: Always.
+        """
+        raise InputError(f"{message.removeprefix('argument ')} (see {self.prog} --help)")
+
+
+def _argument(option: Option) -> dict[str, Any]:
+    """An option as argparse takes it; values are read, and defaults put in, afterwards."""
+    found: dict[str, Any] = {"help": option.text.replace("%", "%%")}
+    if not option.metavar:
+        switch = argparse.BooleanOptionalAction if option.default is not None else "store_true"
+        return found | {"action": switch}
+    names = tuple(option.metavar.split())
+    found |= {"metavar": names if len(names) > 1 else option.metavar, "nargs": option.count}
+    if option.dashed:
+        found["required"] = option.needed
+    return found | ({"action": "extend"} if option.repeated else {})
