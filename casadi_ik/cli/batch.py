@@ -117,8 +117,8 @@ def batch(said: Said) -> Answer:
       penetration
     and with --diagnose, where a target is not solved (else "" and NaN):
       reason (k,), nearest_q (k, n) closest to the contacts,
-      enough_position (k,) [m] and enough_angle (k,) [rad]: the tolerances with which
-      it would be solved
+      enough_position (k,) [m] and enough_angle (k,) [rad]: the tolerances with
+      which it would be solved
     A row that is no target (partly NaN, infinite, a zero normal) gets the status
     INVALID and NaN; it is named on stderr and does not stop the rest.
 

@@ -92,7 +92,7 @@ def view(said: Said) -> Answer:
       casadi-ik view panda+allegro_right        a robot as it stands at home
       casadi-ik view ranked.json                answers of `casadi-ik choose`
       casadi-ik view candidates.yaml --robot R  each solved when it is chosen
-      casadi-ik view cup.mcap                   play a solve; of two logs side by side
+      casadi-ik view cup.mcap                   play a solve; of two side by side
       casadi-ik view my_robot.yaml --pads       correct guessed pads by hand
 
     The page stays until Ctrl-C. Only this machine can open it unless --host says

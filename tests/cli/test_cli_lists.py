@@ -14,6 +14,7 @@ from command_line import FAST, Command
 import casadi_ik as ik
 from casadi_ik.cli.table import COMMANDS
 
+
 def test_robots(run: Command, robot: ik.ArmHand) -> None:
     done = run("robots")
     assert (done.exit, done.err) == (0, "")
