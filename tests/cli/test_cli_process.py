@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -152,25 +153,19 @@ def test_a_killed_batch(tmp_path: Path) -> None:
 
 
 def test_bugs_are_not_hidden(run: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken() -> None:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr("casadi_ik.cli.lists.methods", broken)
+    monkeypatch.setattr("casadi_ik.cli.lists.method_summary", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run("methods")
 
 
 def test_warnings_are_one_line(run: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    import warnings
-
-    real = entry.build_parser
-
-    def warn() -> object:
+    def warn(name: str) -> str:
         with warnings.catch_warnings():
-            warnings.simplefilter("always")
+            warnings.simplefilter("once")
             warnings.warn("no C compiler:\n slower", UserWarning, stacklevel=1)
-        return real()
+        return name
 
-    monkeypatch.setattr(entry, "build_parser", warn)
+    monkeypatch.setattr("casadi_ik.cli.lists.method_summary", warn)
     done = run("methods")
-    assert (done.exit, done.err) == (0, "casadi-ik: warning: no C compiler: slower\n")
+    assert done.exit == 0
+    assert set(done.err.splitlines()) == {"casadi-ik: warning: no C compiler: slower"}
