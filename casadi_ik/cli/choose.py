@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from casadi_ik.answers.solution import Ranking
 from casadi_ik.api import Solver
 from casadi_ik.arrays import Array
 from casadi_ik.cli.inputs import located, the_object_pose, the_robot, the_solver, the_start
@@ -47,7 +48,6 @@ from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.limits import RAISED, limit
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.load import GraspFile, grasp_data, grasp_of
-from casadi_ik.problem.ranking import Ranking
 
 MOST_BYTES = 2**26
 """Of a file of ranked answers: ten thousand answers take a third of it."""

@@ -18,10 +18,10 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from casadi_ik.answers.diagnosis import Diagnosis
+from casadi_ik.answers.solution import Solution
 from casadi_ik.api import Solver
 from casadi_ik.cli.outputs import write_output
-from casadi_ik.problem.diagnosis import Diagnosis
-from casadi_ik.problem.solution import Solution
 from casadi_ik.problem.status import Status
 
 UNITS = {"rad": (math.degrees(1.0), "deg"), "m": (1e3, "mm")}
