@@ -288,6 +288,7 @@ def _solve_parts(said: Said, path: Path, totals: _Totals) -> Solver:
     robot = the_robot(said.robot)
     q0, fixed = the_start(said, robot), the_fixed(said, robot)
     source = source_of(path, robot.fingers, said.part_size or PART_SIZE)
+    count = source.count  # read before anything is written
     one_file = bool(file.suffix) and not file.is_dir()
     if one_file:
         check_outputs({"--out": file}, inputs=[each.path for each in source.files])
@@ -301,7 +302,7 @@ def _solve_parts(said: Said, path: Path, totals: _Totals) -> Solver:
         _answers(folder, source, number)  # before hours are spent on the rest
     before = sum(source.sizes[number] for number in done)
     faults: dict[int, str] = {}
-    with _progress(source.count, before) as show, writing(folder.path, "--out"):
+    with _progress(count, before) as show, writing(folder.path, "--out"):
         parts = solve_parts(solver, source, asked, folder, said.jobs, said.dask, pose)
         try:
             for part in parts:
