@@ -10,6 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from casadi_ik.arms.recognise import family_in_words
 from casadi_ik.cli.options import out
 from casadi_ik.cli.outputs import writing
 from casadi_ik.cli.report import fields, headline, table
@@ -26,7 +27,6 @@ from casadi_ik.motion.retarget import Retarget
 from casadi_ik.registry import METHODS, method_summary
 from casadi_ik.robots import load_description
 from casadi_ik.robots.schema import ArmFile, ArmHandFile, HandFile, ImportedFile
-from casadi_ik.symbolic.closed_arms.in_words import form_in_words
 
 FILES: dict[str, tuple[Any, str]] = {
     "robot": (ArmHandFile | ImportedFile, "A robot: an arm, a hand, and what joins them"),
@@ -73,7 +73,7 @@ def robots(_: Said) -> Answer:
             "actuators": f"{len(robot.actuators)}: {', '.join(robot.actuator_names)}",
         }
         if robot.arm_actuators:
-            pairs["arm"] = f"closed form: {form_in_words(robot)}"
+            pairs["arm"] = f"closed form: {family_in_words(robot)}"
         description = convert(read_yaml(path), ArmHandFile, path).description
         parts += [Text(name, "bold"), Text(f"  {description}"), fields(pairs)]
     return Answer(Group(*parts, *_catalogue()))
@@ -87,7 +87,7 @@ def _catalogue() -> list[RenderableType]:
         path = resolve(name, "arms")
         arm = convert(read_yaml(path), ArmFile, path)
         count = sum(joint.type != "fixed" for joint in arm.joints)
-        form = form_in_words(load_description(f"{name}+{some_hand}"))
+        form = family_in_words(load_description(f"{name}+{some_hand}"))
         arms.add_row(name, str(count), form, _short(arm.description))
     hands = table("hand", "motors", "fingers", "what it is", right=("motors", "fingers"))
     for name in shipped_names("hands"):

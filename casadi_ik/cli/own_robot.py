@@ -13,6 +13,7 @@ from rich.text import Text
 
 from casadi_ik import calibration
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arms.recognise import family_in_words, is_searched
 from casadi_ik.cli.inputs import located, the_robot
 from casadi_ik.cli.options import (
     POSE,
@@ -38,7 +39,6 @@ from casadi_ik.importing.check import largest_difference
 from casadi_ik.importing.imported import Imported
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.robots.parts import PREFIX
-from casadi_ik.symbolic.closed_arms.in_words import form_in_words, is_searched
 
 SAME = 1e-9
 """Poses that differ by no more [m, or in their axes] are the same."""
@@ -193,7 +193,7 @@ def _import_report(
         pairs["tip"] = f"{lines.arm.end}: {lines.arm.how}"
         pairs["mount"] = lines.mount_how
     pairs["palm"] = f"{lines.hand.end}: {lines.hand.how}"
-    pairs["closed form"] = form_in_words(description) if arm else ""
+    pairs["closed form"] = family_in_words(description) if arm else ""
     pairs["thumb"] = f"{lines.thumb[0]}: {lines.thumb[1]}"
     for line in filter(None, (lines.arm, lines.hand)):
         if line.limits:
