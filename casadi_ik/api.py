@@ -167,8 +167,8 @@ class Solver(MovingSolver, ChoosingSolver, SurroundedSolver):
         problems = self._questions.of_grasps(
             [grasp], fixed, self._engine.preference(prefer, q0 is not None)
         )
-        if log is None and (quick := self._engine.quick(problems, Run(q0, seed))) is not None:
-            return quick
+        if log is None:
+            return self._engine.solve_one(problems, Run(q0, seed, diagnose=diagnose))
         with recorder_of(self, log, seed) as recorder:
             run = Run(q0, seed, recorder=recorder, diagnose=diagnose)
             return self._engine.solve(problems, run).solution(0)

@@ -369,4 +369,6 @@ WITHOUT = (
 
 def without_scene() -> dict[str, str]:
     """What stands for the marks where an export knows no scene."""
-    return dict.fromkeys(WITHOUT, "") | {"SCENE_LOOK": "#define run_on rounds_run\n"}
+    return dict.fromkeys(WITHOUT, "") | {
+        "SCENE_LOOK": "#define run_on(solver, most) search_run(solver, most, 1)\n"
+    }

@@ -130,7 +130,7 @@ class SinglePrecision:
 
     @property
     def reals(self) -> dict[str, float]:
-        """Numbers of rounds.c that follow the precision."""
+        """Numbers of the search that follow the precision."""
         return {
             "NUDGE": NUDGE,
             "LIMIT_SLACK": 0.0,
@@ -141,6 +141,6 @@ class SinglePrecision:
 
     @property
     def arrays(self) -> dict[str, Array]:
-        """Arrays of rounds.c that follow the precision."""
+        """Arrays of the search that follow the precision."""
         lower, upper = self.bounds
         return {"LOWER": lower, "UPPER": upper}

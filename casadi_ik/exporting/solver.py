@@ -25,8 +25,8 @@ from casadi_ik.kernels.constants import define_arrays
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.lookup import TILE
 from casadi_ik.methods.hand_first.beginning import terms
+from casadi_ik.methods.hand_first.driver import SearchPlan, source_text
 from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.methods.hand_first.rounds import RoundsPlan, source_text
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.verdict import LIMIT_SLACK
 from casadi_ik.registry import build_method
@@ -72,16 +72,16 @@ class SolverSources:
     single: SinglePrecision | None = None
 
     @cached_property
-    def plan(self) -> RoundsPlan:
-        """All rounds of one target."""
-        return self.method.rounds_plan(enforce_limits=True)
+    def plan(self) -> SearchPlan:
+        """The search for one target."""
+        return self.method.plan(enforce_limits=True)
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
         """The kernels."""
         plan = self.plan
-        lookup, n_state = plan.hands.table.lookup, plan.layouts.state.size
-        rows = max(spread.count for spread in plan.hands.spreads[:2]) + TILE
+        lookup, n_state = plan.seeds.table.lookup, plan.layouts.state.size
+        rows = max(spread.count for spread in plan.seeds.spreads[:2]) + TILE
         # Distances of all rows and of their tiles are 32 bits each.
         room = rows if self.single is None else rows + rows // TILE
         # The record of an iteration is never asked for.
@@ -92,11 +92,11 @@ class SolverSources:
             self._part("begin", "map", plan.begin),
             self._part("solve", "loop", plan.solve, loop, 2 * n_state),
             self._part("contacts", "map", plan.contacts),
-            self._part("valley", "map", plan.hands.valley),
+            self._part("valley", "map", plan.seeds.valley),
             self._part("judge", "map", plan.judge),
         )
-        if plan.mends and plan.hands.each_finger is not None:
-            parts += (self._part("each_finger", "map", plan.hands.each_finger),)
+        if plan.mends:
+            parts += (self._part("each_finger", "map", plan.seeds.each_finger),)
         return parts + self._scene_parts()
 
     def _scene_parts(self) -> tuple[Part, ...]:
@@ -125,7 +125,7 @@ class SolverSources:
             constants = define({"N_IN": function.n_in(), "N_OUT": function.n_out()})
         if driver == "lookup":
             extra += function.numel_out(0)
-        before = {"loop": "marks", "clearance": "lanes_alone"}.get(driver)
+        before = {"clearance": "lanes_alone"}.get(driver)
         text = driver_text(before) if before else ""
         text += driver_text(driver)
         # In Python a driver has its memory from the heap; here it is handed to it.
@@ -181,13 +181,13 @@ class SolverSources:
             "ARG": str(arg),
             "RES": str(res),
             "IW": str(max(iw, 1)),
-            "STRUCT": self._struct(),
+            "STRUCT": self.plan.members().rstrip(),
             "JOBS": jobs,
             "PARTS": parts,
             "CALLS": calls,
             "SIZES": define(sizes),
             "CONSTANTS": self.plan.constants(*changed),
-            "ROUNDS": source_text("rounds"),
+            "SEARCH": source_text("seeds") + source_text("hand_first"),
             "TERMS": define_arrays({"TERMS": self._terms(), "HOME": robot.home}),
             "LIMITS": define_arrays(
                 {f"{self.prefix}_lower": lower, f"{self.prefix}_upper": upper}, "const"
@@ -200,20 +200,12 @@ class SolverSources:
         """The file of the lookup tables' keys."""
         tables = {
             f"{self.prefix}_table_{i}": np.ascontiguousarray(table.lookup.tiles).reshape(-1)
-            for i, table in enumerate(self.plan.hands.tables(enforce_limits=True))
+            for i, table in enumerate(self.plan.seeds.tables(enforce_limits=True))
         }
         head = (
             f'/* Shapes of hand postures, to be compared with targets. */\n#include "{self.prefix}'
         )
         return head + '_parts.h"\n\n' + define_arrays(tables, "const")
-
-    def _struct(self) -> str:
-        """The body of the struct that rounds.c works on, with numbers for its macros."""
-        text = source_text("rounds_job")
-        body = text[text.index("typedef struct {") + len("typedef struct {") : text.index("OWN_")]
-        for name, size in self.plan.sizes.items():
-            body = re.sub(rf"\b{name}\b", str(size), body)
-        return body.strip("\n").rstrip()
 
     @property
     def _bounds(self) -> tuple[Array, Array]:

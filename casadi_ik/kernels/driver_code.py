@@ -17,6 +17,8 @@ class DriverCode(IntEnum):
     DONE = 0
     SLICE_OVER = 1
     ROWS_FULL = 2
+    GOES_ON = 3
+    FEW_LEFT = 4
     NO_MEMORY = -1
     NO_CHECKOUT = -2
     STEP_FAILED = -3

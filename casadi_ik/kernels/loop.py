@@ -5,40 +5,49 @@ from __future__ import annotations
 import ctypes
 import logging
 import warnings
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, KernelError
-from casadi_ik.kernels.buffered import doubles
+from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
+from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
-from casadi_ik.kernels.loop_job import FIRST_MARK, SLOTS, CompiledBatch
 from casadi_ik.kernels.loop_result import (
     CODE_LIMIT,
     FAILED,
+    FIRST_MARK,
     FIRST_ROWS,
     NON_FINITE,
     REPEATED,
+    UNBEGUN,
     LoopResult,
 )
 from casadi_ik.kernels.loop_vm import run_vm
 from casadi_ik.kernels.machine_lanes import machine_lanes
-from casadi_ik.kernels.rows import row_driver
+from casadi_ik.kernels.rows import opaque, row_driver
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
 
 logger = logging.getLogger(__name__)
 
 SYMBOL = "casadi_ik_loop"
-SYMBOL_LANES = "casadi_ik_loop_lanes"
+
+SLOTS = 32
+"""Solves under way at once, of which four or eight have the lanes."""
 
 FEWEST = 4
 """Solves from which on they are made side by side."""
+
+FOREVER = 2**62
+"""Steps of a call that has no bound."""
 
 WORTH = 64
 """Solves from which on a compiler is waited for, if no library that makes them side by side is at
@@ -49,6 +58,145 @@ SPARE = 1.25
 
 ROOM_BYTES = 2**24
 """What it begins with at most [bytes]."""
+
+
+class Job(ctypes.Structure):
+    """`loop_job` of drivers/loop_job.c."""
+
+    _fields_ = (
+        ("states", ctypes.c_void_p),
+        ("parameters", ctypes.c_void_p),
+        ("state_step", ctypes.c_int64),
+        ("parameter_step", ctypes.c_int64),
+        ("iterations", ctypes.c_void_p),
+        ("status", ctypes.c_void_p),
+        ("seconds", ctypes.c_void_p),
+        ("slots", ctypes.c_void_p),
+        ("begun", ctypes.c_void_p),
+        ("mark", ctypes.c_void_p),
+        ("slot_count", ctypes.c_int64),
+        ("rows", ctypes.c_void_p),
+        ("places", ctypes.c_void_p),
+        ("capacity", ctypes.c_int64),
+        ("used", ctypes.c_int64),
+        ("count", ctypes.c_int64),
+        ("solve", ctypes.c_int64),
+        ("max_iterations", ctypes.c_int64),
+        ("left", ctypes.c_int64),
+        ("fewest", ctypes.c_int64),
+        ("slice", ctypes.c_double),
+        ("follow", ctypes.c_void_p),
+        ("method", ctypes.c_void_p),
+    )
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Where the starts of solves stand, and what writes them.
+
+    Attributes:
+        states: Address of the first state.
+        parameters: Address of the first parameters.
+        step: Doubles from one state to the next.
+        slots: Solves under way at a time, at most `SLOTS`.
+        parameter_step: The same of parameters, 0: the same for all; None: as of states.
+        follow: Address of the function that says what follows, 0: nothing does.
+        method: Address of what it works on.
+    """
+
+    states: int
+    parameters: int
+    step: int
+    slots: int
+    parameter_step: int | None = None
+    follow: int = 0
+    method: int = 0
+
+
+class CompiledBatch:
+    """A batch on its way through a compiled loop."""
+
+    def __init__(self, step: StepGraph, result: LoopResult, starts: Followed, budget: int) -> None:
+        """Keep the arrays; `result` gets everything.
+
+        Args:
+            step: The step.
+            result: As `LoopKernel.run` makes it.
+            starts: Where solves begin.
+            budget: Iterations of each start.
+        """
+        self.name = step.name
+        self.result = result
+        slots = starts.slots
+        self._places = np.empty((0, 2), dtype=np.int64)
+        self._slots = np.full(slots, -1, dtype=np.int64)
+        self._begun = np.zeros(slots, dtype=np.int64)
+        self._mark = np.zeros((slots, step.state.size))
+        self.job = Job(
+            states=starts.states,
+            parameters=starts.parameters,
+            state_step=starts.step,
+            parameter_step=starts.step if starts.parameter_step is None else starts.parameter_step,
+            iterations=memory(result.iterations),
+            status=memory(result.status),
+            seconds=memory(result.time),
+            slots=memory(self._slots),
+            begun=memory(self._begun),
+            mark=memory(self._mark),
+            slot_count=slots,
+            count=len(result.status),
+            max_iterations=budget,
+            left=FOREVER,
+            fewest=FEWEST,
+            slice=SLICE,
+            follow=starts.follow,
+            method=starts.method,
+        )
+
+    def run(self, several: Any, alone: Any) -> LoopResult:
+        """Solve.
+
+        Args:
+            several: The loop that makes some solves at a time, None if there is none.
+            alone: The loop that makes one after the other: the last few, too.
+
+        Returns:
+            The result, its rows solve by solve.
+
+        Raises:
+            KernelError: No work memory, or the step failed.
+        """
+        loop = several or alone
+        if self.result.rows is not None:
+            self._rows_to(len(self.result.rows))
+        while (code := loop(ctypes.byref(self.job))) != DriverCode.DONE:
+            check(self.name, code)
+            if code == DriverCode.ROWS_FULL:
+                self._rows_to(2 * self.job.capacity)
+            if code == DriverCode.FEW_LEFT:
+                loop = alone
+        self._rows_to(self.job.used)
+        if self.result.rows is None or self.job.count == 1:
+            return self.result
+        return replace(self.result, rows=self._in_order(self.result.rows))
+
+    def _rows_to(self, count: int) -> None:
+        """Make room for so many rows, in place: a long trace is not copied."""
+        rows = self.result.rows
+        if rows is not None:
+            rows.resize(count, refcheck=False)
+            self._places.resize((count, 2), refcheck=False)
+            self.job.rows, self.job.places = memory(rows), memory(self._places)
+            self.job.capacity = count
+
+    def _in_order(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Rows solve by solve, from the order in which they were made."""
+        iterations = self.result.iterations
+        first = np.cumsum(iterations) - iterations
+        solve, iteration = self._places.T
+        ordered = np.empty_like(rows)
+        opaque(ordered)[first[solve] + iteration] = opaque(rows)
+        return ordered
 
 
 class LoopKernel:
@@ -84,7 +232,7 @@ class LoopKernel:
         return load_library(
             self.step.name,
             lambda: self.function,
-            self._driver("loop"),
+            self._driver(),
             SYMBOL,
             f"{self.step.recipe} wide {wide}" if self.step.recipe else "",
             partial(library_source, wide=wide),
@@ -125,8 +273,8 @@ class LoopKernel:
             library = load_library(
                 f"{self.step.name}_lanes{lanes}",
                 lambda: self.function,
-                self._driver("loop_lanes"),
-                SYMBOL_LANES,
+                self._driver(),
+                SYMBOL,
                 f"{self.step.recipe} lanes {lanes}" if self.step.recipe else "",
                 partial(lanes_source, lanes=lanes),
                 at_hand=at_hand,
@@ -137,7 +285,7 @@ class LoopKernel:
         except KernelError as error:
             warnings.warn(f"one solve at a time: {error}", RuntimeWarning, stacklevel=2)
             return None
-        return None if library is None else library[SYMBOL_LANES]
+        return None if library is None else library[SYMBOL]
 
     @property
     def constants(self) -> dict[str, int]:
@@ -155,10 +303,10 @@ class LoopKernel:
             "STAGE": self.step.stage_place,
         }
 
-    def _driver(self, name: str) -> str:
-        """C text of one of the two drivers, with its constants."""
-        job = driver_text("loop_job") + driver_text("marks")
-        return define(self.constants) + row_driver(self.step.record) + job + driver_text(name)
+    def _driver(self) -> str:
+        """C text of the driver, with its constants."""
+        texts = driver_text("loop_job"), driver_text("loop")
+        return define(self.constants) + row_driver(self.step.record) + "".join(texts)
 
     @cached_property
     def function(self) -> ca.Function:
@@ -203,22 +351,53 @@ class LoopKernel:
             )
         if max_iterations < 0:
             raise InputError(f"{self.step.name}: max_iterations is {max_iterations}, expected >= 0")
-        result = LoopResult(
-            states=first.copy(),
+        result = self._empty(first.copy(), trace)
+        if not self.compiled:
+            run_vm(self.step, self.function, result, given, max_iterations)
+            return result
+        if not max_iterations:
+            return replace(result, rows=np.empty(0, self.step.record.dtype) if trace else None)
+        rows = Followed(
+            memory(result.states),
+            memory(given),
+            n_state,
+            slots=SLOTS,
+            parameter_step=0 if given.ndim == 1 else n_parameters,
+        )
+        return self._drive(CompiledBatch(self.step, result, rows, max_iterations))
+
+    def run_followed(
+        self, starts: Followed, count: int, max_iterations: int, trace: bool
+    ) -> LoopResult:
+        """Solve a batch whose starts a method writes; see `follow` in drivers/loop_job.c.
+
+        Args:
+            starts: Where it writes them, and how it is called; in compiled code only.
+            count: Solves.
+            max_iterations: Budget of each start, >= 1.
+            trace: Whether to keep the record of every iteration.
+
+        Returns:
+            As `run`, without states.
+        """
+        stop_if_cancelled()
+        result = self._empty(np.empty((count, 0)), trace)
+        result.status[...] = UNBEGUN
+        return self._drive(CompiledBatch(self.step, result, starts, max_iterations))
+
+    def _empty(self, states: NDArray[np.float64], trace: bool) -> LoopResult:
+        count = len(states)
+        return LoopResult(
+            states=states,
             iterations=np.zeros(count, dtype=np.int64),
             status=np.full(count, RUNNING, dtype=np.int32),
             time=np.zeros(count),
             rows=np.empty(self._room(count), dtype=self.step.record.dtype) if trace else None,
         )
-        if not self.compiled:
-            run_vm(self.step, self.function, result, given, max_iterations)
-            return result
-        batch = CompiledBatch(self.step, result, given, max_iterations)
-        several = self._for(count) if max_iterations > 0 else None
-        if several is not None:
-            result = batch.run_side_by_side(several)
-        else:
-            batch.run(self.entry)
+
+    def _drive(self, batch: CompiledBatch) -> LoopResult:
+        count = len(batch.result.status)
+        result = batch.run(self._for(count), self.entry)
         if count and result.rows is not None:
             self._rows_each = len(result.rows) / count
         return result

@@ -20,8 +20,14 @@ FAILED = -2
 REPEATED = -3
 """Status of a solve that came back to an earlier state bit for bit, and so would for ever."""
 
+UNBEGUN = -4
+"""Status of a solve that a method has not begun yet."""
+
 FIRST_ROWS = 256
 """Rows a trace starts with at least; it doubles when they are full."""
+
+FIRST_MARK = 16
+"""Iteration, a power of two, of the first state that later ones are compared with."""
 
 CODE_LIMIT = 2**31 - 1
 """A status has to be smaller than this (it is kept as int32)."""

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.buffered import BufferedFunction
 from casadi_ik.kernels.cancellation import stop_if_cancelled
-from casadi_ik.kernels.loop_job import FIRST_MARK
 from casadi_ik.kernels.loop_result import (
     CODE_LIMIT,
     FAILED,
+    FIRST_MARK,
     FIRST_ROWS,
     NON_FINITE,
     REPEATED,

@@ -81,7 +81,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Quick:
-    """What a method believes to be the solution of one target; fields as in `Outcome`.
+    """What a method made of one target; fields as in `Outcome`.
 
     Attributes:
         errors: As the verdict measures them, if it was asked: distances [m] and angles [rad] by
@@ -89,10 +89,22 @@ class Quick:
     """
 
     q: Array
+    status: int
     iterations: int
     restarts: int
     phases: Mapping[str, int]
     errors: tuple[list[float], list[float], float] | None = None
+
+    def outcome(self, seconds: float) -> Outcome:
+        """The same as a batch of one that took some seconds."""
+        return Outcome(
+            q=self.q[None],
+            status=np.array([self.status]),
+            iterations=np.array([self.iterations]),
+            restarts=np.array([self.restarts]),
+            time=np.array([seconds]),
+            phases={name: np.array([count]) for name, count in self.phases.items()},
+        )
 
 
 class Method(Protocol):
@@ -163,10 +175,10 @@ class PreferringMethod(Protocol):
 
 @runtime_checkable
 class QuickMethod(Protocol):
-    """A method with a shorter way to the same answer for one easy target."""
+    """A method with a shorter way to the same answer for one target."""
 
     def quick(self, problems: Problems, q0: Array) -> Quick | None:
-        """What `run` would find, if that is a solution found at once; None: ask `run`.
+        """What `run` would find; None: ask `run`.
 
         Args:
             problems: One target.

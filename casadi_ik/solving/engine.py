@@ -24,7 +24,7 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.clearance import SceneCheck, Surroundings
 from casadi_ik.problem.contacts.arrays import by_kinds
 from casadi_ik.problem.contacts.kinds import Kinds, usual
-from casadi_ik.problem.method import Method, Outcome, PreferringMethod, QuickMethod
+from casadi_ik.problem.method import Method, Outcome, PreferringMethod, Quick, QuickMethod
 from casadi_ik.problem.preference import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Status
@@ -39,6 +39,7 @@ from casadi_ik.solving.freeing import RANKED, freed, freed_at_once
 from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.solved_part import SolvedPart, judged
+from casadi_ik.solving.trials import HandMethod
 from casadi_ik.solving.workers import workers
 
 MANIPULABILITY = "manipulability"
@@ -75,21 +76,25 @@ class Engine:
         )
 
     @cached_property
+    def _own_hands(self) -> HandMethod | None:
+        """The method, if its hands can be tried one by one."""
+        return self.method if isinstance(self.method, HandMethod) else None
+
+    @cached_property
     def diagnostician(self) -> Diagnostician:
-        """Finds why a target was not solved, with hand-first, whichever the method is."""
-        method = self.method
-        if not isinstance(method, HandFirstMethod):
-            method = HandFirstMethod(
-                self.robot.description, HandFirstParameters(), self.compiled, self.kinds
-            )
+        """Finds why a target was not solved, with hand-first where the method cannot."""
+        method = self._own_hands or HandFirstMethod(
+            self.robot.description, HandFirstParameters(), self.compiled, self.kinds
+        )
         return Diagnostician(self.robot, method, self.compiled)
 
     @property
-    def _hand_first(self) -> HandFirstMethod:
-        method = self.method
-        if not isinstance(method, HandFirstMethod):
+    def _several(self) -> HandMethod:
+        method = self._own_hands
+        if method is None:
             raise UnsupportedError(
-                f"method {method.name!r} gives one solution; several need {HandFirstMethod.name!r}"
+                f"method {self.method.name!r} gives one solution; several need "
+                f"{HandFirstMethod.name!r}"
             )
         method.prepare()
         return method
@@ -120,16 +125,16 @@ class Engine:
         """Finds several solutions.
 
         Raises:
-            UnsupportedError: The method is not hand-first.
+            UnsupportedError: The method gives one.
         """
-        return AlternativeFinder(self.robot, self._hand_first, self.compiled)
+        return AlternativeFinder(self.robot, self._several, self.compiled)
 
     @cached_property
     def freer(self) -> FreeFinder:
         """Finds answers that touch nothing.
 
         Raises:
-            UnsupportedError: The method is not hand-first.
+            UnsupportedError: The method gives one.
         """
         return FreeFinder(self.finder, self.compiled)
 
@@ -165,31 +170,40 @@ class Engine:
             f"q0; found {prefer!r}"
         )
 
-    def quick(self, problems: Problems, run: Run) -> Solution | None:
-        """The answer to one target if it is solved at once, by the shortest way; None: `solve` it.
+    def solve_one(self, problems: Problems, run: Run) -> Solution:
+        """Solve one target, by the shortest way that the method has.
 
         Args:
             problems: One target.
-            run: As for `solve`; its random numbers are for hard targets only.
+            run: How to solve it.
 
         Raises:
-            InputError: Bad q0.
+            InputError: Bad q0, or a target the method cannot take.
         """
         if problems.more:
             ((kinds, _, _),) = by_kinds(problems)
             if (other := self.of_kinds(kinds)) is not self:
-                return other.quick(problems, run)
-        method, robot = self._quick, self.robot
-        if method is None or problems.palms is not None or problems.prefer in RANKED:
+                return other.solve_one(problems, run)
+        method, start, known = self._quick, run.start(self.robot), None
+        plain = problems.palms is None and problems.prefer not in RANKED and start.ndim == 1
+        if method is not None and plain and run.recorder is None:
+            self.method.prepare()
+            begin = time.perf_counter()
+            found = method.quick(problems, start)
+            if found is not None:
+                solution = self._solved(problems, found, start, begin)
+                if solution is not None:
+                    return solution
+                known = found.outcome(time.perf_counter() - begin)
+        return self.solve(problems, run, known).solution(0)
+
+    def _solved(
+        self, problems: Problems, found: Quick, start: Array, begin: float
+    ) -> Solution | None:
+        """A single answer with its verdict, begun at a time of the clock, if it is a solution."""
+        if found.status != Status.SOLVED:
             return None
-        if (start := run.start(robot)).ndim != 1:
-            return None
-        self.method.prepare()
-        begin = time.perf_counter()
-        found = method.quick(problems, start)
-        seconds = time.perf_counter() - begin
-        if found is None:
-            return None
+        robot, seconds = self.robot, time.perf_counter() - begin
         if found.errors is None:
             verdict = judge_one(robot, problems, found.q)
         else:
@@ -223,18 +237,19 @@ class Engine:
             closest=closest,
         )
 
-    def solve(self, problems: Problems, run: Run) -> BatchSolution:
+    def solve(self, problems: Problems, run: Run, known: Outcome | None = None) -> BatchSolution:
         """Solve a batch of k targets.
 
         Args:
             problems: The targets.
             run: How to solve them.
+            known: What the method came to, if it was asked before.
 
         Raises:
             InputError: Bad q0, or targets the method cannot take.
         """
         if problems.palms is not None:
-            _ = self._hand_first  # no other method keeps every target's hand where it is
+            _ = self._several  # no other method keeps every target's hand where it is
         starts, recorder = run.starts(self.robot, len(problems)), run.recorder
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
         for kinds, _, _ in by_kinds(problems):
@@ -243,14 +258,16 @@ class Engine:
             measures.prepare()
         batches = []
         with InBackground() as background:
-            for part in self._parts(problems, starts, run):
+            for part in self._parts(problems, starts, run, known):
                 if recorder is not None:
                     form = self.method.trace_format
                     background.do(partial(part.record, recorder, form, run.seed))
                 batches.append(part.batch)
         return BatchSolution.joined(batches)
 
-    def _parts(self, problems: Problems, starts: Array, run: Run) -> Iterator[SolvedPart]:
+    def _parts(
+        self, problems: Problems, starts: Array, run: Run, known: Outcome | None
+    ) -> Iterator[SolvedPart]:
         """Parts of the batch in order, solved, judged and diagnosed side by side."""
         trace, jobs, diagnose = run.recorder is not None, run.jobs, run.diagnose
 
@@ -259,14 +276,14 @@ class Engine:
 
         def solve(rows: slice) -> SolvedPart:
             started, asked = time.time_ns(), problems.rows(rows)
-            outcome = run_by_kinds(method, asked, starts[rows], run.seed, trace)
+            outcome = known or run_by_kinds(method, asked, starts[rows], run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
             around = self.around(asked)
             if around is None and problems.prefer == MANIPULABILITY:
                 outcome = self._most_manipulable(asked, starts[rows], run.seed, outcome)
             batch = judged(self.robot, self.method.name, asked, outcome, around)
-            if around is not None and isinstance(self.method, HandFirstMethod):
+            if around is not None and self._own_hands is not None:
                 q0, seed = starts[rows], run.seed
                 batch = freed(self.kinds_of, asked, around, q0, seed, outcome, batch, diagnose)
                 outcome = replace(outcome, q=batch.q, time=batch.time)
@@ -281,7 +298,7 @@ class Engine:
                 _ = self.of_kinds(kinds).diagnostician
         if problems.prefer == MANIPULABILITY or self.check is not None:
             for kinds, _, _ in by_kinds(problems):
-                if isinstance(self.method, HandFirstMethod):
+                if self._own_hands is not None:
                     _ = self.of_kinds(kinds).finder
         if jobs == 1 and not trace:
             yield solve(slice(0, len(problems)))
@@ -319,7 +336,7 @@ class Engine:
         """Find the reasons; a solution found by hand-first's own diagnosis is the answer."""
         if batch.success.all():
             return replace(batch, diagnoses=(None,) * len(batch))
-        own = isinstance(self.method, HandFirstMethod)
+        own = self._own_hands is not None
         q, seconds = outcome.q.copy(), outcome.time.copy()
         rows = np.flatnonzero(~batch.success & (batch.status != Status.COLLISION))
         if not len(rows):

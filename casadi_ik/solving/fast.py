@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.grasps.grasp import real_array
-from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.methods.hand_first.one_target import OneTarget
+from casadi_ik.methods.hand_first.driver import Searches
 from casadi_ik.problem.preference import preference
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.status import Status
 from casadi_ik.solving.engine import Engine
@@ -21,8 +21,21 @@ from casadi_ik.solving.run import Run
 STATUSES = {int(status): status for status in Status}
 
 
+@runtime_checkable
+class FastMethod(Protocol):
+    """A method that solves one target after the other in memory made once."""
+
+    def alone(self, enforce_limits: bool) -> Searches | None:
+        """That memory; None where there is no compiler."""
+        ...
+
+    def terms(self, problems: Problems) -> Array:
+        """What targets of the same tolerances and limits have in common."""
+        ...
+
+
 class FastSolver:
-    """Solves one target a call by hand-first, in memory made once.
+    """Solves one target a call, in memory made once.
 
     The answers are bit for bit those of `Solver.solve(..., diagnose=False)`, all restarts and the
     verdict included. What it does without: a diagnosis, a log, a `Solution` (errors are in two
@@ -40,29 +53,23 @@ class FastSolver:
         """Compile what is not compiled yet, and lay the arrays out.
 
         Raises:
-            UnsupportedError: The method is not hand-first, or there is a scene.
+            UnsupportedError: The method has no such memory, or there is a scene.
         """
         if engine.check is not None:
             raise UnsupportedError("fast: checks no collisions, expected a solver without a scene")
         method = engine.method
-        if not isinstance(method, HandFirstMethod):
+        if not isinstance(method, FastMethod):
             raise UnsupportedError(f"fast: expected method 'hand-first', found {method.name!r}")
-        method.prepare()
         self._engine, self._questions = engine, questions
         robot = engine.robot
         f, n = len(robot.fingers), len(robot.actuators)
         self._home, self._shapes = robot.home, ((f, 3), (f, 3), (n,))
         self.position_error, self.angle_error = np.full(f, np.nan), np.full(f, np.nan)
-        self._one: OneTarget | None = None
-        if method.kernel.compiled:
-            self._lay_out(method)
-
-    def _lay_out(self, method: HandFirstMethod) -> None:
-        questions = self._questions
-        plan = method.rounds_plan(questions.enforce_limits)
-        self._one = one = OneTarget(plan, whole=True)
+        self._one = one = method.alone(questions.enforce_limits)
+        if one is None:
+            return
         self._points, self._normals, self._here = one.points, one.normals, one.here
-        self._terms, self._q = one.terms, one.q
+        self._terms, self._q, self._rounds = one.terms, one.q, one.plan.rounds
         self.position_error, self.angle_error = one.position_error, one.angle_error
         # Tolerances and limits are the same for all targets.
         any_contact = np.zeros((1, *self._shapes[0])), np.ones((1, *self._shapes[0]))
@@ -98,7 +105,7 @@ class FastSolver:
             return self._slowly(points, normals, q0)
         self._points[...], self._normals[...], self._here[...] = p, n, here
         self._terms[-1] = q0 is not None
-        status = one()
+        status = one(self._rounds)
         if status is None:
             return self._slowly(points, normals, q0)
         return self._q.copy(), STATUSES[status]

@@ -22,8 +22,7 @@ from casadi_ik.kernels import (
 )
 from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.kernels.lanes_lines import UnsuitedError
-from casadi_ik.kernels.loop import FEWEST, ROOM_BYTES, WORTH
-from casadi_ik.kernels.loop_job import SLOTS
+from casadi_ik.kernels.loop import FEWEST, ROOM_BYTES, SLOTS, WORTH
 from casadi_ik.kernels.machine_lanes import machine_lanes
 
 from .graphs import (
@@ -141,7 +140,7 @@ def test_every_end_beside_every_other(count: int) -> None:
 
 
 def test_pauses_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("casadi_ik.kernels.loop_job.SLICE", 0.0)
+    monkeypatch.setattr("casadi_ik.kernels.loop.SLICE", 0.0)
     rng = np.random.default_rng(3)
     count = COUNTS[-1]
     states = np.column_stack([rng.normal(size=count), np.zeros(count)])

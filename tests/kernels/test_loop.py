@@ -277,7 +277,7 @@ def test_pauses_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     kernel = LoopKernel(random_step())
     states, parameters = starts(5)
     whole = kernel.run(states, parameters, 300, trace=True)
-    monkeypatch.setattr("casadi_ik.kernels.loop_job.SLICE", 0.0)
+    monkeypatch.setattr("casadi_ik.kernels.loop.SLICE", 0.0)
     assert_same(kernel.run(states, parameters, 300, trace=True), whole)
 
 

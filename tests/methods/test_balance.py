@@ -9,7 +9,6 @@ import casadi_ik as ik
 from casadi_ik.methods.common.balance import NEAR
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.restarts import ANYWHERE, VALLEYS
 from casadi_ik.problem.problems import Problems, target_arrays
 from casadi_ik.problem.status import Phase, Status
 
@@ -123,17 +122,15 @@ def test_fits_that_come_back_to_a_minimum_that_misses_end_the_rounds_of_tables(r
     missed = ~batch.success
     assert missed.sum() >= 10
     # Two rounds of tables instead of six.
-    given_up = 8 * (2 + VALLEYS + ANYWHERE) - 1
+    given_up = 8 * (2 + 3 + 2) - 1
     assert np.median(batch.restarts[missed]) == given_up
     assert np.median(batch.phases["balance"][missed]) < 15
-    whole = HandFirstMethod(robot.description, HandFirstParameters())
-    whole.hopeful = lambda states, number: np.ones(len(states), dtype=bool)
-    asked = Problems(points[missed], normals[missed], TOLERANCE, True)
-    home = np.tile(robot.home, (len(asked), 1))
-    assert not (whole.run(asked, home, 0, False).status == Status.SOLVED).any()
-    first = np.flatnonzero(batch.restarts[missed] == given_up)[0]
-    stepper = solver._engine.method.stepper(asked.rows(slice(first, first + 1)), robot.home)
-    assert max(record["restart"] for record in stepper) <= given_up + 1
+    patient = ik.Solver(robot, options={"same_minimum": (10**6, 10**6), "far_cost": (1e9, 1e9)})
+    assert not patient.solve_batch(points[missed], normals[missed]).success.any()
+    row = np.flatnonzero(missed)[batch.restarts[missed] == given_up][0]
+    contacts = zip(robot.fingers, points[row], normals[row], strict=True)
+    grasp = ik.Grasp({finger: ik.Contact(point, normal) for finger, point, normal in contacts})
+    assert max(record["restart"] for record in solver.stepper(grasp)) <= given_up + 1
 
 
 def test_what_is_missed_by_far_is_not_balanced(robot):

@@ -7,11 +7,9 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.methods.hand_first import one_by_one
-from casadi_ik.methods.hand_first.each_finger import each_finger, mends
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.restarts import NARROW, SPREAD, Restarts
+from casadi_ik.methods.hand_first.seeds import Seeds, each_finger
 from casadi_ik.problem.problems import Problems
 
 
@@ -22,7 +20,7 @@ def hand() -> ik.ArmHand:
 
 @pytest.fixture(scope="module")
 def kernel(hand) -> FunctionKernel:
-    return FunctionKernel(each_finger(hand.description))
+    return FunctionKernel(each_finger(hand.description, HandFirstParameters()))
 
 
 def postures(hand, q):
@@ -35,7 +33,8 @@ def postures(hand, q):
 )
 def test_whose_postures_are_mended(name, wanted):
     """Not those of hands with few motors, whose fingers share one besides."""
-    assert mends(ik.load_robot(name).description) == wanted
+    robot = ik.load_robot(name).description
+    assert Seeds(robot, HandFirstParameters(), compiled=False).mends == wanted
 
 
 def test_mended_postures_are_nearer_to_the_target_in_its_measure(hand, kernel, rng):
@@ -81,48 +80,25 @@ def test_a_finger_without_contact_stays(hand, kernel, rng):
     assert (mended != begun).any(axis=1).all()
 
 
-def test_every_round_begins_elsewhere(hand, rng):
-    description = hand.description
-    options = HandFirstParameters(table=64, wide_table=512)
-    hands = Restarts(description, description.hand_actuators, options, compiled=False)
-    points, normals = hand.contacts(hand.random(rng, 4))
-    problems = Problems(points, normals, ik.Tolerance(), True)
-    assert hands.mends(problems)
-    assert not hands.mends(Problems(points, normals, ik.Tolerance(), False))
-    rounds = [hands.mended(problems, number) for number in (2, 3)]
-    size = options.candidates, len(description.hand_actuators)
-    assert all(found.shape == (4, *size) for found in rounds)
-    assert (rounds[0] != rounds[1]).any(axis=2).mean() > 0.9
-    # Late ones are by turns the best of fewer, and what no finger has mended.
-    table = hands.wide_table
-    for number in (NARROW, NARROW + 1):
-        late = hands.mended(problems, number)
-        plain = table.spread(number * SPREAD, options.candidates)
-        assert late.shape == (4, *size)
-        assert (late == plain).all() == bool(number % 2)
-    np.testing.assert_array_equal(table.spread(0, 512), table.postures)
-
-
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
-def test_what_is_out_of_reach_ends_the_same_alone_and_in_a_batch(hand, rng, monkeypatch, prefer):
-    """All rounds are made for it: in compiled code for few targets, in Python for many."""
+def test_what_is_out_of_reach_ends_the_same_alone_and_in_a_batch(hand, rng, prefer):
+    """All rounds are made for it."""
     points, normals = hand.contacts(hand.random(rng, 6))
     points = points + rng.normal(0, 0.008, points.shape)
     solver = ik.Solver(hand)
-    few = solver.solve_batch(points, normals, prefer=prefer)
-    assert not few.success.all()
-    assert few.restarts.max() > 100
-    monkeypatch.setattr(one_by_one, "ALONE", 0)
     many = solver.solve_batch(points, normals, prefer=prefer)
-    for name in ("q", "status", "restarts", "iterations"):
-        np.testing.assert_array_equal(getattr(few, name), getattr(many, name))
-    for name, spent in many.phases.items():
-        np.testing.assert_array_equal(few.phases[name], spent)
+    assert not many.success.all()
+    assert many.restarts.max() > 100
     alone = solver.fast()
     for row in range(len(points)):
         start = hand.home if prefer == "q0" else None
         q, _ = alone(points[row], normals[row], start)
         np.testing.assert_array_equal(q, many.q[row])
+        one = solver.solve_batch(points[row : row + 1], normals[row : row + 1], prefer=prefer)
+        for name in ("q", "status", "restarts", "iterations"):
+            assert np.array_equal(getattr(one, name)[0], getattr(many, name)[row])
+        for name, spent in many.phases.items():
+            assert one.phases[name][0] == spent[row]
 
 
 def test_so_many_rounds_and_no_more(rng):

@@ -309,5 +309,5 @@ def test_a_wrist_at_its_limits_is_searched_where_holding_it_fails():
     robot = ik.load_robot("panda+shadow")
     q = np.array(MISSED_BY_HOLDING)
     points, normals = robot.contacts(q[None])
-    solver = ik.Solver(robot, compiled=False)
+    solver = ik.Solver(robot)
     assert solver.solve_batch(points, normals).success.all()

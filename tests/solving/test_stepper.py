@@ -11,7 +11,6 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.restarts import ANYWHERE, VALLEYS
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 
 STEPPED = [name for name in ik.METHODS if name != "ipopt"]
@@ -70,7 +69,7 @@ def test_steps_go_through_all_rounds(method: str, tmp_path) -> None:
     solution = same_as_the_log(solver, away, tmp_path / "x.mcap")
     assert solution.status is ik.Status.STALLED
     usual = HandFirstParameters()
-    tried = usual.candidates * (usual.rounds + VALLEYS + ANYWHERE)
+    tried = usual.candidates * usual.first_rugged
     expected = tried if method == "hand-first" else ThumbFirstParameters().starts
     assert solution.restarts == expected - 1
 

@@ -134,7 +134,7 @@ static void look_about(@PREFIX@_solver *solver) {
 }
 
 /* Begins the fit of the next hand of the round. */
-static int begin_hand(rounds *job) {
+static int begin_hand(search *job) {
   @PREFIX@_scene *look = &job->scene;
   const double *inputs[5], near = job->terms[TERMS_NEAREST];
   double *outputs[2], here[N_MOTORS];
@@ -166,14 +166,14 @@ static int begin_hand(rounds *job) {
   code = BEGIN(&map);
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = N_CANDIDATES - 1;
-  job->in_round = 0;
+  job->slot = -1;
+  job->loop_status = RUNNING;
   return code;
 }
 
 /* Goes on with the search: at most so many iterations of one fit, or the arms of one hand. */
 static int look_on(@PREFIX@_solver *solver, int64_t most) {
   @PREFIX@_scene *look = &solver->scene;
-  int32_t status = RUNNING;
   int code;
   if (look->fit == N_CANDIDATES) {
     if (look->next < look->n_met) {
@@ -188,16 +188,13 @@ static int look_on(@PREFIX@_solver *solver, int64_t most) {
     }
     look->fit = look->next = look->n_met = 0;
   }
-  if (!solver->under_way) {
-    if (most <= 0) return DONE;
+  if (most <= 0) return DONE;
+  if (solver->slot < 0) {
     code = begin_hand(solver);
     if (code != DONE) return code;
-    solver->under_way = 1;
   }
-  code = iterate(solver, most, &status);
-  if (code != DONE) return code;
-  if (status == RUNNING && solver->in_round < BUDGET) return DONE;
-  solver->under_way = 0;
+  code = iterate(solver, most, NULL);
+  if (code != DONE) return code == SLICE_OVER ? DONE : code;
   ++look->fit;
   memcpy(solver->q, solver->state + STATE_Q, sizeof solver->q);
   if (answered(solver, solver->q)) {
@@ -213,7 +210,7 @@ static int look_on(@PREFIX@_solver *solver, int64_t most) {
 static int run_on(@PREFIX@_solver *solver, int64_t most) {
   int code;
   if (solver->scene.looking) return look_on(solver, most);
-  code = rounds_run(solver, most);
+  code = search_run(solver, most, 1);
   if (code != DONE || solver->status == RUNNING) return code;
   if (solver->status == SOLVED_STATUS) look_about(solver);
   else if (solver->scene.again) end_look(solver, 0);

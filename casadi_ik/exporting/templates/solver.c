@@ -1,15 +1,15 @@
-/* The solver itself: all rounds of a target. */
+/* The solver itself: the search for a target. */
 #include "@PREFIX@_parts.h"
 
-enum { DONE = 0, SLICE_OVER = 1 };
+enum { DONE = 0, SLICE_OVER = 1, GOES_ON = 3 };
 
-typedef @PREFIX@_solver rounds;
+typedef @PREFIX@_solver search;
 
 #define TILES(table) ((table) ? @PREFIX@_table_1 : @PREFIX@_table_0)
 @CALLS@
 @SIZES@
 @CONSTANTS@
-@ROUNDS@
+@SEARCH@
 @TERMS@
 @LIMITS@
 const char *const @PREFIX@_finger_names[] = {@FINGER_NAMES@};
@@ -20,7 +20,7 @@ void @PREFIX@_init(@PREFIX@_solver *solver) {
   memset(solver, 0, sizeof *solver);
   memcpy(solver->terms, TERMS, sizeof TERMS);
   memcpy(solver->ranges, TERMS + TERMS_LOWER, sizeof solver->ranges);
-  solver->rounds = ROUNDS;
+  solver->most = ROUNDS;
   solver->status = @GUARD@_BAD_INPUT;
 @SCENE_INIT@}
 
@@ -45,7 +45,7 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const double *points, const double *
   memcpy(solver->here, q0 ? q0 : HOME, sizeof solver->here);
   memcpy(solver->terms + TERMS_LOWER, solver->ranges, sizeof solver->ranges);
   solver->terms[TERMS_NEAREST] = q0 ? 1.0 : 0.0;
-@SCENE_BEGIN@  if (!rounds_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
+@SCENE_BEGIN@  if (!search_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
   return (int) solver->status;
 }
 

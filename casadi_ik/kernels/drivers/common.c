@@ -15,7 +15,10 @@
 #endif
 
 /* What a driver returns to Python. */
-enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, NO_MEMORY = -1, NO_CHECKOUT = -2, STEP_FAILED = -3 };
+enum {
+  DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, GOES_ON = 3, FEW_LEFT = 4,
+  NO_MEMORY = -1, NO_CHECKOUT = -2, STEP_FAILED = -3
+};
 
 /* The clock is looked at once in so many evaluations: reading it costs about 25 ns. */
 #define CLOCK_INTERVAL 16

@@ -6,7 +6,7 @@
 
 #define FREESTANDING
 
-enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, STEP_FAILED = -3 };
+enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, GOES_ON = 3, FEW_LEFT = 4, STEP_FAILED = -3 };
 
 #define EXPORT
 #define CLOCK_INTERVAL 16

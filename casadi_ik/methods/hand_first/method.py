@@ -3,44 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from casadi_ik.arms.recognise import arm_family
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
+from casadi_ik.kernels.loop_result import UNBEGUN
 from casadi_ik.kernels.robot_kernels import RobotKernels
-from casadi_ik.methods.common.contact_fit import fresh_fit
+from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.methods.common.coupling_record import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
-from casadi_ik.methods.common.posture_table import squared_distance
-from casadi_ik.methods.hand_first import one_by_one
 from casadi_ik.methods.hand_first.beginning import beginning
-from casadi_ik.methods.hand_first.going_on import (
-    CARRIED,
-    COUNTED,
-    NEAR_OF_MANY,
-    NEAR_SHRINKS,
-    RETURNS_OF_MANY,
-    SURE,
-    TINY,
-    VARIED,
-    goes_on,
-    most_returns,
-    near_cost,
-)
-from casadi_ik.methods.hand_first.one_by_one import OneByOne
+from casadi_ik.methods.hand_first.driver import Searches, SearchPlan, SearchPool
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.methods.hand_first.restarts import VALLEYS, Restarts, first_rugged, later
-from casadi_ik.methods.hand_first.rounds import RoundsPlan
+from casadi_ik.methods.hand_first.seeds import Seeds
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts.kinds import Kinds, usual
-from casadi_ik.problem.method import Quick
+from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
@@ -58,7 +41,9 @@ NEAREST = "q0"
 class HandFirstMethod(LoopedMethod):
     """`hand-first`: contacts fix palm and hand, the arm follows in closed form.
 
-    A round takes other hand postures, see `Restarts`; nearly all targets need one round only.
+    Rounds begin from other hand postures each; nearly all targets need one round only. What follows
+    a round is said in C (hand_first.c), for a batch, one target and a solve by steps alike. Without
+    a compiler there is the first round only, in CasADi's virtual machine.
 
     Attributes:
         step: Its step for this robot.
@@ -81,24 +66,15 @@ class HandFirstMethod(LoopedMethod):
         """Recognise the arm and lay out the step; point and normal if no kinds are given."""
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
-        motors = len(robot.hand_actuators)
-        self._rugged = first_rugged(options)
-        every = options.rounds + later(motors)
-        self.rounds = min(every, options.max_rounds or every)
-        self._near, self._returns = near_cost(motors), most_returns(motors)
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = HandFirstStep(robot, arm_family(robot), options.candidates, self._kinds)
-        self._alone = OneByOne(self.step.layouts, self.rounds_plan)
+        self.seeds = Seeds(robot, options, compiled)
+        self._searches = SearchPool(self.plan)
         self._kept: tuple[Any, Array] | None = None
 
     def step_graph(self) -> StepGraph:
         """The whole iteration."""
         return self.step.graph()
-
-    @cached_property
-    def hands(self) -> Restarts:
-        """The hand postures that rounds begin from."""
-        return Restarts(self.robot, self.robot.hand_actuators, self.options, self._compiled)
 
     def for_kinds(self, kinds: Kinds) -> HandFirstMethod:
         """The same for contacts of other kinds."""
@@ -108,56 +84,118 @@ class HandFirstMethod(LoopedMethod):
 
     def prepare(self) -> None:
         """Build and compile the loop, and fill the table of the first round."""
-        _ = self.kernel, self.hands.table, self.first
+        _ = self.kernel, self.seeds.table, self.first
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:
         """Those of the couplings."""
         return coupling_jacobian(self.robot)
 
-    def begin(
-        self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
-    ) -> Start:
-        """Start with the hand postures of the round; what was found before is kept."""
-        states, parameters = self._round(problems, q0, number, last if number else None)
-        if last is None:
-            return states, parameters
-        layout = self.step.layouts.state
-        for name in CARRIED if number else COUNTED:
-            states[:, layout.slice(name)] = last[:, layout.slice(name)]
-        if number:
-            earlier = layout.slice("earlier")
-            states[:, earlier] = last[:, earlier] + self.options.candidates
-        return states, parameters
-
-    def searches(self, problems: Problems) -> tuple[Problems, ...]:
-        """Near where the robot is, if that is wanted; then anywhere."""
-        if problems.prefer != NEAREST:
-            return (problems,)
-        return problems, replace(problems, prefer="limits")
-
-    def hopeful(self, states: Array, number: int) -> NDArray[np.bool_]:
-        """Whether a round may still help: see `most_returns` and `rugged`."""
-        layout = self.step.layouts.state
-        returns, cost, held = (
-            states[:, layout.slice(name).start] for name in ("returns", "best_cost", "held")
+    def plan(self, enforce_limits: bool) -> SearchPlan:
+        """What the C of its driver is made of."""
+        kernels = RobotKernels(self.robot)
+        return SearchPlan(
+            layouts=self.step.layouts,
+            options=self.options,
+            budget=self.max_iterations,
+            seeds=self.seeds,
+            enforce_limits=enforce_limits,
+            begin=self.first,
+            solve=self.kernel,
+            contacts=kernels.contacts,
+            judge=kernels.deviations,
         )
-        most = np.where(held > 0, RETURNS_OF_MANY, self._returns)
-        further = number - self._rugged
-        if further >= 0:
-            near = np.where(held > 0, NEAR_OF_MANY, self._near)
-            return (returns < most) & (cost < np.minimum(near, NEAR_SHRINKS / (further + 1)))
-        # No more hands of tables if their fits come back to a minimum that just misses.
-        tables = VARIED <= number < self.options.rounds
-        return (returns < most) | (cost < SURE) | (not tables)
 
-    def rounds_for(self, problems: Problems) -> int:
+    @property
+    def rounds(self) -> int:
+        """How many a search has at most."""
+        return self.options.all_rounds(self.robot)
+
+    def run(
+        self, problems: Problems, q0: Array, seed: int, trace: bool, rounds: int | None = None
+    ) -> Outcome:
+        """Solve a batch; see `Method.run`. No random numbers are drawn.
+
+        `rounds` are so many of each search at most instead of all.
+        """
+        self._check(problems)
+        if not self.kernel.compiled:
+            return super().run(problems, q0, seed, trace)
+        most = np.full(len(problems), self._rounds_for(problems))
+        if rounds is not None:
+            most = np.minimum(most, rounds)
+        reachable = None if problems.palms is None else palms_in_span(self._span, problems)
+        if reachable is not None:
+            most[~reachable] = 0  # a first round leads near what the arm cannot reach
+        with self._searches.lent(problems.enforce_limits, len(problems)) as searches:
+            return searches.batch(problems, q0, self.terms(problems), most, trace)
+
+    def quick(self, problems: Problems, q0: Array) -> Quick | None:
+        """The answer to one target; see `QuickMethod.quick`."""
+        if not self.kernel.compiled:
+            return None
+        with self._searches.lent(problems.enforce_limits) as search:
+            search.ask(problems, 0, q0, self.terms(problems))
+            status = search(self._rounds_for(problems))
+            return None if status is None else search.answer(status)
+
+    def alone(self, enforce_limits: bool) -> Searches | None:
+        """Memory for one search after the other; None without a compiler."""
+        self.prepare()
+        return Searches(self.plan(enforce_limits), 1) if self.kernel.compiled else None
+
+    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+        """One target, one iteration at a time; see `Method.stepper`."""
+        self._check(problems)
+        search, rounds = self.alone(problems.enforce_limits), self._rounds_for(problems)
+        if search is None:
+            return super().stepper(problems, q0)
+        search.ask(problems, 0, q0, self.terms(problems).reshape(-1))
+
+        def following(status: int, state: Array) -> Start | None:
+            search.state[...] = state
+            if not search.decide(status, rounds):
+                return None
+            return search.state.copy(), search.parameters.copy()
+
+        search.decide(UNBEGUN, rounds)
+        return Stepper(self.graph, search.state, search.parameters, following)
+
+    def postures(self, problems: Problems, number: int) -> Array:
+        """Candidates (k, candidates, hand) of a round whose postures look like the targets.
+
+        Args:
+            problems: The targets.
+            number: The round, below `options.rounds`.
+        """
+        count, terms = self.options.candidates, self.terms(problems)
+        if not number or not self.kernel.compiled:
+            table, most = self.seeds.table, (number + 1) * count
+            return table.nearest(problems.points, problems.normals, most)[:, -count:]
+        every = np.broadcast_to(terms, (len(problems), terms.shape[-1]))
+        here = np.zeros(len(self.robot.actuators))
+        with self._searches.lent(problems.enforce_limits) as search:
+            found = np.empty((len(problems), *search.postures.shape))
+            for row in range(len(problems)):
+                search.ask(problems, row, here, every[row])
+                found[row] = search.hands(number)
+        return found
+
+    def begin(self, problems: Problems, q0: Array) -> Start:
+        """The first round; where what is near q0 is wanted, its own hand comes first."""
+        postures = self.seeds.table.nearest(
+            problems.points, problems.normals, self.options.candidates
+        )
+        if problems.prefer == NEAREST and self.robot.arm_actuators and postures.shape[1] > 1:
+            own = np.clip(q0, *problems.bounds(self.robot, UNBOUNDED))[:, None]
+            own = own[:, :, list(self.robot.hand_actuators)]
+            postures = np.concatenate([own, postures[:, :-1]], axis=1)
+        return self.rows(problems, q0, postures)
+
+    def _rounds_for(self, problems: Problems) -> int:
         """So many; of hands that are given none from anywhere but what every target gets."""
-        return self.rounds if problems.palms is None else min(self.rounds, self._rugged)
-
-    def reachable(self, problems: Problems) -> NDArray[np.bool_] | None:
-        """Whether palms that are given are where the arm can hold its wrist."""
-        return None if problems.palms is None else palms_in_span(self._span, problems)
+        every = self.rounds
+        return every if problems.palms is None else min(every, self.options.first_rugged)
 
     @cached_property
     def _span(self) -> ArmSpan | None:
@@ -171,42 +209,8 @@ class HandFirstMethod(LoopedMethod):
 
     def restarts(self, states: Array) -> Counts:
         """Hand postures tried but the first."""
-        layout = self.step.layouts.state
-        earlier, candidate = (
-            states[:, layout.slice(name).start].astype(np.int64)
-            for name in ("earlier", "candidate")
-        )
-        return earlier + np.clip(candidate, 0, self.options.candidates - 1)
-
-    def quick(self, problems: Problems, q0: Array) -> Quick | None:
-        """The first round of one target; see `QuickMethod.quick`."""
-        if not self.kernel.compiled:
-            return None
-        return self._alone.first(problems, q0, self.terms(problems))
-
-    def finish(
-        self, problems: Problems, q0: Array, last: LoopResult, number: int, rounds: int
-    ) -> LoopResult | None:
-        """Few targets are solved one by one in compiled code; see `LoopedMethod.finish`."""
-        if not self.kernel.compiled or len(problems) > one_by_one.ALONE:
-            return None
-        return self._alone.rest(problems, q0, self.terms(problems), last, number, rounds)
-
-    def rounds_plan(self, enforce_limits: bool) -> RoundsPlan:
-        """All rounds of one target, as compiled code makes them."""
-        kernels = RobotKernels(self.robot)
-        return RoundsPlan(
-            layouts=self.step.layouts,
-            options=self.options,
-            rounds=self.rounds,
-            budget=self.max_iterations,
-            hands=self.hands,
-            enforce_limits=enforce_limits,
-            begin=self.first,
-            solve=self.kernel,
-            contacts=kernels.contacts,
-            judge=kernels.deviations,
-        )
+        candidate = states[:, self.step.layouts.state.slice("candidate").start].astype(np.int64)
+        return np.clip(candidate, 0, self.options.candidates - 1)
 
     def rows(
         self, problems: Problems, q0: Array, postures: Array, begun: bool = False
@@ -239,72 +243,6 @@ class HandFirstMethod(LoopedMethod):
     def run_rows(self, states: Array, parameters: Array, trace: bool = False) -> LoopResult:
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, self.max_iterations, trace)
-
-    def postures(self, problems: Problems, number: int) -> Array:
-        """Candidates (k, candidates, hand) of a round whose postures look like the targets.
-
-        Args:
-            problems: k targets.
-            number: The round, below `options.rounds`.
-        """
-        return self.hands.from_tables(problems, number)
-
-    def _round(self, problems: Problems, q0: Array, number: int, last: Array | None) -> Start:
-        """What a round begins with, the memory of those before aside."""
-        later, layouts = number - self.options.rounds, self.step.layouts
-        if later < 0 or last is None:
-            postures = self.hands.from_tables(problems, number)
-            if problems.prefer == NEAREST:
-                postures = self.order(problems, q0, postures, own=last is None)
-            return self.rows(problems, q0, postures, begun=last is not None)
-        if later < VALLEYS:
-            best = last[:, layouts.state.slice("best_q")]
-            return self.rows(problems, q0, self.hands.along_valley(problems, best, later), True)
-        # The first of them begins as a whole: what stands in the way may be arm and hand together.
-        anywhere = self.hands.anywhere(problems, later - VALLEYS)
-        whole = np.repeat(anywhere[:1], len(last), axis=0)
-        if self.hands.mends(problems):
-            hands = self.hands.mended(problems, number)
-        else:
-            hand = list(self.robot.hand_actuators)
-            hands = np.repeat(anywhere[None][:, :, hand], len(last), axis=0)
-        if goes_on(later - VALLEYS):
-            best, cost = (last[:, layouts.state.slice(name)] for name in ("best_q", "best_cost"))
-            flat = np.flatnonzero(cost < SURE)
-            which = VALLEYS + (later - VALLEYS) // 2
-            if len(flat):
-                whole[flat] = best[flat]
-                hands[flat] = self.hands.along_valley(problems.rows(flat), best[flat], which)
-        states, parameters = self.rows(problems, q0, hands, True)
-        lower, upper = (parameters[:, layouts.parameters.slice(end)] for end in ("lower", "upper"))
-        states[:, layouts.state.slice("q")] = np.clip(whole, lower, upper)
-        states[:, layouts.state.slice("phase")] = float(Phase.REFINEMENT)
-        for name, value in fresh_fit().items():
-            states[:, layouts.state.slice(name)] = value
-        return states, parameters
-
-    def order(self, problems: Problems, q0: Array, postures: Array, own: bool) -> Array:
-        """Hand postures (k, c, hand), the nearest first.
-
-        Args:
-            problems: The targets.
-            q0: (k, n) where the robot is.
-            postures: The postures.
-            own: Whether its own posture comes first, instead of the last of them.
-        """
-        hand = list(self.robot.hand_actuators)
-        here = np.clip(q0, *problems.bounds(self.robot, UNBOUNDED))[:, None, hand]
-        # A hand without an arm has begun there already.
-        own = own and bool(self.robot.arm_actuators)
-        if own:
-            postures = postures[:, : max(postures.shape[1] - 1, 1)]
-        ranges = np.maximum((self.robot.upper - self.robot.lower)[hand], TINY)
-        distance = squared_distance(postures / ranges, here / ranges)
-        rows = np.argsort(distance, axis=1, kind="stable")[:, :, None]
-        ordered = np.take_along_axis(postures, rows, axis=1)
-        if not own or self.options.candidates == 1:
-            return ordered
-        return np.concatenate([here, ordered], axis=1)
 
     def terms(self, problems: Problems) -> Array:
         """What `beginning` calls terms; kept, since making them costs as much as a solve."""

@@ -1,25 +1,72 @@
-"""Numbers of the hand-first method."""
+"""Numbers of the hand-first method, each with what it was chosen by."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from casadi_ik.errors import InputError
+from casadi_ik.robots.description import RobotDescription
+
+STRIDES = (0.05, 0.1, 0.2, 0.4, 0.03, 0.15, 0.3, 0.8, 0.5, 0.6, 0.7, 0.25, 1.0, 1.2, 1.5, 2.0)
 
 
 @dataclass(frozen=True)
 class HandFirstParameters:
     """Parameters of the method.
 
+    A round begins from up to `candidates` hand postures. In order there are `rounds` from tables,
+    `valley_rounds` along the direction in which the contacts move least, `global_rounds` from
+    anywhere that every target gets, and `rugged_rounds` more for targets that end elsewhere each
+    time. Many motors are more than `many_motors` of the hand: such a hand has so many places where
+    fits end that few of them tell little. Where held motors leave a hand or arm less than its
+    motions, no table holds its postures, and the numbers for many motors count.
+
     Attributes:
-        table: Hand postures the targets' shapes are compared with; of hands with few motors and
-            more than three fingers fewer (`restarts.FEWER_ROWS`).
+        table: Hand postures the targets' shapes are compared with.
         candidates: Of those, how many a round of the compiled loop may start from.
         wide_table: The same for the rounds after the first.
-        rounds: Rounds that begin from the tables, each from the next best candidates. After them
-            some begin elsewhere (`restarts.later`), before a target is given up.
+        rounds: Rounds that begin from the tables, each from the next best candidates.
         max_rounds: Rounds of all kinds at most, each of up to `candidates` hand postures: the limit
             of effort. 1 solves nearly all that can be reached. None: as many as may help.
+        few_motors_table: Part of `table` that a hand with few motors and more than three fingers
+            is compared with: its contacts' shape is more telling, and each row costs as much as
+            three of three fingers. Of 4,000 targets of a Panda with a hand of five fingers and six
+            motors 16 instead of 4 need a second posture, and all of them an eighth less time.
+        many_motors: See above.
+        at_limits: Part of the range that the wide table moves to the limits.
+        similar: Postures nearer to each other than this [root mean square, of the motors' ranges]
+            are alike.
+        pool: From so many times as many postures as are wanted those that differ are taken. Twice
+            as many cost more time than the fits they save.
+        varied_rounds: Rounds from tables in any case: the second takes hands that differ.
+        finger_rows: Postures of a finger that is chosen by itself; with four times as many no more
+            fits succeed.
+        finger_turns: How often palm and fingers are chosen in turns; a third time mends little.
+        fresh_pool: Postures mended finger by finger for a round after the second: not those that
+            look like the target, but as many others in every round.
+        late_pool: The same after `late_round`: what the best of many is not near in one round it is
+            not in the next. Of 64,000 targets of a LEAP hand near limits 100 are left after 16
+            rounds and 8 after 64; with 96 in all rounds 140 and 16. By turns with these there are
+            rounds of postures that are not mended.
+        late_round: See above.
+        valley_rounds: Rounds along the directions in which the contacts move least.
+        strides: How far along a valley, to either side, a hand begins anew [rad of the motor that
+            moves most], round by round.
+        global_rounds: See above.
+        rugged_rounds: Of a hand with few motors, and with many. Of 640,000 targets at limits of
+            LEAP hands on eight arms 200 are left after 32 rounds of all kinds, 55 after 64, 14
+            after 100, 6 after 150 and 2 after the last.
+        same_minimum: When so many fits and balances have ended where one had before, no table holds
+            another kind; of a hand with few motors, and with many. With eight a reachable target
+            was given up one round too early; sixteen cost a tenth more time where contacts
+            contradict each other. A hand with many motors comes back to a minimum that just misses
+            from many sides: one target did 166 times ten rounds before it was solved.
+        flat_cost: Cost (0.01 mm, 0.1 mrad) above which this is a minimum, no long flat valley.
+        far_cost: Cost (14 mm, 8 deg; 0.3 m) from which on a target that still misses is taken to be
+            out of reach; of a hand with few motors, and with many.
+        far_cost_shrinks: After the k-th rugged round at most this / (k + 1): the longer a target
+            stays far off the less there is to hope. One had more than 3 after 7 rounds and was
+            solved in the 18th, one 0.3 after 26 and was solved in the 75th.
     """
 
     table: int = 1024
@@ -27,16 +74,51 @@ class HandFirstParameters:
     wide_table: int = 8192
     rounds: int = 6
     max_rounds: int | None = None
+    few_motors_table: float = 3 / 8
+    many_motors: int = 9
+    at_limits: float = 0.5
+    similar: float = 0.25
+    pool: int = 3
+    varied_rounds: int = 2
+    finger_rows: int = 128
+    finger_turns: int = 2
+    fresh_pool: int = 64
+    late_pool: int = 24
+    late_round: int = 12
+    valley_rounds: int = 3
+    strides: tuple[float, ...] = STRIDES
+    global_rounds: int = 2
+    rugged_rounds: tuple[int, int] = (40, 250)
+    same_minimum: tuple[int, int] = (16, 600)
+    flat_cost: float = 1e-8
+    far_cost: tuple[float, float] = (0.02, 10.0)
+    far_cost_shrinks: float = 60.0
 
     def __post_init__(self) -> None:
-        for name in ("table", "candidates", "wide_table", "rounds", "max_rounds"):
-            value = getattr(self, name)
-            if name == "max_rounds" and value is None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if "int" not in str(field.type) or isinstance(value, tuple):
+                continue
+            if value is None and field.name == "max_rounds":
                 continue
             if isinstance(value, bool) or not (isinstance(value, int) and value >= 1):
-                raise InputError(f"{name}: found {value!r}, expected a whole number >= 1")
+                raise InputError(f"{field.name}: found {value!r}, expected a whole number >= 1")
         if self.candidates * self.rounds > self.table:
             raise InputError(
                 f"table: found {self.table}, expected at least candidates x rounds = "
                 f"{self.candidates * self.rounds}"
             )
+
+    def is_many(self, robot: RobotDescription) -> bool:
+        """Whether a robot's hand has many motors."""
+        return len(robot.hand_actuators) > self.many_motors
+
+    @property
+    def first_rugged(self) -> int:
+        """Rounds before those from anywhere that not every target gets."""
+        return self.rounds + self.valley_rounds + self.global_rounds
+
+    def all_rounds(self, robot: RobotDescription) -> int:
+        """Rounds of all kinds at most."""
+        every = self.first_rugged + self.rugged_rounds[self.is_many(robot)]
+        return min(every, self.max_rounds or every)

@@ -41,6 +41,13 @@ STAGES = (
 
 STAGE_LABELS = tuple(stage.label for stage in STAGES)
 
+CARRIED = (
+    *("passed", "near", "balanced", "least", "returns"),
+    *("best_cost", "best_q", "counts"),
+)
+"""What a round leaves to the next: how far the numeric arm's list of starts is through, which fits
+were balanced in vain, and what was found."""
+
 NOTHING = float("nan")
 
 

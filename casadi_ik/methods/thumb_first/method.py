@@ -32,9 +32,6 @@ NEAREST = "q0"
 class ThumbFirstMethod(LoopedMethod):
     """`thumb-first`: the arm starts at the estimated palm, then the closed chain does the rest.
 
-    Nearly all targets need one start only, so the others are looked up in a second round, for the
-    targets left over.
-
     Attributes:
         step: Its step for this robot; in the virtual machine if it is ProxQP's.
         preferences: What it can prefer.
@@ -56,7 +53,6 @@ class ThumbFirstMethod(LoopedMethod):
         """Recognise the arm and lay out the step; point and normal if no kinds are given."""
         super().__init__(robot, options, compiled)
         self.options: ThumbFirstParameters = options
-        self.rounds = 1 if options.starts == 1 else 2
         self._kinds = kinds or usual(len(robot.fingers))
         self.step = ThumbFirstStep(robot, options, self._kinds, arm_family(robot))
 
@@ -86,16 +82,14 @@ class ThumbFirstMethod(LoopedMethod):
         """Build and compile the loop, and fill the table."""
         _ = self.kernel, self.table
 
-    def begin(
-        self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
-    ) -> Start:
+    def begin(self, problems: Problems, q0: Array) -> Start:
         """Start where the robot is, if its nearest is wanted, and from estimates of the palm."""
         count, step, most = len(problems), self.step, self.options.starts
         lower, upper = problems.bounds(self.robot, UNBOUNDED)
         hand = list(self.robot.hand_actuators)
         here = np.clip(q0, lower, upper)
         nearest = problems.prefer == NEAREST
-        found = self._hands(problems, here[:, hand], nearest, most if number else 1)[:, :most]
+        found = self._hands(problems, here[:, hand], nearest, most)[:, :most]
         postures = np.zeros((count, most, len(hand)))
         postures[:, : found.shape[1]] = found
         known = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
@@ -116,10 +110,6 @@ class ThumbFirstMethod(LoopedMethod):
             "step_cap": self.options.step_cap,
         }
         parameters = step.parameters.pack_rows(values, count)
-        if last is not None:
-            states = last.copy()
-            states[:, step.state.slice("phase")] = Phase.CANDIDATE
-            return states, parameters
         first = {item.name: np.zeros(item.shape) for item in step.state} | {
             "q": here if nearest else q0,
             "passed": -1.0,

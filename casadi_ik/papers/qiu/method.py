@@ -33,11 +33,8 @@ class _QiuMethod(LoopedMethod, Generic[Step]):
         """The whole iteration."""
         return self.step.graph()
 
-    def begin(
-        self, problems: Problems, q0: Array, number: int = 0, last: Array | None = None
-    ) -> Start:
+    def begin(self, problems: Problems, q0: Array) -> Start:
         """Start at q0, moved into limits that are enforced."""
-        del number, last
         step, count = self.step, len(problems)
         first = step.first_state(starts_within(self.robot, problems, q0))
         states = step.state.pack_rows(first, count)

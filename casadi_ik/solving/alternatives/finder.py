@@ -16,7 +16,6 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.cancellation import stop_if_cancelled
-from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.palm_targets import free_palms
 from casadi_ik.problem.preference import CLEARANCE, preference
@@ -24,7 +23,7 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
 from casadi_ik.solving.alternatives.distinct import checked_distance, distinct
-from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
+from casadi_ik.solving.trials import Bounds, Descent, HandMethod, Trials, repeated
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.measures import manipulability
 
@@ -97,7 +96,7 @@ class AlternativeFinder:
         hand: Positions in q of the hand's actuators.
     """
 
-    def __init__(self, robot: ArmHand, method: HandFirstMethod, compiled: bool = True) -> None:
+    def __init__(self, robot: ArmHand, method: HandMethod, compiled: bool = True) -> None:
         """Take the robot and hand-first on it."""
         self.robot = robot
         self.trials = Trials(robot, method)

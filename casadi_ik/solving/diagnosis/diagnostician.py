@@ -21,7 +21,6 @@ from casadi_ik.answers.diagnosis import (
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.grasps import Tolerance
-from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import Verdict, deviations, judge, judge_palms
 from casadi_ik.proofs.proof import Proof, ProofKind
@@ -29,7 +28,7 @@ from casadi_ik.proofs.prove import EFFORT, Prover
 from casadi_ik.solving.diagnosis.minimax import Closest, closest
 from casadi_ik.solving.diagnosis.palm_free import HandFits, PalmFree
 from casadi_ik.solving.diagnosis.remedies import RemedyFinder
-from casadi_ik.solving.trials import Descent, Rows, Trials
+from casadi_ik.solving.trials import Descent, HandMethod, Rows, Trials
 
 TOGETHER = 64
 """Targets that are diagnosed in the same runs of the compiled loop."""
@@ -71,7 +70,7 @@ class Diagnostician:
         method: Hand-first on that robot.
     """
 
-    def __init__(self, robot: ArmHand, method: HandFirstMethod, compiled: bool = True) -> None:
+    def __init__(self, robot: ArmHand, method: HandMethod, compiled: bool = True) -> None:
         """Keep robot and method; nothing is built before the first diagnosis."""
         self.robot = robot
         self.method = method

@@ -1,9 +1,15 @@
-/* All rounds of hand-first for one target, as method.py and restarts.py make them for a batch.
+/* Where the rounds of hand-first begin: hand postures, each round's of another kind.
  *
- * Calls the compiled kernels by the macros LOOK_UP, BEGIN, SOLVE, CONTACTS, VALLEY, EACH_FINGER (if
- * MENDS) and JUDGE, which take a pointer to a job of the drivers. The constants come from
- * rounds.py. Bit for bit the answers of a batch: what is computed here is computed in the same
- * order there.
+ * The first round compares the target with a table of postures. The next ones compare it with a
+ * table many times as large, half of it at limits, and take only postures that differ from each
+ * other: the neighbours of one that failed fail as well. Of hands with many motors every finger
+ * takes the posture that suits it best by itself. What all of them miss is one of two things. Its
+ * fit has come to rest in a long valley, where the contacts hardly move while the hand does: so the
+ * next round begins along it, to either side of the best fit so far. Or no table holds its like:
+ * then postures drawn from anywhere follow, and a whole configuration of arm and hand.
+ *
+ * The kernels are called by the macros LOOK_UP, CONTACTS, VALLEY and EACH_FINGER (if MENDS), which
+ * take a pointer to a job of the drivers; the constants come from driver.py.
  */
 
 static const int64_t ALONE[] = {0, 0, 0, 0, 0, 0, 0, 0};
@@ -27,7 +33,7 @@ static double posture(int table, int64_t row, int motor) {
   return TABLE_LOWER[table][motor] + clipped(spread, 0.0, 1.0) * TABLE_RANGE[table][motor];
 }
 
-static int look_up(rounds *job, int table, int64_t wanted) {
+static int look_up(search *job, int table, int64_t wanted) {
   const double *inputs[2];
   lookup_job look = {0};
   inputs[0] = job->points;
@@ -63,7 +69,7 @@ static double apart(const double *one, const double *other) {
 
 #if MENDS
 /* Every finger of the pool's postures chosen by itself; those of which least is left come first. */
-static int mend(rounds *job, int64_t pool) {
+static int mend(search *job, int64_t pool) {
   static const int64_t in[] = {0, 0, N_HAND}, out[] = {N_HAND, 1};
   const double *inputs[3];
   double *outputs[2];
@@ -92,7 +98,7 @@ static int mend(rounds *job, int64_t pool) {
 #endif
 
 /* Of the pool of postures those that differ, best first, without the first of them. */
-static void vary(rounds *job, int table, int64_t pool, int64_t count, int64_t first, double *into) {
+static void vary(search *job, int table, int64_t pool, int64_t count, int64_t first, double *into) {
   int64_t i, k, place, pick;
   for (i = 0; i < pool; ++i) {
     for (k = 0; k < N_HAND; ++k) {
@@ -125,13 +131,13 @@ static void vary(rounds *job, int table, int64_t pool, int64_t count, int64_t fi
 #if MENDS
 /* Mended postures that do not look like the target in particular, other ones in every round; late
  * ones by turns as they are. */
-static int from_spread(rounds *job, int64_t number) {
-  const int plain = number >= NARROW && number % 2;
-  const int64_t count = plain ? N_CANDIDATES : number < NARROW ? SPREAD : NARROWER;
+static int from_spread(search *job, int64_t number) {
+  const int plain = number >= LATE_ROUND && number % 2;
+  const int64_t count = plain ? N_CANDIDATES : number < LATE_ROUND ? FRESH_POOL : LATE_POOL;
   int64_t i;
   int code, k;
   for (i = 0; i < count; ++i) {
-    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, number * SPREAD + i, k);
+    for (k = 0; k < N_HAND; ++k) job->near[i * N_HAND + k] = posture(1, number * FRESH_POOL + i, k);
   }
   if (plain) {
     memcpy(job->postures, job->near, sizeof job->postures);
@@ -144,7 +150,7 @@ static int from_spread(rounds *job, int64_t number) {
 #endif
 
 /* Nearest to where the robot is first; its own posture before them, instead of the last. */
-static void order(rounds *job, int own) {
+static void order(search *job, int own) {
   double here[N_HAND], near[N_HAND], sorted[N_CANDIDATES * N_HAND], distance[N_CANDIDATES];
   const int first = own && HAS_ARM && N_CANDIDATES > 1;
   const int count = first ? N_CANDIDATES - 1 : N_CANDIDATES;
@@ -172,7 +178,7 @@ static void order(rounds *job, int own) {
 }
 
 /* Postures whose contacts look like the target. */
-static int from_table(rounds *job, int64_t number) {
+static int from_table(search *job, int64_t number) {
   const int table = !number ? 0 : !ENFORCE_LIMITS && number % 2 ? 2 : 1;
   const int64_t wanted = number ? number * N_CANDIDATES : N_CANDIDATES;
   const int64_t most = TABLE_ROWS[table];
@@ -205,7 +211,7 @@ static int from_table(rounds *job, int64_t number) {
 }
 
 /* How the contacts move with palm and hand. */
-static int find_slopes(rounds *job, const double *q) {
+static int find_slopes(search *job, const double *q) {
   const double *inputs[1];
   double *outputs[2];
   static const int64_t in[] = {N_MOTORS}, out[] = {3 * N_FINGERS, 3 * N_FINGERS};
@@ -251,7 +257,7 @@ static int find_slopes(rounds *job, const double *q) {
 }
 
 /* Postures to either side of a fit that came to rest. */
-static int along_valley(rounds *job, int64_t which) {
+static int along_valley(search *job, int64_t which) {
   const double *q = job->last + STATE_BEST_Q;
   const double *inputs[3];
   double *outputs[1];
@@ -279,7 +285,7 @@ static int along_valley(rounds *job, int64_t which) {
 }
 
 /* Hand postures from anywhere, and all motors of the first of them. */
-static void from_anywhere(rounds *job, int64_t number, double *first) {
+static void from_anywhere(search *job, int64_t number, double *first) {
   int i, k;
   for (i = 0; i < N_CANDIDATES; ++i) {
     const int64_t place = number * N_CANDIDATES + i + 1;
@@ -293,209 +299,4 @@ static void from_anywhere(rounds *job, int64_t number, double *first) {
     first[k] = ANYWHERE_LOWER[k]
              + even(number * N_CANDIDATES + 1, ALL_STEPS[k]) * ANYWHERE_RANGE[k];
   }
-}
-
-static int begin_round(rounds *job, int64_t number) {
-  const double *inputs[5 + N_MORE];
-  double *outputs[2], first[N_MOTORS];
-  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
-  const int64_t later = number - TABLE_ROUNDS;
-  int code = DONE, goes_on, i, k;
-  memcpy(job->last, job->state, sizeof job->last);
-  goes_on = later >= VALLEYS && (later - VALLEYS) % 2 == 0 && job->last[STATE_BEST_COST] < SURE;
-  if (later < 0 || !number) code = from_table(job, number);
-  else if (later < VALLEYS) code = along_valley(job, later);
-  else if (goes_on) code = along_valley(job, VALLEYS + (later - VALLEYS) / 2);
-  else from_anywhere(job, later - VALLEYS, first);
-#if MENDS
-  if (later >= VALLEYS && !goes_on) code = from_spread(job, number);
-#endif
-  if (code != DONE) return code;
-  inputs[0] = job->points;
-  inputs[1] = job->normals;
-  for (i = 0; i < N_MORE; ++i) inputs[2 + i] = job->more + 3 * N_FINGERS * i;
-  inputs[2 + N_MORE] = job->here;
-  inputs[3 + N_MORE] = job->terms;
-  inputs[4 + N_MORE] = job->postures;
-  outputs[0] = job->state;
-  outputs[1] = job->parameters;
-  code = BEGIN(&map);
-  if (code != DONE) return code;
-  if (!number) {
-    for (i = 0; job->again && i < N_COUNTS; ++i) {
-      job->state[STATE_COUNTS + i] = job->last[STATE_COUNTS + i];
-    }
-    return DONE;
-  }
-  job->state[STATE_PHASE] = CANDIDATE_PHASE;
-  job->state[STATE_CANDIDATE] = 0.0;
-  if (later >= VALLEYS) {
-    /* The first begins as a whole: what stands in the way may be arm and hand together. */
-    if (goes_on) memcpy(first, job->last + STATE_BEST_Q, sizeof first);
-    for (k = 0; k < N_MOTORS; ++k) {
-      job->state[STATE_Q + k] = clipped(first[k], job->parameters[PARAMETERS_LOWER + k],
-                                        job->parameters[PARAMETERS_UPPER + k]);
-    }
-    job->state[STATE_PHASE] = REFINEMENT_PHASE;
-    for (i = 0; i < N_FRESH; ++i) job->state[FRESH_PLACES[i]] = FRESH_VALUES[i];
-  }
-  for (i = 0; i < N_CARRIED; ++i) job->state[CARRIED[i]] = job->last[CARRIED[i]];
-  job->state[STATE_EARLIER] = job->last[STATE_EARLIER] + N_CANDIDATES;
-  return DONE;
-}
-
-static int is_hopeful(const rounds *job, int64_t number) {
-  const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
-  const int held = job->state[STATE_HELD] > 0;
-  const double most = held ? RETURNS_OF_HELD : RETURNS, near = held ? NEAR_OF_HELD : NEAR_COST;
-  const int64_t rugged = number - FIRST_RUGGED;
-  if (rugged >= 0) {
-    return returns < most && cost < near && cost < NEAR_SHRINKS / (double) (rugged + 1);
-  }
-  return returns < most || cost < SURE || number < VARIED || number >= TABLE_ROUNDS;
-}
-
-/* The verdict, which has the last word on what is solved. */
-static int finish(rounds *job) {
-  const double slack = 1 + TOLERANCE_SLACK, tried = job->state[STATE_CANDIDATE];
-  const double *inputs[3];
-  double *outputs[3];
-  map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
-  int code, i, met = 1;
-  if (job->again) job->terms[TERMS_NEAREST] = 1.0;
-  memcpy(job->q, job->state + STATE_Q, sizeof job->q);
-  job->restarts = (int64_t) job->state[STATE_EARLIER]
-                + (int64_t) clipped((double) (int64_t) tried, 0.0, N_CANDIDATES - 1);
-  if (N_MORE) return DONE;
-  inputs[0] = job->q;
-  inputs[1] = job->points;
-  inputs[2] = job->normals;
-  outputs[0] = job->position_error;
-  outputs[1] = job->angle_error;
-  outputs[2] = &job->beyond;
-  code = JUDGE(&map);
-  if (code != DONE) return code;
-  for (i = 0; i < N_FINGERS; ++i) {
-    met &= job->position_error[i] <= job->terms[i] * slack || !is_number(job->points[3 * i]);
-    met &= job->angle_error[i] <= job->terms[N_FINGERS + i] * slack
-        || !is_number(job->normals[3 * i]);
-  }
-  if (ENFORCE_LIMITS) met &= job->beyond <= LIMIT_SLACK;
-  if (met) job->status = SOLVED_STATUS;
-  else if (job->status == SOLVED_STATUS) job->status = STALLED_STATUS;
-  return DONE;
-}
-
-static double length_of(const double *vector) {
-  return sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]);
-}
-
-/* Whether a vector is free, or a direction: that gets length one as `unit_vectors` makes it. */
-static int made_unit(double *vector) {
-  double length;
-  int i;
-  if (vector[0] != vector[0]) return vector[1] != vector[1] && vector[2] != vector[2];
-  if (!(is_finite(vector[0]) && is_finite(vector[1]) && is_finite(vector[2]))) return 0;
-  length = length_of(vector);
-  if (!(length >= SMALL_LENGTH && length <= LARGE_LENGTH)) {
-    /* By powers of two, which change no digit; in two halves, as one may be out of range. */
-    double most = 0;
-    int power, half;
-    for (i = 0; i < 3; ++i) most = fabs(vector[i]) > most ? fabs(vector[i]) : most;
-    (void) frexp(most, &power);
-    half = (-power - (power & 1)) / 2;
-    for (i = 0; i < 3; ++i) vector[i] = ldexp(ldexp(vector[i], half), -power - half);
-    length = length_of(vector);
-  }
-  if (length == 0) return 0;
-  if (length - 1 < UNIT && 1 - length < UNIT) return 1;
-  for (i = 0; i < 3; ++i) vector[i] /= length;
-  return 1;
-}
-
-/* Takes up the question that stands in the job; 0 if it is malformed. */
-static int rounds_begin(rounds *job) {
-  int i, asked = 0, sound = 1;
-  for (i = 0; i < N_FINGERS; ++i) {
-    double *point = job->points + 3 * i, *normal = job->normals + 3 * i;
-    const int placed = is_finite(point[0]) && is_finite(point[1]) && is_finite(point[2]);
-    const int placeless = !is_number(point[0]) && !is_number(point[1]) && !is_number(point[2]);
-    sound &= placed || (placeless && !is_number(normal[0]));
-    sound &= made_unit(normal);
-    asked |= placed;
-  }
-  for (i = 0; i < N_MOTORS; ++i) sound &= is_finite(job->here[i]);
-  job->round = 0;
-  job->under_way = 0;
-  job->iterations = 0;
-  job->restarts = 0;
-  job->again = 0;
-  job->status = RUNNING;
-  return sound && asked;
-}
-
-/* A preference orders answers: where none was found near `here`, all rounds follow without it. 0 if
- * they have been made, and if a first round alone is wanted. */
-static int search_again(rounds *job) {
-  if (!job->rounds || !(job->terms[TERMS_NEAREST] > 0)) return 0;
-  job->terms[TERMS_NEAREST] = 0.0;
-  job->again = 1;
-  job->round = 0;
-  return 1;
-}
-
-/* Goes on with what is under way for at most so many iterations. */
-static int iterate(rounds *job, int64_t most, int32_t *status) {
-  const int64_t before = job->in_round;
-  double seconds = 0;
-  loop_job loop = {0};
-  int code;
-  loop.states = job->state;
-  loop.parameters = job->parameters;
-  loop.iterations = &job->in_round;
-  loop.status = status;
-  loop.seconds = &seconds;
-  loop.mark = job->mark;
-  loop.count = 1;
-  loop.max_iterations = before + most < BUDGET ? before + most : BUDGET;
-  loop.slice = SLICE;
-  code = SOLVE(&loop);
-  job->iterations += job->in_round - before;
-  return code;
-}
-
-/* Goes on for so many iterations, and begins one round at most; `status` says whether it is over.
- *
- * Returns DONE, SLICE_OVER if it has to be called again, or what went wrong.
- */
-static int rounds_run(rounds *job, int64_t most) {
-  int begun = 0, code;
-  while (job->status == RUNNING) {
-    const int64_t before = job->iterations;
-    int32_t status = RUNNING;
-    if (!job->under_way) {
-      if (begun++ || most <= 0) return DONE;
-      code = begin_round(job, job->round);
-      if (code != DONE) return code;
-      job->under_way = 1;
-      job->in_round = 0;
-    }
-    code = iterate(job, most, &status);
-    most -= job->iterations - before;
-    if (code != DONE) return code;
-    if (status == RUNNING && job->in_round < BUDGET) return DONE;
-    job->under_way = 0;
-    if (status == SOLVED_STATUS) {
-      job->status = SOLVED_STATUS;
-      return finish(job);
-    }
-    do ++job->round;
-    while (job->round < job->rounds && !is_hopeful(job, job->round));
-    if (job->round < job->rounds || search_again(job)) continue;
-    job->status = status == RUNNING ? LIMIT_STATUS
-                : status == REPEATED ? STALLED_STATUS
-                : status < 0 ? INVALID_STATUS : status;
-    return finish(job);
-  }
-  return DONE;
 }

@@ -1,0 +1,582 @@
+"""The driver of hand-first: C that is made for a robot, and its calls for one target and for many.
+
+What is done when stands in hand_first.c and seeds.c, and in the loop that calls them. Here they get
+their memory, their constants and the kernels that they call.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array
+from casadi_ik.errors import KernelError
+from casadi_ik.grasps.grasp import LARGE, SMALL, UNIT
+from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
+from casadi_ik.kernels.buffered import memory
+from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.codegen import define, driver_text
+from casadi_ik.kernels.constants import define_arrays, number
+from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
+from casadi_ik.kernels.loop import SLOTS, Followed
+from casadi_ik.kernels.loop_result import UNBEGUN
+from casadi_ik.made import made
+from casadi_ik.methods.common.contact_fit import fresh_fit
+from casadi_ik.methods.hand_first.beginning import terms
+from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.methods.hand_first.seeds import Seeds
+from casadi_ik.methods.hand_first.state import CARRIED, STAGE_LABELS, STAGES, HandFirstLayouts
+from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.method import Outcome, Quick
+from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
+from casadi_ik.symbolic.even_spread import even_steps
+
+MALFORMED = -9
+"""What a search returns for a question that is none."""
+
+FOREVER = 2**62
+"""Steps and rounds of a call that has no bound."""
+
+SMALLEST = 1e-9
+"""Smallest range [rad or m] a motion is measured by."""
+
+NUDGE = 1e-6
+"""Difference [rad or m] from which slopes are taken."""
+
+AT_END = 1e-6
+"""A motor this near to a limit [rad or m] stays there while its hand moves along a valley."""
+
+HELD = 1e6
+"""What holds a motor at its limit, in a matrix of squared slopes of order one."""
+
+KERNELS = {
+    "look_up": "lookup_job",
+    "begin": "map_job",
+    "solve": "loop_job",
+    "contacts": "map_job",
+    "valley": "map_job",
+    "each_finger": "map_job",
+    "judge": "map_job",
+}
+"""The compiled functions it calls, and what they work on."""
+
+STATE = (
+    *("q", "phase", "candidate", "earlier", "held", "returns"),
+    *("best_cost", "best_q", "counts"),
+)
+"""What the C reads and writes of a state."""
+
+
+@cache
+def source_text(name: str) -> str:
+    """The text of "seeds", "hand_first" or "calls"."""
+    source = resources.files("casadi_ik.methods.hand_first") / f"{name}.c"
+    return source.read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True, eq=False)
+class SearchPlan:
+    """What the C is made of for a robot and a way of taking limits.
+
+    Attributes:
+        layouts: Of the step.
+        options: Of the method.
+        budget: Iterations of a round.
+        seeds: The hand postures that rounds begin from.
+        enforce_limits: Whether limits are part of being solved.
+        begin: Makes first state and parameters of a round.
+        solve: The loop.
+        contacts: Contact points and normals of configurations.
+        judge: Errors and excess over limits of a configuration.
+    """
+
+    layouts: HandFirstLayouts
+    options: HandFirstParameters
+    budget: int
+    seeds: Seeds
+    enforce_limits: bool
+    begin: FunctionKernel
+    solve: LoopKernel
+    contacts: FunctionKernel
+    judge: FunctionKernel
+
+    @property
+    def rounds(self) -> int:
+        """How many there are at most."""
+        return self.options.all_rounds(self.layouts.robot)
+
+    @property
+    def mends(self) -> bool:
+        """Whether every finger by itself mends the postures that rounds begin from."""
+        return self.enforce_limits and self.seeds.mends
+
+    @property
+    def kernels(self) -> dict[str, Any]:
+        """Those that are called, by the names of `KERNELS`."""
+        seeds = self.seeds
+        found = {
+            "look_up": seeds.table.lookup,
+            "begin": self.begin,
+            "solve": self.solve,
+            "contacts": self.contacts,
+            "valley": seeds.valley,
+            "judge": self.judge,
+        }
+        return found | ({"each_finger": seeds.each_finger} if self.mends else {})
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The macros that dimensions of arrays are made of."""
+        robot, layouts = self.layouts.robot, self.layouts
+        return {
+            "N_FINGERS": len(robot.fingers),
+            "N_MOTORS": len(robot.actuators),
+            "N_HAND": len(robot.hand_actuators),
+            "N_TERMS": terms(robot).size,
+            "N_STATE": layouts.state.size,
+            "N_PARAMETERS": layouts.parameters.size,
+            "N_CANDIDATES": self.options.candidates,
+            "N_POOL": self.seeds.pool,
+            "N_MENDED": self.seeds.pool if self.mends else 1,
+            "N_MORE": len(layouts.contacts.data) - 2,
+        }
+
+    @property
+    def fields(self) -> dict[str, tuple[str, int, str]]:
+        """Type, length and meaning of what a search has in memory, all of eight bytes each."""
+        f, n, h, _, state, parameters, candidates, pool, mended, more = self.sizes.values()
+        double, whole = "double", "int64_t"
+        return {
+            "points": (double, 3 * f, "the question: base frame, NaN = free"),
+            "normals": (double, 3 * f, ""),
+            "more": (double, 3 * f * more + 1, "contacts' other vectors, without a verdict here"),
+            "here": (double, n, "where the robot is"),
+            "terms": (double, self.sizes["N_TERMS"], "tolerances, bounds, 1 = nearest wanted"),
+            "most": (whole, 0, "rounds of a search; 0: its first alone, no search without"),
+            "q": (double, n, "the answer"),
+            "position_error": (double, f, "[m]"),
+            "angle_error": (double, f, "[rad]"),
+            "beyond": (double, 0, "by how much the worst motor or joint is beyond its limits"),
+            "iterations": (whole, 0, ""),
+            "restarts": (whole, 0, ""),
+            "status": (whole, 0, ""),
+            "judged": (whole, 0, "on its way: whether there is a verdict"),
+            "round": (whole, 0, ""),
+            "again": (whole, 0, "1 = near `here` there was none: the search without preference"),
+            "may_begin": (whole, 0, "rounds of this call"),
+            "slot": (whole, 0, "of the loop, -1 = not under way"),
+            "begun": (whole, 0, "iterations before the round"),
+            "loop_status": (whole, 0, ""),
+            "paused": (whole, 0, ""),
+            "state": (double, state, ""),
+            "parameters": (double, parameters, ""),
+            "last": (double, state, "the state in which the round before ended"),
+            "mark": (double, state, ""),
+            "postures": (double, candidates * h, "of the round"),
+            "near": (double, pool * h, "room for seeds.c"),
+            "mended": (double, mended * h, ""),
+            "left": (double, mended, ""),
+            "places": (double, pool * h, ""),
+            "closest": (double, pool, ""),
+            "found": (whole, pool, ""),
+            "taken": (whole, pool, ""),
+            "moved": (double, (h + 1) * n, ""),
+            "moved_points": (double, (h + 1) * 3 * f, ""),
+            "moved_normals": (double, (h + 1) * 3 * f, ""),
+            "rigid": (double, 36 * f, ""),
+            "slopes": (double, 6 * f * h, ""),
+            "held": (double, h, ""),
+            "motion": (double, h, ""),
+        }
+
+    def members(self) -> str:
+        """The `fields` as members of a struct of C."""
+        lines = []
+        for name, (kind, length, doc) in self.fields.items():
+            size = f"[{length}]" if length or (kind == "double" and name != "beyond") else ""
+            lines.append(f"  {kind} {name}{size};{f'  /* {doc} */' if doc else ''}\n")
+        return "".join(lines)
+
+    def constants(
+        self,
+        reals: Mapping[str, float] | None = None,
+        arrays: Mapping[str, NDArray[Any]] | None = None,
+    ) -> str:
+        """All of them but the `sizes`, as C text.
+
+        Args:
+            reals: Those of them that are others than in Python.
+            arrays: Likewise.
+        """
+        numbers = self._real_numbers() | dict(reals or {})
+        lines = (f"#define {name} {number(value)}\n" for name, value in numbers.items())
+        tables = self._arrays() | dict(arrays or {})
+        return define(self._whole_numbers()) + "".join(lines) + define_arrays(tables)
+
+    def _whole_numbers(self) -> dict[str, int]:
+        layouts, options = self.layouts, self.options
+        many = options.is_many(layouts.robot)
+        places = {f"STATE_{name.upper()}": layouts.state.slice(name).start for name in STATE}
+        for label, layout in (("PARAMETERS", layouts.parameters), ("TERMS", terms(layouts.robot))):
+            for name in ("lower", "upper", "nearest"):
+                places[f"{label}_{name.upper()}"] = layout.slice(name).start
+        return {
+            "RUNNING": RUNNING,
+            "REPEATED": REPEATED,
+            "UNBEGUN": UNBEGUN,
+            "BUDGET": self.budget,
+            "TABLE_ROUNDS": options.rounds,
+            "ROUNDS": self.rounds,
+            "VALLEYS": options.valley_rounds,
+            "FIRST_RUGGED": options.first_rugged,
+            "VARIED": options.varied_rounds,
+            "RETURNS": options.same_minimum[many],
+            "RETURNS_OF_HELD": options.same_minimum[1],
+            "POOL": options.pool,
+            "MENDS": int(self.mends),
+            "FRESH_POOL": options.fresh_pool,
+            "LATE_POOL": options.late_pool,
+            "LATE_ROUND": options.late_round,
+            "ENFORCE_LIMITS": int(self.enforce_limits),
+            "HAS_ARM": int(bool(layouts.robot.arm_actuators)),
+            "SOLVED_STATUS": int(Status.SOLVED),
+            "STALLED_STATUS": int(Status.STALLED),
+            "LIMIT_STATUS": int(Status.ITERATION_LIMIT),
+            "INVALID_STATUS": int(Status.INVALID),
+            "CANDIDATE_PHASE": int(Phase.CANDIDATE),
+            "REFINEMENT_PHASE": int(Phase.REFINEMENT),
+            "N_CARRIED": len(self._carried),
+            "N_FRESH": len(fresh_fit()),
+            "N_COUNTS": len(STAGES),
+            **places,
+        }
+
+    def _real_numbers(self) -> dict[str, float]:
+        options, hand = self.options, len(self.layouts.robot.hand_actuators)
+        return {
+            "SURE": options.flat_cost,
+            "NEAR_COST": options.far_cost[options.is_many(self.layouts.robot)],
+            "NEAR_OF_HELD": options.far_cost[1],
+            "NEAR_SHRINKS": options.far_cost_shrinks,
+            "AT_END": AT_END,
+            "HELD": HELD,
+            "NUDGE": NUDGE,
+            "LENGTH": LENGTH,
+            "ALIKE": options.similar * options.similar * hand,
+            "UNIT": UNIT,
+            "SMALL_LENGTH": SMALL,
+            "LARGE_LENGTH": LARGE,
+            "TOLERANCE_SLACK": TOLERANCE_SLACK,
+            "LIMIT_SLACK": LIMIT_SLACK,
+            "SLICE": SLICE,
+        }
+
+    @property
+    def _carried(self) -> list[int]:
+        """Places in the state."""
+        slices = map(self.layouts.state.slice, CARRIED)
+        return [place for one in slices for place in range(one.start, one.stop)]
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        robot, seeds = self.layouts.robot, self.seeds
+        hand, spreads = list(robot.hand_actuators), seeds.spreads
+        lower, upper = seeds.anywhere_bounds(self.enforce_limits)
+        fresh, state = fresh_fit(), self.layouts.state
+        return {
+            "HAND": np.array(hand, dtype=np.int64),
+            "CARRIED": np.array(self._carried),
+            "FRESH_PLACES": np.array([state.slice(name).start for name in fresh]),
+            "FRESH_VALUES": np.array([float(value) for value in fresh.values()]),
+            "LOWER": robot.lower,
+            "UPPER": robot.upper,
+            "SIZE": seeds.size,
+            "ORDER_RANGES": np.maximum((robot.upper - robot.lower)[hand], SMALLEST),
+            "STRIDES": np.concatenate([seeds.strides(i) for i in range(self.rounds)]),
+            "HAND_STEPS": even_steps(len(hand)),
+            "ALL_STEPS": even_steps(len(robot.actuators)),
+            "ANYWHERE_LOWER": lower,
+            "ANYWHERE_RANGE": upper - lower,
+            "TABLE_LOWER": np.array([spread.lower[hand] for spread in spreads]),
+            "TABLE_RANGE": np.array([(spread.upper - spread.lower)[hand] for spread in spreads]),
+            "TABLE_SQUEEZE": np.array([1 - spread.at_limits for spread in spreads]),
+            "TABLE_ROWS": np.array([spread.count for spread in spreads]),
+        }
+
+
+class Searches:
+    """Memory for some searches at a time, and the calls that make them; not shared by threads.
+
+    The arrays of the first are there to be written into and read.
+
+    Attributes:
+        points: (f, 3) [m], NaN where free; write into it.
+        normals: (f, 3); write into it.
+        more: (f, 3) each, the contacts' other vectors; write into them.
+        here: (n,) where the robot is; write into it.
+        terms: What `beginning` calls so; write into it.
+        q: (n,) the answer; a call overwrites it, as all below.
+        position_error: (f,) [m], where there are points and normals only.
+        angle_error: (f,) [rad], likewise.
+        state: (ns,) of the loop.
+        parameters: (np,) of the loop.
+        postures: (candidates, hand) of a round.
+    """
+
+    def __init__(self, plan: SearchPlan, count: int) -> None:
+        """Compile what is not compiled yet.
+
+        Args:
+            plan: What it is made of; its kernels are compiled.
+            count: How many searches may be under way.
+
+        Raises:
+            KernelError: The compiler refused.
+        """
+        robot = plan.layouts.robot
+        self.plan = plan
+        self._name = ca.Function.fix_name(f"hand_first_search_{robot.name}")
+        library = load_library(
+            self._name, _nothing, _text(plan), "casadi_ik_search", write=lambda _, driver: driver
+        )
+        if library is None:
+            raise KernelError(f"{self._name}: the compiler that made the other kernels is gone")
+        self._search: Any = library["casadi_ik_search"]
+        self._decide: Any = library["casadi_ik_decide"]
+        self._find_postures: Any = library["casadi_ik_postures"]
+        self._follow = ctypes.cast(library["casadi_ik_follow"], ctypes.c_void_p).value
+        kinds = {"double": np.float64, "int64_t": np.int64}
+        form: list[Any] = [
+            (name, kinds[kind], (length,) if _is_array(name, kind, length) else ())
+            for name, (kind, length, _) in plan.fields.items()
+        ]
+        form += [("tiles", np.int64, (3,)), *((name, np.int64) for name in KERNELS)]
+        self._memory = searches = np.zeros(count, dtype=form)
+        self._kept = plan.kernels, plan.seeds.tables(plan.enforce_limits)
+        for i, table in enumerate(self._kept[1]):
+            searches["tiles"][:, i] = memory(table.lookup.tiles)
+        for name, kernel in self._kept[0].items():
+            searches[name] = ctypes.cast(kernel.entry, ctypes.c_void_p).value
+        f = len(robot.fingers)
+        one = searches[0]
+        self.points, self.normals = one["points"].reshape(f, 3), one["normals"].reshape(f, 3)
+        self.more = list(one["more"][:-1].reshape(-1, f, 3))
+        self.here, self.terms, self.q = one["here"], one["terms"], one["q"]
+        self.position_error, self.angle_error = one["position_error"], one["angle_error"]
+        self.state, self.parameters = one["state"], one["parameters"]
+        self.postures = one["postures"].reshape(plan.options.candidates, -1)
+        self._one = one
+        self._counts = self.state[plan.layouts.state.slice("counts")]
+        self._address = ctypes.c_void_p(memory(searches.view(np.uint8)))
+        # An entry of a record costs as much as a tenth of a solve: these are read in every one.
+        base, offsets = memory(searches.view(np.uint8)), searches.dtype.fields or {}
+        self._most, self._iterations, self._restarts, self._status, self._paused = (
+            ctypes.c_int64.from_address(base + offsets[name][1])
+            for name in ("most", "iterations", "restarts", "status", "paused")
+        )
+        self._beyond = ctypes.c_double.from_address(base + offsets["beyond"][1])
+
+    def ask(self, problems: Problems, row: int, here: Array, given: Array) -> None:
+        """Put one of k targets in.
+
+        Args:
+            problems: k targets.
+            row: Which of them.
+            here: (n,) where the robot is.
+            given: Its terms.
+        """
+        self.points[...], self.normals[...] = problems.points[row], problems.normals[row]
+        self.here[...], self.terms[...] = here, given
+        for vectors, name in zip(self.more, self.plan.layouts.contacts.data[2:], strict=True):
+            vectors[...] = problems.vectors(f"{name}s")[row]
+
+    def __call__(self, rounds: int) -> int | None:
+        """Search for the target that stands in the arrays.
+
+        Args:
+            rounds: At most.
+
+        Returns:
+            Code of `Status`, after the verdict where there is one; None: the target is malformed.
+
+        Raises:
+            KernelError: No work memory.
+        """
+        self._most.value = rounds
+        code = self._search(self._address)
+        if code == DriverCode.DONE:
+            return self._status.value
+        if code == MALFORMED:
+            return None
+        try:
+            while code != DriverCode.DONE:
+                check(self._name, code)
+                code = self._search(self._address)
+        finally:
+            self._paused.value = 0
+        return self._status.value
+
+    def answer(self, status: int) -> Quick:
+        """The last answer, copied.
+
+        Args:
+            status: What the call returned.
+        """
+        errors = None
+        if not self.more:
+            errors = self.position_error.tolist(), self.angle_error.tolist(), self._beyond.value
+        return made(
+            Quick,
+            q=self.q.copy(),
+            status=status,
+            iterations=self._iterations.value,
+            restarts=self._restarts.value,
+            phases=dict(zip(STAGE_LABELS, map(int, self._counts.tolist()), strict=True)),
+            errors=errors,
+        )
+
+    def decide(self, status: int, rounds: int) -> bool:
+        """Whether a round follows; it then begins with `state` and `parameters`.
+
+        Args:
+            status: How the loop ended in `state`, or `UNBEGUN`.
+            rounds: At most.
+        """
+        self._one["loop_status"], self._one["most"] = status, rounds
+        code = self._decide(self._address)
+        if code != DriverCode.GOES_ON:
+            check(self._name, code)
+        return code == DriverCode.GOES_ON
+
+    def hands(self, number: int) -> Array:
+        """Postures (candidates, hand) of a round that look like the target in the arrays."""
+        self._one["round"], self.terms[-1] = number, 0.0  # in no particular order
+        check(self._name, self._find_postures(self._address))
+        return self.postures.copy()
+
+    def batch(
+        self,
+        problems: Problems,
+        q0: Array,
+        given: Array,
+        rounds: NDArray[np.int64],
+        trace: bool,
+    ) -> Outcome:
+        """Search for k targets, some of them at a time.
+
+        Args:
+            problems: The targets.
+            q0: (k, n) where the robot is.
+            given: Their terms, (t,) or (k, t).
+            rounds: (k,) at most.
+            trace: Whether to keep every iteration.
+        """
+        plan, count = self.plan, len(problems)
+        data = plan.layouts.contacts.data
+        more = [problems.vectors(f"{name}s") for name in data[2:]]
+        asked = [
+            *map(np.ascontiguousarray, (problems.points, problems.normals)),
+            np.stack(more, axis=1) if more else np.zeros(1),
+            *map(np.ascontiguousarray, (q0, given)),
+            rounds,
+        ]
+        answers = [
+            np.empty_like(q0, order="C"),
+            np.empty((count, len(STAGES))),
+            np.empty(count, dtype=np.int64),
+        ]
+        step = 0 if given.ndim == 1 else given.shape[1]
+        job = (ctypes.c_int64 * 11)(
+            self._address.value or 0, *map(memory, asked), step, *map(memory, answers)
+        )
+        fields: Any = self._memory.dtype.fields
+        base = self._address.value or 0
+        result = plan.solve.run_followed(
+            Followed(
+                states=base + fields["state"][1],
+                parameters=base + fields["parameters"][1],
+                step=self._memory.dtype.itemsize // 8,
+                slots=len(self._memory),
+                follow=self._follow or 0,
+                method=ctypes.addressof(job),
+            ),
+            count,
+            plan.budget,
+            trace,
+        )
+        q, counts, restarts = answers
+        return Outcome(
+            q=q,
+            status=result.status.astype(np.int64),
+            iterations=result.iterations,
+            restarts=restarts,
+            time=result.time,
+            phases=dict(zip(STAGE_LABELS, counts.astype(np.int64).T, strict=True)),
+            rows=result.rows,
+        )
+
+
+class SearchPool:
+    """Memory of searches, made once for as many threads as are at work at a time."""
+
+    def __init__(self, plan: Callable[[bool], SearchPlan]) -> None:
+        """Nothing is compiled before it is asked for.
+
+        Args:
+            plan: For limits that are enforced or not.
+        """
+        self._plan = plan
+        self._free: dict[tuple[bool, int], list[Searches]] = {}
+
+    @contextmanager
+    def lent(self, enforce_limits: bool, count: int = 1) -> Iterator[Searches]:
+        """Memory for one search, or for `SLOTS` if there are more targets than one."""
+        size = SLOTS if count > 1 else 1
+        free = self._free.setdefault((enforce_limits, size), [])
+        try:
+            searches = free.pop()
+        except IndexError:
+            searches = Searches(self._plan(enforce_limits), size)
+        yield searches
+        free.append(searches)
+
+
+def _is_array(name: str, kind: str, length: int) -> bool:
+    return bool(length) or (kind == "double" and name != "beyond")
+
+
+def _text(plan: SearchPlan) -> str:
+    """The C text of the library."""
+    jobs = (driver_text(name) for name in ("loop_job", "map_job", "lookup_job"))
+    pointers = "".join(f"  int (*{name})({job} *);\n" for name, job in KERNELS.items())
+    calls = "".join(f"#define {name.upper()}(work) (job->{name})(work)\n" for name in KERNELS)
+    codes = {code.name: int(code) for code in DriverCode} | {"MALFORMED": MALFORMED}
+    return "".join(
+        (
+            "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
+            define(codes | {"FOREVER": FOREVER}),
+            *jobs,
+            f"typedef struct {{\n{plan.members()}",
+            f"  const int16_t *tiles[3];\n{pointers}}} search;\n",
+            f"{calls}#define TILES(table) (job->tiles[table])\n",
+            define(plan.sizes),
+            plan.constants(),
+            *map(source_text, ("seeds", "hand_first", "calls")),
+        )
+    )
+
+
+def _nothing() -> ca.Function:
+    """The search is no function of CasADi."""
+    x = ca.SX.sym("x")
+    return ca.Function("nothing", [x], [x])

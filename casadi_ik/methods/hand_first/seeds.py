@@ -1,0 +1,387 @@
+"""What rounds of hand-first begin from: tables of hand postures, and graphs that make better ones.
+
+Which round begins from which of them stands in seeds.c.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.kernels import FunctionGraph, FunctionKernel
+from casadi_ik.kernels.recipe import recipe
+from casadi_ik.methods.common.posture_table import PostureTable
+from casadi_ik.methods.hand_first.parameters import HandFirstParameters
+from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.alignment import align
+from casadi_ik.symbolic.even_spread import evenly
+from casadi_ik.symbolic.linear_algebra import solve_spd
+from casadi_ik.symbolic.smooth import Expr
+from casadi_ik.symbolic.subexpressions import shared
+
+FEATURES = 8
+"""Numbers of a row: point / `LENGTH` and normal in the palm frame, and the square of either."""
+
+ROOM = 1e-12
+"""Smallest sum of weights that is divided by."""
+
+
+FLAT = 1e-12
+"""Squared slope below which directions are alike."""
+
+DEPENDENT = 1e-9
+"""Part of a column that must be left for it to be a direction of its own."""
+
+SQUARINGS = 7
+"""Of the inverse: the flattest direction then counts (ratio of squared slopes)^128 times."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """How postures of a table are spread.
+
+    Attributes:
+        count: How many.
+        at_limits: Part of the range that is moved to the limits.
+        lower: (n,) from where.
+        upper: (n,) to where.
+    """
+
+    count: int
+    at_limits: float
+    lower: Array
+    upper: Array
+
+
+class Seeds:
+    """The hand postures that a robot's rounds begin from; tables are filled when first needed."""
+
+    def __init__(
+        self, robot: RobotDescription, options: HandFirstParameters, compiled: bool
+    ) -> None:
+        """Remember what the tables are made of.
+
+        Args:
+            robot: The description.
+            options: How many postures there are.
+            compiled: Whether lookups run in compiled code.
+        """
+        self._robot = ArmHand(robot)
+        self._hand = list(robot.hand_actuators)
+        self._options = options
+        self._compiled = compiled
+
+    @property
+    def spreads(self) -> tuple[Spread, Spread, Spread]:
+        """Of the first table, the wide one, and the wide one where limits are ignored."""
+        own, options = (self._robot.lower, self._robot.upper), self._options
+        rows = options.table
+        if not options.is_many(self._robot.description) and len(self._robot.fingers) > 3:
+            least = options.candidates * options.rounds
+            rows = max(int(options.few_motors_table * rows), least)
+        return (
+            Spread(rows, 0.0, *own),
+            Spread(options.wide_table, options.at_limits, *own),
+            Spread(options.wide_table, 0.0, *self._everywhere),
+        )
+
+    @cached_property
+    def table(self) -> PostureTable:
+        """The hand postures of the first round."""
+        return self._table(0)
+
+    @cached_property
+    def _wide_table(self) -> PostureTable:
+        return self._table(1)
+
+    @cached_property
+    def _free_table(self) -> PostureTable:
+        return self._table(2)
+
+    def tables(self, enforce_limits: bool) -> tuple[PostureTable, ...]:
+        """Those that are asked, in the order of `spreads`."""
+        own = (self.table, self._wide_table)
+        return own if enforce_limits else (*own, self._free_table)
+
+    def _table(self, which: int) -> PostureTable:
+        spread = self.spreads[which]
+        return PostureTable(
+            self._robot,
+            tuple(self._hand),
+            spread.count,
+            spread.at_limits,
+            compiled=self._compiled,
+            bounds=(spread.lower, spread.upper),
+        )
+
+    @property
+    def mends(self) -> bool:
+        """Whether postures are mended: a hand with many motors, no two fingers share one."""
+        robot = self._robot.description
+        fingers = [robot.finger_actuators(finger) for finger in robot.finger_names]
+        hand = [a for motors in fingers for a in motors if a in robot.hand_actuators]
+        return self._options.is_many(robot) and len(fingers) > 1 and len(hand) == len(set(hand))
+
+    @cached_property
+    def each_finger(self) -> FunctionKernel:
+        """Mends postures of such a hand."""
+        return FunctionKernel(each_finger(self._robot.description, self._options), self._compiled)
+
+    @property
+    def pool(self) -> int:
+        """Postures of which a round's are taken, at most."""
+        options = self._options
+        wanted = options.candidates * max(options.rounds - 1, 1)
+        fresh = max(options.fresh_pool, options.late_pool) if self.mends else 0
+        return max(options.pool * wanted, fresh)
+
+    @cached_property
+    def valley(self) -> FunctionKernel:
+        """Finds the direction in which the contacts move least, from their slopes."""
+        rows = 6 * len(self._robot.fingers)
+        return FunctionKernel(valley(rows, len(self._hand)), self._compiled)
+
+    def strides(self, which: int) -> Array:
+        """(candidates,) how far the hands of a round begin along their valley."""
+        both_sides = [sign * size for size in self._options.strides for sign in (1, -1)]
+        first = (which + 1) // 2 * self._options.candidates
+        return np.resize(np.roll(both_sides, -first), self._options.candidates)
+
+    def anywhere_bounds(self, enforce_limits: bool) -> tuple[Array, Array]:
+        """(n,) between which configurations from anywhere are."""
+        return (self._robot.lower, self._robot.upper) if enforce_limits else self._everywhere
+
+    @property
+    def size(self) -> Array:
+        """(hand,) a radian of every motor, or half the range of a slider [m]."""
+        units = [self._robot.description.actuators[column].unit for column in self._hand]
+        ranges = (self._robot.upper - self._robot.lower)[self._hand]
+        return np.where([unit == "rad" for unit in units], 1.0, ranges / 2)
+
+    @property
+    def _everywhere(self) -> tuple[Array, Array]:
+        """(n,) bounds where limits are ignored: a full turn, or what the mechanisms permit."""
+        description = self._robot.description
+        middle = (self._robot.lower + self._robot.upper) / 2
+        far = np.where([a.unit == "rad" for a in description.actuators], np.pi, 0.0)
+        lower = np.minimum(middle - far, self._robot.lower)
+        upper = np.maximum(middle + far, self._robot.upper)
+        ends = description.mechanical
+        return np.maximum(lower, ends[0]), np.minimum(upper, ends[1])
+
+
+@dataclass(frozen=True, eq=False)
+class FingerRows:
+    """Postures of a finger.
+
+    Attributes:
+        places: Of its motors among the hand's.
+        postures: (t, m).
+        features: (t, `FEATURES`).
+    """
+
+    places: tuple[int, ...]
+    postures: Array
+    features: Array
+
+
+def each_finger(robot: RobotDescription, options: HandFirstParameters) -> FunctionGraph:
+    """Mends hand postures for a target: every finger by itself takes the posture that fits best.
+
+    A table of whole hands is thin where there are many motors: of 16 motors thousands of postures
+    are fewer than two for each. Seen from a palm, though, the fingers know nothing of each other,
+    and a small table of every finger together stands for all combinations of its rows. So a posture
+    is mended in turns: the palm pose that suits it best, then for that pose the best row of each
+    finger.
+
+    Args:
+        robot: Its fingers have motors of their own.
+        options: How many postures a finger has, and how often it is chosen.
+
+    Returns:
+        points (f, 3) [m] and normals (f, 3), NaN where free, posture (hand, 1) -> the posture
+        mended, (hand, 1), and what is left of its contacts' squared errors with the best palm.
+    """
+    f, hand = len(robot.finger_names), len(robot.hand_actuators)
+    name = ca.Function.fix_name(f"each_finger_{robot.name}")
+    inputs = {"points": (f, 3), "normals": (f, 3), "posture": (hand, 1)}
+    outputs = ((hand, 1), (1, 1))
+    return FunctionGraph(
+        name,
+        lambda: _each_finger(name, robot, options),
+        inputs,
+        outputs,
+        recipe(name, robot, options),
+        loops=True,
+    )
+
+
+def _each_finger(name: str, robot: RobotDescription, options: HandFirstParameters) -> ca.Function:
+    f, hand = len(robot.finger_names), len(robot.hand_actuators)
+    points, normals = ca.MX.sym("points", f, 3), ca.MX.sym("normals", f, 3)
+    posture = ca.MX.sym("posture", hand)
+    tips = _tips(robot)
+    seen = _seen(robot, tips)
+    tables = [_rows(robot, tips, finger, options) for finger in range(f)]
+    q = posture
+    for _ in range(options.finger_turns):
+        wanted, own, _ = seen(points, normals, q)
+        mended = ca.MX(q)
+        for finger, table in enumerate(tables):
+            distances = ca.DM(table.features) @ wanted[:, finger]
+            least = ca.mmin(distances)
+            row = ca.MX(ca.DM(table.postures.T))[:, ca.find(distances <= least)]
+            places = list(table.places)
+            mended[places] = ca.if_else(least < own[finger], row, q[places])
+        q = mended
+    _, _, left = seen(points, normals, q)
+    return ca.Function(name, [points, normals, posture], [ca.densify(q), ca.densify(left)])
+
+
+def _tips(robot: RobotDescription) -> ca.Function:
+    """(hand, 1) -> features (6, f): point / `LENGTH` and normal in the palm frame."""
+    hand = ca.SX.sym("hand", len(robot.hand_actuators))
+    # With the arm at zero the palm is a constant, and everything up to it folds away.
+    q = ca.SX.zeros(len(robot.actuators), 1)
+    for i, column in enumerate(robot.hand_actuators):
+        q[column] = hand[i]
+    kinematics = actuated(robot, q).kinematics
+    columns = []
+    for finger in robot.finger_names:
+        point, normal = kinematics.contact(finger)
+        local = kinematics.palm.inverse_apply(point) / LENGTH
+        columns.append(ca.vertcat(local, kinematics.palm.rotation.T @ normal))
+    return ca.Function("tips", [hand], [ca.densify(ca.horzcat(*columns))])
+
+
+def _seen(robot: RobotDescription, tips: ca.Function) -> ca.Function:
+    """The target seen from the palm pose that suits a posture best.
+
+    Returns:
+        points, normals, posture -> what the rows of a table are multiplied with (`FEATURES`, f)
+        for their squared distances, without the part that all rows share; these distances of the
+        posture itself (f, 1), without that part; their sum with it.
+    """
+    f = len(robot.finger_names)
+    points, normals = ca.SX.sym("points", f, 3), ca.SX.sym("normals", f, 3)
+    hand = ca.SX.sym("posture", len(robot.hand_actuators))
+    here = tips(hand)
+    weights = [[_known(part[i, 0]) for part in (points, normals)] for i in range(f)]
+    goals = [
+        [ca.if_else(w, part[i, :].T, 0.0) for w, part in zip(weights[i], parts, strict=True)]
+        for i, parts in enumerate([(points / LENGTH, normals)] * f)
+    ]
+    total = ca.fmax(sum(w[0] for w in weights), ROOM)
+    target = sum((w[0] * goal[0] for w, goal in zip(weights, goals, strict=True))) / total
+    centre = sum(weights[i][0] * here[:3, i] for i in range(f)) / total
+    correlation = ca.SX.zeros(3, 3)
+    for i, ((w_point, w_normal), (point, normal)) in enumerate(zip(weights, goals, strict=True)):
+        correlation += w_point * (point - target) @ (here[:3, i] - centre).T
+        correlation += w_normal * normal @ here[3:, i].T
+    rotation = align(correlation)
+    wanted, own, cost = [], [], ca.SX(0)
+    for i, ((w_point, w_normal), (point, normal)) in enumerate(zip(weights, goals, strict=True)):
+        point, normal = rotation.T @ (point - target) + centre, rotation.T @ normal
+        factors = ca.vertcat(-2 * w_point * point, -2 * w_normal * normal, w_point, w_normal)
+        wanted.append(factors)
+        own.append(ca.dot(factors, _features(here[:, i])))
+        cost += own[i] + w_point * ca.sumsqr(point) + w_normal * ca.sumsqr(normal)
+    outputs = ca.horzcat(*wanted), ca.vertcat(*own), cost
+    return ca.Function("seen", [points, normals, hand], shared(*outputs))
+
+
+def _features(tip: Expr) -> Expr:
+    """The `FEATURES` of a tip (6, 1)."""
+    return ca.vertcat(tip, ca.sumsqr(tip[:3]), ca.sumsqr(tip[3:]))
+
+
+def _rows(
+    robot: RobotDescription, tips: ca.Function, finger: int, options: HandFirstParameters
+) -> FingerRows:
+    hand, count = list(robot.hand_actuators), options.finger_rows
+    moved = robot.finger_actuators(robot.finger_names[finger])
+    places = [hand.index(actuator) for actuator in moved if actuator in hand]
+    lower, upper = robot.lower[hand][places], robot.upper[hand][places]
+    spread = (evenly(count, len(places)) - 0.5) / (1 - options.at_limits) + 0.5
+    postures = np.zeros((len(hand), count))
+    postures[places] = (lower + np.clip(spread, 0.0, 1.0) * (upper - lower)).T
+    columns = np.array(tips.map(count)(postures)).reshape(6, count, -1)[:, :, finger]
+    squares = [np.square(part).sum(axis=0) for part in (columns[:3], columns[3:])]
+    return FingerRows(tuple(places), postures[places].T, np.vstack([columns, *squares]).T)
+
+
+def _known(x: Expr) -> Expr:
+    """1 where x is a number, 0 where NaN; written so that it is not simplified to 1."""
+    return ca.logic_or(x <= 0, x > 0)
+
+
+def valley(rows: int, hand: int) -> FunctionGraph:
+    """The direction in which a hand moves while its contacts hardly do, the palm following.
+
+    Args:
+        rows: How many numbers the contacts have.
+        hand: How many motors the hand has.
+
+    Returns:
+        slopes (6, rows) of the contacts as the palm moves as a whole, zero for a palm that cannot;
+        slopes (hand, rows) as the motors do; what holds each motor (hand, 1), squared -> (hand, 1)
+        motion of the motors, 1 for the one that moves most.
+    """
+    name = f"valley_{rows}_{hand}"
+    inputs = {"rigid": (6, rows), "slopes": (hand, rows), "held": (hand, 1)}
+    return FunctionGraph(
+        name, lambda: _valley(name, rows, hand), inputs, ((hand, 1),), recipe(name)
+    )
+
+
+def _valley(name: str, rows: int, hand: int) -> ca.Function:
+    """As operations on whole matrices: unrolled they would be tens of thousands."""
+    rigid, given = ca.MX.sym("rigid", 6, rows), ca.MX.sym("slopes", hand, rows)
+    held, slopes = ca.MX.sym("held", hand), given.T
+    if not hand:  # a tool
+        return ca.Function(name, [rigid, given, held], [ca.MX(0, 1)])
+    # The palm follows as well as it can: what is left of a motor's motion counts.
+    for base in _orthonormal(rigid.T):
+        slopes = slopes - base @ (base.T @ slopes)
+    inverse = _inverse(hand)(slopes.T @ slopes + ca.diag(held + FLAT))
+    # With every squaring the largest eigenvalue stands out twice as much.
+    for _ in range(SQUARINGS):
+        inverse = inverse / ca.trace(inverse)
+        inverse = inverse @ inverse
+    # Any vector that no symmetry of a hand makes orthogonal to the direction.
+    first = ca.DM((1 + np.arange(hand) * 0.6180339887 % 1.0).tolist())
+    direction = inverse @ first
+    motion = direction / ca.norm_inf(direction)
+    return ca.Function(name, [rigid, given, held], [ca.densify(motion)])
+
+
+def _inverse(n: int) -> ca.Function:
+    """(n, n) -> its inverse, of a symmetric positive definite matrix."""
+    a, b = ca.SX.sym("a", n, n), ca.SX.sym("b", n)
+    one = ca.Function("one", [a, b], [solve_spd(a, b)])
+    matrix = ca.MX.sym("matrix", n, n)
+    columns = ca.MX(ca.DM.eye(n))
+    return ca.Function(
+        "inverse", [matrix], [one.map("columns", "serial", n, [0], [])(matrix, ca.densify(columns))]
+    )
+
+
+def _orthonormal(columns: Expr) -> list[Expr]:
+    """Orthonormal columns that span the same, zero for one that depends on those before."""
+    found: list[Expr] = []
+    for i in range(columns.shape[1]):
+        column = columns[:, i]
+        whole = ca.norm_2(column)
+        for base in found:
+            column = column - base * ca.dot(base, column)
+        left = ca.norm_2(column)
+        own = left > DEPENDENT * whole
+        found.append(column * ca.if_else(own, 1 / ca.if_else(own, left, 1.0), 0.0))
+    return found
