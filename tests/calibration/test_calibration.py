@@ -21,7 +21,6 @@ from casadi_ik.calibration import (
     write_description,
     write_measurements,
 )
-from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.symbolic import dual_quaternion as dq
 
 EXACT = (1e-9, 1e-9)
@@ -237,16 +236,18 @@ def test_a_file_of_measurements_round_trip(index, ar10, tmp_path, rng):
 
 def test_bad_arguments(ar10, index, rng):
     description = ar10.description
-    with pytest.raises(InputError, match="groups: found 'screws', expected some of linkage"):
+    with pytest.raises(
+        ik.errors.InputError, match="groups: found 'screws', expected some of linkage"
+    ):
         hand_parameters(description, ["index"], ["screws"])
-    with pytest.raises(InputError, match="fingers: none"):
+    with pytest.raises(ik.errors.InputError, match="fingers: none"):
         hand_parameters(description, [])
-    with pytest.raises(UnknownNameError, match="no finger 'toe'"):
+    with pytest.raises(ik.errors.UnknownNameError, match="no finger 'toe'"):
         hand_parameters(description, ["toe"])
-    with pytest.raises(InputError, match=r"priors\.length: found -1"):
+    with pytest.raises(ik.errors.InputError, match=r"priors\.length: found -1"):
         Priors(length=-1)
     data = simulate(index, index.nominal, "index", 5, rng)
-    with pytest.raises(UnknownNameError, match="loss: found 'median'"):
+    with pytest.raises(ik.errors.UnknownNameError, match="loss: found 'median'"):
         calibrate(index, data, loss="median")
-    with pytest.raises(InputError, match="sigma_position: found 0"):
+    with pytest.raises(ik.errors.InputError, match="sigma_position: found 0"):
         calibrate(index, data, sigma_position=0)

@@ -17,7 +17,6 @@ from casadi_ik.cli.main import main
 from casadi_ik.cli.report import reasons
 from casadi_ik.datasets.conventions import load_convention
 from casadi_ik.datasets.postures import HandPoses
-from casadi_ik.errors import DescriptionError, UnknownNameError, UnsupportedError
 from casadi_ik.grasps import load_object
 from casadi_ik.robots.poses import link_poses
 
@@ -201,7 +200,7 @@ def _table(tmp_path: Path, **changes: Any) -> Path:
     ],
 )
 def test_bad_tables(changes: dict[str, Any], says: str, tmp_path: Path) -> None:
-    with pytest.raises(DescriptionError, match=says) as caught:
+    with pytest.raises(ik.errors.DescriptionError, match=says) as caught:
         ik.load_candidates(_table(tmp_path, **changes), KUKA)
     assert "\n" not in str(caught.value)
     assert "grasps.csv" in str(caught.value)
@@ -210,7 +209,7 @@ def test_bad_tables(changes: dict[str, Any], says: str, tmp_path: Path) -> None:
 def test_an_empty_set(tmp_path: Path) -> None:
     path = tmp_path / "grasps.csv"
     path.write_text("x,y,z,roll,pitch,yaw\n")
-    with pytest.raises(DescriptionError, match="found no grasps, expected at least one"):
+    with pytest.raises(ik.errors.DescriptionError, match="found no grasps, expected at least one"):
         ik.load_candidates(path, KUKA)
 
 
@@ -242,7 +241,7 @@ def _getagrip(**changes: Any) -> dict[str, Any]:
 def test_bad_data_sets(content: Any, says: str, tmp_path: Path) -> None:
     path = tmp_path / "set.npy"
     np.save(path, np.array(content, dtype=object))
-    with pytest.raises(DescriptionError, match=says) as caught:
+    with pytest.raises(ik.errors.DescriptionError, match=says) as caught:
         ik.load_candidates(path, "panda+allegro_right")
     assert "\n" not in str(caught.value)
 
@@ -250,9 +249,11 @@ def test_bad_data_sets(content: Any, says: str, tmp_path: Path) -> None:
 def test_another_hand(tmp_path: Path) -> None:
     path = tmp_path / "set.npy"
     np.save(path, np.array(_getagrip(), dtype=object))
-    with pytest.raises(UnsupportedError, match="layout getagrip: no hand of it is that of robot"):
+    with pytest.raises(
+        ik.errors.UnsupportedError, match="layout getagrip: no hand of it is that of robot"
+    ):
         ik.load_candidates(path, KUKA)
-    with pytest.raises(UnknownNameError, match="layout: found 'mine'"):
+    with pytest.raises(ik.errors.UnknownNameError, match="layout: found 'mine'"):
         ik.load_candidates(path, KUKA, layout="mine")
 
 
@@ -312,9 +313,11 @@ def test_joints_that_are_free_in_the_data(tmp_path: Path) -> None:
 def test_sizes_of_an_object(tmp_path: Path) -> None:
     written = _dexgraspnet(tmp_path)
     says = r"found grasps of 5 sizes \(scale 0\.06: 2 rows, 0\.08: 1 rows, .*; say which \(scale"
-    with pytest.raises(DescriptionError, match=says):
+    with pytest.raises(ik.errors.DescriptionError, match=says):
         ik.load_candidates(written.path, written.robot)
-    with pytest.raises(DescriptionError, match=r"scale: found 0\.07, expected one of 5 sizes"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"scale: found 0\.07, expected one of 5 sizes"
+    ):
         ik.load_candidates(written.path, written.robot, scale=0.07)
     with pytest.raises(ik.CasadiIKError, match=r"scale: found 1, but grasps\.csv says of no size"):
         ik.load_candidates(_table(tmp_path), KUKA, scale=1.0)
@@ -327,7 +330,7 @@ def test_rows_beyond_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     written = _dexgraspnet(tmp_path, beyond=1)
     given = {"path": written.path, "robot": written.robot, "scale": SIZES[0]}
     says = r"row 0: shadow_thj3: found .*; 1 of 2 rows are invalid; invalid='drop'.*'clip'.*--inv"
-    with pytest.raises(DescriptionError, match=says) as caught:
+    with pytest.raises(ik.errors.DescriptionError, match=says) as caught:
         ik.load_candidates(**given)
     assert "\n" not in str(caught.value)
     whole = ik.load_candidates(**given, invalid="clip")
@@ -340,7 +343,9 @@ def test_rows_beyond_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert (fewer.rows, fewer.dropped, fewer.clipped) == ((5,), 1, 0)
     assert "1 of 2 rows left out" in str(fewer)
     again = _dexgraspnet(tmp_path, beyond=2)
-    with pytest.raises(DescriptionError, match=r"row 1: shadow_thj3: .*; 1 of 1 rows are invalid$"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"row 1: shadow_thj3: .*; 1 of 1 rows are invalid$"
+    ):
         ik.load_candidates(again.path, again.robot, scale=SIZES[1], invalid="drop")
     with pytest.raises(ik.CasadiIKError, match="invalid: found 'no', expected one of error, drop"):
         ik.load_candidates(**given, invalid="no")  # pyright: ignore[reportArgumentType]
@@ -361,12 +366,14 @@ def test_rows_that_are_no_grasps(tmp_path: Path) -> None:
     thumb = ik.load_candidates(path, robot, take="contacts")[0].contacts["thumb"].point
     wrong["trans"][[0, 5]] = [0, 0, load_object("apple").mesh()[0][:, 2].max()] - thumb
     np.save(path, np.array(wrong, dtype=object))
-    with pytest.raises(DescriptionError, match=r"row 1: position: holds NaN.*; 3 of 6 rows"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"row 1: position: holds NaN.*; 3 of 6 rows"
+    ):
         ik.load_candidates(path, robot, invalid="clip")
     assert ik.load_candidates(path, robot, invalid="drop").rows == (0, 4, 5)
     wrong["trans"][4] = 0.0, 0.5, 0.0
     np.save(path, np.array(wrong, dtype=object))
-    with pytest.raises(DescriptionError, match="4 of 6 rows are invalid; invalid='drop'"):
+    with pytest.raises(ik.errors.DescriptionError, match="4 of 6 rows are invalid; invalid='drop'"):
         ik.load_candidates(path, robot, take="contacts", grasped="apple")
     assert ik.load_candidates(
         path, robot, invalid="drop", take="contacts", grasped="apple"
@@ -427,7 +434,7 @@ class _Runs:
 def test_nothing_in_a_pickle_is_run(build: Any, tmp_path: Path) -> None:
     path, flag = tmp_path / "set.npy", tmp_path / "flag"
     np.save(path, np.array(_getagrip(trans=build(flag)), dtype=object), allow_pickle=True)
-    with pytest.raises(DescriptionError, match=r"set\.npy: its pickle holds .* only$"):
+    with pytest.raises(ik.errors.DescriptionError, match=r"set\.npy: its pickle holds .* only$"):
         ik.load_candidates(path, "panda+allegro_right")
     assert not flag.exists()
 

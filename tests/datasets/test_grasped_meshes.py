@@ -11,8 +11,7 @@ import trimesh
 from make_grasp_sets import made
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError
-from casadi_ik.grasps import load_object
+from casadi_ik import grasps
 
 ROBOT = "panda+allegro_right"
 
@@ -54,14 +53,14 @@ def _grasp_file(folder: Path, thumb_at: np.ndarray) -> Path:
 def test_distances_are_those_of_the_body(kind: str, tmp_path: Path) -> None:
     """Two boxes that touch are one: what is between them is inside; a hole is outside."""
     halves = [_box((0.1, 0.12, 0.08), (side * 0.05, 0.0, 0.0)) for side in (-1, 1)]
-    one = load_object(_written(tmp_path / f"a.{kind}", [_box((0.2, 0.12, 0.08), (0, 0, 0))]))
-    two = load_object(_written(tmp_path / f"b.{kind}", halves))
+    one = grasps.load_object(_written(tmp_path / f"a.{kind}", [_box((0.2, 0.12, 0.08), (0, 0, 0))]))
+    two = grasps.load_object(_written(tmp_path / f"b.{kind}", halves))
     points = np.random.default_rng(0).uniform(-0.15, 0.15, (300, 3))
-    exact = ik.grasps.Box(size=(0.2, 0.12, 0.08), source="").signed_distance(points)
+    exact = grasps.Box(size=(0.2, 0.12, 0.08), source="").signed_distance(points)
     assert one.signed_distance(points) == pytest.approx(exact, abs=1e-7)
     assert two.signed_distance(points) == pytest.approx(exact, abs=1e-7)
     assert len(ik.Scene().holding(two.name, np.eye(4)).items[two.name].parts) == 2
-    handle = load_object(_written(tmp_path / f"c.{kind}", _arch()))
+    handle = grasps.load_object(_written(tmp_path / f"c.{kind}", _arch()))
     assert handle.signed_distance([0.0, 0.0, 0.0]) == pytest.approx(0.5)
     assert handle.signed_distance([0.6, 0.0, 0.1]) == pytest.approx(-0.1)
     assert handle.normal([0.45, 0.0, 0.0]) == pytest.approx([-1, 0, 0], abs=1e-7)
@@ -82,7 +81,9 @@ def test_pads_touch_the_mesh(tmp_path: Path) -> None:
     (several,) = ik.load_candidates(large, ROBOT, take="contacts", grasped=files)
     assert several.contacts["thumb"].point == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
     within = _grasp_file(tmp_path, np.zeros(3))
-    with pytest.raises(DescriptionError, match=r"no pad is within 10 mm of .*handle.obj's surface"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"no pad is within 10 mm of .*handle.obj's surface"
+    ):
         ik.load_candidates(within, ROBOT, take="contacts", grasped=whole)
 
 
@@ -90,9 +91,9 @@ def test_a_mesh_is_as_large_as_the_data_say(tmp_path: Path) -> None:
     written = made("bodex_allegro", tmp_path)  # obj_scale 0.06
     ball: Any = trimesh.creation.icosphere(3, 1.0)
     ball.export(tmp_path / "ball.obj")
-    grasps = ik.load_candidates(written.path, written.robot, grasped=tmp_path / "ball.obj")
-    assert {grasp.object for grasp in grasps} == {f"{tmp_path / 'ball.obj'}@0.06"}
-    assert load_object(grasps[0].object).signed_distance([0.0, 0.0, 0.1]) == pytest.approx(
+    found = ik.load_candidates(written.path, written.robot, grasped=tmp_path / "ball.obj")
+    assert {grasp.object for grasp in found} == {f"{tmp_path / 'ball.obj'}@0.06"}
+    assert grasps.load_object(found[0].object).signed_distance([0.0, 0.0, 0.1]) == pytest.approx(
         0.04, abs=1e-4
     )
 
@@ -134,7 +135,7 @@ def test_an_object_file_with_a_mesh(tmp_path: Path) -> None:
     )
     path = tmp_path / "handle.yaml"
     path.write_text(text.replace("FILE", "[handle.obj]").replace("FACTOR", "0.1"))
-    held = load_object(path)
+    held = grasps.load_object(path)
     assert (held.name, held.mass) == ("handle", 0.1)
     assert held.signed_distance([0.0, 0.0, 0.0]) == pytest.approx(0.05)
     assert len(ik.Scene().holding(str(path), np.eye(4)).items[str(path)].parts) == 3
@@ -144,15 +145,19 @@ def test_an_object_file_with_a_mesh(tmp_path: Path) -> None:
         ("handle.obj", "0", r"shape\.scale: found 0\.0, expected a positive"),
     ):
         path.write_text(text.replace("FILE", file).replace("FACTOR", factor))
-        with pytest.raises(DescriptionError, match=says) as caught:
-            load_object(path)
+        with pytest.raises(ik.errors.DescriptionError, match=says) as caught:
+            grasps.load_object(path)
         assert "\n" not in str(caught.value)
-    with pytest.raises(DescriptionError, match="found factor 'two', expected a number > 0"):
-        load_object(f"{tmp_path / 'handle.obj'}@two")
+    with pytest.raises(
+        ik.errors.DescriptionError, match="found factor 'two', expected a number > 0"
+    ):
+        grasps.load_object(f"{tmp_path / 'handle.obj'}@two")
 
 
 def test_a_flat_part_is_named(tmp_path: Path) -> None:
     sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]])
     path = _written(tmp_path / "a.stl", [*_arch(), sheet])
-    with pytest.raises(DescriptionError, match=r"piece \d of 4: all points are in a plane"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"piece \d of 4: all points are in a plane"
+    ):
         ik.Scene({"a": {"kind": "mesh", "file": str(path), "parts": True}})

@@ -13,7 +13,6 @@ from torch_zip import write_torch
 
 import casadi_ik as ik
 from casadi_ik.datasets.unpickling import read_torch
-from casadi_ik.errors import DescriptionError
 
 
 def test_a_file_that_torch_wrote() -> None:
@@ -31,9 +30,11 @@ def test_a_file_that_torch_wrote() -> None:
     assert [grasp.palm is not None and len(grasp.posture) for grasp in grasps] == [16, 16]
     assert grasps[1].posture["allegro_thumb_3"] == pytest.approx(0.45)
     says = r"found grasps of 2 objects \(contactdb\+apple, ycb\+pear\), expected one; say which"
-    with pytest.raises(DescriptionError, match=says):
+    with pytest.raises(ik.errors.DescriptionError, match=says):
         ik.load_candidates(path, robot)
-    with pytest.raises(DescriptionError, match="of: found 'cup', expected one of 2 objects"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match="of: found 'cup', expected one of 2 objects"
+    ):
         ik.load_candidates(path, robot, of="cup")
 
 
@@ -50,7 +51,7 @@ def test_a_file_that_torch_wrote() -> None:
 )
 def test_bad_torch_files(content: Any, says: str, tmp_path: Path) -> None:
     write_torch(tmp_path / "set.pt", content)
-    with pytest.raises(DescriptionError, match=says) as caught:
+    with pytest.raises(ik.errors.DescriptionError, match=says) as caught:
         ik.load_candidates(tmp_path / "set.pt", "panda+allegro_right")
     assert "\n" not in str(caught.value)
 
@@ -59,10 +60,12 @@ def test_torch_files_of_other_kinds(tmp_path: Path) -> None:
     """The format before torch 1.6, no torch file at all, and tensors beyond their numbers."""
     path = tmp_path / "set.pt"
     path.write_bytes(pickle.dumps(0x1950A86A20F9469CFC6C, 2))
-    with pytest.raises(DescriptionError, match=r"before torch 1\.6, .*: torch\.save\(torch\.load"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"before torch 1\.6, .*: torch\.save\(torch\.load"
+    ):
         read_torch(path)
     path.write_bytes(b"x,y,z")
-    with pytest.raises(DescriptionError, match="found no zip, expected a file of torch"):
+    with pytest.raises(ik.errors.DescriptionError, match="found no zip, expected a file of torch"):
         read_torch(path)
     write_torch(path, {"a": np.arange(4.0)})
     size, more = (pickle.BININT + n.to_bytes(4, "little") + pickle.TUPLE for n in (4, 9))
@@ -73,5 +76,7 @@ def test_torch_files_of_other_kinds(tmp_path: Path) -> None:
     with ZipFile(path, "w") as archive:
         for name, data in (entries | {"set/data.pkl": head + more + shape}).items():
             archive.writestr(name, data)
-    with pytest.raises(DescriptionError, match="a tensor that is larger than its numbers"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match="a tensor that is larger than its numbers"
+    ):
         read_torch(path)

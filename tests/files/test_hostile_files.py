@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import casadi_ik as ik
+from casadi_ik import grasps
 from casadi_ik.batches.target_file import TargetFile
 from casadi_ik.cli.outputs import OutputError, check_outputs
-from casadi_ik.errors import LONGEST, CasadiIKError, DescriptionError, InputError
-from casadi_ik.grasps import load_object
 
 CONTACT = "contacts: {thumb: {point: [0, 0, 0]}}\n"
 
@@ -44,11 +43,11 @@ def test_hostile_yaml(tmp_path: Path, case: str) -> None:
     text, says = HOSTILE[case]
     path = tmp_path / "grasp.yaml"
     path.write_text(text)
-    for load in (ik.load_grasp, ik.load_robot, load_object):
-        with pytest.raises(DescriptionError) as caught:
+    for load in (ik.load_grasp, ik.load_robot, grasps.load_object):
+        with pytest.raises(ik.errors.DescriptionError) as caught:
             load(path)
         assert says in str(caught.value)
-        assert len(str(caught.value)) <= LONGEST
+        assert len(str(caught.value)) <= ik.errors.LONGEST
         assert str(caught.value).isprintable()
 
 
@@ -71,7 +70,7 @@ def test_hostile_yaml(tmp_path: Path, case: str) -> None:
 def test_units_of_another_dimension(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "grasp.yaml"
     path.write_text(text)
-    with pytest.raises(DescriptionError) as caught:
+    with pytest.raises(ik.errors.DescriptionError) as caught:
         ik.load_grasp(path)
     assert says in str(caught.value)
 
@@ -91,7 +90,7 @@ def test_normals_of_any_length_in_a_batch() -> None:
     scale = np.array([1e-300, 1e-160, 1.0, 1e155, 1e200, 1e300])[:, None, None]
     batch = ik.Solver(robot).solve_batch(points, scale * normals)
     assert batch.success.all()
-    with pytest.raises(InputError, match="normals: row 0, finger 0 is zero"):
+    with pytest.raises(ik.errors.InputError, match="normals: row 0, finger 0 is zero"):
         ik.Solver(robot).solve_batch(points, 0 * normals)
 
 
@@ -101,18 +100,20 @@ def test_numbers_that_would_lose_something(kind: str) -> None:
     points, normals = robot.contacts(robot.home[None])
     odd = points + 1j if kind == "complex" else np.ma.masked_greater(points, 0)
     solver = ik.Solver(robot)
-    with pytest.raises(InputError, match=f"points: expected an array of numbers: .*{kind}"):
+    with pytest.raises(
+        ik.errors.InputError, match=f"points: expected an array of numbers: .*{kind}"
+    ):
         solver.solve_batch(odd, normals)
-    with pytest.raises(InputError, match=f"points: .*{kind}"):
+    with pytest.raises(ik.errors.InputError, match=f"points: .*{kind}"):
         list(solver.solve_blocks([(odd, normals)]))
-    with pytest.raises(InputError, match="point: found"):
+    with pytest.raises(ik.errors.InputError, match="point: found"):
         ik.Contact(odd[0, 0])
 
 
 def test_a_name_that_commands_a_terminal_or_fills_it() -> None:
-    text = str(InputError("\x1b[2J" + "x" * 5000))
+    text = str(ik.errors.InputError("\x1b[2J" + "x" * 5000))
     assert text.isprintable()
-    assert len(text) <= LONGEST
+    assert len(text) <= ik.errors.LONGEST
     assert text.endswith("xxx")
 
 
@@ -150,12 +151,12 @@ def npz(path: Path, shape: tuple[int, ...], data: bytes) -> Path:
 )
 def test_hostile_npz(tmp_path: Path, shape: tuple[int, ...], size: int, says: str) -> None:
     path = npz(tmp_path / "targets.npz", shape, bytes(size))
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(ik.errors.InputError, match=says):
         TargetFile(path, 3).check(64)
 
 
 def test_an_endless_file() -> None:
-    with pytest.raises(InputError, match="no plain file"):
+    with pytest.raises(ik.errors.InputError, match="no plain file"):
         TargetFile(Path("/dev/zero"), 3).check(64)
 
 
@@ -172,11 +173,11 @@ def refused(load: Callable[[], object]) -> None:
     """Call a reader; if it refuses, then by one short line."""
     try:
         load()
-    except CasadiIKError as error:
+    except ik.errors.CasadiIKError as error:
         said = str(error)
     else:
         return
-    assert len(said) <= LONGEST
+    assert len(said) <= ik.errors.LONGEST
     assert said.isprintable()
 
 
@@ -185,7 +186,7 @@ def refused(load: Callable[[], object]) -> None:
 def test_any_text_is_read_or_refused(tmp_path_factory, text: bytes | str) -> None:
     path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
-    for load in (ik.load_grasp, ik.load_robot, load_object):
+    for load in (ik.load_grasp, ik.load_robot, grasps.load_object):
         refused(partial(load, path))
 
 

@@ -12,7 +12,6 @@ import pytest
 import trimesh
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError
 
 DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -72,8 +71,8 @@ def scene(mesh: Path, scale: float = 0.01) -> Path:
 def test_a_mesh_is_read_in_metres(tmp_path: Path, kind: str) -> None:
     path = tetrahedron(tmp_path, kind)
     found = ik.load_scene(scene(path, 1.0 if kind == "dae" else 0.01))
-    ((solid, _),) = found.items["body"].parts
-    corners = CORNERS / 100 + [0.01 if kind == "dae" else 0, 0, 0]
+    ((solid, pose),) = found.items["body"].parts
+    corners = CORNERS / 100 + [0.01 if kind == "dae" else 0, 0, 0] - pose[:3, 3]
     outside = corners @ solid.planes[:, :3].T - solid.planes[:, 3]
     np.testing.assert_allclose(np.sort(outside)[:, -3:], 0, atol=1e-7)  # each on three planes
 
@@ -118,7 +117,7 @@ def test_meshes_that_are_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         ("3e-5", "found 80 triangles, expected at mo"),
     ):
         monkeypatch.setenv("CASADI_IK_LIMITS", factor)
-        with pytest.raises(DescriptionError, match=says) as caught:
+        with pytest.raises(ik.errors.DescriptionError, match=says) as caught:
             ik.load_scene(scene(path))
         assert "ball.ply" in str(caught.value)
         assert "CASADI_IK_LIMITS" in str(caught.value)

@@ -16,7 +16,6 @@ import yaml
 import casadi_ik as ik
 from casadi_ik.cli.lists import FILES, schema_of
 from casadi_ik.cli.main import main
-from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import convert
 from casadi_ik.files.units import check_units, in_si
 from casadi_ik.robots.load import _imports
@@ -91,7 +90,7 @@ def reads(kind: str, data: Any) -> bool:
     try:
         convert(in_si(data), type_, Path("file"))
         check_units(data, type_, Path("file"))
-    except DescriptionError:
+    except ik.errors.DescriptionError:
         return False
     return True
 

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from casadi_ik.errors import DescriptionError, UnknownNameError
+import casadi_ik as ik
 from casadi_ik.files.reading import (
     UNITS,
     Frame,
@@ -20,7 +20,7 @@ from casadi_ik.files.reading import (
     read_yaml,
     refuse_non_finite,
 )
-from casadi_ik.files.shipped import models_folder, resolve, shipped_names
+from casadi_ik.files.shipped import models_folder, resolve
 
 
 class Entry(Struct, frozen=True):
@@ -88,7 +88,7 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_error_names_file_and_key(tmp_path, case):
     text, key, says = BAD[case]
-    with pytest.raises(DescriptionError) as caught:
+    with pytest.raises(ik.errors.DescriptionError) as caught:
         entry(tmp_path, text)
     message = str(caught.value)
     assert message.startswith(f"{tmp_path / 'file.yaml'}: {key}: ")
@@ -111,7 +111,7 @@ def test_error_names_file_and_key(tmp_path, case):
     ],
 )
 def test_not_yaml(tmp_path, text, says):
-    with pytest.raises(DescriptionError) as caught:
+    with pytest.raises(ik.errors.DescriptionError) as caught:
         entry(tmp_path, text)
     message = str(caught.value)
     assert re.match(re.escape(str(tmp_path / "file.yaml")) + says, message), message
@@ -119,10 +119,12 @@ def test_not_yaml(tmp_path, text, says):
 
 
 def test_unreadable_files(tmp_path):
-    with pytest.raises(DescriptionError, match="cannot be read"):
+    with pytest.raises(ik.errors.DescriptionError, match="cannot be read"):
         read_yaml(tmp_path)
     (tmp_path / "latin.yaml").write_bytes("text: gr\xfc\xdfe".encode("latin-1"))
-    with pytest.raises(DescriptionError, match=r"latin\.yaml: cannot be read: not UTF-8 text"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"latin\.yaml: cannot be read: not UTF-8 text"
+    ):
         read_yaml(tmp_path / "latin.yaml")
 
 
@@ -141,12 +143,14 @@ def test_frame_is_that_of_urdf(rng):
 
 
 def test_shipped_names_and_paths(tmp_path):
-    assert "kuka_lwr_barrett" in shipped_names("arm_hands")
+    assert "kuka_lwr_barrett" in ik.shipped_names("arm_hands")
     assert resolve("kuka_lwr4", "arms") == models_folder() / "arms" / "kuka_lwr4.yaml"
     (tmp_path / "part.yaml").write_text("")
     assert resolve("part.yaml", "arms", beside=tmp_path / "robot.yaml") == tmp_path / "part.yaml"
     assert resolve(tmp_path / "part.yaml", "arms") == tmp_path / "part.yaml"
-    with pytest.raises(UnknownNameError, match="no shipped arm-hand is called 'kuka'; shipped: "):
+    with pytest.raises(
+        ik.errors.UnknownNameError, match="no shipped arm-hand is called 'kuka'; shipped: "
+    ):
         resolve("kuka", "arm_hands")
-    with pytest.raises(DescriptionError, match=r"nowhere\.yaml: no such file"):
+    with pytest.raises(ik.errors.DescriptionError, match=r"nowhere\.yaml: no such file"):
         resolve(str(tmp_path / "nowhere.yaml"), "arms")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.grasps import Cylinder, Grasp, load_object
+from casadi_ik import grasps
 
 NAMES = ik.shipped_grasps("baxter_ar10")
 BALLS = {"ar10_golf_ball", "ar10_orange", "ar10_tennis_ball"}
@@ -23,7 +23,7 @@ def baxter() -> ik.ArmHand:
     return ik.load_robot("baxter_ar10")
 
 
-def touching(grasp: Grasp) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+def touching(grasp: ik.Grasp) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """The fingers that touch, their points and normals."""
     fingers = tuple(grasp.contacts)
     return fingers, *grasp.arrays(fingers)
@@ -40,14 +40,14 @@ def test_six_grasps() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_contacts_are_on_the_surface_and_face_into_it(name: str) -> None:
     grasp = ik.load_grasp(name)
-    item = load_object(grasp.object)
+    item = grasps.load_object(grasp.object)
     _, points, normals = touching(grasp)
     assert grasp.object_pose is not None
     rotation, origin = grasp.object_pose[:3, :3], grasp.object_pose[:3, 3]
     local = (points - origin) @ rotation
     assert np.abs(item.signed_distance(local)).max() < 1e-9
     np.testing.assert_allclose(normals @ rotation, -item.normal(local), atol=1e-9)
-    if isinstance(item.shape, Cylinder):
+    if isinstance(item.shape, grasps.Cylinder):
         assert np.all(item.shape.height / 2 - np.abs(local[:, 2]) > 0.0049)
         np.testing.assert_allclose(grasp.object_pose[2, 2], 1.0, atol=1e-9)  # stands upright
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
-from casadi_ik.grasps import Contact, Grasp, load_grasp
+import casadi_ik as ik
 
 GOOD = """\
 robot: kuka_lwr_barrett
@@ -24,10 +23,10 @@ contacts:
 
 
 def test_contact_normalises_and_freezes() -> None:
-    contact = Contact([1, 2, 3], [0, 0, 5])
+    contact = ik.Contact([1, 2, 3], [0, 0, 5])
     np.testing.assert_array_equal(contact.point, [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(contact.normal, [0.0, 0.0, 1.0])
-    assert Contact([1, 2, 3]).normal is None
+    assert ik.Contact([1, 2, 3]).normal is None
     with pytest.raises(ValueError, match="read-only"):
         contact.point[0] = 9.0
 
@@ -35,45 +34,45 @@ def test_contact_normalises_and_freezes() -> None:
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: Contact([0, 0, 0], [0, 0, 0]), "normal: .*not zero"),
-        (lambda: Contact([0, np.nan, 0]), "point: .*finite"),
-        (lambda: Contact([0, 0, 0], [np.inf, 0, 0]), "normal: .*finite"),
-        (lambda: Contact([0, 0]), r"point: found shape \(2,\), expected \(3,\)"),
-        (lambda: Contact(np.zeros((3, 1))), r"point: found shape \(3, 1\)"),
-        (lambda: Contact([0, 0, 0], [[0, 0, 1]]), r"normal: found shape \(1, 3\)"),
-        (lambda: Contact(["a", "b", "c"]), "point: found .*three numbers"),
-        (lambda: Contact([[1, 2], [3]]), "point: found .*three numbers"),
-        (lambda: Grasp({}), "contacts: found none"),
-        (lambda: Grasp({"thumb": ([0, 0, 0], [0, 0, 1])}), "contacts.thumb: found tuple"),  # pyright: ignore[reportArgumentType]
+        (lambda: ik.Contact([0, 0, 0], [0, 0, 0]), "normal: .*not zero"),
+        (lambda: ik.Contact([0, np.nan, 0]), "point: .*finite"),
+        (lambda: ik.Contact([0, 0, 0], [np.inf, 0, 0]), "normal: .*finite"),
+        (lambda: ik.Contact([0, 0]), r"point: found shape \(2,\), expected \(3,\)"),
+        (lambda: ik.Contact(np.zeros((3, 1))), r"point: found shape \(3, 1\)"),
+        (lambda: ik.Contact([0, 0, 0], [[0, 0, 1]]), r"normal: found shape \(1, 3\)"),
+        (lambda: ik.Contact(["a", "b", "c"]), "point: found .*three numbers"),
+        (lambda: ik.Contact([[1, 2], [3]]), "point: found .*three numbers"),
+        (lambda: ik.Grasp({}), "contacts: found none"),
+        (lambda: ik.Grasp({"thumb": ([0, 0, 0], [0, 0, 1])}), "contacts.thumb: found tuple"),  # pyright: ignore[reportArgumentType]
     ],
 )
 def test_bad_input(make: Callable[[], Any], says: str) -> None:
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(ik.errors.InputError, match=says):
         make()
 
 
 def test_arrays_mark_what_is_free() -> None:
-    grasp = Grasp({"b": Contact([1, 2, 3], [1, 0, 0]), "a": Contact([4, 5, 6])})
+    grasp = ik.Grasp({"b": ik.Contact([1, 2, 3], [1, 0, 0]), "a": ik.Contact([4, 5, 6])})
     points, normals = grasp.arrays(("a", "b", "c"))
     np.testing.assert_array_equal(points, [[4, 5, 6], [1, 2, 3], [np.nan] * 3])
     np.testing.assert_array_equal(normals, [[np.nan] * 3, [1, 0, 0], [np.nan] * 3])
-    with pytest.raises(InputError, match=r"contacts\.b: no such finger; .*a, c"):
+    with pytest.raises(ik.errors.InputError, match=r"contacts\.b: no such finger; .*a, c"):
         grasp.arrays(("a", "c"))
 
 
 def test_contacts_of_a_grasp_cannot_be_changed() -> None:
-    given = {"a": Contact([4, 5, 6])}
-    grasp = Grasp(given)
+    given = {"a": ik.Contact([4, 5, 6])}
+    grasp = ik.Grasp(given)
     given.clear()
     assert tuple(grasp.contacts) == ("a",)
     with pytest.raises(TypeError):
-        grasp.contacts["b"] = Contact([0, 0, 0])  # pyright: ignore[reportIndexIssue]
+        grasp.contacts["b"] = ik.Contact([0, 0, 0])  # pyright: ignore[reportIndexIssue]
 
 
 def test_good_file(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(GOOD)
-    grasp = load_grasp(path)
+    grasp = ik.load_grasp(path)
     assert (grasp.name, grasp.robot, grasp.object) == ("mine", "kuka_lwr_barrett", "cup")
     assert grasp.posture["bh_spread"] == pytest.approx(np.pi / 6)
     assert grasp.object_pose is not None
@@ -81,13 +80,13 @@ def test_good_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(grasp.object_pose, expected, atol=1e-15)
     np.testing.assert_array_equal(grasp.contacts["thumb"].normal, [0.0, -1.0, 0.0])
     assert grasp.contacts["finger_2"].normal is None
-    assert load_grasp(str(path)).contacts.keys() == grasp.contacts.keys()
+    assert ik.load_grasp(str(path)).contacts.keys() == grasp.contacts.keys()
 
 
 def test_contacts_alone_suffice(tmp_path: Path) -> None:
     path = tmp_path / "bare.yaml"
     path.write_text("contacts: {thumb: {point: [0, 0, 1]}}\n")
-    grasp = load_grasp(path)
+    grasp = ik.load_grasp(path)
     assert (grasp.robot, grasp.object, grasp.object_pose, grasp.posture) == ("", "", None, {})
 
 
@@ -147,14 +146,16 @@ def test_missing_binary_and_unknown(tmp_path: Path) -> None:
     binary = tmp_path / "binary.yaml"
     binary.write_bytes(b"\xff\xfe\x00\x81")
     refused(binary, "", "not UTF-8")
-    with pytest.raises(UnknownNameError, match=r"no shipped grasp is called 'teacup'.*cup"):
-        load_grasp("teacup")
+    with pytest.raises(
+        ik.errors.UnknownNameError, match=r"no shipped grasp is called 'teacup'.*cup"
+    ):
+        ik.load_grasp("teacup")
 
 
 def refused(path: Path, key: str, says: str) -> None:
     """One line that names the file, the key and what is wrong."""
-    with pytest.raises(DescriptionError) as caught:
-        load_grasp(path)
+    with pytest.raises(ik.errors.DescriptionError) as caught:
+        ik.load_grasp(path)
     message = str(caught.value)
     assert message.startswith(str(path))
     assert key in message

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.files.shipped import shipped_names
-from casadi_ik.grasps import Grasp, load_object
+from casadi_ik import grasps
 
 HANDS = ("allegro_right", "leap", "shadow", "robotiq_3f", "panda_hand", "robotiq_2f85")
 NAMES = [name for hand in HANDS for name in ik.shipped_grasps(f"panda+{hand}")]
@@ -32,7 +31,7 @@ def solver_of(name: str) -> ik.Solver:
     return ik.Solver(robot_of(name), tolerance=ik.Tolerance(1e-6, 1e-6), compiled=False)
 
 
-def placed(grasp: Grasp) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+def placed(grasp: ik.Grasp) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """The fingers that touch, and their points and normals in the object's frame."""
     assert grasp.object_pose is not None
     fingers = tuple(grasp.contacts)
@@ -51,7 +50,7 @@ def test_every_hand_has_grasps(hand: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_contacts_are_on_the_surface_and_face_into_it(name: str) -> None:
     grasp = ik.load_grasp(name)
-    item = load_object(grasp.object)
+    item = grasps.load_object(grasp.object)
     fingers, points, normals = placed(grasp)
     assert fingers[0] == robot_of(grasp.robot).thumb
     assert np.abs(item.signed_distance(points)).max() < 1e-9
@@ -68,7 +67,7 @@ def test_posture_and_object_keep_clear_of_limits_and_table(name: str) -> None:
         q[robot.actuators.index(actuator)] = value
     assert ((q >= robot.lower) & (q <= robot.upper)).all()
     assert grasp.object_pose is not None
-    vertices = load_object(grasp.object).mesh(32)[0] @ grasp.object_pose[:3, :3].T
+    vertices = grasps.load_object(grasp.object).mesh(32)[0] @ grasp.object_pose[:3, :3].T
     assert (vertices[:, 2] + grasp.object_pose[2, 3]).min() > 0.05
 
 
@@ -84,7 +83,7 @@ def solver_on_a_table(name: str) -> ik.Solver:
     return ik.Solver(robot_of(name), scene=ik.load_scene("table"), compiled=False)
 
 
-@pytest.mark.parametrize("name", sorted(shipped_names("grasps")))
+@pytest.mark.parametrize("name", sorted(ik.shipped_names("grasps")))
 def test_nothing_touches_but_the_pads(name: str) -> None:
     """On a table there is an answer that is free: the hand holds the object and hits nothing."""
     grasp = ik.load_grasp(name)
@@ -94,7 +93,7 @@ def test_nothing_touches_but_the_pads(name: str) -> None:
 
 def test_the_script_makes_the_shipped_file(tmp_path: Path) -> None:
     """To six digits: the optimiser may differ in the last ones from machine to machine."""
-    script = Path(__file__).resolve().parents[2] / "studies" / "make_hand_grasps.py"
+    script = Path(__file__).resolve().parents[2] / "tools" / "make_hand_grasps.py"
     command = [
         sys.executable,
         str(script),

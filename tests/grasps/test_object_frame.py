@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.grasps.pose import inverse
 
@@ -94,5 +93,5 @@ def test_a_grasp_that_knows_its_object_is_taken_along(robot):
     ],
 )
 def test_what_is_no_pose(pose, says):
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(ik.errors.InputError, match=says):
         ALL_KINDS.at(pose)

@@ -8,18 +8,8 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from casadi_ik.errors import DescriptionError, UnknownNameError
-from casadi_ik.files.shipped import shipped_names
-from casadi_ik.grasps import (
-    BentCapsule,
-    Box,
-    Cylinder,
-    EllipticCylinder,
-    GraspObject,
-    Shape,
-    Sphere,
-    load_object,
-)
+import casadi_ik as ik
+from casadi_ik import grasps
 
 NAMES = (
     "apple",
@@ -36,13 +26,13 @@ NAMES = (
     "tomato_soup_can",
 )
 
-SHAPES: tuple[Shape, ...] = (
-    Sphere(diameter=0.08, source="x"),
-    Cylinder(diameter=0.06, height=0.1, source="x"),
-    EllipticCylinder(width=0.09, depth=0.05, height=0.12, source="x"),
-    EllipticCylinder(width=0.03, depth=0.12, height=0.07, source="x"),
-    Box(size=(0.04, 0.09, 0.17), source="x"),
-    BentCapsule(diameter=0.036, length=0.19, width=0.069, source="x"),
+SHAPES: tuple[grasps.Shape, ...] = (
+    grasps.Sphere(diameter=0.08, source="x"),
+    grasps.Cylinder(diameter=0.06, height=0.1, source="x"),
+    grasps.EllipticCylinder(width=0.09, depth=0.05, height=0.12, source="x"),
+    grasps.EllipticCylinder(width=0.03, depth=0.12, height=0.07, source="x"),
+    grasps.Box(size=(0.04, 0.09, 0.17), source="x"),
+    grasps.BentCapsule(diameter=0.036, length=0.19, width=0.069, source="x"),
 )
 
 GOOD = """\
@@ -56,7 +46,7 @@ sources: {list: somewhere}
 
 
 def test_every_kind_of_shape_is_tested():
-    assert {type(shape) for shape in SHAPES} == set(get_args(Shape))
+    assert {type(shape) for shape in SHAPES} == set(get_args(grasps.Shape))
 
 
 @pytest.fixture(scope="module")
@@ -64,18 +54,18 @@ def points() -> np.ndarray:
     return np.random.default_rng(7).uniform(-0.15, 0.15, (400, 3))
 
 
-def shape_id(shape: Shape) -> str:
+def shape_id(shape: grasps.Shape) -> str:
     return type(shape).__name__
 
 
 def test_the_twelve_objects_and_a_golf_ball_are_shipped() -> None:
-    assert set(shipped_names("objects")) == {*NAMES, "golf_ball"}
+    assert set(ik.shipped_names("objects")) == {*NAMES, "golf_ball"}
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_shipped_object(name: str) -> None:
-    item = load_object(name)
-    assert isinstance(item, GraspObject)
+    item = grasps.load_object(name)
+    assert isinstance(item, grasps.GraspObject)
     assert item.name == name
     assert 0.01 < item.mass < 1.2
     assert {"list", "primitive"} <= set(item.sources)
@@ -100,14 +90,14 @@ def test_shipped_object(name: str) -> None:
 )
 def test_published_dimensions(name: str, size: tuple[float, float, float]) -> None:
     # The banana's tips are rounded, so its bounding box is met by the tube's own geometry.
-    vertices, _ = load_object(name).mesh(256)
+    vertices, _ = grasps.load_object(name).mesh(256)
     np.testing.assert_allclose(
         np.ptp(vertices, axis=0), size, atol=3e-3 if name == "banana" else 5e-5
     )
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=shape_id)
-def test_normal_is_the_gradient_of_the_distance(shape: Shape, points: np.ndarray) -> None:
+def test_normal_is_the_gradient_of_the_distance(shape: grasps.Shape, points: np.ndarray) -> None:
     step = 1e-6
     gradient = np.stack(
         [
@@ -123,7 +113,7 @@ def test_normal_is_the_gradient_of_the_distance(shape: Shape, points: np.ndarray
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=shape_id)
-def test_distance_leads_to_the_surface(shape: Shape, points: np.ndarray) -> None:
+def test_distance_leads_to_the_surface(shape: grasps.Shape, points: np.ndarray) -> None:
     distance, normal = shape.signed_distance(points), shape.normal(points)
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
     foot = points - distance[:, None] * normal
@@ -133,7 +123,7 @@ def test_distance_leads_to_the_surface(shape: Shape, points: np.ndarray) -> None
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=shape_id)
-def test_distance_is_the_distance_to_the_mesh(shape: Shape, points: np.ndarray) -> None:
+def test_distance_is_the_distance_to_the_mesh(shape: grasps.Shape, points: np.ndarray) -> None:
     vertices, faces = shape.mesh(96)
     # Points spread over every triangle; the nearest of them is within a spacing of the distance.
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -147,7 +137,7 @@ def test_distance_is_the_distance_to_the_mesh(shape: Shape, points: np.ndarray) 
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=shape_id)
-def test_mesh_is_closed_and_faces_outward(shape: Shape) -> None:
+def test_mesh_is_closed_and_faces_outward(shape: grasps.Shape) -> None:
     vertices, faces = shape.mesh(48)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     directed = {(int(i), int(j)) for i, j in edges}
@@ -163,7 +153,7 @@ def test_mesh_is_closed_and_faces_outward(shape: Shape) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=shape_id)
-def test_single_points_and_the_centre(shape: Shape) -> None:
+def test_single_points_and_the_centre(shape: grasps.Shape) -> None:
     assert shape.signed_distance([0.0, 0.0, 0.0]).shape == ()
     assert shape.signed_distance([0.0, 0.0, 0.0]) < 0
     normal = shape.normal([0.0, 0.0, 0.0])
@@ -199,8 +189,8 @@ def test_bad_object_file(tmp_path: Path, old: str, new: str, key: str, says: str
     path = tmp_path / "ball.yaml"
     assert old in GOOD
     path.write_text(GOOD.replace(old, new, 1))
-    with pytest.raises(DescriptionError) as caught:
-        load_object(path)
+    with pytest.raises(ik.errors.DescriptionError) as caught:
+        grasps.load_object(path)
     message = str(caught.value)
     assert message.startswith(str(path))
     assert key in message
@@ -211,13 +201,15 @@ def test_bad_object_file(tmp_path: Path, old: str, new: str, key: str, says: str
 def test_good_object_file(tmp_path: Path) -> None:
     path = tmp_path / "ball.yaml"
     path.write_text(GOOD)
-    item = load_object(path)
-    assert item.shape == Sphere(diameter=0.06, source="list")
+    item = grasps.load_object(path)
+    assert item.shape == grasps.Sphere(diameter=0.06, source="list")
     assert item.signed_distance([[0.04, 0, 0], [0, 0, 0]]) == pytest.approx([0.01, -0.03])
 
 
 def test_unknown_object() -> None:
-    with pytest.raises(UnknownNameError, match=r"no shipped object is called 'teapot'.*apple"):
-        load_object("teapot")
-    with pytest.raises(DescriptionError, match="no such file"):
-        load_object("nowhere/teapot.yaml")
+    with pytest.raises(
+        ik.errors.UnknownNameError, match=r"no shipped object is called 'teapot'.*apple"
+    ):
+        grasps.load_object("teapot")
+    with pytest.raises(ik.errors.DescriptionError, match="no such file"):
+        grasps.load_object("nowhere/teapot.yaml")

@@ -11,20 +11,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.files.shipped import shipped_names
-from casadi_ik.grasps import (
-    Box,
-    Cylinder,
-    EllipticCylinder,
-    Grasp,
-    load_grasp,
-    load_object,
-    shipped_grasps,
-)
-from casadi_ik.robots import RobotDescription, load_description
+import casadi_ik as ik
+from casadi_ik import grasps, robots
 from casadi_ik.symbolic.kinematics import forward
 
-NAMES = shipped_grasps("kuka_lwr_barrett")
+NAMES = ik.shipped_grasps("kuka_lwr_barrett")
 FINGERS = ("thumb", "finger_2", "finger_3")
 SHARED = {"bh_finger_2_spread": "bh_spread", "bh_finger_3_spread": "bh_spread"}
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
@@ -32,12 +23,12 @@ PALM_SURFACE = 0.080  # [m] in frame W
 
 
 @pytest.fixture(scope="module")
-def robot() -> RobotDescription:
-    return load_description("kuka_lwr_barrett")
+def robot() -> robots.RobotDescription:
+    return robots.load_description("kuka_lwr_barrett")
 
 
 @pytest.fixture(scope="module")
-def in_palm(robot: RobotDescription) -> ca.Function:
+def in_palm(robot: robots.RobotDescription) -> ca.Function:
     """Contact points and normals (3, 3) each, in Barrett frame W, from theta."""
     theta = ca.SX.sym("theta", len(robot.joint_names))
     kin = forward(robot, theta)
@@ -48,14 +39,14 @@ def in_palm(robot: RobotDescription) -> ca.Function:
 
 
 def posture_contacts(
-    robot: RobotDescription, in_palm: ca.Function, grasp: Grasp
+    robot: robots.RobotDescription, in_palm: ca.Function, grasp: ik.Grasp
 ) -> tuple[np.ndarray, np.ndarray]:
     theta = [grasp.posture.get(SHARED.get(name, name), 0.0) for name in robot.joint_names]
     points, normals = (np.array(matrix).T for matrix in in_palm(theta))
     return points, normals
 
 
-def local(grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
+def local(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals of the contacts in the object's frame."""
     assert grasp.object_pose is not None
     points, normals = grasp.arrays(FINGERS)
@@ -74,16 +65,16 @@ def frame_of(points: np.ndarray) -> np.ndarray:
 
 
 def test_every_object_has_a_grasp() -> None:
-    grasped = {load_grasp(name).object for name in shipped_names("grasps")}
-    assert grasped == set(shipped_names("objects"))
+    grasped = {ik.load_grasp(name).object for name in ik.shipped_names("grasps")}
+    assert grasped == set(ik.shipped_names("objects"))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_contacts_are_on_the_surface_and_face_into_it(name: str) -> None:
-    grasp = load_grasp(name)
+    grasp = ik.load_grasp(name)
     assert grasp.robot == "kuka_lwr_barrett"
     assert grasp.object == name
-    item = load_object(grasp.object)
+    item = grasps.load_object(grasp.object)
     points, normals = local(grasp)
     assert np.abs(item.signed_distance(points)).max() < 1e-9
     np.testing.assert_allclose(normals, -item.normal(points), atol=1e-9)
@@ -91,19 +82,19 @@ def test_contacts_are_on_the_surface_and_face_into_it(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_contacts_keep_away_from_edges(name: str) -> None:
-    points, _ = local(load_grasp(name))
-    shape = load_object(name).shape
-    if isinstance(shape, (Cylinder, EllipticCylinder)):
+    points, _ = local(ik.load_grasp(name))
+    shape = grasps.load_object(name).shape
+    if isinstance(shape, (grasps.Cylinder, grasps.EllipticCylinder)):
         assert np.all(shape.height / 2 - np.abs(points[:, 2]) > 0.0048)
-    elif isinstance(shape, Box):
+    elif isinstance(shape, grasps.Box):
         gaps = np.sort(np.asarray(shape.size) / 2 - np.abs(points), axis=1)
         np.testing.assert_allclose(gaps[:, 0], 0.0, atol=1e-9)
         assert np.all(gaps[:, 1] > 0.0099)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_posture_is_within_limits(name: str, robot: RobotDescription) -> None:
-    posture = load_grasp(name).posture
+def test_posture_is_within_limits(name: str, robot: robots.RobotDescription) -> None:
+    posture = ik.load_grasp(name).posture
     assert set(posture) == {n for n in robot.actuator_names if n.startswith("bh_")}
     for actuator, value in posture.items():
         index = robot.actuator_index(actuator)
@@ -114,9 +105,9 @@ def test_posture_is_within_limits(name: str, robot: RobotDescription) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_posture_reproduces_the_contacts(
-    name: str, robot: RobotDescription, in_palm: ca.Function
+    name: str, robot: robots.RobotDescription, in_palm: ca.Function
 ) -> None:
-    grasp = load_grasp(name)
+    grasp = ik.load_grasp(name)
     points, normals = grasp.arrays(FINGERS)
     hand_points, hand_normals = posture_contacts(robot, in_palm, grasp)
     for i, j in combinations(range(3), 2):
@@ -130,14 +121,14 @@ def test_posture_reproduces_the_contacts(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_object_keeps_clear_of_the_palm_and_above_the_table(
-    name: str, robot: RobotDescription, in_palm: ca.Function
+    name: str, robot: robots.RobotDescription, in_palm: ca.Function
 ) -> None:
-    grasp = load_grasp(name)
+    grasp = ik.load_grasp(name)
     assert grasp.object_pose is not None
     points, _ = grasp.arrays(FINGERS)
     hand_points, _ = posture_contacts(robot, in_palm, grasp)
     palm = frame_of(points) @ np.linalg.inv(frame_of(hand_points))
-    vertices, _ = load_object(name).mesh(64)
+    vertices, _ = grasps.load_object(name).mesh(64)
     world = vertices @ grasp.object_pose[:3, :3].T + grasp.object_pose[:3, 3]
     assert world[:, 2].min() > -1e-6
     heights = (world - palm[:3, 3]) @ palm[:3, 2]
@@ -148,7 +139,7 @@ def test_object_keeps_clear_of_the_palm_and_above_the_table(
 @pytest.mark.parametrize("name", NAMES)
 def test_thumb_opposes_the_fingers(name: str) -> None:
     """The squeeze is an equilibrium inside friction cones: tensions along the triangle's sides."""
-    points, normals = load_grasp(name).arrays(FINGERS)
+    points, normals = ik.load_grasp(name).arrays(FINGERS)
     thumb, second, third = points
     between = np.linspace(-4, 4, 4001)[:, None]
     forces = {
@@ -165,7 +156,7 @@ def test_thumb_opposes_the_fingers(name: str) -> None:
 
 
 def kind(name: str) -> str:
-    return "box" if isinstance(load_object(name).shape, Box) else "round"
+    return "box" if isinstance(grasps.load_object(name).shape, grasps.Box) else "round"
 
 
 def test_the_script_agrees_and_refuses_a_broken_file(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import pytest
 from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnknownNameError
 
 KINDS = ("pose", "position", "planar-pose", "distance", "contact")
 
@@ -147,18 +146,30 @@ def test_a_log_of_a_run(toy, rng, tmp_path):
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
-        (lambda toy: law(toy, "grip"), UnknownNameError, "unknown kind 'grip'"),
-        (lambda toy: law(toy, relative_to="toe"), UnknownNameError, "no finger 'toe'"),
-        (lambda toy: law(toy, relative_to="left"), InputError, "'left' twice"),
-        (lambda toy: law(toy, "distance", None), InputError, "relative_to: missing"),
-        (lambda toy: law(toy, gain=2.0), InputError, "product below 2"),
-        (lambda toy: law(toy, gain=-1.0), InputError, "gain: found -1.0"),
-        (lambda toy: law(toy, centring=2.0), InputError, "centring: found 2.0"),
-        (lambda toy: law(toy, speed=[1, 2]), InputError, "speed: found"),
-        (lambda toy: law(toy).run(None, {}), InputError, "found nothing, task 'position' expects"),
-        (lambda toy: law(toy).run(None, {"point": [0, 0]}), InputError, "point: found"),
-        (lambda toy: law(toy).run([0.0], {"point": [0, 0, 0]}), InputError, "q0: found shape"),
-        (lambda toy: law(toy).run(None, {"point": [0, 0, 0]}, 0), InputError, "steps: found 0"),
+        (lambda toy: law(toy, "grip"), ik.errors.UnknownNameError, "unknown kind 'grip'"),
+        (lambda toy: law(toy, relative_to="toe"), ik.errors.UnknownNameError, "no finger 'toe'"),
+        (lambda toy: law(toy, relative_to="left"), ik.errors.InputError, "'left' twice"),
+        (lambda toy: law(toy, "distance", None), ik.errors.InputError, "relative_to: missing"),
+        (lambda toy: law(toy, gain=2.0), ik.errors.InputError, "product below 2"),
+        (lambda toy: law(toy, gain=-1.0), ik.errors.InputError, "gain: found -1.0"),
+        (lambda toy: law(toy, centring=2.0), ik.errors.InputError, "centring: found 2.0"),
+        (lambda toy: law(toy, speed=[1, 2]), ik.errors.InputError, "speed: found"),
+        (
+            lambda toy: law(toy).run(None, {}),
+            ik.errors.InputError,
+            "found nothing, task 'position' expects",
+        ),
+        (lambda toy: law(toy).run(None, {"point": [0, 0]}), ik.errors.InputError, "point: found"),
+        (
+            lambda toy: law(toy).run([0.0], {"point": [0, 0, 0]}),
+            ik.errors.InputError,
+            "q0: found shape",
+        ),
+        (
+            lambda toy: law(toy).run(None, {"point": [0, 0, 0]}, 0),
+            ik.errors.InputError,
+            "steps: found 0",
+        ),
     ],
 )
 def test_bad_input_is_one_clear_error(make, error, words, toy):

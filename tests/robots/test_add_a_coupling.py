@@ -16,7 +16,6 @@ import pytest
 from toy_robots import replace, write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.errors import UnsupportedError
 from casadi_ik.robots.couplings import CouplingKind
 from casadi_ik.symbolic.couplings import coupling_rate, follow, has_toggle
 
@@ -27,8 +26,8 @@ import sys
 import casadi as ca
 import numpy as np
 import casadi_ik as ik
-from casadi_ik.calibration.model import hand_parameters
-from casadi_ik.symbolic.couplings import coupling_rate, follow, joint_positions
+from casadi_ik.calibration.model import (hand_parameters)
+from casadi_ik.symbolic.couplings import (coupling_rate, follow, joint_positions)
 
 robot = ik.load_robot(sys.argv[1])
 rng = np.random.default_rng(3)
@@ -119,9 +118,9 @@ def test_an_unknown_kind_is_an_error(coupled_robot):
     (joint,) = (joint for joint in coupled_robot.description.movable if joint.name == "left_4")
     wired = dataclasses.replace(joint, coupling=Wire("left_3"))  # type: ignore[arg-type]
     for ask in (follow, coupling_rate):
-        with pytest.raises(UnsupportedError, match="no graphs for the kind Wire"):
+        with pytest.raises(ik.errors.UnsupportedError, match="no graphs for the kind Wire"):
             ask(wired, ca.SX.sym("s"))
-    with pytest.raises(UnsupportedError, match="Wire"):
+    with pytest.raises(ik.errors.UnsupportedError, match="Wire"):
         has_toggle(wired)
     with pytest.raises(NotImplementedError, match="Wire"):
         wired.coupling.followed(np.zeros(1))
@@ -130,5 +129,5 @@ def test_an_unknown_kind_is_an_error(coupled_robot):
         coupled_robot.description,
         joints=tuple(wired if one is joint else one for one in joints),
     )
-    with pytest.raises(UnsupportedError, match="Wire"):
+    with pytest.raises(ik.errors.UnsupportedError, match="Wire"):
         ik.ArmHand(described).contacts(coupled_robot.home)

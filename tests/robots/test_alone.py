@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError, UnknownNameError
 
 
 @pytest.mark.parametrize("name", ["allegro_right", "panda_hand"])
@@ -40,10 +39,12 @@ def test_an_arm_alone_is_a_robot_whose_fingertip_is_its_tip(rng: np.random.Gener
 
 @pytest.mark.parametrize("name", ["arm.urdf", "some/hand.xacro", "hand.xml"])
 def test_a_robots_file_is_led_to_its_import(name: str) -> None:
-    with pytest.raises(DescriptionError, match=f"casadi-ik import {name} --out .*yaml makes one"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=f"casadi-ik import {name} --out .*yaml makes one"
+    ):
         ik.load_robot(name)
 
 
 def test_unknown_names_are_told_what_there_is() -> None:
-    with pytest.raises(UnknownNameError, match="ARM\\+HAND"):
+    with pytest.raises(ik.errors.UnknownNameError, match="ARM\\+HAND"):
         ik.load_robot("no_such_robot")

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import brentq
 
 import casadi_ik as ik
-from casadi_ik.robots import FourBar, LeadScrew
+from casadi_ik import robots
 from casadi_ik.symbolic import four_bar, lead_screw
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.couplings import linkage
@@ -75,7 +75,7 @@ def test_triangles_obey_the_cosine_rule(ar10):
     joints = ar10.joints(q)
     seen = 0
     for joint in ar10.description.movable:
-        if isinstance(coupling := joint.coupling, LeadScrew):
+        if isinstance(coupling := joint.coupling, robots.LeadScrew):
             s, b, c = q[:, ar10.actuators.index(coupling.of)], coupling.b, coupling.c
             theta = joints[joint.name] + coupling.theta_0
             np.testing.assert_allclose(s**2, b**2 + c**2 - 2 * b * c * np.cos(theta), atol=1e-16)
@@ -88,7 +88,7 @@ def test_four_bars_close(ar10):
     joints = ar10.joints(strokes(ar10))
     seen = 0
     for joint in ar10.description.movable:
-        if isinstance(bar := joint.coupling, FourBar):
+        if isinstance(bar := joint.coupling, robots.FourBar):
             phi = bar.phi_0 + joints[bar.of]
             beta = phi + joints[joint.name] + bar.theta_3_0
             pin = bar.p * np.exp(1j * phi) + bar.h * np.exp(1j * beta)
@@ -126,13 +126,13 @@ def test_slider_to_joint_and_back(ar10):
     joints = ar10.joints(q)
     for joint in ar10.description.movable:
         coupling, values = joint.coupling, joints[joint.name]
-        if isinstance(coupling, LeadScrew):
+        if isinstance(coupling, robots.LeadScrew):
             back = lead_screw.slider_from_angle(
                 ca.DM(values + coupling.theta_0), coupling.b, coupling.c
             )
             expected = q[:, ar10.actuators.index(coupling.of)]
             np.testing.assert_allclose(np.array(back).ravel(), expected, atol=1e-15)
-        elif isinstance(coupling, FourBar):
+        elif isinstance(coupling, robots.FourBar):
             phi = coupling.phi_0 + joints[coupling.of]
             bar, middle = linkage(coupling, coupling), phi.mean()
             for value, expected in zip(values[20:], phi[20:], strict=True):
@@ -170,9 +170,9 @@ def test_toggle_margins(ar10):
     joints, margins = ar10.joints(q), ar10.toggle_margins(q)
     assert set(margins) == set(joints)
     for joint in ar10.description.movable:
-        if isinstance(coupling := joint.coupling, LeadScrew):
+        if isinstance(coupling := joint.coupling, robots.LeadScrew):
             sine = np.sin(joints[joint.name] + coupling.theta_0)
-        elif isinstance(coupling, FourBar):
+        elif isinstance(coupling, robots.FourBar):
             phi = coupling.phi_0 + joints[coupling.of]
             beta = phi + joints[joint.name] + coupling.theta_3_0
             pin = coupling.p * np.exp(1j * phi) + coupling.h * np.exp(1j * beta)
@@ -201,7 +201,7 @@ def test_the_four_bar_keeps_its_branch_to_the_toggle(ar10):
     """On the way to the toggle position the measure falls to zero and the joint never jumps."""
     index = next(j for j in ar10.description.movable if j.name == "index_distal")
     bar = index.coupling
-    assert isinstance(bar, FourBar)
+    assert isinstance(bar, robots.FourBar)
     linked = linkage(bar, bar)
     end = brentq(lambda phi: float(four_bar.toggle(ca.DM(phi), linked)), 3.33, 6.2)
     phi = np.linspace(bar.phi_0, end, 2000)

@@ -15,12 +15,11 @@ import pytest
 import yaml
 
 import casadi_ik as ik
+from casadi_ik import robots
 from casadi_ik.cli.inputs import the_robot
-from casadi_ik.errors import DescriptionError, UnknownNameError
 from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve
 from casadi_ik.importing.posture import Postures
-from casadi_ik.robots import load_description
 from casadi_ik.robots.parts import arm_part, hand_part
 from casadi_ik.robots.schema import ArmFile, HandFile
 
@@ -79,7 +78,7 @@ def test_names():
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_every_arm_takes_a_hand(arm):
-    description = load_description(f"{arm}+allegro_right")
+    description = robots.load_description(f"{arm}+allegro_right")
     assert description.name == f"{arm}+allegro_right"
     assert len(description.arm_actuators) in (6, 7)
     assert description.thumb == "thumb"
@@ -91,7 +90,7 @@ def test_every_arm_takes_a_hand(arm):
 
 @pytest.mark.parametrize("hand", HANDS)
 def test_every_hand_goes_on_an_arm(hand):
-    description = load_description(f"ur5e+{hand}")
+    description = robots.load_description(f"ur5e+{hand}")
     assert len(description.fingers) >= FEWER.get(hand, 3)
     assert description.actuator_names[:6] == tuple(f"ur5e_joint_{i}" for i in range(1, 7))
     assert description.sources
@@ -132,11 +131,15 @@ def test_hands_stand_where_published_files_have_them(hand):
 
 
 def test_unknown_arms_and_hands_are_named():
-    with pytest.raises(UnknownNameError, match=r"no shipped arm is called 'pander'; shipped: "):
+    with pytest.raises(
+        ik.errors.UnknownNameError, match=r"no shipped arm is called 'pander'; shipped: "
+    ):
         ik.load_robot("pander+allegro_right")
-    with pytest.raises(UnknownNameError, match=r"no shipped hand is called 'allegra'; shipped: "):
+    with pytest.raises(
+        ik.errors.UnknownNameError, match=r"no shipped hand is called 'allegra'; shipped: "
+    ):
         ik.load_robot("panda+allegra")
-    with pytest.raises(DescriptionError, match="no such file"):
+    with pytest.raises(ik.errors.DescriptionError, match="no such file"):
         ik.load_robot("a+b/robot.yaml")
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import UnsupportedError
 
 FINGERS = ("thumb", "finger_2", "finger_3")
 
@@ -56,7 +55,7 @@ def test_the_same_hand_otherwise(coupled, robot, rng):
 @pytest.mark.parametrize("method", ["enhanced-dls", "enhanced-sdls"])
 def test_the_papers_methods_say_why_not(coupled, method):
     """Eq. (5) distributes a sum over two flexions; here there is nothing to distribute."""
-    with pytest.raises(UnsupportedError) as caught:
+    with pytest.raises(ik.errors.UnsupportedError) as caught:
         ik.Solver(coupled, method)
     assert str(caught.value) == (
         "robot 'kuka_lwr_barrett_coupled': finger 'finger_2' is not a planar finger: "

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from toy_robots import replace, write_coupled_robot
 
-from casadi_ik.errors import DescriptionError, UnknownNameError
-from casadi_ik.robots import load_description
+import casadi_ik as ik
 
 THUMB_ORIGIN = "origin: {xyz: [0, 50 mm, 75.4 mm], rpy: [90 deg, -2.456 deg, 90 deg]}"
 COUPLED = "coupling: {kind: linear, of: bh_spread}"
@@ -321,8 +320,8 @@ def test_broken_shipped_robot(own_robot, case):
     file, old, new, key, says = SHIPPED[case]
     path = own_robot.with_name(f"{file}.yaml")
     replace(path, old, new)
-    with pytest.raises(DescriptionError) as caught:
-        load_description(own_robot)
+    with pytest.raises(ik.errors.DescriptionError) as caught:
+        ik.load_robot(own_robot)
     message = str(caught.value)
     assert message.startswith(f"{path}: {key}: "), message
     assert says in message[len(str(path)) + len(key) :], message
@@ -331,8 +330,10 @@ def test_broken_shipped_robot(own_robot, case):
 
 def test_duplicate_key(own_robot):
     replace(own_robot, "thumb: thumb", "thumb: thumb\nthumb: finger_2")
-    with pytest.raises(DescriptionError, match=r"robot\.yaml:\d+:1: .*key 'thumb' appears twice"):
-        load_description(own_robot)
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"robot\.yaml:\d+:1: .*key 'thumb' appears twice"
+    ):
+        ik.load_robot(own_robot)
 
 
 COUPLINGS = {
@@ -365,8 +366,8 @@ def test_broken_coupling(tmp_path, case):
     old, new, key, says = COUPLINGS[case]
     path = write_coupled_robot(tmp_path)
     replace(tmp_path / "parts" / "hand.yaml", old, new)
-    with pytest.raises(DescriptionError) as caught:
-        load_description(path)
+    with pytest.raises(ik.errors.DescriptionError) as caught:
+        ik.load_robot(path)
     message = str(caught.value)
     assert message.startswith(f"{tmp_path / 'parts' / 'hand.yaml'}: joint {key}: "), message
     assert says in message
@@ -374,8 +375,8 @@ def test_broken_coupling(tmp_path, case):
 
 def test_unknown_robot_lists_the_shipped():
     with pytest.raises(
-        UnknownNameError, match=r"no shipped arm-hand is called 'pr2'.*kuka_lwr_barr"
+        ik.errors.UnknownNameError, match=r"no shipped arm-hand is called 'pr2'.*kuka_lwr_barr"
     ):
-        load_description("pr2")
-    with pytest.raises(DescriptionError, match=r"my/robot\.yaml: no such file"):
-        load_description("my/robot.yaml")
+        ik.load_robot("pr2")
+    with pytest.raises(ik.errors.DescriptionError, match=r"my/robot\.yaml: no such file"):
+        ik.load_robot("my/robot.yaml")

@@ -10,7 +10,6 @@ import pytest
 import yaml
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError
 from casadi_ik.files.shipped import models_folder
 
 
@@ -43,7 +42,7 @@ def test_it_is_the_same_robot(name, tmp_path, rng):
 )
 def test_its_errors_name_the_file_and_the_key(changes, words, tmp_path):
     path = in_full(tmp_path, **changes)
-    with pytest.raises(DescriptionError, match=words) as caught:
+    with pytest.raises(ik.errors.DescriptionError, match=words) as caught:
         ik.load_robot(path)
     assert str(caught.value).startswith(f"{path}: ")
 
@@ -51,5 +50,7 @@ def test_its_errors_name_the_file_and_the_key(changes, words, tmp_path):
 def test_neither_a_name_nor_a_hand(tmp_path):
     path = tmp_path / "whole.yaml"
     path.write_text("name: a\nhand: 3\nthumb: b\nfingers: [b]\n")
-    with pytest.raises(DescriptionError, match=r"hand: expected `str \| object`, got `int`"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"hand: expected `str \| object`, got `int`"
+    ):
         ik.load_robot(path)

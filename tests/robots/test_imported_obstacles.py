@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from imported_files import FINGERS, describe, hand, joint, link, urdf
 
-from casadi_ik.errors import CasadiIKError
-from casadi_ik.robots import load_description
+import casadi_ik as ik
 
 BOMB = """<?xml version="1.0"?>
 <!DOCTYPE robot [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>
@@ -83,8 +82,8 @@ def test_refusals(tmp_path, case):
 
 
 def refusal(path: Path) -> str:
-    with pytest.raises(CasadiIKError) as caught:
-        load_description(path)
+    with pytest.raises(ik.errors.CasadiIKError) as caught:
+        ik.load_robot(path)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -176,7 +175,7 @@ def test_missing_meshes_are_no_matter(tmp_path):
     mesh = '<mesh filename="package://nowhere/left.stl"/>'
     shaped = f'<link name="left_1"><visual><geometry>{mesh}</geometry></visual></link>'
     hand(tmp_path, ('<link name="left_1"/>', shaped))
-    assert load_description(describe(tmp_path, "hand: {file: hand.urdf}")).fingers
+    assert ik.load_robot(describe(tmp_path, "hand: {file: hand.urdf}")).fingers
 
 
 @pytest.mark.parametrize(("module", "name"), [("mujoco", "x.xml"), ("xacro", "x.urdf.xacro")])
@@ -196,5 +195,5 @@ def test_formats_whose_reader_is_missing_name_the_extra(tmp_path, module, name):
 def test_pinocchio_says_nothing_of_its_own(tmp_path, capfd):
     path = hand(tmp_path)
     path.write_text(path.read_text().replace('<robot name="hand">', '<robot name="">'))
-    load_description(describe(tmp_path, "hand: {file: hand.urdf}"))
+    ik.load_robot(describe(tmp_path, "hand: {file: hand.urdf}"))
     assert capfd.readouterr().err == ""

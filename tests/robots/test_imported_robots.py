@@ -7,7 +7,6 @@ import pytest
 from imported_files import FINGERS, arm, describe, hand, joint, link, urdf
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.importing.check import largest_difference
 from casadi_ik.importing.robot_shapes import robot_shapes
 from casadi_ik.robots.robot_files.read import read_tree
@@ -165,7 +164,9 @@ def test_two_arms_in_one_file_with_one_chosen(tmp_path, rng):
     urdf(tmp_path / "arms.urdf", text)
     hand(tmp_path)
     description = "arm: {{file: arms.urdf{tip}}}\nhand: {{file: hand.urdf}}"
-    with pytest.raises(DescriptionError, match=r"arm.tip: missing; arms.urdf .* one of a6, b6"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"arm.tip: missing; arms.urdf .* one of a6, b6"
+    ):
         ik.load_robot(describe(tmp_path, description.format(tip="")))
     robot = ik.load_robot(describe(tmp_path, description.format(tip=", tip: b6")))
     assert [name for name in robot.actuators if name[1] == "_"] == [f"b_joint{i}" for i in range(6)]
@@ -189,7 +190,9 @@ def test_arm_from_a_file_with_a_shipped_hand(tmp_path, rng):
 
 def test_a_method_that_needs_a_thumb_says_so(tmp_path):
     robot = both(tmp_path)
-    with pytest.raises(UnsupportedError, match=r"names no thumb.*'thumb: FINGER'.*left, right"):
+    with pytest.raises(
+        ik.errors.UnsupportedError, match=r"names no thumb.*'thumb: FINGER'.*left, right"
+    ):
         ik.Solver(robot, "enhanced-dls")
 
 

@@ -9,8 +9,7 @@ import yaml
 from toy_robots import COUPLED_HAND, copy_shipped_robot, write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError
-from casadi_ik.files.shipped import models_folder, shipped_names
+from casadi_ik.files.shipped import models_folder
 from casadi_ik.robots.couplings import FourBar, LeadScrew, Linear
 from casadi_ik.symbolic.couplings import follow
 
@@ -77,7 +76,7 @@ def test_the_range_is_as_wide_as_the_joints_allow(narrow):
 
 
 def test_shipped_robots_keep_their_strokes_to_the_last_digit():
-    for name in shipped_names("arm_hands"):
+    for name in ik.shipped_names("arm_hands"):
         robot = ik.load_robot(name)
         np.testing.assert_array_equal(robot.lower, robot.description.strokes[0])
         np.testing.assert_array_equal(robot.upper, robot.description.strokes[1])
@@ -130,14 +129,18 @@ def test_a_motor_with_nowhere_to_go(tmp_path):
     data = yaml.safe_load(hand.read_text())
     next(j for j in data["joints"] if j["name"] == "left_spread")["limits"] = [0.9, 1]
     hand.write_text(yaml.safe_dump(data))
-    with pytest.raises(DescriptionError, match=r"actuators\.spread: limits: nowhere from -0\.4 to"):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"actuators\.spread: limits: nowhere from -0\.4 to"
+    ):
         ik.load_robot(path)
 
 
 def test_home_beyond_a_joint_limit(tmp_path):
     path = narrow_robot(tmp_path)
     path.write_text(path.read_text().replace("spread: 0.2", "spread: 0.8"))
-    with pytest.raises(DescriptionError, match=r"home\.spread: 0\.8 is outside the limits \["):
+    with pytest.raises(
+        ik.errors.DescriptionError, match=r"home\.spread: 0\.8 is outside the limits \["
+    ):
         ik.load_robot(path)
 
 

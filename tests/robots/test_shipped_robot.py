@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 import casadi_ik as ik
+from casadi_ik import robots
 from casadi_ik.files.shipped import models_folder
-from casadi_ik.robots import load_description
 
 DEG = np.pi / 180
 
@@ -191,7 +191,7 @@ def test_every_shipped_robot_loads(name):
     assert robot.thumb in robot.fingers
     assert np.all(robot.lower < robot.upper)
     assert robot.home.shape == (len(robot.actuators),)
-    assert load_description(name).sources
+    assert robots.load_description(name).sources
     points, normals = robot.contacts(robot.home)
     assert points.shape == (len(robot.fingers), 3)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, rtol=1e-14)

@@ -11,7 +11,7 @@ import pytest
 from pinocchio_oracle import PinocchioRobot
 
 import casadi_ik as ik
-from casadi_ik.robots import FourBar, LeadScrew, Linear
+from casadi_ik import robots
 
 
 @pytest.fixture(params=["every coupling", *ik.shipped_names("arm_hands")])
@@ -54,7 +54,7 @@ def test_mimic_joints_stand_for_the_linear_couplings(pair, rng):
     followers = {
         joint.name
         for joint in robot.description.movable
-        if isinstance(joint.coupling, Linear) and joint.name not in leaders
+        if isinstance(joint.coupling, robots.Linear) and joint.name not in leaders
     }
     assert model.nq == len(robot.description.joint_names) - len(followers)
     for q in robot.random(rng, 20):
@@ -80,4 +80,4 @@ def test_couplings_without_a_urdf_form_are_said(pair):
     text = robot.urdf()
     for joint in robot.description.movable:
         said = f"<!-- {joint.coupling} -->" in text
-        assert said == isinstance(joint.coupling, LeadScrew | FourBar)
+        assert said == isinstance(joint.coupling, robots.LeadScrew | robots.FourBar)

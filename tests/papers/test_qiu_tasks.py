@@ -1,0 +1,383 @@
+"""The tasks of Qiu & Kermani 2021: palm estimate, hierarchy, palm motion, the record of numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from toy_robots import replace
+
+import casadi_ik as ik
+from casadi_ik.papers.qiu.parameters import QiuParameters
+from casadi_ik.papers.qiu.tasks import (
+    Task,
+    axes_through,
+    base_axes,
+    combine,
+    contact_tasks,
+    damped,
+    palm_motion,
+    palm_orientation,
+    palm_orientation_task,
+)
+from casadi_ik.problem.target import Target
+from casadi_ik.symbolic.actuated import actuated
+
+
+def estimate(robot: ik.ArmHand, points: np.ndarray) -> np.ndarray:
+    """Estimated palm orientation for (f, 3) contact points in the order of `robot.fingers`."""
+    symbols = ca.SX.sym("p", 3, len(points))
+    goals = {name: Target(symbols[:, i], ca.SX.zeros(3, 1)) for i, name in enumerate(robot.fingers)}
+    f = ca.Function("f", [symbols], [palm_orientation(robot.description, goals)])
+    return np.array(f(points.T))
+
+
+def rotation(rng) -> np.ndarray:
+    return pin.exp3(rng.normal(size=3))
+
+
+def test_bases_of_the_barrett_hand_span_the_palm_frame(robot):
+    np.testing.assert_allclose(base_axes(robot.description), np.eye(3), atol=1e-15)
+
+
+def test_symmetric_pinch_gives_the_palm_itself(robot, rng):
+    """Without spread the fingertips form the same triangle as the bases."""
+    q = robot.random(rng, 20)
+    q[:, 7] = 0.0
+    q[:, 12:] = q[:, 10:12]
+    q[:, 8:10] = q[:, 10:12]
+    for row in q:
+        points, _ = robot.contacts(row)
+        palm = robot.palm(row)
+        side = (points[0] - points[1]) @ palm[:3, 1]
+        expected = palm[:3, :3] if side > 0 else palm[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+        np.testing.assert_allclose(estimate(robot, points), expected, atol=1e-9)
+
+
+def test_moves_with_the_contacts(robot, rng):
+    for _ in range(20):
+        points = rng.normal(size=(3, 3))
+        R, p = rotation(rng), rng.normal(size=3)
+        there = estimate(robot, points @ R.T + p)
+        np.testing.assert_allclose(there, R @ estimate(robot, points), atol=1e-12)
+        np.testing.assert_allclose(there @ there.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(there) == pytest.approx(1.0)
+
+
+def test_eqs_1_and_2_literally(robot, rng):
+    thumb, second, third = points = rng.normal(size=(3, 3))
+    x, y = second - third, thumb - (second + third) / 2
+    z = np.cross(x, y)
+    x = np.cross(y, z)
+    axes = [axis / np.linalg.norm(axis) for axis in (x, y, z)]
+    np.testing.assert_allclose(estimate(robot, points), np.stack(axes, axis=1), atol=1e-12)
+
+
+def test_another_palm_frame_turns_the_estimate_with_it(own_robot, robot, rng):
+    replace(
+        own_robot.with_name("hand.yaml"),
+        "palm: {link: bh_base,",
+        "palm: {link: bh_base, rpy: [0.3, 0.2, 1.0],",
+    )
+    own = ik.load_robot(own_robot)
+    points = rng.normal(size=(3, 3))
+    turned = estimate(robot, points) @ own.description.palm_placement[:3, :3]
+    np.testing.assert_allclose(estimate(own, points), turned, atol=1e-12)
+
+
+def test_points_on_a_line_give_finite_numbers():
+    points = [ca.SX([0, 0, 0]), ca.SX([1, 0, 0]), ca.SX([2, 0, 0])]
+    assert np.all(np.isfinite(np.array(ca.evalf(ca.densify(axes_through(points))))))
+
+
+def test_two_fingers_are_too_few(own_robot):
+    replace(own_robot, "[thumb, finger_2, finger_3]", "[thumb, finger_2]")
+    with pytest.raises(ik.errors.UnsupportedError, match=r"has 2 fingers; .* at least three"):
+        base_axes(ik.load_robot(own_robot).description)
+
+
+COLUMNS = (0, 1, 2, 3, 4, 5, 6, 8, 9)
+
+
+@pytest.fixture(scope="module")
+def tasks(robot):
+    """(q, R desired, point, normal) -> Jacobian and error of palm (both ways), point, normal."""
+    q, R = ca.SX.sym("q", 14), ca.SX.sym("R", 3, 3)
+    point, normal = ca.SX.sym("point", 3), ca.SX.sym("normal", 3)
+    body = actuated(robot.description, q)
+    parts = [palm_orientation_task(body, R, COLUMNS, euler) for euler in (True, False)]
+    parts += contact_tasks(body, "thumb", Target(point, normal), COLUMNS)
+    outputs = [ca.densify(x) for part in parts for x in (part.jacobian, part.error)]
+    f = ca.Function("f", [q, R, point, normal], outputs)
+
+    def evaluate(*values):
+        numbers = [np.array(x) for x in f.call([ca.DM(v) for v in values])]
+        return [(J, e.ravel()) for J, e in zip(numbers[::2], numbers[1::2], strict=True)]
+
+    return evaluate
+
+
+def own_pose(robot, q):
+    points, normals = robot.contacts(q)
+    return robot.palm(q)[:3, :3], points[0], normals[0]
+
+
+def test_errors_vanish_where_the_thumb_is(robot, tasks, rng):
+    for q in robot.random(rng, 5):
+        for _, error in tasks(q, *own_pose(robot, q)):
+            np.testing.assert_allclose(error, 0, atol=1e-11)
+
+
+def test_jacobians_predict_how_the_errors_fall(robot, tasks, rng):
+    """A small step dq changes each error by -J dq near the goal."""
+    for q in robot.random(rng, 10):
+        R = robot.palm(q)[:3, :3]
+        if abs(R[2, 0]) > 0.95:
+            continue
+        step = np.zeros(14)
+        step[list(COLUMNS)] = rng.normal(scale=1e-5, size=9)
+        goal = own_pose(robot, q + step)
+        for i, (J, error) in enumerate(tasks(q, *goal)):
+            predicted = J @ step[list(COLUMNS)]
+            if i == 3:  # of the turn, the one about the normal is free
+                predicted -= goal[2] * (goal[2] @ predicted)
+            scale = 1e3 if i == 2 else 1.0
+            np.testing.assert_allclose(error, predicted, atol=2e-8 * scale)
+            assert np.linalg.norm(error) > 1e-7
+
+
+def test_position_is_in_millimetres(robot, tasks):
+    R, point, normal = own_pose(robot, robot.home)
+    _, error = tasks(robot.home, R, point + np.array([0.003, 0, 0]), normal)[2]
+    np.testing.assert_allclose(error, [3, 0, 0], atol=1e-9)
+
+
+def test_euler_differences_are_wrapped(robot, tasks):
+    """Rotations on both sides of the half turn are close."""
+    q = np.zeros(14)
+    q[0] = np.radians(169)
+    R = pin.utils.rotate("z", np.radians(-175))
+    _, error = tasks(q, R, np.zeros(3), np.array([0.0, 0.0, 1.0]))[0]
+    np.testing.assert_allclose(np.degrees(error), [16, 0, 0], atol=1e-9)
+    _, error = tasks(q, R, np.zeros(3), np.array([0.0, 0.0, 1.0]))[1]
+    np.testing.assert_allclose(np.degrees(error), [0, 0, 16], atol=1e-9)
+
+
+def step_function(count, damping, projection="successive"):
+    J = [ca.SX.sym(f"J{i}", 3, 9) for i in range(count)]
+    e = [ca.SX.sym(f"e{i}", 3) for i in range(count)]
+
+    tasks = [Task(a, b, is_position=False) for a, b in zip(J, e, strict=True)]
+    solve = damped(damping)
+    total = combine(tasks, [solve(task) for task in tasks], projection)
+    return ca.Function("f", [*J, *e], [total])
+
+
+def damped_steps(rng, damping):
+    """Three random tasks and numpy's damped solution of each."""
+    J, e = rng.normal(size=(3, 3, 9)), rng.normal(size=(3, 3))
+    solved = [
+        A.T @ np.linalg.solve(A @ A.T + damping**2 * np.eye(3), b)
+        for A, b in zip(J, e, strict=True)
+    ]
+    return J, e, solved
+
+
+def test_hierarchy_is_the_successive_projection(rng):
+    """dq_1 + N_1 dq_2 + N_1 N_2 dq_3 with numpy's own pseudoinverse."""
+    J, e, steps = damped_steps(rng, 0.1)
+    N = [np.eye(9) - np.linalg.pinv(A) @ A for A in J]
+    expected = steps[0] + N[0] @ steps[1] + N[0] @ N[1] @ steps[2]
+    found = np.array(step_function(3, 0.1).call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+
+
+def test_augmented_projection_keeps_every_higher_task(rng):
+    """dq_1 + N_1 dq_2 + N_12 dq_3 with numpy's own pseudoinverse of the stacked tasks."""
+    J, e, steps = damped_steps(rng, 0.1)
+    stacked = [np.concatenate(J[: i + 1]) for i in range(2)]
+    N = [np.eye(9) - np.linalg.pinv(A) @ A for A in stacked]
+    expected = steps[0] + N[0] @ steps[1] + N[1] @ steps[2]
+    f = step_function(3, 0.1, "augmented")
+    found = np.array(f.call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
+    # RANK_FLOOR damps the projector a little.
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_lower_tasks_leave_the_first_alone(robot, tasks, rng):
+    """To first order the palm turns as if the thumb had no task, on the real Jacobians."""
+    f = step_function(3, 1e-3)
+    alone = step_function(1, 1e-3)
+    for q in robot.random(rng, 10):
+        goal = own_pose(robot, robot.random(rng, 1)[0])
+        palm, point, normal = (tasks(q, *goal)[i] for i in (1, 2, 3))
+        J = [palm[0], point[0], normal[0]]
+        e = [palm[1], point[1], normal[1]]
+        step = np.array(f.call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
+        first = np.array(alone.call([ca.DM(J[0]), ca.DM(e[0])])[0]).ravel()
+        np.testing.assert_allclose(J[0] @ step, J[0] @ first, atol=1e-7 * np.abs(step).max())
+        # Unlike an augmented projection the successive one lets the third disturb the second.
+        assert np.abs(step - first).max() > 1e-3
+
+
+def test_thumb_keeping_puts_the_point_before_the_normal(robot, tasks, rng):
+    """With two tasks the hierarchy is strict: the point moves as if it were alone."""
+    both, alone = step_function(2, 1.0), step_function(1, 1.0)
+    for q in robot.random(rng, 10):
+        _, _, point, normal = tasks(q, *own_pose(robot, robot.random(rng, 1)[0]))
+        step = np.array(both(point[0], normal[0], point[1], normal[1])).ravel()
+        first = np.array(alone(point[0], point[1])).ravel()
+        np.testing.assert_allclose(point[0] @ step, point[0] @ first, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def motion(robot):
+    """(q, points (k, 3), normals (k, 3)) -> translation [mm], rotation [rad], palm frame."""
+    q = ca.SX.sym("q", 14)
+    points, normals = ca.SX.sym("p", 3, 2), ca.SX.sym("n", 3, 2)
+    goals = {f: Target(points[:, i], normals[:, i]) for i, f in enumerate(robot.fingers[1:])}
+    f = ca.Function(
+        "f", [q, points, normals], [*palm_motion(actuated(robot.description, q), goals)]
+    )
+    return lambda q, p, n: tuple(np.array(x).ravel() for x in f.call([ca.DM(q), p.T, n.T]))
+
+
+def displaced(robot, q, translation, rotation):
+    """Where fingers 2 and 3 get if the palm moves by a motion given in the palm frame."""
+    points, normals = robot.contacts(q)
+    palm = pin.SE3(robot.palm(q))
+    moved = palm * pin.SE3(pin.exp3(rotation), translation) * palm.inverse()
+    return points[1:] @ moved.rotation.T + moved.translation, normals[1:] @ moved.rotation.T
+
+
+def test_nothing_to_do_at_the_contacts(robot, motion, rng):
+    for q in robot.random(rng, 10):
+        translation, rotation = motion(q, *displaced(robot, q, np.zeros(3), np.zeros(3)))
+        np.testing.assert_allclose(translation, 0, atol=1e-9)
+        np.testing.assert_allclose(rotation, 0, atol=1e-12)
+
+
+def test_translations_are_found_exactly(robot, motion, rng):
+    for q in robot.random(rng, 10):
+        shift = rng.normal(scale=0.05, size=3)
+        translation, rotation = motion(q, *displaced(robot, q, shift, np.zeros(3)))
+        np.testing.assert_allclose(translation, 1e3 * shift, atol=1e-9)
+        np.testing.assert_allclose(rotation, 0, atol=1e-12)
+
+
+def test_rotations_across_both_normals_are_found(robot, motion, rng):
+    """A rotation about the one axis that both normals show completely, with a translation."""
+    checked = 0
+    for q in robot.random(rng, 20):
+        palm = robot.palm(q)[:3, :3]
+        local = robot.contacts(q)[1][1:] @ palm
+        axis = np.cross(*local)
+        if np.linalg.norm(axis) < 0.1:
+            continue
+        w = 1e-4 * axis / np.linalg.norm(axis)
+        shift = rng.normal(scale=1e-5, size=3)
+        translation, rotation = motion(q, *displaced(robot, q, shift, w))
+        np.testing.assert_allclose(rotation, w, atol=1e-7)
+        np.testing.assert_allclose(translation, 1e3 * shift, atol=1e-5)
+        checked += 1
+    assert checked > 10
+
+
+def test_first_order_of_any_motion(robot, motion, rng):
+    """A turn about a finger's normal is invisible to that finger: the paper's averages say so.
+
+    Finger i asks for w_i = w - n_i (n_i . w) and for t + (w - w_i) x p_i, which eqs. (12) and (13)
+    average.
+    """
+    for q in robot.random(rng, 10):
+        palm = pin.SE3(robot.palm(q))
+        points, normals = robot.contacts(q)
+        levers = [palm.inverse().act(p) for p in points[1:]]
+        normals = normals[1:] @ palm.rotation
+        shift, w = rng.normal(scale=1e-5, size=3), rng.normal(scale=1e-4, size=3)
+        seen = [w - n * (n @ w) for n in normals]
+        expected = np.mean(
+            [shift + np.cross(w - w_i, p) for w_i, p in zip(seen, levers, strict=True)], axis=0
+        )
+        translation, rotation = motion(q, *displaced(robot, q, shift, w))
+        np.testing.assert_allclose(rotation, np.mean(seen, axis=0), atol=2e-7)
+        np.testing.assert_allclose(translation, 1e3 * expected, atol=2e-5)
+
+
+def test_large_rotation_is_the_chordal_mean_of_the_shortest(robot, motion, rng):
+    """Eq. (12) with its projection to SO(3) by singular values."""
+    q = robot.random(rng, 1)[0]
+    palm = robot.palm(q)[:3, :3]
+    points, normals = robot.contacts(q)
+    goals = normals[1:] + rng.normal(scale=0.5, size=(2, 3))
+    goals /= np.linalg.norm(goals, axis=1)[:, None]
+    turns = []
+    for a, b in zip(normals[1:] @ palm, goals @ palm, strict=True):
+        axis = np.cross(a, b)
+        axis *= np.arctan2(np.linalg.norm(axis), a @ b) / np.linalg.norm(axis)
+        turns.append(pin.exp3(axis))
+    U, _, Vt = np.linalg.svd(sum(turns) / 2)
+    _, rotation = motion(q, points[1:], goals)
+    np.testing.assert_allclose(pin.exp3(rotation), U @ Vt, atol=1e-12)
+
+
+def test_three_fingers(robot, rng):
+    """More than two demands go through the polar projection."""
+    q = ca.SX.sym("q", 14)
+    points, normals = ca.SX.sym("p", 3, 3), ca.SX.sym("n", 3, 3)
+    goals = {f: Target(points[:, i], normals[:, i]) for i, f in enumerate(robot.fingers)}
+    f = ca.Function(
+        "f", [q, points, normals], [*palm_motion(actuated(robot.description, q), goals)]
+    )
+    row = robot.random(rng, 1)[0]
+    p, n = robot.contacts(row)
+    shift = rng.normal(scale=0.02, size=3)
+    translation, rotation = f(row, (p + robot.palm(row)[:3, :3] @ shift).T, n.T)
+    np.testing.assert_allclose(np.array(translation).ravel(), 1e3 * shift, atol=1e-9)
+    np.testing.assert_allclose(np.array(rotation).ravel(), 0, atol=1e-12)
+
+
+def test_defaults_are_the_papers():
+    options = QiuParameters()
+    assert options.reaching_damping == 1.0
+    assert options.chain_damping == 150.0
+    assert (options.virtual_weight, options.joint_weight) == (10.0, 1.0)
+    assert options.max_iterations == 10_000
+    assert options.finger_step == "ipopt"
+    assert options.borrowed == 1
+
+
+def test_every_field_is_explained():
+    text = QiuParameters.__doc__ or ""
+    for entry in dataclasses.fields(QiuParameters):
+        assert f"{entry.name}:" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"finger_step": "fmincon"}, "finger_step: found 'fmincon', expected one of ipopt, closed"),
+        ({"palm_error": 3}, "palm_error: found 3, expected one of euler"),
+        ({"platform": "hand"}, "platform: found 'hand', expected one of arm-leg, palm"),
+        ({"chain_damping": 0.0}, "chain_damping: found 0.0, expected a number > 0"),
+        ({"chain_damping": float("nan")}, "chain_damping: found nan"),
+        ({"reaching_damping": "much"}, "reaching_damping: found 'much', expected a number > 0"),
+        ({"virtual_weight": -1}, "virtual_weight: found -1"),
+        ({"max_iterations": 0}, "max_iterations: found 0, expected an integer > 0"),
+        ({"max_iterations": 10.5}, "max_iterations: found 10.5, expected an integer"),
+        ({"borrowed": -1}, "borrowed: found -1, expected an integer >= 0"),
+        ({"borrowed": True}, "borrowed: found True"),
+        ({"step_cap": 0.0}, "step_cap: found 0.0"),
+    ],
+)
+def test_impossible_values(options, says):
+    with pytest.raises(ik.errors.InputError) as caught:
+        QiuParameters(**options)
+    assert says in str(caught.value)
+
+
+def test_zero_where_it_means_something():
+    assert QiuParameters(borrowed=0).borrowed == 0
