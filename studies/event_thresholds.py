@@ -15,10 +15,9 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from bench_logs import Kept
 from runner import command, markdown_table, program, write_page
 from samplers import random_arm_targets, random_hands
 
@@ -57,6 +56,26 @@ arrives nevertheless.
 """
 
 
+class Kept:
+    """A recorder that keeps the blocks in memory."""
+
+    def __init__(self) -> None:
+        self.blocks: list[Any] = []
+
+    def record(self, block: Any) -> None:
+        """Keep it."""
+        self.blocks.append(block)
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to do."""
+
+
 class Trial(NamedTuple):
     """A rule to be tried.
 
@@ -84,7 +103,7 @@ class Caught:
     rate: float
 
 
-def trials(block: SolveBlock, factors: Sequence[float] = FACTORS) -> Iterator[Trial]:
+def trials(block: Any, factors: Sequence[float] = FACTORS) -> Iterator[Trial]:
     """Rules for every Jacobian of a method, for stalls and for oscillations."""
     known = measured_format(block.format).jacobians
     silent = dict.fromkeys(known, 0.0), dict.fromkeys(known, math.inf)
@@ -110,7 +129,7 @@ def trials(block: SolveBlock, factors: Sequence[float] = FACTORS) -> Iterator[Tr
         yield Trial(EventKind.OSCILLATION, "shortest step", value, factor == 1, rules)
 
 
-def caught(blocks: Sequence[SolveBlock], trial: Trial) -> Caught:
+def caught(blocks: Sequence[Any], trial: Trial) -> Caught:
     """What a rule catches, from a log written by it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.mcap"
@@ -138,7 +157,8 @@ def targets_of(robot: ik.ArmHand, count: int, seed: int) -> tuple[np.ndarray, np
 
 def section(solver: ik.Solver, count: int, seed: int, factors: Sequence[float]) -> str:
     """The table of one method on one robot, as Markdown."""
-    kept, targets = Kept(), targets_of(solver.robot, count, seed)
+    kept: Any = Kept()
+    targets = targets_of(solver.robot, count, seed)
     batch = solver.solve_batch(*targets, seed=seed, log=kept)
     rows = []
     for trial in trials(kept.blocks[0], factors):

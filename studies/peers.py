@@ -1,34 +1,477 @@
-"""The same targets, restarts and rule of success for other solvers: success and speed.
+"""Other solvers on our problem, each set up as its experts would, with our restarts and verdict.
 
     pip install -e ".[peers]"
-    python studies/peers.py --count 300
+    python studies/bench.py --part peers
 
-Each peer starts from `robot.home`, then from one evenly spread configuration after the other until
-the contacts are within tolerance and the motors within limits. What it reports is judged by our
-own verdict. The peers' times include their Python loop, as users run them.
+Every peer sees the robot through a URDF, contacts as points and normals, and joints that follow
+others. What is theirs is theirs: kinematics, tasks and quadratic program. All keep the limits in
+every step. Each starts from `robot.home`, then from one evenly spread configuration after the other
+until the contacts are within tolerance and the motors within limits. What it reports is judged by
+our own verdict. The peers' times include their Python loop, as users run them.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol
+from xml.etree import ElementTree
 
 import numpy as np
-from bench_report import Section
-from peer_qp import Mink, Pink, Placo
-from peer_steps import Peer, Scipy
-from samplers import random_arm_targets
+from numpy.typing import NDArray
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.verdict import judge
-from casadi_ik.symbolic.even_spread import evenly
+from casadi_ik.files.reading import roll_pitch_yaw
 
 Targets = tuple[Array, Array]
+
+LENGTH = 0.1
+"""Position errors are divided by this [m], so that they weigh like those of the normals."""
+
+FREE = 1.0
+"""How far beyond what its motor permits a follower may go [rad or m]: its motor's limits hold it,
+and its own, met in the same place, would leave a quadratic program without a solution."""
+
+LINEAR = 1e-9
+"""Largest error of a linear coupling [rad or m]."""
+
+
+class Joints:
+    """Our motors and the peers' joints: theta = C q.
+
+    What a coupling adds to a follower is in the URDF, whose follower is zero where its motor is:
+    peers that know ratios alone need no more.
+    """
+
+    def __init__(self, robot: ik.ArmHand) -> None:
+        """Read the couplings off the robot."""
+        n = len(robot.actuators)
+        zero = np.array(list(robot.joints(np.zeros(n)).values()))
+        self.names = list(robot.joints(robot.home))
+        moved = [list(robot.joints(row).values()) for row in np.eye(n)]
+        self.C = np.stack(moved, axis=1) - zero[:, None]
+        self.offsets = zero
+        """(k,) what the couplings add [rad or m]; not in theta."""
+        some = robot.random(np.random.default_rng(0), 8)
+        there = np.stack(list(robot.joints(some).values()), axis=-1)
+        if np.abs(there - zero - some @ self.C.T).max() > LINEAR:
+            raise SystemExit(f"peers: {robot.name} has a coupling that is not linear")
+        rows = [np.flatnonzero(column) for column in self.C.T]
+        self.leader = [int(row[0]) for row in rows]
+        """A joint that moves as its motor does, for every motor."""
+        if not np.array_equal(self.C[self.leader], np.eye(n)):
+            raise SystemExit(f"peers: a motor of {robot.name} has no joint that moves as it does")
+        self.pairs = [
+            (int(row[0]), int(other), float(self.C[other, motor]))
+            for motor, row in enumerate(rows)
+            for other in row[1:]
+        ]
+        """Leader, follower and how far this moves as the leader moves by one."""
+        ends = np.sort([self.C @ robot.lower, self.C @ robot.upper], axis=0)
+        slack = np.full(len(self.names), FREE)
+        slack[self.leader] = 0.0
+        self.lower, self.upper = ends[0] - slack, ends[1] + slack
+
+    def order(self, names: list[str]) -> NDArray[np.intp]:
+        """Where our joints are among a peer's."""
+        return np.array([names.index(name) for name in self.names])
+
+
+def peer_urdf(robot: ik.ArmHand, joints: Joints) -> str:
+    """The robot with the motors' limits and followers without offset, no joint a mimic."""
+    root = ElementTree.fromstring(robot.urdf())
+    places = {name: i for i, name in enumerate(joints.names)}
+    described = {joint.name: joint for joint in robot.description.movable}
+    for element in root.iter("joint"):
+        name = element.get("name", "")
+        if name not in places:
+            continue
+        i = places[name]
+        for mimic in element.findall("mimic"):
+            element.remove(mimic)
+        for limit in element.findall("limit"):
+            limit.set("lower", repr(float(joints.lower[i])))
+            limit.set("upper", repr(float(joints.upper[i])))
+        if joints.offsets[i]:
+            joint = described[name]
+            pose = joint.placement @ _moved(joint.type, joint.axis, float(joints.offsets[i]))
+            for origin in element.findall("origin"):
+                origin.set("xyz", _numbers(pose[:3, 3]))
+                origin.set("rpy", _numbers(np.asarray(roll_pitch_yaw(pose[:3, :3]))))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _moved(kind: str, axis: Array, by: float) -> Array:
+    """(4, 4) motion of a joint."""
+    pose = np.eye(4)
+    if kind == "prismatic":
+        pose[:3, 3] = by * axis
+    else:
+        K = np.cross(np.eye(3), axis)
+        pose[:3, :3] += np.sin(by) * K + (1 - np.cos(by)) * (K @ K)
+    return pose
+
+
+def _numbers(values: Array) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+class Peer(Protocol):
+    """One iteration of a solver; configurations are ours, (n,)."""
+
+    def aim(self, points: Array, normals: Array) -> None:
+        """Take a target: (f, 3) points [m] and normals."""
+        ...
+
+    def contacts(self, q: Array) -> tuple[Array, Array]:
+        """Go to a configuration; points and normals there, by the peer's own kinematics."""
+        ...
+
+    def step(self, q: Array) -> Array:
+        """The change of q that the peer makes from where it is."""
+        ...
+
+
+class PinContacts:
+    """Contacts and their Jacobian by pinocchio, in our motors."""
+
+    def __init__(self, robot: ik.ArmHand) -> None:
+        """Load the robot and look the contact frames up."""
+        self.pin: Any = import_module("pinocchio")
+        self.joints = Joints(robot)
+        self.model = model = self.pin.buildModelFromXML(peer_urdf(robot, self.joints))
+        self.frames = [model.getFrameId(f"{name}_contact") for name in robot.fingers]
+        place = self.joints.order([n for n in model.names if n != "universe"])
+        self.rows = np.array([model.joints[int(i) + 1].idx_q for i in place])
+        self.axes = normal_axes(robot, self.at(model.createData(), robot.home)[2])
+
+    def theta(self, q: Array) -> Array:
+        """Joints in pinocchio's order."""
+        theta = np.empty(self.model.nq)
+        theta[self.rows] = self.joints.C @ q
+        return theta
+
+    def at(self, data: Any, q: Array) -> tuple[Any, Array, Array]:
+        """Points and rotations of the contact frames; `data` then holds the Jacobians."""
+        self.pin.computeJointJacobians(self.model, data, self.theta(q))
+        self.pin.updateFramePlacements(self.model, data)
+        placed = [data.oMf[frame] for frame in self.frames]
+        return (
+            data,
+            np.array([m.translation for m in placed]),
+            np.array([m.rotation for m in placed]),
+        )
+
+    def rows_of(self, data: Any, normals: Array) -> Array:
+        """(6 f, joints) derivative of points / LENGTH and normals, in pinocchio's order."""
+        world = self.pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        parts = [self.pin.getFrameJacobian(self.model, data, i, world) for i in self.frames]
+        turned = [-cross(n) @ J[3:] for n, J in zip(normals, parts, strict=True)]
+        return np.concatenate([J[:3] / LENGTH for J in parts] + turned)
+
+
+class Scipy:
+    """`scipy.optimize.least_squares` (trf, analytic Jacobian): a whole descent is one step."""
+
+    def __init__(self, robot: ik.ArmHand, evaluations: int, tight: bool) -> None:
+        """Set it up.
+
+        Args:
+            robot: The robot.
+            evaluations: Budget of a descent.
+            tight: Whether to go on to the last digits.
+        """
+        self._least_squares: Any = import_module("scipy.optimize").least_squares
+        self._robot = robot
+        self._evaluations, self._tolerance = evaluations, 1e-15 if tight else 1e-6
+        self._pin = PinContacts(robot)
+        self._data = self._pin.model.createData()
+
+    def aim(self, points: Array, normals: Array) -> None:
+        """See `Peer`."""
+        self._target = points, normals
+
+    def contacts(self, q: Array) -> tuple[Array, Array]:
+        """See `Peer`."""
+        _, points, rotations = self._pin.at(self._data, q)
+        return points, np.einsum("fij,fj->fi", rotations, self._pin.axes)
+
+    def step(self, q: Array) -> Array:
+        """See `Peer`."""
+        margin = 1e-12  # the start has to be inside
+        found = self._least_squares(
+            self._residual,
+            np.clip(q, self._robot.lower + margin, self._robot.upper - margin),
+            self._jacobian,
+            bounds=(self._robot.lower, self._robot.upper),
+            max_nfev=self._evaluations,
+            ftol=self._tolerance,
+            xtol=self._tolerance,
+            gtol=self._tolerance,
+        )
+        return found.x - q
+
+    def _residual(self, q: Array) -> Array:
+        return residual(*self.contacts(q), *self._target)
+
+    def _jacobian(self, q: Array) -> Array:
+        _, normals = self.contacts(q)
+        return self._pin.rows_of(self._data, normals)[:, self._pin.rows] @ self._pin.joints.C
+
+
+def normal_axes(robot: ik.ArmHand, rotations: Array) -> Array:
+    """(f, 3) the normals in the contact frames, from the rotations of these at home."""
+    _, normals = robot.contacts(robot.home)
+    return np.einsum("fji,fj->fi", rotations, normals)
+
+
+def residual(points: Array, normals: Array, wanted: Array, facing: Array) -> Array:
+    """(6 f,) errors of the points / LENGTH, then of the normals."""
+    return np.concatenate([((points - wanted) / LENGTH).ravel(), (normals - facing).ravel()])
+
+
+def cross(v: Array) -> Array:
+    """(3, 3) the matrix of the cross product with v."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+LEAST = 1e-9
+"""Smallest weight of placo's regularization: its program has to be strictly convex."""
+
+
+class Pink:
+    """Pink: all contacts as one task of our own, DAQP with the limits as bounds."""
+
+    def __init__(self, robot: ik.ArmHand, damping: float) -> None:
+        """Set it up; `damping` is the task's Levenberg-Marquardt damping."""
+        self._pink: Any = import_module("pink")
+        self._qp: Any = import_module("qpsolvers")
+        tasks: Any = import_module("pink.tasks")
+        self._pin = contacts = PinContacts(robot)
+        model = contacts.model
+        names = contacts.joints.names
+        start = contacts.theta(robot.home)
+        self._configuration = self._pink.Configuration(model, model.createData(), start)
+        self._lower, self._upper = model.lowerPositionLimit, model.upperPositionLimit
+        peer = self
+
+        class Contacts(tasks.Task):
+            def compute_error(self, configuration: Any) -> Array:
+                del configuration
+                return residual(*peer._now, *peer._target)
+
+            def compute_jacobian(self, configuration: Any) -> Array:
+                return contacts.rows_of(configuration.data, peer._now[1])
+
+            def __repr__(self) -> str:
+                return "Contacts()"
+
+        self._tasks = [Contacts(lm_damping=damping)]
+        self._coupled = [
+            tasks.JointCouplingTask([names[a], names[b]], [r, -1.0], 1.0, self._configuration)
+            for a, b, r in contacts.joints.pairs
+        ]
+
+    def aim(self, points: Array, normals: Array) -> None:
+        """See `Peer`."""
+        self._target = points, normals
+
+    def contacts(self, q: Array) -> tuple[Array, Array]:
+        """See `Peer`."""
+        self._configuration.update(self._pin.theta(q))
+        placed = [self._configuration.data.oMf[frame] for frame in self._pin.frames]
+        self._now = (
+            np.array([m.translation for m in placed]),
+            np.array([m.rotation @ a for m, a in zip(placed, self._pin.axes, strict=True)]),
+        )
+        return self._now
+
+    def step(self, q: Array) -> Array:
+        """See `Peer`."""
+        del q
+        problem = self._pink.build_ik(
+            self._configuration, self._tasks, 1.0, 1e-8, limits=[], constraints=self._coupled
+        )
+        theta = self._configuration.q
+        problem.lb, problem.ub = self._lower - theta, self._upper - theta
+        change = self._qp.solve_problem(problem, solver="daqp").x
+        return np.zeros(len(self._pin.joints.leader)) if change is None else self._ours(change)
+
+    def _ours(self, change: Array) -> Array:
+        return change[self._pin.rows][self._pin.joints.leader]
+
+
+class Mink:
+    """mink: all contacts as one stacked task, DAQP with the limits as bounds."""
+
+    def __init__(self, robot: ik.ArmHand, damping: float) -> None:
+        """Set it up; `damping` is the task's Levenberg-Marquardt damping."""
+        mink: Any = import_module("mink")
+        mujoco: Any = import_module("mujoco")
+        self._mink, self._mujoco = mink, mujoco
+        self._qp: Any = import_module("qpsolvers")
+        joints = self._joints = Joints(robot)
+        self._model = model = self._spec(robot).compile()
+        order = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, n) for n in joints.names]
+        self._rows = np.array([model.jnt_qposadr[i] for i in order])
+        self._bodies = [
+            mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{name}_contact")
+            for name in robot.fingers
+        ]
+        self._configuration = mink.Configuration(model)
+        self._limits = model.jnt_range[:, 0], model.jnt_range[:, 1]
+        self._axes = np.zeros((len(self._bodies), 3))
+        self.contacts(robot.home)
+        rotations = self._configuration.data.xmat[self._bodies].reshape(-1, 3, 3)
+        self._axes = normal_axes(robot, rotations)
+        peer = self
+
+        class Contacts(mink.Task):
+            def compute_error(self, configuration: Any) -> Array:
+                del configuration
+                return residual(*peer._now, *peer._target)
+
+            def compute_jacobian(self, configuration: Any) -> Array:
+                return peer._derivative(configuration.data)
+
+        rows = 6 * len(self._bodies)
+        self._tasks = [Contacts(cost=np.ones(rows), lm_damping=damping)]
+        self._coupled = [mink.EqualityConstraintTask(model, 1.0)] if joints.pairs else []
+
+    def limits(self) -> list[Any]:
+        """What the program keeps beside the bounds of motors."""
+        return []
+
+    def _spec(self, robot: ik.ArmHand) -> Any:
+        """The robot, before it is compiled."""
+        compiler = (
+            '<mujoco><compiler fusestatic="false" boundmass="0.01" boundinertia="0.001"/></mujoco>'
+        )
+        urdf = peer_urdf(robot, self._joints).replace("<link", f"{compiler}<link", 1)
+        spec = self._mujoco.MjSpec.from_string(urdf)
+        for a, b, ratio in self._joints.pairs:
+            shared = spec.add_equality(
+                type=self._mujoco.mjtEq.mjEQ_JOINT,
+                name1=self._joints.names[b],
+                name2=self._joints.names[a],
+            )
+            shared.data[:2] = 0.0, ratio  # the polynomial b = 0 + ratio a
+        return spec
+
+    def aim(self, points: Array, normals: Array) -> None:
+        """See `Peer`."""
+        self._target = points, normals
+
+    def contacts(self, q: Array) -> tuple[Array, Array]:
+        """See `Peer`."""
+        theta = np.empty(self._model.nq)
+        theta[self._rows] = self._joints.C @ q
+        self._configuration.update(theta)
+        data = self._configuration.data
+        rotations = data.xmat[self._bodies].reshape(-1, 3, 3)
+        self._now = data.xpos[self._bodies], np.einsum("fij,fj->fi", rotations, self._axes)
+        return self._now
+
+    def step(self, q: Array) -> Array:
+        """See `Peer`."""
+        del q
+        problem = self._mink.build_ik(
+            self._configuration,
+            self._tasks,
+            1.0,
+            1e-8,
+            limits=self.limits(),
+            constraints=self._coupled,
+        )
+        theta = self._configuration.q
+        problem.lb, problem.ub = self._limits[0] - theta, self._limits[1] - theta
+        change = self._qp.solve_problem(problem, solver="daqp").x
+        if change is None:
+            return np.zeros(len(self._joints.leader))
+        return change[self._rows][self._joints.leader]
+
+    def _derivative(self, data: Any) -> Array:
+        parts = []
+        for body in self._bodies:
+            J = np.zeros((6, self._model.nv))
+            self._mujoco.mj_jacBody(self._model, data, J[:3], J[3:], body)
+            parts.append(J)
+        turned = [-cross(n) @ J[3:] for n, J in zip(self._now[1], parts, strict=True)]
+        return np.concatenate([J[:3] / LENGTH for J in parts] + turned)
+
+
+class Placo:
+    """placo: a position and an axis-align task per contact, limits and coupling hard."""
+
+    def __init__(self, robot: ik.ArmHand, damping: float) -> None:
+        """Set it up; `damping` times the squared error is the weight of the regularization task."""
+        placo: Any = import_module("placo")
+        self._joints = Joints(robot)
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "robot.urdf"
+            file.write_text(peer_urdf(robot, self._joints), encoding="utf-8")
+            self._robot = placo.RobotWrapper(str(file), placo.Flags.ignore_collisions)
+        self._solver = placo.KinematicsSolver(self._robot)
+        self._solver.mask_fbase(True)
+        self._solver.enable_joint_limits(True)
+        self._damping, self._regular = damping, self._solver.add_regularization_task(damping)
+        names = self._joints.names
+        for a, b, ratio in self._joints.pairs:
+            gear = self._solver.add_gear_task()
+            gear.set_gear(names[b], names[a], ratio)
+            gear.configure("gear", "hard", 1.0)
+        self._offsets = np.array([self._robot.get_joint_offset(name) for name in names])
+        self._moves = np.array([self._robot.get_joint_v_offset(name) for name in names])
+        self._frames = [f"{name}_contact" for name in robot.fingers]
+        rotations = self._placed(robot.home)[:, :3, :3]
+        self._axes = normal_axes(robot, rotations)
+        zero = np.zeros(3)
+        self._points = [self._solver.add_position_task(frame, zero) for frame in self._frames]
+        self._normals = [
+            self._solver.add_axisalign_task(frame, axis, np.array([0.0, 0.0, 1.0]))
+            for frame, axis in zip(self._frames, self._axes, strict=True)
+        ]
+        for i, (point, normal) in enumerate(zip(self._points, self._normals, strict=True)):
+            point.configure(f"point {i}", "soft", 1 / LENGTH**2)
+            normal.configure(f"normal {i}", "soft", 1.0)
+
+    def _placed(self, q: Array) -> Array:
+        state = self._robot.state.q
+        state[self._offsets] = self._joints.C @ q
+        self._robot.state.q = state
+        self._robot.update_kinematics()
+        return np.array([self._robot.get_T_world_frame(frame) for frame in self._frames])
+
+    def aim(self, points: Array, normals: Array) -> None:
+        """See `Peer`."""
+        self._target = points, normals
+        for i, (point, normal) in enumerate(zip(self._points, self._normals, strict=True)):
+            point.target_world = points[i]
+            normal.targetAxis_world = normals[i]
+
+    def contacts(self, q: Array) -> tuple[Array, Array]:
+        """See `Peer`."""
+        placed = self._placed(q)
+        self._now = placed[:, :3, 3], np.einsum("fij,fj->fi", placed[:, :3, :3], self._axes)
+        return self._now
+
+    def step(self, q: Array) -> Array:
+        """See `Peer`."""
+        error = residual(*self._now, *self._target)
+        weight = max(self._damping * float(error @ error), LEAST)
+        self._regular.configure("regularization", "soft", weight)
+        try:
+            change = self._solver.solve(False)
+        except RuntimeError:  # its quadratic program has no solution
+            return np.zeros_like(q)
+        return change[self._moves][self._joints.leader]
+
 
 STARTS = 400
 """Restarts before a target is given up, unless said otherwise."""
@@ -83,7 +526,24 @@ class Run:
 
 def installed() -> list[str]:
     """Peers that can be imported."""
-    return [name for name, s in SETTINGS.items() if importlib.util.find_spec(s.package)]
+    return [name for name, s in SETTINGS.items() if importlib.util.find_spec(s.package)] + ["ipopt"]
+
+
+def starts_of(robot: ik.ArmHand, count: int) -> Array:
+    """Home, then evenly spread configurations."""
+    qmc: Any = import_module("scipy.stats.qmc")
+    spread = qmc.Halton(len(robot.actuators), scramble=False).random(count)
+    return np.vstack([robot.home, robot.lower + spread * (robot.upper - robot.lower)])
+
+
+def judged(
+    robot: ik.ArmHand, q: Array, targets: Targets, tolerance: ik.Tolerance
+) -> NDArray[np.bool_]:
+    """(k,) whether answers (k, n) meet their contacts within limits."""
+    position, angle, beyond = robot.deviations(q, *targets)
+    slack = 1 + 1e-9
+    met = (position <= tolerance.position * slack) & (angle <= tolerance.angle * slack)
+    return met.all(axis=1) & (beyond <= 1e-9)
 
 
 def run_peer(
@@ -91,13 +551,14 @@ def run_peer(
     robot: ik.ArmHand,
     targets: Targets,
     tolerance: ik.Tolerance,
-    restarts: int,
+    restarts: int = STARTS,
 ) -> Run:
     """Solve targets with restarts, then judge."""
+    if name == "ipopt":
+        return _by_ipopt(robot, targets, tolerance)
     setting = SETTINGS[name]
     peer = setting.make(robot, tolerance.position < 1e-4)
-    spread = evenly(restarts, len(robot.actuators))
-    starts = np.vstack([robot.home, robot.lower + spread * (robot.upper - robot.lower)])
+    starts = starts_of(robot, restarts)
     count = len(targets[0])
     q, used, times = np.empty((count, len(robot.home))), np.empty(count), np.empty(count)
     for row, (points, normals) in enumerate(zip(*targets, strict=True)):
@@ -105,8 +566,7 @@ def run_peer(
         peer.aim(points, normals)
         q[row], used[row] = _restarted(peer, robot, setting, points, normals, starts, tolerance)
         times[row] = time.thread_time() - begin
-    verdict = judge(robot, Problems(*targets, tolerance, True), q)
-    solved = verdict.ok.all(axis=1) & verdict.limits_ok
+    solved = judged(robot, q, targets, tolerance)
     return Run(float(solved.mean()), float((solved & (used == 0)).mean()), times)
 
 
@@ -140,89 +600,14 @@ def _restarted(
     return q, len(starts)
 
 
-def run_ours(method: str, robot: ik.ArmHand, targets: Targets, tolerance: ik.Tolerance) -> Run:
-    """One of our methods on the same targets, one call of `Solver.solve` each."""
-    solver = ik.Solver(robot, method, tolerance)
-    count = len(targets[0])
-    solved, first, times = np.zeros(count), np.zeros(count), np.zeros(count)
-    solver.solve(_grasp(robot, targets, 0))
-    for row in range(count):
-        grasp = _grasp(robot, targets, row)
+def _by_ipopt(robot: ik.ArmHand, targets: Targets, tolerance: ik.Tolerance) -> Run:
+    """The whole system as one nonlinear program, a call a target."""
+    solver, batch = ik.Solver(robot, "ipopt", tolerance), list[ik.BatchSolution]()
+    times = []
+    for points, normals in zip(*targets, strict=True):
         begin = time.thread_time()
-        solution = solver.solve(grasp, diagnose=False)
-        times[row] = time.thread_time() - begin
-        solved[row], first[row] = solution.success, solution.success and solution.restarts == 0
-    return Run(float(solved.mean()), float(first.mean()), times)
-
-
-def run_batch(robot: ik.ArmHand, targets: Targets, tolerance: ik.Tolerance) -> Run:
-    """Hand-first on all targets in one call; every target is given the mean time."""
-    solver = ik.Solver(robot, tolerance=tolerance)
-    solver.solve_batch(*targets)
-    begin = time.thread_time()
-    batch = solver.solve_batch(*targets)
-    times = np.full(len(batch), (time.thread_time() - begin) / len(batch))
-    first = batch.success & (batch.restarts == 0)
-    return Run(float(batch.success.mean()), float(first.mean()), times)
-
-
-def _grasp(robot: ik.ArmHand, targets: Targets, row: int) -> ik.Grasp:
-    pairs = zip(robot.fingers, targets[0][row], targets[1][row], strict=True)
-    return ik.Grasp({name: ik.Contact(point, normal) for name, point, normal in pairs})
-
-
-def measured(count: int, seed: int, names: Sequence[str], restarts: int = STARTS) -> Section:
-    """The table of all kinds of targets and tolerances."""
-    robot = ik.load_robot("kuka_lwr_barrett")
-    rows = []
-    for kind, tolerance, targets in kinds(robot, count, seed):
-        ours = run_batch(robot, targets, tolerance)
-        runs = {"hand-first, in a batch": ours}
-        for method in ("hand-first", "ipopt"):
-            runs[method] = run_ours(method, robot, targets, tolerance)
-        runs |= {name: run_peer(name, robot, targets, tolerance, restarts) for name in names}
-        for name, run in runs.items():
-            cells = (
-                f"{100 * run.solved:.1f}",
-                f"{100 * run.first:.0f}",
-                f"{1e3 * run.times.mean():.3f}",
-                f"{1e3 * np.quantile(run.times, 0.99):.2f}",
-                f"{run.times.mean() / ours.times.mean():.1f}",
-            )
-            rows.append((kind, name, *cells))
-    missing = [name for name in SETTINGS if name not in names]
-    note = (
-        f"{count} targets of each kind, one start from home, then evenly spread restarts "
-        "until solved; CPU time of the one thread, Python loops included, as users run them; "
-        "solved by our own verdict."
-        + (f" Not measured (extra `peers`): {', '.join(missing)}." if missing else "")
-    )
-    columns = "targets", "solver", "solved %", "first start %", "mean ms", "99 % ms", "ratio"
-    return Section("Other solvers", columns, rows, note)
-
-
-def kinds(robot: ik.ArmHand, count: int, seed: int) -> list[tuple[str, ik.Tolerance, Targets]]:
-    """Grasps and random hands, at the usual and at a tight tolerance."""
-    rng = np.random.default_rng(seed)
-    grasps = ik.shipped_grasps(robot.name)
-    sets = {
-        "grasps": random_arm_targets(robot, grasps, max(count // len(grasps), 1), rng),
-        "random hands": robot.contacts(robot.random(rng, count)),
-    }
-    tolerances = {"5 mm / 3 deg": ik.Tolerance(), "1e-6 m / 1e-6 rad": ik.Tolerance(1e-6, 1e-6)}
-    return [(f"{s}, {t}", tolerances[t], sets[s]) for t in tolerances for s in sets]
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Run all that are installed and print a table."""
-    parser = argparse.ArgumentParser(description="Other solvers on the same targets.")
-    parser.add_argument("--count", type=int, default=120, help="targets of each kind")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--restarts", type=int, default=STARTS, help="of a peer for a target")
-    parser.add_argument("--peers", nargs="+", default=installed(), choices=SETTINGS)
-    options = parser.parse_args(arguments)
-    measured(options.count, options.seed, options.peers, options.restarts).show()
-
-
-if __name__ == "__main__":
-    main()
+        batch.append(solver.solve_batch(points[None], normals[None]))
+        times.append(time.thread_time() - begin)
+    solved = np.array([one.success[0] for one in batch])
+    first = np.array([one.restarts[0] == 0 for one in batch])
+    return Run(float(solved.mean()), float((solved & first).mean()), np.array(times))

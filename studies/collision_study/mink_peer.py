@@ -1,7 +1,7 @@
 """mink with limits on collisions, on the targets and in the scenes of the choice.
 
 Its model has our shapes: every pair that we check is one of a collision limit, with what it may
-overlap. Set up as in the comparison of solvers (`peer_qp`), one start from home and then evenly
+overlap. Set up as in the comparison of solvers (`peers`), one start from home and then evenly
 spread ones, until an answer meets the contacts and is free by our check.
 """
 
@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from peer_qp import Mink
+from peers import Mink
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench_view import NO_PAINTING
 from browser import Browser, Page
-from drag_latency.probes import NO_PAINTING
 
 import casadi_ik as ik
 from casadi_ik.exporting import wasm

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import bench
 import bench_parts
+import numpy as np
+import peers
 import pytest
 
 import casadi_ik as ik
@@ -42,3 +44,30 @@ def test_two_checkouts_by_turns(tmp_path):
     assert len(rows) == 4
     assert all(float(cell) > 0 for row in rows for cell in row.split(" | "))
     assert "--against" in text
+
+
+@pytest.mark.parametrize("name", ["xarm7+ability", "kinova_gen3+inspire_rh56", "ur5e+shadow"])
+def test_peers_see_the_robot_that_we_solve(name):
+    """Couplings with offsets and several followers of a motor are in their URDF."""
+    robot = ik.load_robot(name)
+    contacts = peers.PinContacts(robot)
+    q = robot.random(np.random.default_rng(0), 5)
+    for one, points, normals in zip(q, *robot.contacts(q), strict=True):
+        _, found, rotations = contacts.at(contacts.model.createData(), one)
+        np.testing.assert_allclose(found, points, atol=1e-12)
+        turned = np.einsum("fij,fj->fi", rotations, contacts.axes)
+        np.testing.assert_allclose(turned, normals, atol=1e-12)
+        theta = contacts.theta(one)
+        assert (theta >= contacts.model.lowerPositionLimit).all()
+        assert (theta <= contacts.model.upperPositionLimit).all()
+
+
+@pytest.mark.parametrize("name", ["scipy", "ipopt"])
+def test_a_peer_is_restarted_and_judged(robot, name):
+    targets = robot.contacts(robot.random(np.random.default_rng(0), 4))
+    run = peers.run_peer(name, robot, targets, ik.Tolerance(), restarts=40)
+    assert run.times.shape == (4,)
+    assert run.solved == 1 if name == "scipy" else run.solved > 0
+    assert not peers.judged(
+        robot, robot.random(np.random.default_rng(1), 4), targets, ik.Tolerance()
+    ).any()

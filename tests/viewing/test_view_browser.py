@@ -10,8 +10,8 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from bench_view import NO_PAINTING
 from browser import CHROMIUM, Browser, Page
-from drag_latency.probes import NO_PAINTING
 
 import casadi_ik as ik
 from casadi_ik.viewing import Viewer, files, view_log, view_pads

@@ -4,7 +4,7 @@ What `casadi-ik view` shows of a grasp, of a contact out of reach, of ranked cho
 of the pads of an imported hand (`--hand`: its URDF), and the page without a server (`--page`: built
 by `make page`)::
 
-    python studies/viewer_pictures.py --hand leap_hand_right.urdf --page out/page/index.html
+    python tools/viewer_pictures.py --hand leap_hand_right.urdf --page out/page/index.html
 
 Without a graphics card a picture takes seconds.
 """
@@ -12,7 +12,9 @@ Without a graphics card a picture takes seconds.
 from __future__ import annotations
 
 import argparse
+import importlib
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -20,8 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from drag_latency.hand import browser_tools
-from drag_latency.probes import COMMON
 
 from casadi_ik.cli.main import main as command
 from casadi_ik.cli.table import parse
@@ -44,6 +44,10 @@ FRAMES = 3
 CLOSE = "document.querySelector('.mantine-Notification-closeButton')"
 """Of the note that there is no graphics card, which lies over the picture."""
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "studies"))
+BENCH: Any = importlib.import_module("bench_view")
+"""Its browser, and what tells a page that something is painted."""
+
 Use = Callable[[Any, Any], None]
 """What is done on a page, with the viewer and the browser's page."""
 
@@ -52,7 +56,7 @@ def taken(browser: Any, words: list[str], path: Path, use: Use) -> None:
     """Open what `casadi-ik view` opens, use it, save what is seen."""
     viewer = opened(parse(["view", *words])[1])
     page = browser.open("about:blank", *WINDOW)
-    page.call("Page.addScriptToEvaluateOnNewDocument", source=COMMON)
+    page.call("Page.addScriptToEvaluateOnNewDocument", source=BENCH.COMMON)
     page.go(viewer.url)
     page.wait("document.querySelector('.ik-status, .ik-iteration, .ik-pad') !== null")
     time.sleep(2.0)
@@ -148,7 +152,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--only", nargs="*", default=(), help="names of pictures, without .png")
     options = parser.parse_args(arguments)
     wanted = set(options.only)
-    with browser_tools().Browser() as browser, tempfile.TemporaryDirectory() as name:
+    with BENCH.browser_tools().Browser() as browser, tempfile.TemporaryDirectory() as name:
         folder, cup = Path(name), ["cup", "--scene", "table"]
         pictures: dict[str, tuple[Callable[[], list[str]], Use]] = {
             "view": (lambda: cup, dragged("thumb", 0.004, 0.006, 0.004)),

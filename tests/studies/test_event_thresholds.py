@@ -1,15 +1,14 @@
-"""The studies of the log: what its events catch, what it consists of."""
+"""The study of the log's events: what they catch."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-import bench_log_parts
 import event_thresholds
 import numpy as np
 import pytest
-from bench_logs import Kept
+from event_thresholds import Kept
 
 import casadi_ik as ik
 from casadi_ik.logs import EventKind
@@ -56,15 +55,3 @@ def test_the_report_marks_the_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert text.count("| STALL") == 2 * sections
     assert text.count("**0.0001**") == 2 * sections
     assert "## hand-first on baxter_ar10" in text
-
-
-def test_the_parts_of_a_log_are_the_whole() -> None:
-    report = bench_log_parts.report(count=240, repeats=1)
-    of = [row for row in report.rows if row[0] == "hand-first"]
-    seconds = {row[1]: float(row[2]) for row in of}
-    assert set(bench_log_parts.STAGES) < set(seconds)
-    assert all(seconds[stage] > 0 for stage in bench_log_parts.STAGES)
-    whole = seconds.pop("solving and logging")
-    (sampled,) = (name for name in seconds if "keep" in name)
-    seconds.pop(sampled)
-    assert sum(seconds.values()) == pytest.approx(whole, abs=0.1)

@@ -1,22 +1,26 @@
-"""An exported solver in single precision beside the one in double: how often, how fast, how large.
+"""How often does an exported solver in single precision differ from the one in double?
 
-Both are built with the machine's compiler and solve the same random targets within reach, one by
-one; every answer is judged by Python's kinematics, in double precision. Run by
-`exported.py --single`.
+Both are exported and built with the machine's compiler, and solve the same random targets within
+reach, one by one; every answer is judged by Python's kinematics, in double precision. What they
+take is measured by `bench.py --part export`::
+
+    python studies/single_precision.py --report out/single_precision
 """
 
 from __future__ import annotations
 
+import argparse
 import ctypes
-import json
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
-from exported import built, by_turns, run, sizes, tail_of
-from runner import markdown_table
+from runner import command, markdown_table, program, provenance, write_page
 
 import casadi_ik as ik
-from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
+from casadi_ik.batches.code import code_version
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right")
 TOLERANCES = ((5e-3, 3.0), (1e-3, 0.5), (1e-4, 0.05))
@@ -24,6 +28,9 @@ TOLERANCES = ((5e-3, 3.0), (1e-3, 0.5), (1e-4, 0.05))
 
 AWAY = 0.3
 """How far from the configuration that was drawn the robot is, each motor [rad, 1 sigma]."""
+
+SLACK = 1e-9
+"""Part of a tolerance, and distance beyond a limit [rad or m], that is rounding."""
 
 MANY = """
 #include "arm.h"
@@ -41,7 +48,7 @@ void many(int count, REAL position, REAL angle, const REAL *points, const REAL *
 }
 """
 
-HOW_OFTEN = """
+INTRODUCTION = """
 Random arms and hands within limits, {count:,} targets a row; from home a solution far from limits
 is wanted, from near (every motor some {away} rad off) one near that. Lost: solved in double
 precision only; gained: in single only. False: called solved by single precision, but not so for
@@ -59,7 +66,7 @@ class Library:
         texts = [str(path.relative_to(project)) for path in sorted(project.glob("src/*.c"))]
         flags = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno")
         command = ("cc", *flags, "-Iinclude", "-Isrc", "many.c", *texts, "-lm", "-o", "many.so")
-        run(*command, folder=project)
+        subprocess.run(command, cwd=project, check=True)
         self._real = real
         self._many = ctypes.CDLL(str(project / "many.so")).many
         number = ctypes.c_float if real is np.float32 else ctypes.c_double
@@ -101,9 +108,9 @@ def how_often(name: str, libraries: tuple[Library, Library], count: int) -> list
                 library(points, normals, q0, drawn.shape[1], tolerance) for library in libraries
             )
             position, angle, beyond = robot.deviations(single[0], points, normals)
-            slack = 1 + TOLERANCE_SLACK
+            slack = 1 + SLACK
             met = (position <= tolerance[0] * slack) & (angle <= tolerance[1] * slack)
-            right = met.all(axis=1) & (beyond <= LIMIT_SLACK)
+            right = met.all(axis=1) & (beyond <= SLACK)
             numbers = (
                 double[1].sum(),
                 single[1].sum(),
@@ -117,50 +124,32 @@ def how_often(name: str, libraries: tuple[Library, Library], count: int) -> list
     return rows
 
 
-def compared(folder: Path, count: int, seconds: float, turns: int) -> list[str]:
-    """Parts of the page.
+def built(name: str, folder: Path, *flags: str) -> Path:
+    """An exported project."""
+    words = [name, "--out", str(folder), "--prefix", "arm", *flags]
+    subprocess.run([sys.executable, "-m", "casadi_ik", "export", *words], check=True)
+    return folder
 
-    Args:
-        folder: Where projects are built.
-        count: Targets of a row.
-        seconds: Of a benchmark of 1e6 targets, at most.
-        turns: Of the comparison of CPU time.
-    """
-    rows, times, tails, bytes_of = [], [], [], {}
-    for name in ROBOTS:
-        robot = ik.load_robot(name)
-        places = {
-            what: built(robot, folder / name / what, single=what == "single")
-            for what in ("double", "single")
-        }
-        libraries = Library(places["double"], np.float64), Library(places["single"], np.float32)
-        rows += how_often(name, libraries, count)
 
-        def benched(place: Path) -> float:
-            return json.loads(run("build/bench", "2", "20000", folder=place))["cpu_mean"]
+def main(arguments: list[str] | None = None) -> None:
+    """Compare and write the report."""
+    parser = argparse.ArgumentParser(description="An exported solver in single precision.")
+    parser.add_argument("--robots", nargs="+", default=ROBOTS)
+    parser.add_argument("--count", type=int, default=10_000, help="targets of a row")
+    parser.add_argument("--report", type=Path, default=Path("out/single_precision"), help="folder")
+    options = parser.parse_args(arguments)
+    rows = list[list[str]]()
+    for name in options.robots:
+        with tempfile.TemporaryDirectory() as place:
+            double = Library(built(name, Path(place) / "double"), np.float64)
+            single = Library(built(name, Path(place) / "single", "--single"), np.float32)
+            rows += how_often(name, (double, single), options.count)
+    heads = ["robot", "tolerance", "start", "double", "single", "lost", "gained", "false"]
+    text = INTRODUCTION.format(count=options.count, away=AWAY)
+    parts = [text, markdown_table(heads, rows), f"`{command(__file__, arguments)}`"]
+    code = provenance({"single_precision": code_version()})
+    write_page("A solver in single precision", [*parts, code], options.report)
 
-        cpu = by_turns(
-            {what: lambda place=place: benched(place) for what, place in places.items()}, turns
-        )
-        ratio = cpu["single"] / cpu["double"]
-        times.append([name, f"{cpu['double']:.1f}", f"{cpu['single']:.1f}", f"{ratio:.2f}"])
-        for what, place in places.items():
-            said = json.loads(run("build/bench", f"{seconds}", folder=place))
-            tails.append(tail_of(f"{name}, {what}", said))
-            bytes_of[f"{name}, {what}"] = sizes(place, "float" if what == "single" else "double")
-    kinds = list(next(iter(bytes_of.values())))
-    return [
-        "## How often\n" + HOW_OFTEN.format(count=count, away=AWAY),
-        markdown_table(
-            ["robot", "tolerances", "start", "double", "single", "lost", "gained", "false"], rows
-        ),
-        f"## CPU time of a solve [us], the smallest mean of {turns} turns",
-        markdown_table(["robot", "double", "single", "ratio"], times),
-        "## The tail, by the clock on the wall [us]",
-        markdown_table(["", "targets", "mean", "median", "99.9th percentile", "largest"], tails),
-        "## Bytes",
-        markdown_table(
-            ["", *kinds],
-            [[name, *(f"{found[kind]:,}" for kind in kinds)] for name, found in bytes_of.items()],
-        ),
-    ]
+
+if __name__ == "__main__":
+    program(main)

@@ -1,0 +1,326 @@
+"""From the mouse to the drawn answer: a contact of the shipped cup dragged by mouse in Chromium.
+
+On the page of `casadi-ik view` or on the page without a server, one step after the other, each
+begun when the one before is drawn: after a second's rest, when motors and most solutions are told
+as well, or as a hand drags. Without a graphics card Chromium paints in software, on the same
+processors as everything else, which takes most of the time: therefore also with the calls that
+paint left out.
+
+Scripts put into a page before its own write a row of times for every answer to a pointer's event
+into `window.rows` [ms, the page's clock]. A page that a server solves for: `event` (the browser has
+it), `sent` (handed to the socket), `came` (the answer is there), `told` (the verdict is on the
+page), `drawn` (the frame that shows it is painted by the graphics library: a pixel is read back,
+which waits for all of it). One that solves by itself: `event`, `asked` (the solve begins),
+`solved`, `placed` (what is drawn stands where it belongs), `submitted` (drawing calls are made),
+`drawn`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+import casadi_ik as ik
+
+PATIENCE = 20.0
+"""A step that is not drawn after so long is counted as lost [s]."""
+
+WARM = 2
+"""Steps before the first that counts: they take hold, and compile what the others use."""
+
+STEPS, PAINTED = 40, 5
+"""Steps of a drag, and where all is painted, which may take seconds a step."""
+
+REST, FLOW = 1.0, 0.03
+"""Between what is drawn and the next step [s]."""
+
+HELD = {"button": "left", "buttons": 1}
+
+BOX = (
+    "(({x, y, width, height}) => [x, y, width, height])"
+    "(document.querySelector('canvas').getBoundingClientRect())"
+)
+
+HANDLE = 0.06
+"""Length of the axes by which a contact is held [m]."""
+
+COMMON = """
+window.rows = []; window.row = null;
+addEventListener('pointermove', e => { window.row = {event: e.timeStamp}; }, true);
+window.painted = canvas => {
+  const gl = canvas.getContext('webgl2');
+  gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+  return performance.now();
+};
+"""
+
+SERVED = (
+    COMMON
+    + """
+const verdict = m => m.type === 'GuiUpdateMessage' && /ik-status/.test(m.updates?.content ?? '');
+const done = row => { if (row.told && row.painted) {
+  row.drawn = Math.max(row.told, row.painted); window.rows.push(row); } };
+window.messages = 0;
+window.Worker = class extends Worker {
+  constructor(...given) {
+    super(...given);
+    this.addEventListener('message', e => {
+      if (e.data?.type !== 'message_batch') return;
+      window.messages += e.data.messages.length;
+      const row = window.row;
+      if (!row?.sent || row.came || !e.data.messages.some(verdict)) return;
+      row.came = performance.now();
+      requestAnimationFrame(() => setTimeout(() => {
+        row.painted = window.painted(document.querySelector('canvas'));
+        done(row);
+      }));
+    });
+  }
+  postMessage(data, ...more) {
+    const row = window.row;
+    if (row && !row.sent && data?.message?.type === 'TransformControlsUpdateMessage')
+      row.sent = performance.now();
+    super.postMessage(data, ...more);
+  }
+};
+const told = n => n.querySelector && n.querySelector('.ik-status') !== null;
+new MutationObserver(records => {
+  const row = window.row;
+  if (!row?.came || row.told) return;
+  if (!records.some(r => told(r.target) || [...r.addedNodes].some(told))) return;
+  row.told = performance.now();
+  done(row);
+}).observe(document, {subtree: true, childList: true, characterData: true});
+"""
+)
+"""For the page of `casadi-ik view`."""
+
+ALONE = (
+    COMMON
+    + """
+(() => {
+  const { stage, now } = casadiIk, render = stage.renderer.render, { solving } = now;
+  const tried = solving.tried;
+  solving.tried = function (...given) {
+    const asked = performance.now(), answer = tried.apply(this, given);
+    if (window.row) Object.assign(window.row, {asked, solved: performance.now()});
+    return answer;
+  };
+  stage.renderer.render = function (...given) {
+    const row = window.row;
+    window.row = null;
+    if (row) row.placed = performance.now();
+    render.apply(this, given);
+    if (!row?.solved) return;
+    row.submitted = performance.now();
+    row.drawn = window.painted(this.domElement);
+    window.rows.push(row);
+  };
+})()
+"""
+)
+"""For the page without a server, once it is there."""
+
+NO_PAINTING = """
+for (const kind of ['drawElements', 'drawArrays', 'drawElementsInstanced', 'drawArraysInstanced',
+    'clear', 'clearBufferfv', 'clearBufferiv', 'clearBufferuiv', 'clearBufferfi',
+    'blitFramebuffer'])
+  WebGL2RenderingContext.prototype[kind] = () => {};
+"""
+"""Leaves out what a graphics card is for, clearing too: all that the page itself does remains.
+
+A picture that is only cleared is put on the screen as well, in software too: 25 ms of a processor.
+"""
+
+STILL = """new Promise(done => {
+  const took = [], canvas = document.querySelector('canvas');
+  const next = () => requestAnimationFrame(begun => setTimeout(() => {
+    took.push(window.painted(canvas) - begun);
+    took.length < 8 ? next() : done(took.slice(2)); }));
+  DRAW; next(); })"""
+"""Times [ms] of painting one and the same picture again and again."""
+
+
+STAGES = {
+    "server": ("event", "sent", "came", "told", "drawn"),
+    "page": ("event", "asked", "solved", "placed", "submitted", "drawn"),
+}
+
+Found = dict[str, float]
+
+
+def measure(where: str, painted: bool, flow: bool) -> Found:
+    """One drag: medians of times [ms], and processor times a step.
+
+    Args:
+        where: "server": the page of `casadi-ik view`; else the file of the page without one.
+        painted: Whether it is painted.
+        flow: Whether steps follow each other as a hand drags.
+    """
+    steps, rest = PAINTED if painted else STEPS, FLOW if flow else REST
+    with browser_tools().Browser() as browser:
+        drag = _on_view if where == "server" else _on_page
+        rows, more = drag(where, browser, steps, painted, rest)
+    found: Found = {"steps lost": float(steps - len(rows))}
+    if rows:
+        stages = STAGES["server" if where == "server" else "page"]
+        whole = [row["drawn"] - row["event"] for row in rows]
+        found["pointer to drawn answer ms"] = float(np.median(whole))
+        found["nine of ten ms"] = float(np.quantile(whole, 0.9))
+        for start, end in pairwise(stages):
+            name = f"{start} to {end} ms"
+            found[name] = float(np.median([row[end] - row[start] for row in rows]))
+    return found | more
+
+
+def browser_tools() -> ModuleType:
+    """The tests' browser, which studies use as well."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    try:
+        tools = importlib.import_module("browser")
+    finally:
+        del sys.path[0]
+    vars(tools)["PATIENCE"] = 300.0  # a picture painted in software on a busy machine
+    return tools
+
+
+def _opened(browser: Any, url: str, *scripts: str) -> Any:
+    """A page with scripts before its own."""
+    page = browser.open("about:blank", 1280, 800)
+    for script in scripts:
+        page.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+    page.go(url)
+    return page
+
+
+def _cpu_times(browser: Any) -> Found:
+    """Processor time of a browser's processes by kind [s]."""
+    connect = importlib.import_module("websockets.sync.client").connect
+    with urllib.request.urlopen(f"{browser._address}/json/version") as answer:
+        address = json.loads(answer.read())["webSocketDebuggerUrl"]
+    with connect(address) as socket:
+        socket.send(json.dumps({"id": 1, "method": "SystemInfo.getProcessInfo"}))
+        found: Found = {"server": time.process_time()}
+        for one in json.loads(socket.recv(PATIENCE))["result"]["processInfo"]:
+            found[one["type"]] = found.get(one["type"], 0.0) + float(one["cpuTime"])
+    return found
+
+
+@contextmanager
+def _cpu_of(browser: Any, steps: int, found: Found, *kinds: str) -> Iterator[None]:
+    """Notes what steps take of each processor, a step [ms]."""
+    before = _cpu_times(browser)
+    yield
+    after = _cpu_times(browser)
+    for kind in kinds:
+        spent = after.get(kind, 0.0) - before.get(kind, 0.0)
+        found[f"{kind} ms of CPU a step"] = 1e3 * spent / (steps + WARM)
+
+
+def _drag(
+    page: Any, start: np.ndarray, way: np.ndarray, steps: int, rest: float
+) -> list[dict[str, float]]:
+    """Drag something to and fro about a start [pixels], each step once the one before is drawn."""
+
+    def place(i: int) -> dict[str, float]:
+        x, y = start + way * (np.sin(0.9 * i) + 0.1 * np.sin(0.37 * i)) * (i > 0)
+        return {"x": float(x), "y": float(y)}
+
+    page.mouse("Moved", **place(0))
+    page.mouse("Pressed", **place(0), clickCount=1, **HELD)
+    for i in range(1, steps + WARM + 1):
+        if i == WARM + 1:
+            page.evaluate("window.rows = []")
+        before, end = page.evaluate("window.rows.length"), time.monotonic() + PATIENCE
+        page.mouse("Moved", **place(i), **HELD)
+        while page.evaluate("window.rows.length") == before and time.monotonic() < end:
+            time.sleep(0.02)
+        time.sleep(rest)
+    page.mouse("Released", **place(steps), button="left", buttons=0, clickCount=1)
+    return page.evaluate("window.rows")
+
+
+def _on_view(
+    _: str, browser: Any, steps: int, painted: bool, rest: float
+) -> tuple[list[dict[str, float]], Found]:
+    """A drag on the page of `casadi-ik view`; what of it are the server's and the solver's."""
+    viewing = importlib.import_module("casadi_ik.viewing")
+    robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
+    viewer = viewing.view_grasp(robot, grasp, scene=ik.load_scene("table"))
+    shown, served, solves, begun = viewer.page, [], [], [0.0]
+    put, draw = shown.work.put, shown.draw
+
+    def asked(key: str, change: Callable[[], None]) -> None:
+        begun[0] = time.perf_counter()
+        put(key, change)
+
+    def answered(answer: Any) -> None:
+        draw(answer)
+        if begun[0]:
+            served.append(1e3 * (time.perf_counter() - begun[0]))
+            solves.append(1e3 * answer.seconds)
+            begun[0] = 0.0
+
+    page = _opened(browser, viewer.url, SERVED, *([] if painted else [NO_PAINTING]))
+    page.wait("document.querySelector('.ik-status') !== null")
+    time.sleep(4.0)  # the camera comes to rest
+    client = list(viewer._server.get_clients().values())[-1]
+    box, pose = page.evaluate(BOX), shown.asked.held["thumb"].control
+
+    def pixel(point: np.ndarray) -> np.ndarray:
+        camera = client.camera
+        w, x, y, z = camera.wxyz
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+        seen = turn.T @ (point - camera.position)
+        focal = box[3] / 2 / np.tan(camera.fov / 2)
+        return np.array(box[:2]) + np.array(box[2:]) / 2 + focal * seen[:2] / seen[2]
+
+    here = pixel(pose[:3, 3])
+    tips = [pixel(pose[:3, 3] + HANDLE * pose[:3, i]) for i in range(3)]
+    way = max((tip - here for tip in tips), key=lambda one: float(np.linalg.norm(one)))
+    found: Found = {}
+    found["picture painted again ms"] = _still(page, STILL.replace("DRAW", ""))
+    shown.work.put, shown.draw = asked, answered
+    with _cpu_of(browser, steps, found, "server", "renderer", "GPU"):
+        rows = _drag(page, here + 0.92 * way, 0.25 * way, steps, rest)
+    viewer.stop()
+    found["server's share ms"], found["solver's share ms"] = map(
+        float, map(np.median, (served, solves))
+    )
+    return rows, found
+
+
+def _on_page(
+    path: str, browser: Any, steps: int, painted: bool, rest: float
+) -> tuple[list[dict[str, float]], Found]:
+    """A drag on the page without a server."""
+    url, scripts = Path(path).resolve().as_uri(), [] if painted else [NO_PAINTING]
+    page = _opened(browser, url, *scripts)
+    page.wait("globalThis.casadiIk?.now.answer && !casadiIk.stage.asked", 60.0)
+    time.sleep(1.0)
+    page.evaluate(ALONE)
+    still = STILL.replace("DRAW; next()", "next()")
+    still = still.replace("took.push(", "casadiIk.stage.draw(); took.push(")
+    found: Found = {}
+    found["picture painted again ms"] = _still(page, still)
+    start = np.array(page.evaluate("casadiIk.pixel('point 0')"))
+    with _cpu_of(browser, steps, found, "renderer", "GPU"):
+        rows = _drag(page, start, np.array([9.0, -9.0]), steps, rest)
+    page.wait("!casadiIk.stage.asked")
+    return rows, found
+
+
+def _still(page: Any, script: str) -> float:
+    return float(np.median(page.evaluate(script)))
