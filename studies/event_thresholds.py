@@ -22,7 +22,6 @@ from runner import command, markdown_table, program, write_page
 from samplers import random_arm_targets, random_hands
 
 import casadi_ik as ik
-from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.logs import EventKind, EventRules, Keep, McapRecorder
 from casadi_ik.logs.write.measured import measured_format
 
