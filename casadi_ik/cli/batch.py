@@ -30,18 +30,8 @@ from casadi_ik.batches.part import Asked
 from casadi_ik.batches.run import solve_parts
 from casadi_ik.batches.sources import Source, source_of
 from casadi_ik.batches.target_file import TargetFile
+from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import the_fixed, the_object_pose, the_robot, the_solver, the_start
-from casadi_ik.cli.options import (
-    ROBOT,
-    SIZE_LIMITS,
-    SOLVER,
-    Option,
-    diagnose,
-    needed,
-    npz_or_folder,
-    out,
-    whole,
-)
 from casadi_ik.cli.outputs import check_outputs, folder_of, say, write_output, writing
 from casadi_ik.cli.report import counted, duration, fields, files, headline
 from casadi_ik.cli.table import Answer, Said, command
@@ -61,31 +51,29 @@ ROWS_SHOWN = 10
 
 
 @command(
-    Option(
-        "targets",
+    opt.Option(
         "TARGETS",
         "points and normals in an npz or Parquet file, or a folder of such files, see below",
     ),
-    needed(ROBOT),
-    *SOLVER,
-    Option("--jobs", "N", "threads, or in parts processes", whole(1), default=1),
-    out(
+    opt.needed(opt.ROBOT),
+    *opt.SOLVER,
+    opt.Option("--jobs N", "threads, or in parts processes", opt.whole(1), default=1),
+    opt.out(
         "OUT",
         "write the solutions: to OUT.npz, or in parts into a folder (a name without suffix)",
-        npz_or_folder,
+        opt.npz_or_folder,
     ),
-    Option(
-        "--dask",
-        "ADDRESS",
-        "solve in parts on a Dask cluster: what `dask scheduler` prints, tcp://HOST:8786 (needs "
-        "casadi-ik[cluster])",
+    opt.Option(
+        "--dask ADDRESS",
+        "solve in parts on a Dask cluster: what `dask scheduler` prints, tcp://HOST:8786 "
+        "(needs casadi-ik[cluster])",
     ),
-    Option(
-        "--resume", "", "solve in parts that survive a kill, and go on with those that are there"
+    opt.Option(
+        "--resume", "solve in parts that survive a kill, and go on with those that are there"
     ),
-    Option("--part-size", "N", "targets of a part", whole(1), otherwise=str(PART_SIZE)),
-    diagnose(default=False),
-    SIZE_LIMITS,
+    opt.Option("--part-size N", "targets of a part", opt.whole(1), otherwise=str(PART_SIZE)),
+    opt.diagnose(default=False),
+    opt.SIZE_LIMITS,
 )
 def batch(said: Said) -> Answer:
     """Find the position of every motor for many targets.

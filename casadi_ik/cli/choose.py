@@ -14,24 +14,8 @@ from rich.text import Text
 from casadi_ik.answers.solution import Ranking
 from casadi_ik.api import Solver
 from casadi_ik.arrays import Array
+from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import located, the_object_pose, the_robot, the_solver, the_start
-from casadi_ik.cli.options import (
-    MAX_ROUNDS,
-    OBJECT_POSE,
-    PREFER,
-    Q0,
-    ROBOT,
-    SCENE,
-    SEED,
-    SIZE_LIMITS,
-    TOLERANCES,
-    Option,
-    needed,
-    one_of,
-    out,
-    positive,
-    whole,
-)
 from casadi_ik.cli.outputs import check_outputs
 from casadi_ik.cli.report import (
     as_json,
@@ -54,65 +38,58 @@ MOST_BYTES = 2**26
 
 
 @command(
-    Option("candidates", "CANDIDATES", "the grasps, see below"),
-    needed(ROBOT),
-    OBJECT_POSE,
-    Option(
-        "--layout",
-        "L",
+    opt.Option("CANDIDATES", "the grasps, see below"),
+    opt.needed(opt.ROBOT),
+    opt.OBJECT_POSE,
+    opt.Option(
+        "--layout L",
         f"of the file: {', '.join(LAYOUTS)}, table",
-        one_of(*LAYOUTS, "table"),
+        opt.one_of(*LAYOUTS, "table"),
         otherwise="told from it",
     ),
-    Option(
-        "--hand",
-        "FILE",
-        "what the file calls the hand's joints and where it has the hand's frame: a shipped name "
-        "or a YAML file",
+    opt.Option(
+        "--hand FILE",
+        "what the file calls the hand's joints and where it has the hand's frame: a shipped "
+        "name or a YAML file",
         otherwise="the shipped one that fits the robot",
     ),
-    Option(
-        "--take",
-        "palm|contacts",
+    opt.Option(
+        "--take palm|contacts",
         "what a palm and a posture of a data set or table are taken for",
-        one_of("palm", "contacts"),
         default="palm",
     ),
-    Option(
-        "--object",
-        "NAME",
-        "what a data set or table grasps: a shipped name, a YAML file or a mesh (in convex pieces; "
-        "as large as the data say); of --take contacts only the pads that touch it count",
+    opt.Option(
+        "--object NAME",
+        "what a data set or table grasps: a shipped name, a YAML file or a mesh (in convex "
+        "pieces; as large as the data say); of --take contacts only the pads that touch it "
+        "count",
     ),
-    Option(
-        "--of",
-        "NAME",
+    opt.Option(
+        "--of NAME",
         "of which object's grasps, by the file's own name, where it has those of several",
     ),
-    Option(
-        "--scale",
-        "S",
+    opt.Option(
+        "--scale S",
         "of which size of the object, by the file's own scale, where it has several",
-        positive,
+        opt.positive,
     ),
-    Option(
-        "--invalid",
-        "error|drop|clip",
-        "what becomes of rows of a data set or table with joints beyond their limits or with no "
-        "grasp in them: the file is refused, they are left out, or joints are put at their limits",
-        one_of("error", "drop", "clip"),
+    opt.Option(
+        "--invalid error|drop|clip",
+        "what becomes of rows of a data set or table with joints beyond their limits or with "
+        "no grasp in them: the file is refused, they are left out, or joints are put at their "
+        "limits",
         default="error",
     ),
-    SCENE,
-    PREFER,
-    Q0,
-    Option("--limit", "N", "answers at most", whole(1), default=10),
-    Option("--per-candidate", "N", "answers of one candidate at most", whole(1), default=1),
-    SEED,
-    *TOLERANCES,
-    MAX_ROUNDS,
-    out("RANKED.json", "write the answers", Path),
-    SIZE_LIMITS,
+    opt.SCENE,
+    opt.PREFER,
+    opt.Q0,
+    opt.Option("--limit N", "answers at most", opt.whole(1), default=10),
+    opt.Option("--per-candidate N", "answers of one candidate at most", opt.whole(1), default=1),
+    opt.SEED,
+    *opt.TOLERANCES,
+    opt.MAX_ROUNDS,
+    opt.out("RANKED.json", "write the answers", Path),
+    opt.SIZE_LIMITS,
 )
 def choose(said: Said) -> Answer:
     r"""Of many grasps find those that are best to take, and how.

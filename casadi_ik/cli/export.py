@@ -9,7 +9,7 @@ from rich.console import Group
 from rich.text import Text
 
 from casadi_ik.arm_hand import load_robot
-from casadi_ik.cli.options import Option, each, one_of, out, whole
+from casadi_ik.cli import options as opt
 from casadi_ik.cli.outputs import say
 from casadi_ik.cli.report import counted, fields, headline
 from casadi_ik.cli.table import Answer, Said, command
@@ -28,28 +28,23 @@ from casadi_ik.kernels.compiler import find_compiler
 
 
 @command(
-    Option("robot", "ROBOT", "a shipped name or a YAML file"),
-    out("DIR", "folder to write", Path),
-    Option("--method", "M", "hand-first is the only one that can be", default="hand-first"),
-    Option("--prefix", "NAME", "what all names begin with", otherwise="the robot's name"),
-    Option(
-        "--target",
-        "c|wasm",
+    opt.Option("ROBOT", "a shipped name or a YAML file"),
+    opt.out("DIR", "folder to write", Path),
+    opt.Option("--method M", "hand-first is the only one that can be", default="hand-first"),
+    opt.Option("--prefix NAME", "what all names begin with", otherwise="the robot's name"),
+    opt.Option(
+        "--target c|wasm",
         "plain C, or a WebAssembly module for JavaScript (needs casadi-ik[compiler])",
-        one_of("c", "wasm"),
         default="c",
     ),
-    Option(
-        "--scene",
-        "CAPACITY",
+    opt.Option(
+        "--scene CAPACITY",
         "collisions are checked: the robot with itself, and with so many solids at most",
-        whole(1),
+        opt.whole(1),
     ),
-    Option("--single", "", "in single precision, for controllers that have no other (--target c)"),
-    Option(
-        "--follow",
-        "",
-        "with a follower of moving contacts that keeps velocities and accelerations",
+    opt.Option("--single", "in single precision, for controllers that have no other (--target c)"),
+    opt.Option(
+        "--follow", "with a follower of moving contacts that keeps velocities and accelerations"
     ),
 )
 def export(said: Said) -> Answer:
@@ -95,7 +90,7 @@ def export(said: Said) -> Answer:
 
 
 @command(
-    Option("robots", "ROBOT", "a shipped name, ARM+HAND, or a YAML file", each(str), "+"),
+    opt.Option("ROBOT...", "a shipped name, ARM+HAND, or a YAML file", key="robots"),
 )
 def compile_ahead(said: Said) -> Answer:
     """Compile what solving, batches and logs of robots need, ahead of use.

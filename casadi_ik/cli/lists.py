@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from casadi_ik.arms.recognise import family_in_words
-from casadi_ik.cli.options import out
+from casadi_ik.cli import options as opt
 from casadi_ik.cli.outputs import writing
 from casadi_ik.cli.report import fields, headline, table
 from casadi_ik.cli.table import Answer, Said, command
@@ -131,7 +131,7 @@ def grasps(_: Said) -> Answer:
     return Answer(Group(*parts))
 
 
-@command(out("DIR", "folder to write", Path))
+@command(opt.out("DIR", "folder to write", Path))
 def schemas(said: Said) -> Answer:
     """Write JSON Schemas of the files that people write, with which editors complete keys.
 

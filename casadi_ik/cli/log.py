@@ -17,8 +17,8 @@ from rich.text import Text
 
 from casadi_ik import logs
 from casadi_ik.arm_hand import load_robot
+from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import located
-from casadi_ik.cli.options import Option, each, file_name, one_of, out, whole
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.report import (
     counted,
@@ -47,19 +47,19 @@ SHOWN = 12
 USUAL_EVENTS = ("PHASE_CHANGE", "LIMIT_LEFT", "RELEASED")
 """What happens in every solve and so is not told of each."""
 
-LOGS = Option("files", "FILE", "logs, or folders of logs", each(str), "+")
-LOG = Option("file", "FILE", "a log, or a folder of shards")
-SOLVE = Option("--solve", "N", "number of the solve", whole(0))
-ONE_SOLVE = Option(SOLVE.name, "N", SOLVE.help, whole(0), otherwise="the only one")
-METHOD = Option("--method", "M", "method", otherwise="the only one")
+LOGS = opt.Option("FILE...", "logs, or folders of logs", key="files")
+LOG = opt.Option("FILE", "a log, or a folder of shards")
+SOLVE = opt.Option("--solve N", "number of the solve", opt.whole(0))
+ONE_SOLVE = opt.Option(SOLVE.said, SOLVE.help, opt.whole(0), otherwise="the only one")
+METHOD = opt.Option("--method M", "method", otherwise="the only one")
 FILTERS = (
-    Option("--method", "M", "of the solve"),
+    opt.Option("--method M", "of the solve"),
     SOLVE,
-    Option("--status", "S", "of the solve, e.g. STALLED"),
-    Option("--event", "E", "solves in which one happened, and those events, e.g. NEAR_SINGULAR"),
-    Option("--phase", "P", "solves, iterations and events in it, e.g. hand-alignment"),
+    opt.Option("--status S", "of the solve, e.g. STALLED"),
+    opt.Option("--event E", "solves in which one happened, and those events, e.g. NEAR_SINGULAR"),
+    opt.Option("--phase P", "solves, iterations and events in it, e.g. hand-alignment"),
 )
-MOST = Option("--most", "N", "rows shown", whole(1), default=40)
+MOST = opt.Option("--most N", "rows shown", opt.whole(1), default=40)
 KINDS = {".mcap": "viewer", ".parquet": "parquet", ".csv": "csv"}
 """What `log export` writes, by the name's end."""
 
@@ -109,7 +109,7 @@ def events(said: Said) -> Answer:
 
 @command(
     LOG,
-    Option("solve", "SOLVE", ONE_SOLVE.help, whole(0), "?", otherwise=ONE_SOLVE.otherwise),
+    opt.Option("[SOLVE]", ONE_SOLVE.help, opt.whole(0), otherwise=ONE_SOLVE.otherwise),
     METHOD,
 )
 def why(said: Said) -> Answer:
@@ -135,19 +135,16 @@ def why(said: Said) -> Answer:
     LOG,
     ONE_SOLVE,
     METHOD,
-    Option(
-        "--out",
-        "FILE.png",
+    opt.Option(
+        "--out FILE.png",
         "where to",
-        file_name(".png"),
+        opt.file_name(".png"),
         otherwise="named after log, method and solve, in this folder",
     ),
-    Option(
-        "--range",
-        "FIRST LAST",
+    opt.Option(
+        "--range FIRST LAST",
         "iterations drawn; long runs hide what happens at their beginning",
-        each(whole(0)),
-        2,
+        opt.each(opt.whole(0)),
         otherwise="all",
     ),
 )
@@ -176,15 +173,8 @@ def plot(said: Said) -> Answer:
 
 @command(
     LOGS,
-    Option("--solve", "N", "one solve, by its number with the first method", whole(0)),
-    Option(
-        "--methods",
-        "M M",
-        "which two; last on the line",
-        each(str),
-        2,
-        otherwise="the only two",
-    ),
+    opt.Option("--solve N", "one solve, by its number with the first method", opt.whole(0)),
+    opt.Option("--methods M M", "which two; last on the line", otherwise="the only two"),
 )
 def compare(said: Said) -> Answer:
     """Compare two methods on the same targets: one side by side, many in numbers."""
@@ -209,9 +199,9 @@ def compare(said: Said) -> Answer:
 
 @command(
     LOG,
-    out("REPORT.html", "where to"),
-    Option("--title", "TEXT", "of the page", otherwise="what the log is called"),
-    Option("--most", "N", "solves that can be opened", whole(1), default=200),
+    opt.out("REPORT.html", "where to"),
+    opt.Option("--title TEXT", "of the page", otherwise="what the log is called"),
+    opt.Option("--most N", "solves that can be opened", opt.whole(1), default=200),
 )
 def report(said: Said) -> Answer:
     """Write a study as a page that needs nothing but a browser (needs casadi-ik[plots]).
@@ -233,27 +223,18 @@ def report(said: Said) -> Answer:
 @command(
     LOG,
     *FILTERS,
-    Option(
-        "--what",
-        "iterations|solves|events",
+    opt.Option(
+        "--what iterations|solves|events",
         "rows of a table",
-        one_of("iterations", "solves", "events"),
         default="iterations",
     ),
-    Option(
-        "--to",
-        "viewer|parquet|csv",
+    opt.Option(
+        "--to viewer|parquet|csv",
         "kind of file",
-        one_of(*KINDS.values()),
         otherwise=f"what --out ends in: {', '.join(KINDS)}",
     ),
-    Option(
-        "--robot",
-        "R",
-        "for a viewer: a shipped name or a YAML file",
-        otherwise="the log's",
-    ),
-    out("FILE", "where to", file_name()),
+    opt.Option("--robot R", "for a viewer: a shipped name or a YAML file", otherwise="the log's"),
+    opt.out("FILE", "where to", opt.file_name()),
 )
 def export(said: Said) -> Answer:
     """Write tables, or a file for a viewer.
@@ -305,7 +286,7 @@ def finish(said: Said) -> Answer:
     return Answer(Group(*parts))
 
 
-@command(LOGS, out("FILE.mcap", "the log that has all of it"))
+@command(LOGS, opt.out("FILE.mcap", "the log that has all of it"))
 def merge(said: Said) -> Answer:
     """Join the shards of a study, without recompressing."""
     check_outputs({"--out": said.out}, inputs=[path for path, _ in log_files(said.files)])
@@ -353,7 +334,7 @@ def _the_solve(said: Said, log: logs.Log) -> OneSolve:
 
 def _filters(said: Said) -> dict[str, Any]:
     """The filters of a command as `Log` takes them."""
-    return {option.key: getattr(said, option.key) for option in FILTERS}
+    return {one.name.strip("-"): getattr(said, one.attribute) for one in FILTERS}
 
 
 def _title(name: str) -> Text:

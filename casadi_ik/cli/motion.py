@@ -13,25 +13,9 @@ from rich.text import Text
 
 from casadi_ik.api import Solver
 from casadi_ik.arrays import Array
+from casadi_ik.cli import options as opt
 from casadi_ik.cli.choose import ChosenPosture, chosen_posture
 from casadi_ik.cli.inputs import located, the_grasp, the_robot, the_solver, the_start
-from casadi_ik.cli.options import (
-    GRASP,
-    OBJECT_POSE,
-    Q0,
-    ROBOT,
-    SCENE,
-    SEED,
-    SIZE_LIMITS,
-    TOLERANCES,
-    Option,
-    file_name,
-    out,
-    picture,
-    positive,
-    vector,
-    whole,
-)
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.report import fields, files, headline
 from casadi_ik.cli.table import Answer, Exit, Said, command
@@ -45,7 +29,7 @@ from casadi_ik.motion.motion import Motion
 from casadi_ik.motion.reaching import PARTS, Reach
 from casadi_ik.motion.retarget import KEYPOINTS, Retargeter, load_retarget, usual_retarget
 
-MOTION = out("MOTION.mcap", "write the motion", file_name(".mcap", ".npz", ".csv"))
+MOTION = opt.out("MOTION.mcap", "write the motion", opt.file_name(".mcap", ".npz", ".csv"))
 
 CYCLES_AT_ONCE = 1024
 """Cycles whose targets are in memory at once."""
@@ -61,17 +45,17 @@ FAR = 5.0
 
 
 @command(
-    Option("frames", "KEYPOINTS.npz", "the frames, see below"),
-    ROBOT,
+    opt.Option("KEYPOINTS.npz", "the frames, see below", key="frames"),
+    opt.ROBOT,
     MOTION,
-    Option(
-        "--retarget", "FILE.yaml", "how a hand moves the robot's", otherwise="as suits most hands"
+    opt.Option(
+        "--retarget FILE.yaml", "how a hand moves the robot's", otherwise="as suits most hands"
     ),
-    Option("--period", "S", "of a cycle", positive, default=0.005),
-    SCENE,
-    *TOLERANCES,
-    Q0,
-    SIZE_LIMITS,
+    opt.Option("--period S", "of a cycle", opt.positive, default=0.005),
+    opt.SCENE,
+    *opt.TOLERANCES,
+    opt.Q0,
+    opt.SIZE_LIMITS,
 )
 def follow(said: Said) -> Answer:
     """Move the robot as keypoints of a hand, or contacts, move.
@@ -262,49 +246,43 @@ def _followed(
 
 
 @command(
-    Option("grasp", "GRASP", f"{GRASP.help}, or RANKED.json"),
-    Option("--rank", "N", "which of the answers of RANKED.json", whole(1), otherwise="1, the best"),
-    ROBOT,
+    opt.Option("GRASP", f"{opt.GRASP.help}, or RANKED.json"),
+    opt.Option(
+        "--rank N", "which of the answers of RANKED.json", opt.whole(1), otherwise="1, the best"
+    ),
+    opt.ROBOT,
     MOTION,
-    picture("--animation", "draw the motion in real time"),
-    OBJECT_POSE,
-    SCENE,
-    Option(
-        "--opening",
-        "M",
+    opt.picture("--animation", "draw the motion in real time"),
+    opt.OBJECT_POSE,
+    opt.SCENE,
+    opt.Option(
+        "--opening M",
         "how far fingertips are from their contacts before they close",
-        positive,
+        opt.positive,
         default=0.02,
     ),
-    Option("--distance", "M", "how far the hand comes straight", positive, default=0.08),
-    Option(
-        "--direction",
-        "X",
+    opt.Option("--distance M", "how far the hand comes straight", opt.positive, default=0.08),
+    opt.Option(
+        "--direction X...",
         "the way the hand comes: x y z in the base frame, 0 0 -1 from above",
-        vector(3, "x y z"),
-        "+",
+        opt.vector(3, "x y z"),
         otherwise="from where the grasp has its palm before it, if it says, else from the palm to "
         "the contacts",
     ),
-    Option(
-        "--lift",
-        "M",
-        "how far the hand then goes up, with what it holds",
-        positive,
-        default=0.0,
+    opt.Option(
+        "--lift M", "how far the hand then goes up, with what it holds", opt.positive, default=0.0
     ),
-    Option(
-        "--retreat",
-        "M",
+    opt.Option(
+        "--retreat M",
         "how far it goes back after that, against the way it came",
-        positive,
+        opt.positive,
         default=0.0,
     ),
-    Option("--period", "S", "between two samples", positive, default=0.01),
-    SEED,
-    *TOLERANCES,
-    Q0,
-    SIZE_LIMITS,
+    opt.Option("--period S", "between two samples", opt.positive, default=0.01),
+    opt.SEED,
+    *opt.TOLERANCES,
+    opt.Q0,
+    opt.SIZE_LIMITS,
 )
 def reach(said: Said) -> Answer:
     r"""Find the timed motion from where the robot is to a grasp.

@@ -23,36 +23,62 @@ class Option:
     """An option, or an argument without dashes.
 
     Attributes:
-        name: "--q0"; of an argument without dashes the attribute that holds it.
-        metavar: What stands for its value in help; "" for a flag.
+        said: How it is said, in the way of usage lines: "--seed N", "--q0 V..." (one or more
+            words), "--limits enforce|ignore" (one of these), "--pads" (yes, if it is said),
+            "GRASP", "[SOLVE]" (may be left out), "[LOG...]".
         help: What it means, without its default.
-        read: Makes the value of a word, or of all words where `count` is given.
-        count: How many words: None is one, else as argparse's ``nargs`` ("?", "+", "*", 2).
+        read: Makes the value of a word, or of all words where there may be several; None: the
+            word or words as they are.
         default: The value if it is not said.
         otherwise: The default in words, if its value does not say it.
-        needed: Whether it has to be said; arguments without dashes always have to.
+        needed: Whether an option has to be said.
         repeated: Whether it may be said again, for more.
+        key: What holds the value, if it is not called as the option or the argument.
     """
 
-    name: str
-    metavar: str
+    said: str
     help: str
-    read: Callable[[Any], Any] = str
-    count: str | int | None = None
+    read: Callable[[Any], Any] | None = None
     default: Any = None
     otherwise: str = ""
     needed: bool = False
     repeated: bool = False
+    key: str = ""
 
     @property
-    def key(self) -> str:
+    def name(self) -> str:
+        """The option with its dashes; of an argument without dashes its key."""
+        key = self.key or self.metavar.lower()
+        return self.said.partition(" ")[0] if self.dashed else key
+
+    @property
+    def attribute(self) -> str:
         """The attribute of what was said that holds the value."""
-        return self.name.lstrip("-").replace("-", "_")
+        return self.key or self.name.lstrip("-").replace("-", "_")
 
     @property
     def dashed(self) -> bool:
         """Whether it begins with dashes."""
-        return self.name.startswith("-")
+        return self.said.startswith("-")
+
+    @property
+    def value(self) -> str:
+        """What stands for its value or values; "" for a flag."""
+        return self.said.partition(" ")[2] if self.dashed else self.said
+
+    @property
+    def metavar(self) -> str:
+        """What stands for one word of its value."""
+        return self.value.strip("[].")
+
+    @property
+    def count(self) -> str | int | None:
+        """How many words there are, as argparse's ``nargs``."""
+        if "..." in self.value:
+            return "*" if self.value.startswith("[") else "+"
+        if self.value.startswith("["):
+            return "?"
+        return self.value.count(" ") + 1 if " " in self.value else None
 
     @property
     def text(self) -> str:
@@ -62,6 +88,19 @@ class Option:
             default = str(self.default)
         return f"{self.help} (default: {default})" if default else self.help
 
+    def of(self, words: Any) -> Any:
+        """The value of the word, or words, that were said.
+
+        Raises:
+            ValueError: They are none; the message says what was found and what was expected.
+        """
+        if self.read is not None:
+            return self.read(words)
+        choices = self.metavar.split("|")
+        if self.dashed and len(choices) > 1 and words not in choices:
+            raise ValueError(f"found {words!r}, expected one of {', '.join(choices)}")
+        return words
+
 
 def needed(option: Option, **changes: Any) -> Option:
     """The option of a command that cannot do without it."""
@@ -70,7 +109,7 @@ def needed(option: Option, **changes: Any) -> Option:
 
 def out(metavar: str, text: str, read: Callable[[str], Any] | None = None) -> Option:
     """A needed ``--out``; names must end in the metavar's suffix, unless `read` is given."""
-    return Option("--out", metavar, text, read or file_name(Path(metavar).suffix), needed=True)
+    return Option(f"--out {metavar}", text, read or file_name(Path(metavar).suffix), needed=True)
 
 
 # How words become values; a ValueError says what was found and what was expected.
@@ -182,70 +221,58 @@ def each(read: Callable[[str], Any]) -> Callable[[Sequence[str]], list[Any]]:
 
 POSE = vector(6, "x y z [m] roll pitch yaw [rad]")
 
-GRASP = Option("grasp", "GRASP", "a shipped name (`casadi-ik grasps`) or a YAML file")
-ROBOT = Option("--robot", "R", "a shipped name or a YAML file", otherwise="what the file read says")
-METHOD = Option("--method", "M", "one of `casadi-ik methods`", otherwise="the first of them")
+GRASP = Option("GRASP", "a shipped name (`casadi-ik grasps`) or a YAML file")
+ROBOT = Option("--robot R", "a shipped name or a YAML file", otherwise="what the file read says")
+METHOD = Option("--method M", "one of `casadi-ik methods`", otherwise="the first of them")
 Q0 = Option(
-    "--q0",
-    "V",
-    "where the robot is: a number per actuator [rad or m], spaces or commas between; last on the "
-    "line",
+    "--q0 V...",
+    "where the robot is: a number per actuator [rad or m], spaces or commas between; last "
+    "on the line",
     numbers,
-    "+",
     otherwise="home",
 )
 PREFER = Option(
-    "--prefer",
-    "|".join(PREFERENCES),
+    f"--prefer {'|'.join(PREFERENCES)}",
     "which of several solutions comes first: far from its limits, with a manipulable arm, near the "
     "start, or with --scene far from what may be hit",
-    one_of(*PREFERENCES),
     otherwise="q0 if it is given, else limits",
 )
 SCENE = Option(
-    "--scene",
-    "FILE",
+    "--scene FILE",
     "what must not be touched: a shipped name or a YAML file",
     otherwise="collisions are not checked",
 )
 OBJECT_POSE = Option(
-    "--object-pose",
-    "X",
-    "where the object is: x y z [m] roll pitch yaw [rad] in the base frame; contacts move with it, "
-    "and those of a file that does not say where its object is are in its frame",
+    "--object-pose X...",
+    "where the object is: x y z [m] roll pitch yaw [rad] in the base frame; contacts move "
+    "with it, and those of a file that does not say where its object is are in its frame",
     POSE,
-    "+",
 )
-SEED = Option("--seed", "N", "of all random numbers", whole(0), default=0)
+SEED = Option("--seed N", "of all random numbers", whole(0), default=0)
 TOLERANCES = (
     Option(
-        "--tolerance-position",
-        "METRES",
+        "--tolerance-position METRES",
         "when a contact point counts as reached",
         positive,
         otherwise="0.005",
     ),
     Option(
-        "--tolerance-angle",
-        "RADIANS",
+        "--tolerance-angle RADIANS",
         "when a contact normal counts as reached",
         positive,
         otherwise="0.0524, 3 deg",
     ),
 )
 MAX_ROUNDS = Option(
-    "--max-rounds",
-    "N",
-    "rounds of hand postures at most before a target is given up; 1 solves nearly all that can be "
-    "reached",
+    "--max-rounds N",
+    "rounds of hand postures at most before a target is given up; 1 solves nearly all that "
+    "can be reached",
     whole(1),
     otherwise="as many as may help",
 )
 LIMITS = Option(
-    "--limits",
-    "enforce|ignore",
+    "--limits enforce|ignore",
     "whether being solved includes the limits; ignore: the paper's way",
-    one_of("enforce", "ignore"),
     default="enforce",
 )
 SOLVER = (
@@ -259,25 +286,20 @@ SOLVER = (
     MAX_ROUNDS,
     LIMITS,
     Option(
-        "--finger-step",
-        "ipopt|closed-form",
-        "solver of the fingers' own step in the paper's methods; closed-form gives the same answer "
-        "much faster",
-        one_of("ipopt", "closed-form"),
+        "--finger-step ipopt|closed-form",
+        "solver of the fingers' own step in the paper's methods; closed-form gives the same "
+        "answer much faster",
         otherwise="ipopt",
     ),
     Option(
-        "--fixed",
-        "NAME=V",
+        "--fixed NAME=V...",
         "actuators that are not to move, and where they stand [rad or m]",
         each(assignment),
-        "+",
         default=(),
         repeated=True,
     ),
     Option(
-        "--log",
-        "FILE.mcap",
+        "--log FILE.mcap",
         "write every iteration to a log; a batch in parts: into a folder, read as one log",
         file_name(),
     ),
@@ -285,8 +307,7 @@ SOLVER = (
 """Of `solve` and `batch`."""
 
 SIZE_LIMITS = Option(
-    "--size-limits",
-    "FACTOR",
+    "--size-limits FACTOR",
     "allow files that are so many times as large as usual, packed and unpacked",
     positive,
 )
@@ -296,10 +317,10 @@ SIZE_LIMITS = Option(
 def diagnose(default: bool) -> Option:
     """Whether failures are explained; ``--no-diagnose`` says no."""
     text = "find out why what is not solved is not"
-    return Option("--diagnose", "", text, default=default, otherwise="yes" if default else "no")
+    return Option("--diagnose", text, default=default, otherwise="yes" if default else "no")
 
 
 def picture(name: str, text: str) -> Option:
     """A picture to be written."""
     suffix = ".gif" if name == "--animation" else ".png"
-    return Option(name, f"FILE{suffix}", f"{text} (needs casadi-ik[plots])", file_name(suffix))
+    return Option(f"{name} FILE{suffix}", f"{text} (needs casadi-ik[plots])", file_name(suffix))

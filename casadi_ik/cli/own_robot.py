@@ -14,21 +14,8 @@ from rich.text import Text
 from casadi_ik import calibration
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arms.recognise import family_in_words, is_searched
+from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import located, the_robot
-from casadi_ik.cli.options import (
-    POSE,
-    PROGRAM,
-    ROBOT,
-    SIZE_LIMITS,
-    Option,
-    each,
-    file_name,
-    needed,
-    one_of,
-    out,
-    picture,
-    positive,
-)
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.report import UNITS, fields, files, headline, table
 from casadi_ik.cli.table import Answer, Said, command
@@ -45,29 +32,26 @@ SAME = 1e-9
 
 
 @command(
-    Option("first", "ARM|ROBOT", "file of the arm, or of everything"),
-    Option("hand", "HAND", "file of the hand", count="?"),
-    Option(
-        "--out",
-        "ROBOT.yaml",
+    opt.Option("ARM|ROBOT", "file of the arm, or of everything", key="first"),
+    opt.Option("[HAND]", "file of the hand"),
+    opt.Option(
+        "--out ROBOT.yaml",
         "write the description (needed unless one is given to be drawn again)",
-        file_name(".yaml", ".yml"),
+        opt.file_name(".yaml", ".yml"),
     ),
-    Option("--tip", "LINK", "link of the arm that carries the hand"),
-    Option("--palm", "LINK", "link that the fingers hang on"),
-    Option(
-        "--mount",
-        "V",
+    opt.Option("--tip LINK", "link of the arm that carries the hand"),
+    opt.Option("--palm LINK", "link that the fingers hang on"),
+    opt.Option(
+        "--mount V...",
         "the hand's base on the tip: x y z [m] roll pitch yaw [rad]",
-        POSE,
-        "+",
+        opt.POSE,
         otherwise="on it",
     ),
-    Option("--srdf", "FILE.srdf", "links that may touch, beside those that are found to"),
-    Option("--xacro", "", "expand the macros of files that are not called .xacro"),
-    picture("--picture", "draw the hand and the guessed pads"),
-    Option("--check", "", "compare the kinematics with pinocchio's (MuJoCo's) of the files"),
-    SIZE_LIMITS,
+    opt.Option("--srdf FILE.srdf", "links that may touch, beside those that are found to"),
+    opt.Option("--xacro", "expand the macros of files that are not called .xacro"),
+    opt.picture("--picture", "draw the hand and the guessed pads"),
+    opt.Option("--check", "compare the kinematics with pinocchio's (MuJoCo's) of the files"),
+    opt.SIZE_LIMITS,
 )
 def import_robot(said: Said) -> Answer:
     """Describe your robot from the files of an arm and a hand, or of both in one.
@@ -144,7 +128,7 @@ def _drawn_again(path: Path, said: Said) -> Answer:
 
 def _command(said: Said) -> str:
     """The command line, as it stands in the description."""
-    words = [PROGRAM, "import", said.first, *filter(None, [said.hand]), "--out", str(said.out)]
+    words = [opt.PROGRAM, "import", said.first, *filter(None, [said.hand]), "--out", str(said.out)]
     for option in ("tip", "palm", "srdf"):
         if getattr(said, option) is not None:
             words += [f"--{option}", getattr(said, option)]
@@ -237,40 +221,34 @@ def _import_report(
 
 
 @command(
-    Option("data", "DATA.csv", "measured poses, see below"),
-    needed(ROBOT),
-    Option(
-        "--estimate",
-        "GROUP",
+    opt.Option("DATA.csv", "measured poses, see below", key="data"),
+    opt.needed(opt.ROBOT),
+    opt.Option(
+        "--estimate GROUP...",
         "which numbers: linkage, axes, tips",
-        each(one_of("linkage", "axes", "tips")),
-        "+",
+        opt.each(opt.one_of("linkage", "axes", "tips")),
         default=("linkage", "axes", "tips"),
         otherwise="all three",
     ),
-    Option(
-        "--loss",
-        "cauchy|huber|squares",
+    opt.Option(
+        "--loss cauchy|huber|squares",
         "how outliers count; squares takes them in full",
-        one_of("cauchy", "huber", "squares"),
         default="cauchy",
     ),
-    Option(
-        "--noise-position",
-        "METRES",
+    opt.Option(
+        "--noise-position METRES",
         "standard deviation of a measured coordinate, as long as the data are too few to show it",
-        positive,
+        opt.positive,
         default=0.5e-3,
     ),
-    Option(
-        "--noise-angle",
-        "RADIANS",
+    opt.Option(
+        "--noise-angle RADIANS",
         "the same of a measured angle",
-        positive,
+        opt.positive,
         default=math.radians(1.0),
         otherwise="0.0175, 1 deg",
     ),
-    out("CALIBRATED.yaml", "write the robot with its estimated numbers"),
+    opt.out("CALIBRATED.yaml", "write the robot with its estimated numbers"),
 )
 def calibrate(said: Said) -> Answer:
     """Estimate linkage dimensions, joint axes and contact frames of a robot's hand.

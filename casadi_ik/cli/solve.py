@@ -10,6 +10,7 @@ import numpy as np
 
 from casadi_ik.answers.solution import Solution
 from casadi_ik.arm_hand import ArmHand
+from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import (
     located,
     the_fixed,
@@ -17,16 +18,6 @@ from casadi_ik.cli.inputs import (
     the_robot,
     the_solver,
     the_start,
-)
-from casadi_ik.cli.options import (
-    GRASP,
-    ROBOT,
-    SIZE_LIMITS,
-    SOLVER,
-    Option,
-    diagnose,
-    file_name,
-    picture,
 )
 from casadi_ik.cli.outputs import check_outputs
 from casadi_ik.cli.report import as_json, solution_report, write_json
@@ -39,14 +30,14 @@ from casadi_ik.problem.questions import Questions, tolerances_by_finger
 
 
 @command(
-    GRASP,
-    ROBOT,
-    *SOLVER,
-    Option("--out", "FILE.json", "write the solution as JSON", file_name()),
-    picture("--picture", "draw the grasp"),
-    picture("--picture-dark", "the same for a dark page"),
-    diagnose(default=True),
-    SIZE_LIMITS,
+    opt.GRASP,
+    opt.ROBOT,
+    *opt.SOLVER,
+    opt.Option("--out FILE.json", "write the solution as JSON", opt.file_name()),
+    opt.picture("--picture", "draw the grasp"),
+    opt.picture("--picture-dark", "the same for a dark page"),
+    opt.diagnose(default=True),
+    opt.SIZE_LIMITS,
 )
 def solve(said: Said) -> Answer:
     """Find the position of every motor for one grasp.

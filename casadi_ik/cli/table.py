@@ -2,7 +2,7 @@
 
 To add a command, write its function with its options in a module of this folder, new or not::
 
-    @command(GRASP, ROBOT, Option("--colour", "C", "what it is drawn in", default="red"))
+    @command(GRASP, ROBOT, Option("--colour C", "what it is drawn in", default="red"))
     def paint(said: Said) -> Answer:
         \"\"\"Paint a grasp.
 
@@ -204,14 +204,9 @@ def help_of(name: str) -> str:
 
 def usage(name: str, what: Command) -> str:
     """How a command is called: what has to be said."""
-    words = [PROGRAM, name]
-    for option in what.options:
-        value = f"{option.metavar} ..." if option.count in ("+", "*") else option.metavar
-        if not option.dashed:
-            words.append(f"[{value}]" if option.count in ("?", "*") else value)
-        elif option.needed:
-            words.append(f"{option.name} {value}")
-    return " ".join([*words, "[OPTIONS]"] if any(one.dashed for one in what.options) else words)
+    words = [one.said for one in what.options if one.needed or not one.dashed]
+    more = ["[OPTIONS]"] if any(one.dashed for one in what.options) else []
+    return " ".join([PROGRAM, name, *words, *more])
 
 
 def _filled(text: str) -> str:
@@ -273,12 +268,12 @@ class _Parser(argparse.ArgumentParser):
         if rest:
             self.error(self._unknown(rest[0]))
         for option in self._options:
-            raw = getattr(said, option.key)
+            raw = getattr(said, option.attribute)
             if raw is None or raw == []:
-                setattr(said, option.key, option.default)
+                setattr(said, option.attribute, option.default)
             elif option.metavar:
                 try:
-                    setattr(said, option.key, option.read(raw))
+                    setattr(said, option.attribute, option.of(raw))
                 except ValueError as error:
                     self.error(f"{option.name if option.dashed else option.metavar}: {error}")
         return said
@@ -304,9 +299,10 @@ def _argument(option: Option) -> dict[str, Any]:
     found: dict[str, Any] = {"help": option.text.replace("%", "%%")}
     if not option.metavar:
         switch = argparse.BooleanOptionalAction if option.default is not None else "store_true"
-        return found | {"action": switch}
-    names = tuple(option.metavar.split())
-    found |= {"metavar": names if len(names) > 1 else option.metavar, "nargs": option.count}
+        return found | {"action": switch, "dest": option.attribute}
+    several = isinstance(option.count, int)
+    found["metavar"] = tuple(option.metavar.split()) if several else option.metavar
+    found["nargs"] = option.count
     if option.dashed:
-        found["required"] = option.needed
+        found |= {"required": option.needed, "dest": option.attribute}
     return found | ({"action": "extend"} if option.repeated else {})

@@ -12,6 +12,7 @@ import numpy as np
 from casadi_ik import logs
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
+from casadi_ik.cli import options as opt
 from casadi_ik.cli.choose import read_ranked
 from casadi_ik.cli.inputs import (
     located,
@@ -21,18 +22,6 @@ from casadi_ik.cli.inputs import (
     the_robot,
     the_scene,
     the_tolerance,
-)
-from casadi_ik.cli.options import (
-    LIMITS,
-    METHOD,
-    OBJECT_POSE,
-    ROBOT,
-    SCENE,
-    SIZE_LIMITS,
-    TOLERANCES,
-    Option,
-    each,
-    whole,
 )
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.collision.scene import Scene
@@ -52,37 +41,34 @@ if TYPE_CHECKING:
 
 
 @command(
-    Option(
-        "what",
-        "GRASP|ROBOT|LOG|CHOICES",
+    opt.Option(
+        "[GRASP|ROBOT|LOG|CHOICES...]",
         "a shipped name or a file; of logs one or two",
-        each(str),
-        "*",
         default=["cup"],
         otherwise="cup",
+        key="what",
     ),
-    ROBOT,
-    SCENE,
-    METHOD,
-    LIMITS,
-    *TOLERANCES,
-    OBJECT_POSE,
-    Option(
-        "--solve", "N", "which solve of each log", each(whole(0)), "+", otherwise="the only one"
+    opt.ROBOT,
+    opt.SCENE,
+    opt.METHOD,
+    opt.LIMITS,
+    *opt.TOLERANCES,
+    opt.OBJECT_POSE,
+    opt.Option(
+        "--solve N...", "which solve of each log", opt.each(opt.whole(0)), otherwise="the only one"
     ),
-    Option("--pads", "", "correct the pads of a robot's file"),
-    Option("--meshes", "", "draw the meshes of the robot's files"),
-    Option(
-        "--host",
-        "ADDRESS",
+    opt.Option("--pads", "correct the pads of a robot's file"),
+    opt.Option("--meshes", "draw the meshes of the robot's files"),
+    opt.Option(
+        "--host ADDRESS",
         "where it is served; 0.0.0.0: to everybody",
         default="127.0.0.1",
         otherwise="127.0.0.1, this machine only",
     ),
-    Option(
-        "--port", "N", "where it is served", whole(1, 65535), otherwise="the first free from 8080"
+    opt.Option(
+        "--port N", "where it is served", opt.whole(1, 65535), otherwise="the first free from 8080"
     ),
-    SIZE_LIMITS,
+    opt.SIZE_LIMITS,
 )
 def view(said: Said) -> Answer:
     """Show a grasp, a robot, answers or a solve in the browser (needs casadi-ik[view]).

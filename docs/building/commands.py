@@ -25,11 +25,8 @@ def command_line() -> str:
 
 def _option(option: Option) -> str:
     """An option as a definition."""
-    more = " ..." if option.count in ("+", "*") else ""
-    value = f"{option.metavar}{more}" if option.metavar else ""
-    said = f"{option.name} {value}".rstrip() if option.dashed else value
     needed = " *(needed)*" if option.needed else ""
-    return f"`{said}`{needed}\n: {_text(option.text)}"
+    return f"`{option.said}`{needed}\n: {_text(option.text)}"
 
 
 def _text(text: str) -> str:
