@@ -17,7 +17,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import Compression, Keep
-from casadi_ik.logs.write.opening import recorder_of
+from casadi_ik.logs.writer import recorder_of
 from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance

@@ -35,15 +35,6 @@ METHODS = {
 PHASES = ("#f3f1ec", "#fbecd9", "#deebf7", "#e3f2e1")
 """By the code of the phase."""
 
-EVENTS = {
-    "NEAR_SINGULAR": "#8e4ec6",
-    "ILL_CONDITIONED": "#b48ad6",
-    "STALL": "#2b333b",
-    "OSCILLATION": "#0f8b8d",
-    "RESTART": "#2f6db3",
-}
-"""Of the events that are marked; the others show as phases and limits."""
-
 
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
     """A colour for each of some methods: its own, or one that no other of them has."""

@@ -23,7 +23,7 @@ from samplers import random_arm_targets, random_hands
 
 import casadi_ik as ik
 from casadi_ik.logs import EventKind, EventRules, Keep, McapRecorder
-from casadi_ik.logs.write.measured import measured_format
+from casadi_ik.logs.rows import measured_format
 
 FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Thresholds are tried at these multiples of what is the rule, unless said otherwise."""

@@ -38,7 +38,7 @@ from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.writing import tidy
 from casadi_ik.grasps.pose import moved
-from casadi_ik.logs.write.provenance import plain
+from casadi_ik.logs.provenance import plain
 
 BLOCK = 4096
 """Targets in memory at once, at most."""

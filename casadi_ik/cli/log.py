@@ -31,15 +31,14 @@ from casadi_ik.cli.report import (
 )
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
-from casadi_ik.logs.explain.compare import Matched, matched, side_by_side
-from casadi_ik.logs.explain.phrases import SERIOUS, plain_name, told
-from casadi_ik.logs.explain.why import explain
-from casadi_ik.logs.mcap.data_section import NothingWrittenError
-from casadi_ik.logs.read.files import log_files
-from casadi_ik.logs.read.one_solve import OneSolve, happening, one_solve
-from casadi_ik.logs.read.same_robot import check_robot
-from casadi_ik.logs.repair.finish import finish_log
-from casadi_ik.logs.repair.merge import merge_logs
+from casadi_ik.logs.compare import Matched, matched, side_by_side
+from casadi_ik.logs.container import NothingWrittenError
+from casadi_ik.logs.events import SERIOUS, plain_name, told
+from casadi_ik.logs.explanation import explain
+from casadi_ik.logs.repair import finish_log, merge_logs
+from casadi_ik.logs.shards import log_files
+from casadi_ik.logs.solve import OneSolve, check_robot, one_solve
+from casadi_ik.logs.tables import happening
 
 SHOWN = 12
 """How many of a list of names or numbers are shown."""
@@ -303,8 +302,8 @@ def merge(said: Said) -> Answer:
 
 def _exported_view(said: Said, file: Path) -> Answer:
     with located("log export", (MissingExtraError,)):
-        from casadi_ik.logs.viewer.export import write_view
-    from casadi_ik.logs.viewer.layout import layout_of, write_layout
+        from casadi_ik.logs.viewers import write_view
+    from casadi_ik.logs.viewers import layout_of, write_layout
 
     layout = file.with_suffix(".layout.json")
     check_outputs({"--out": file, "the layout": layout}, inputs=[Path(said.file)])

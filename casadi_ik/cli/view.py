@@ -30,8 +30,7 @@ from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.logs.read.one_solve import OneSolve, one_solve
-from casadi_ik.logs.read.same_robot import check_robot
+from casadi_ik.logs.solve import OneSolve, check_robot, one_solve
 
 if TYPE_CHECKING:
     from casadi_ik.viewing import Viewer

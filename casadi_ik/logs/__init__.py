@@ -1,21 +1,16 @@
 """MCAP logs: every iteration into a file, and back."""
 
-from casadi_ik.logs.events.detect import detect_events
-from casadi_ik.logs.events.kinds import EventKind
-from casadi_ik.logs.events.rules import EventRules
-from casadi_ik.logs.explain.compare import matched, side_by_side
-from casadi_ik.logs.explain.why import Explanation, explain
-from casadi_ik.logs.mcap.clock import LogClock
-from casadi_ik.logs.read.asked import Asked
-from casadi_ik.logs.read.info import LogInfo
-from casadi_ik.logs.read.log import Log
-from casadi_ik.logs.read.log import open_log as open  # noqa: A004 - read as `ik.logs.open`
-from casadi_ik.logs.read.one_solve import OneSolve, one_solve
-from casadi_ik.logs.read.table import MethodRows, Table
-from casadi_ik.logs.repair.finish import finish_log
-from casadi_ik.logs.repair.merge import merge_logs
-from casadi_ik.logs.write.keep import Keep
-from casadi_ik.logs.write.recorder import Compression, McapRecorder
+from casadi_ik.logs.compare import matched, side_by_side
+from casadi_ik.logs.detect import detect_events
+from casadi_ik.logs.events import EventKind, EventRules
+from casadi_ik.logs.explanation import Explanation, explain
+from casadi_ik.logs.format import LogClock
+from casadi_ik.logs.reader import Log, LogInfo
+from casadi_ik.logs.reader import open_log as open  # noqa: A004 - read as `ik.logs.open`
+from casadi_ik.logs.repair import finish_log, merge_logs
+from casadi_ik.logs.solve import Asked, OneSolve, one_solve
+from casadi_ik.logs.tables import MethodRows, Table
+from casadi_ik.logs.writer import Compression, Keep, McapRecorder
 
 __all__ = [
     "Asked",

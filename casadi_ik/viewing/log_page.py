@@ -13,7 +13,7 @@ import viser
 from casadi_ik import palette
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
-from casadi_ik.logs.explain.phrases import plain_name
+from casadi_ik.logs.events import EVENT_COLORS, plain_name
 from casadi_ik.viewing.charts import Course, chart
 from casadi_ik.viewing.drawn_contacts import Drags, DrawnContacts
 from casadi_ik.viewing.drawn_robot import DrawnRobot
@@ -224,9 +224,9 @@ def _charts(track: Track, i: int, titled: bool) -> str:
         len(track),
         [(one.first, one.last, shades[one.phase]) for one in solve.stretches],
         [
-            (one.iteration, palette.EVENTS[one.kind])
+            (one.iteration, EVENT_COLORS[one.kind])
             for one in solve.events
-            if one.kind in palette.EVENTS
+            if one.kind in EVENT_COLORS
         ],
         i,
     )
@@ -248,6 +248,6 @@ def _charts(track: Track, i: int, titled: bool) -> str:
     )
     found += chart(f"smallest singular values{of}", track.singular_values, course)
     marks = [(shades[name], plain_name(name)) for name in shades if name]
-    kinds = {one.kind for one in solve.events if one.kind in palette.EVENTS}
-    marks += [(palette.EVENTS[kind], plain_name(kind.lower())) for kind in sorted(kinds)]
+    kinds = {one.kind for one in solve.events if one.kind in EVENT_COLORS}
+    marks += [(EVENT_COLORS[kind], plain_name(kind.lower())) for kind in sorted(kinds)]
     return found + (legend(marks) if marks else "")

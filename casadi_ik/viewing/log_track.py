@@ -11,8 +11,8 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError
 from casadi_ik.grasps import Contact, Grasp
-from casadi_ik.logs.explain.phrases import plain_name, told
-from casadi_ik.logs.read.one_solve import OneSolve, Stretch
+from casadi_ik.logs.events import plain_name, told
+from casadi_ik.logs.solve import OneSolve, Stretch
 from casadi_ik.problem.verdict import ContactVerdict
 from casadi_ik.viewing.asked import Asked, asked_of
 

@@ -15,7 +15,7 @@ from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.grasps import Grasp
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.logs.read.one_solve import OneSolve
+from casadi_ik.logs.solve import OneSolve
 from casadi_ik.viewing.access import LOOPBACK
 from casadi_ik.viewing.asked import Asked, Settings, asked_of
 from casadi_ik.viewing.grasp_page import GraspPage

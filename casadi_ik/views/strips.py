@@ -8,15 +8,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from casadi_ik import palette
 from casadi_ik.logs import Table
-from casadi_ik.logs.events.traces import bits_of
+from casadi_ik.logs.detect import bits_of
+from casadi_ik.logs.events import EVENT_COLORS
 from casadi_ik.views.picture import INK
 
 LIMIT_COLOR = "#c2334d"
-
-EVENT_COLORS = palette.EVENTS
-"""Of the events that are marked; the others show as phases and limits."""
 
 Span = tuple[float, float]
 """Where a bar begins, and how wide it is."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from casadi_ik.kernels.compiler import find_compiler
-from casadi_ik.logs.write.provenance import machine, package_versions
+from casadi_ik.logs.provenance import machine, package_versions
 
 PACKAGES = ("casadi-ik", "casadi", "numpy", "polars", "joblib", "dask")
 

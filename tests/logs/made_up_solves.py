@@ -27,7 +27,7 @@ LAYOUT = Layout.record(
     Field("cost", unit="", doc="what is minimised"),
     Field("sigma_closed_chain", dtype="f4"),
     Field("limit_mask", dtype="u4", doc="coordinates on a limit"),
-    Field("restart", dtype="i4"),
+    Field("restart", dtype="u4"),
     Field("flags", (5,), "u1"),
 )
 LABELS = {"phase": PHASES, "q": JOINTS, "position_error": FINGERS}

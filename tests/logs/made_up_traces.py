@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs.read.asked import Asked
-from casadi_ik.logs.read.one_solve import Happening, OneSolve
+from casadi_ik.logs import Asked
+from casadi_ik.logs.events import Happening
+from casadi_ik.logs.solve import OneSolve
 from casadi_ik.problem.problems import Tolerance
 
 FINGERS = ("thumb", "finger_2")

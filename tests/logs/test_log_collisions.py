@@ -9,9 +9,8 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs import EventKind, detect_events, explain
-from casadi_ik.logs.events.rules import EventRules
-from casadi_ik.logs.read.one_solve import one_solve
+from casadi_ik.logs import EventKind, EventRules, detect_events, explain
+from casadi_ik.logs.solve import one_solve
 from casadi_ik.problem.trace import TraceFormat
 
 

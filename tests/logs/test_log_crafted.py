@@ -23,10 +23,9 @@ import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.errors import CasadiIKError, LogError, printable
 from casadi_ik.logs import McapRecorder, finish_log, merge_logs, one_solve
-from casadi_ik.logs.mcap.contents import read_contents
-from casadi_ik.logs.mcap.metadata import CHECKSUM, METADATA_NAME, checksum
-from casadi_ik.logs.mcap.records import HEAD, MAGIC, records
-from casadi_ik.logs.mcap.unpacking import read_chunk
+from casadi_ik.logs.chunks import RECORD as HEAD
+from casadi_ik.logs.container import MAGIC, read_chunk, read_contents, records
+from casadi_ik.logs.provenance import METADATA_NAME, signed
 
 BOUNDED = settings(
     max_examples=60,
@@ -72,8 +71,8 @@ def places(data: bytes, path: Path) -> list[int]:
         for record in records(stream, len(MAGIC), len(data) - len(MAGIC)):
             kinds[record.opcode] = kinds.get(record.opcode, 0) + 1
             if kinds[record.opcode] <= 2:
-                inside = rng.integers(record.offset, record.end, 4).tolist()
-                found |= {record.offset, record.offset + 1, record.end - 1, *inside}
+                start, end = record.offset, record.offset + record.length
+                found |= {start, start + 1, end - 1, *rng.integers(start, end, 4).tolist()}
     assert len(kinds) >= 12, "every kind of record but a message outside of chunks"
     return sorted(found)
 
@@ -129,7 +128,7 @@ def crafted(
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start("ros2")
-        writer.add_metadata(METADATA_NAME, {**entries, CHECKSUM: checksum(entries)})
+        writer.add_metadata(METADATA_NAME, signed(entries))
         numbers: dict[int, int] = {}
         for form, own, message in found:
             assert form is not None

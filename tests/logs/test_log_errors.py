@@ -37,7 +37,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
         left[0] -= done
         return done
 
-    monkeypatch.setattr("casadi_ik.logs.mcap.file.os.write", limited)
+    monkeypatch.setattr("casadi_ik.logs.writer.os.write", limited)
 
 
 def record_many(path: Path, blocks: int) -> None:
@@ -110,7 +110,7 @@ def test_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         def refuse(*_: object) -> int:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-        monkeypatch.setattr("casadi_ik.logs.mcap.file.os.open", refuse)
+        monkeypatch.setattr("casadi_ik.logs.writer.os.open", refuse)
     with pytest.raises(LogError, match="Permission denied"):
         McapRecorder(folder / "cup.mcap", robot_name="made_up")
     assert list(folder.iterdir()) == []
@@ -187,7 +187,7 @@ def test_an_interrupt_while_a_chunk_is_written(
             raise KeyboardInterrupt
         return done
 
-    monkeypatch.setattr("casadi_ik.logs.mcap.file.os.write", interrupted)
+    monkeypatch.setattr("casadi_ik.logs.writer.os.write", interrupted)
     path = tmp_path / "cup.mcap"
     with pytest.raises(KeyboardInterrupt):
         record_many(path, 4)

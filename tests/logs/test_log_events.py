@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs import EventKind, EventRules, detect_events
-from casadi_ik.logs.events.kinds import event_format
-from casadi_ik.logs.read.table import MethodRows, Table
+from casadi_ik.logs.events import event_format
+from casadi_ik.logs.tables import MethodRows, Table
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 
 STORAGE = {"phase": "u1", "restart": "u4", "limit_mask": "u4", "active_mask": "u4"}

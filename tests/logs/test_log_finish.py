@@ -15,8 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from casadi_ik.errors import LogError
-from casadi_ik.logs import McapRecorder
-from casadi_ik.logs.repair.finish import finish_log
+from casadi_ik.logs import McapRecorder, finish_log
 
 Write = Callable[..., Path]
 

@@ -9,9 +9,8 @@ from made_up_solves import make_block
 
 import casadi_ik as ik
 from casadi_ik.errors import LogError
-from casadi_ik.logs import McapRecorder
-from casadi_ik.logs.mcap import records
-from casadi_ik.logs.write.chunk_stream import CHUNK_SIZE
+from casadi_ik.logs import McapRecorder, chunks
+from casadi_ik.logs.writer import CHUNK_SIZE
 
 LIMIT = 3 * CHUNK_SIZE
 
@@ -19,7 +18,7 @@ LIMIT = 3 * CHUNK_SIZE
 @pytest.fixture(autouse=True)
 def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Readers and writers that take little."""
-    monkeypatch.setattr(records, "RECORD_LIMIT", LIMIT)
+    monkeypatch.setattr(chunks, "RECORD_LIMIT", LIMIT)
 
 
 def test_a_solve_that_is_too_large_leaves_the_log_usable(tmp_path: Path) -> None:

@@ -14,9 +14,8 @@ from rosbags.highlevel import AnyReader
 from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.errors import LogError
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs import LogClock
+from casadi_ik.logs import LogClock, merge_logs
 from casadi_ik.logs import open as open_log
-from casadi_ik.logs.repair.merge import merge_logs
 from casadi_ik.problem.trace import TraceFormat
 
 Write = Callable[..., Path]

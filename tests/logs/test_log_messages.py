@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from casadi_ik.errors import LogError
 from casadi_ik.kernels.layout import STORAGE, Field, Layout
-from casadi_ik.logs.mcap import schema
-from casadi_ik.logs.mcap.message_bytes import CDR_HEADER
+from casadi_ik.logs import format as schema
+from casadi_ik.logs.chunks import CDR_HEADER
 
 NAME = "casadi_ik/msg/Random"
 names = st.from_regex(r"[a-z]([a-z0-9]|_[a-z0-9]){0,12}", fullmatch=True)

@@ -24,7 +24,7 @@ Write = Callable[..., Path]
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every solve ends a chunk."""
-    monkeypatch.setattr("casadi_ik.logs.write.chunk_stream.CHUNK_SIZE", 1)
+    monkeypatch.setattr("casadi_ik.logs.writer.CHUNK_SIZE", 1)
 
 
 def ids(log: Log, **filters: object) -> list[int]:
@@ -68,7 +68,7 @@ def test_only_the_chunks_asked_for_are_read(write: Write, monkeypatch: pytest.Mo
     log = ik.logs.open(write(make_block(*[10] * 20)))
     assert log.info().chunks == 20
     read: list[int] = []
-    from casadi_ik.logs.mcap import unpacking
+    from casadi_ik.logs import shards as unpacking
 
     whole = unpacking.read_chunk
     monkeypatch.setattr(

@@ -10,13 +10,9 @@ import pytest
 from made_up_solves import changed, make_block
 
 import casadi_ik as ik
-from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.kernels.layout import Layout
 from casadi_ik.logs import OneSolve, one_solve
-from casadi_ik.logs.write import recorder as writer
-from casadi_ik.logs.write.solve_rows import solve_format, solve_rows
+from casadi_ik.logs.rows import solve_format
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.trace import TraceFormat
 
 GRASP = ik.load_grasp("cup")
 
@@ -86,32 +82,3 @@ def test_held_actuators_beyond_one_word(write: Callable[..., Path]) -> None:
     assert solve.asked.limits == "ignore"
     assert solve.asked.start is not None
     assert solve.asked.start[[0, 1, 33]].tolist() == [1.0, 0.5, -0.25]
-
-
-def test_a_log_of_an_earlier_version(
-    write: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Then the solver's settings are all there is."""
-    new = ("start", "position_tolerance", "angle_tolerance", "seed", "fixed_mask")
-
-    def before(block: SolveBlock) -> TraceFormat:
-        form = solve_format(block)
-        kept = [item for item in form.layout if item.name not in (*new, "limits_enforced")]
-        return TraceFormat(Layout(tuple(kept)), form.labels)
-
-    def rows(block: SolveBlock, events: np.ndarray, form: TraceFormat) -> np.ndarray:
-        whole = solve_rows(block, events, solve_format(block))
-        old = np.zeros(len(whole), form.layout.dtype)
-        for name in form.layout.names:
-            old[name] = whole[name]
-        return old
-
-    monkeypatch.setattr(writer, "solve_format", before)
-    monkeypatch.setattr(writer, "solve_rows", rows)
-    parameters = {"limits": "ignore", "tolerance": {"thumb": {"position": 1e-3, "angle": 0.1}}}
-    path = write(make_block(3), parameters=parameters, seed=4)
-    solve = one_solve(ik.logs.open(path))
-    assert solve.asked.start is None
-    assert solve.asked.fixed == {}
-    assert (solve.asked.limits, solve.asked.seed) == ("ignore", 4)
-    assert solve.tolerances == (ik.Tolerance(1e-3, 0.1), ik.Tolerance(), ik.Tolerance())

@@ -17,10 +17,10 @@ import casadi_ik as ik
 from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.logs import EventKind, LogClock, Table
-from casadi_ik.logs.events.kinds import event_format
-from casadi_ik.logs.mcap.schema import KINDS, topic
-from casadi_ik.logs.write.chunk_stream import CHUNK_SIZE
-from casadi_ik.logs.write.solve_rows import solve_format
+from casadi_ik.logs.events import event_format
+from casadi_ik.logs.format import KINDS, topic
+from casadi_ik.logs.rows import solve_format
+from casadi_ik.logs.writer import CHUNK_SIZE
 
 Write = Callable[..., Path]
 

@@ -12,8 +12,8 @@ from made_up_solves import FORMAT, LABELS, make_block
 import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.kernels.layout import Layout
-from casadi_ik.logs.explain.why import explain
-from casadi_ik.logs.read.one_solve import one_solve
+from casadi_ik.logs.explanation import explain
+from casadi_ik.logs.solve import one_solve
 from casadi_ik.problem.jacobian_measures import THRESHOLDS, JacobianMeasures
 from casadi_ik.problem.status import Phase
 

@@ -14,7 +14,7 @@ import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.errors import LogError
 from casadi_ik.logs import Keep, Log, finish_log, merge_logs, one_solve
-from casadi_ik.logs.mcap.records import MAGIC
+from casadi_ik.logs.container import MAGIC
 
 Write = Callable[..., Path]
 

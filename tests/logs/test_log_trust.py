@@ -18,8 +18,8 @@ from made_up_solves import make_block
 import casadi_ik as ik
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.logs import Log
-from casadi_ik.logs.mcap.contents import read_contents
-from casadi_ik.logs.write.chunk_stream import CHUNK_SIZE
+from casadi_ik.logs.container import read_contents
+from casadi_ik.logs.writer import CHUNK_SIZE
 
 Write = Callable[..., Path]
 
@@ -62,7 +62,7 @@ def said_of(path: Path) -> Any:
 @pytest.fixture
 def whole(write: Write, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A log of several chunks and two methods."""
-    monkeypatch.setattr("casadi_ik.logs.write.chunk_stream.CHUNK_SIZE", 2**15)
+    monkeypatch.setattr("casadi_ik.logs.writer.CHUNK_SIZE", 2**15)
     blocks = [make_block(*[60] * 3, first=3 * i) for i in range(3)]
     return write(*blocks, make_block(20, 30, method="hand-first"), urdf="<robot/>" * 100)
 

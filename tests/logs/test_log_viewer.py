@@ -17,10 +17,8 @@ from viewer_reader import Decoded, decode, draw
 
 import casadi_ik as ik
 from casadi_ik.errors import LogError
-from casadi_ik.logs.read.one_solve import OneSolve, one_solve
-from casadi_ik.logs.read.same_robot import check_robot
-from casadi_ik.logs.viewer.export import write_view
-from casadi_ik.logs.viewer.layout import layout_of, shipped_layout, write_layout
+from casadi_ik.logs.solve import OneSolve, check_robot, one_solve
+from casadi_ik.logs.viewers import layout_of, shipped_layout, write_layout, write_view
 
 
 @pytest.fixture(scope="module")

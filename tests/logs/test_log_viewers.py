@@ -16,7 +16,7 @@ from made_up_solves import make_block
 
 import casadi_ik as ik
 from casadi_ik.logs import one_solve
-from casadi_ik.logs.viewer.export import write_view
+from casadi_ik.logs.viewers import write_view
 
 PACKAGES = (
     "@mcap/core@2.2.2",

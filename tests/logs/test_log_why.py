@@ -10,9 +10,9 @@ from made_up_traces import LAYOUT, event, make_one, make_rows
 
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.layout import Layout
-from casadi_ik.logs.explain.compare import side_by_side, target_key
-from casadi_ik.logs.explain.phrases import told
-from casadi_ik.logs.explain.why import explain
+from casadi_ik.logs.compare import side_by_side, target_key
+from casadi_ik.logs.events import told
+from casadi_ik.logs.explanation import explain
 
 DEGREE = float(np.deg2rad(1.0))
 

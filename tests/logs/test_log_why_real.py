@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.logs.explain.why import explain
-from casadi_ik.logs.read.one_solve import OneSolve, one_solve
+from casadi_ik.logs.explanation import explain
+from casadi_ik.logs.solve import OneSolve, one_solve
 
 COUNT = 5
 """Arms per grasp."""

@@ -9,9 +9,9 @@ from pathlib import PurePath
 import numpy as np
 
 from casadi_ik.arrays import Array, Bools, Counts
-from casadi_ik.logs.events.kinds import SINGULAR
-from casadi_ik.logs.read.log import Log
-from casadi_ik.logs.read.table import MethodRows
+from casadi_ik.logs.events import SINGULAR
+from casadi_ik.logs.reader import Log
+from casadi_ik.logs.tables import MethodRows
 
 ALL = "all"
 

@@ -9,10 +9,9 @@ from html import escape
 import numpy as np
 
 from casadi_ik.errors import printable
-from casadi_ik.logs.explain.row_errors import worst
-from casadi_ik.logs.explain.why import explain
-from casadi_ik.logs.read.log import Log
-from casadi_ik.logs.read.one_solve import one_solve
+from casadi_ik.logs.explanation import explain, worst
+from casadi_ik.logs.reader import Log
+from casadi_ik.logs.solve import one_solve
 from casadi_ik.views.report.figures import curve, effort, places
 from casadi_ik.views.report.groups import Group, groups_of, hardest
 

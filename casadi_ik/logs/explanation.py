@@ -1,0 +1,377 @@
+"""Solves in words, from their traces alone: how one ended and what happened on its way.
+
+Nothing here is a cause that was proven: what is said to have happened together, happened together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Array
+from casadi_ik.logs.events import errors_text, listed, number, plain_name
+from casadi_ik.logs.solve import OneSolve, Stretch
+from casadi_ik.problem.trace import CLEARANCE, SIGMA
+
+STRETCHES_SHOWN = 6
+"""More stretches than this are told phase by phase."""
+
+DIP = 0.1
+"""A smallest singular value below this share of its median is worth a line."""
+
+STILL_FALLING = 0.05
+"""Share by which the worst error has to fall over the last tenth to count as still falling."""
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """The story of a solve, each part a few lines.
+
+    Attributes:
+        headline: How it ended.
+        phases: What each phase achieved.
+        fingers: Which finger lagged, and how.
+        met: Singularities, limits, stalls and oscillations, and when.
+        verdict: How it stood at the end.
+
+    Example:
+        >>> story = ik.logs.explain(ik.logs.one_solve(ik.logs.open("cup.mcap")))
+        >>> isinstance(story.headline, str), len(story.phases) > 0
+        (True, True)
+    """
+
+    headline: str
+    phases: tuple[str, ...] = ()
+    fingers: tuple[str, ...] = ()
+    met: tuple[str, ...] = ()
+    verdict: tuple[str, ...] = ()
+
+
+def explain(solve: OneSolve) -> Explanation:
+    """Explain a solve.
+
+    Args:
+        solve: The solve; without a trace only how it ended can be said.
+
+    Example:
+        >>> story = ik.logs.explain(ik.logs.one_solve(ik.logs.open("cup.mcap")))
+        >>> bool(story.verdict)
+        True
+    """
+    outcome = "solved" if solve.success else f"not solved ({solve.status})"
+    headline = (
+        f"{solve.method}, solve {solve.solve_id}: {outcome} after {solve.iterations} iterations"
+    )
+    if solve.restarts:
+        headline += f" and {solve.restarts} restarts"
+    if len(solve.rows) == 0:
+        kept = "the log kept no iterations of this solve"
+        return Explanation(headline, verdict=(kept, *_verdict(solve)))
+    return Explanation(
+        headline,
+        tuple(_phases(solve)),
+        tuple(_fingers(solve)),
+        (
+            *_singularities(solve),
+            *_limits(solve),
+            *_standstills(solve),
+            *collision_lines(solve),
+        ),
+        (*_verdict(solve), *_at_the_end(solve)),
+    )
+
+
+def _phases(solve: OneSolve) -> Iterator[str]:
+    position, angle = errors_of(solve)
+    seen: NDArray[np.bool_] = np.any(~np.isnan(solve.columns("position_error")), axis=1)
+    for name, stretches in _by_phase(solve).items():
+        first, last = stretches[0].first, stretches[-1].last
+        count = sum(map(len, stretches))
+        times = f" in {len(stretches)} goes" if len(stretches) > 1 else ""
+        measured = [i for each in stretches for i in range(each.first, each.last + 1) if seen[i]]
+        if not measured:
+            yield f"{name} (iterations {first} to {last}, {count}{times}): errors not measured"
+            continue
+        begin, end = measured[0], measured[-1]
+        ways = [
+            f"{finger} {_short(position[begin, i], angle[begin, i])}"
+            f" -> {_short(position[end, i], angle[end, i])}"
+            for i, finger in enumerate(solve.fingers)
+            if not (math.isnan(position[end, i]) and math.isnan(angle[end, i]))
+        ]
+        yield (f"{name} (iterations {first} to {last}, {count}{times}): " + ", ".join(ways))
+
+
+def _by_phase(solve: OneSolve) -> dict[str, list[Stretch]]:
+    """Stretches one by one under names of their own, or by phase if they are many."""
+    names = Counter(stretch.phase for stretch in solve.stretches)
+    found: dict[str, list[Stretch]] = {}
+    for i, stretch in enumerate(solve.stretches):
+        name = plain_name(stretch.phase) or "the solve"
+        if len(solve.stretches) <= STRETCHES_SHOWN and names[stretch.phase] > 1:
+            before = sum(each.phase == stretch.phase for each in solve.stretches[:i])
+            name += f" {before + 1}"
+        found.setdefault(name, []).append(stretch)
+    return found
+
+
+def _short(position: float, angle: float) -> str:
+    parts = [] if math.isnan(position) else [f"{1e3 * position:.1f} mm"]
+    parts += [] if math.isnan(angle) else [f"{math.degrees(angle):.1f} deg"]
+    return " ".join(parts)
+
+
+def _fingers(solve: OneSolve) -> Iterator[str]:
+    """Who lagged: on failure every finger that is out, otherwise the last one to come in."""
+    inside, (position, angle) = within(solve), errors_of(solve)
+    for i in np.flatnonzero(~solve.ok).tolist():
+        tolerance = solve.tolerances[i]
+        share = np.fmax(position[:, i] / tolerance.position, angle[:, i] / tolerance.angle)
+        best = int(np.nanargmin(share))
+        line = (
+            f"{solve.fingers[i]} lagged: it ends"
+            f" {errors_text(float(solve.position_error[i]), float(solve.angle_error[i]))} off"
+        )
+        if inside[:, i].any():
+            last = int(np.flatnonzero(inside[:, i])[-1])
+            line += f"; it was within tolerance in {int(inside[:, i].sum())} iterations"
+            line += f", the last of them {last}"
+        else:
+            line += (
+                f"; at its nearest, in iteration {best}, it was"
+                f" {errors_text(position[best, i], angle[best, i])} off"
+            )
+        yield line
+    if solve.ok.all() and len(solve.fingers) > 1:
+        entered = [_entered(inside[:, i]) for i in range(len(solve.fingers))]
+        order = np.argsort(entered, kind="stable")
+        if entered[order[-1]] > entered[order[-2]]:
+            yield (
+                f"{solve.fingers[order[-1]]} was the last to come within tolerance, in iteration"
+                f" {entered[order[-1]]}; the others were there in iteration {entered[order[-2]]}"
+            )
+        else:
+            yield f"the fingers came within tolerance together, in iteration {entered[order[-1]]}"
+
+
+def _entered(inside: NDArray[np.bool_]) -> int:
+    """From which row on it holds to the end."""
+    out = np.flatnonzero(~inside)
+    return int(out[-1]) + 1 if len(out) else 0
+
+
+def _singularities(solve: OneSolve) -> Iterator[str]:
+    entries: dict[str, list[int]] = {}
+    thresholds: dict[str, float] = {}
+    for event in solve.events:
+        if event.kind == "NEAR_SINGULAR":
+            entries.setdefault(event.jacobian, []).append(event.iteration)
+            thresholds[event.jacobian] = event.threshold
+    for jacobian, iterations in entries.items():
+        line = f"{plain_name(jacobian)} near singular from iteration {iterations[0]} on"
+        name = SIGMA + jacobian
+        if name in solve.layout.names and solve.rows[name].ndim == 1:
+            sigma = solve.rows[name].astype(float)
+            below = int((sigma < thresholds[jacobian]).sum())
+            lowest = int(np.nanargmin(sigma))
+            line += (
+                f", {below} iterations in all; smallest singular value {number(sigma[lowest])} in"
+                f" iteration {lowest} (threshold {number(thresholds[jacobian])})"
+            )
+        if len(iterations) > 1:
+            line += f", entered {len(iterations)} times"
+        yield line
+    measured = [name for name in solve.layout.names if name.startswith(SIGMA)]
+    if not measured:
+        yield "singular values: not measured"
+    for name in measured:
+        jacobian = name.removeprefix(SIGMA)
+        if jacobian in entries:
+            continue
+        sigma = solve.columns(name)
+        if np.isnan(sigma).all():
+            yield f"singular values of the {plain_name(jacobian)}: not measured"
+            continue
+        lowest, usual = float(np.nanmin(sigma)), float(np.nanmedian(sigma))
+        if lowest < DIP * usual:
+            row = int(np.nanargmin(np.fmin.reduce(sigma, axis=1)))
+            yield (
+                f"smallest singular value of the {plain_name(jacobian)} down to {number(lowest)} in"
+                f" iteration {row} (median {number(usual)})"
+            )
+        else:
+            yield (
+                f"{plain_name(jacobian)} never near singular: smallest singular value"
+                f" {number(lowest)}"
+            )
+
+
+def _limits(solve: OneSolve) -> Iterator[str]:
+    hits = Counter(
+        joint for event in solve.events if event.kind == "LIMIT_HIT" for joint in event.joints
+    )
+    restless = {joint: count for joint, count in hits.items() if count > 3}
+    if restless:
+        shown = [f"{joint} {count} times" for joint, count in Counter(restless).most_common()]
+        yield f"to its limit and off again: {listed(shown)}"
+    beyond = " or beyond" if solve.asked.limits == "ignore" else ""
+    for joint, since in limits_held(solve).items():
+        yield f"{joint} at{beyond} its limit from iteration {since} to the end"
+
+
+def limits_held(solve: OneSolve) -> dict[str, int]:
+    """Actuators that stand at a limit in the last row, and since which row."""
+    if len(solve.rows) == 0 or "limit_mask" not in solve.layout.names:
+        return {}
+    bits = solve.bits("limit_mask")
+    return {
+        solve.name_of("limit_mask", bit): _entered(bits[:, bit])
+        for bit in np.flatnonzero(bits[-1]).tolist()
+    }
+
+
+def _standstills(solve: OneSolve) -> Iterator[str]:
+    stalls = [event for event in solve.events if event.kind == "STALL"]
+    if stalls:
+        phase = plain_name(stalls[0].phase) or "it"
+        line = f"{phase} stood still in iteration {stalls[0].iteration}"
+        yield line + (f" and {len(stalls) - 1} times more" if len(stalls) > 1 else "")
+    swings = [event for event in solve.events if event.kind == "OSCILLATION"]
+    if swings:
+        joints = Counter(joint for event in swings for joint in event.joints)
+        line = f"{listed([joint for joint, _ in joints.most_common()])} went to and fro without"
+        line += f" progress, first in iteration {swings[0].iteration}"
+        yield line + (f", {len(swings)} times" if len(swings) > 1 else "")
+
+
+def _verdict(solve: OneSolve) -> Iterator[str]:
+    for i, finger in enumerate(solve.fingers):
+        tolerance, missed = solve.tolerances[i], []
+        if solve.position_error[i] > tolerance.position:
+            missed.append(f"its point by {1e3 * solve.position_error[i]:.2f} mm")
+        if solve.angle_error[i] > tolerance.angle:
+            missed.append(f"its normal by {math.degrees(solve.angle_error[i]):.2f} deg")
+        if not solve.ok[i]:
+            yield f"{finger} misses {' and '.join(missed) or 'a tolerance of its own'}"
+    if solve.ok.all():
+        good = "every contact is within tolerance"
+        if solve.status == "COLLISION":
+            yield f"{good}, and limits are kept, but something touches"
+        else:
+            yield good if solve.success else f"{good}, but a limit is violated"
+    yield from answer_lines(solve)
+
+
+def _at_the_end(solve: OneSolve) -> Iterator[str]:
+    """What held when a solve that failed came to its end."""
+    if solve.success:
+        return
+    last = len(solve.rows) - 1
+    singular = {
+        event.jacobian: event.threshold for event in solve.events if event.kind == "NEAR_SINGULAR"
+    }
+    for jacobian, threshold in singular.items():
+        sigma = solve.columns(SIGMA + jacobian)[last]
+        if np.any(sigma < threshold):
+            yield f"at its end the {plain_name(jacobian)} is near singular"
+    at_limit = limits_held(solve)
+    if at_limit:
+        beyond = " or beyond" if solve.asked.limits == "ignore" else ""
+        yield f"at its end at{beyond} a limit: {', '.join(at_limit)}"
+    if solve.status == "ITERATION_LIMIT":
+        yield _progress(solve)
+
+
+def _progress(solve: OneSolve) -> str:
+    share = worst(solve)
+    tenth = max(len(share) // 10, 1)
+    before, now = float(share[-tenth - 1 if len(share) > tenth else 0]), float(share[-1])
+    if now < (1 - STILL_FALLING) * before:
+        return (
+            f"its budget ran out while the worst error was still falling: by"
+            f" {100 * (1 - now / before):.0f} % over the last {tenth} iterations"
+        )
+    return f"its budget ran out, and over the last {tenth} iterations the worst error did not fall"
+
+
+def collision_lines(solve: OneSolve) -> Iterator[str]:
+    """When iterations touched something; nothing is said of a solve without a scene."""
+    if CLEARANCE not in solve.layout.names or len(solve.rows) == 0:
+        return
+    clearance = solve.rows[CLEARANCE].astype(float)
+    entered = [one for one in solve.events if one.kind == "COLLISION_ENTERED"]
+    left = [one for one in solve.events if one.kind == "COLLISION_LEFT"]
+    if not entered:
+        yield f"nothing touched on the way: clearance at least {_mm(float(np.nanmin(clearance)))}"
+        return
+    deepest = int(np.nanargmin(clearance))
+    line = f"something touched from iteration {entered[0].iteration} on"
+    if len(entered) > 1:
+        line += f", {len(entered)} times"
+    line += f"; clearance down to {_mm(float(clearance[deepest]))} in iteration {deepest}"
+    if len(left) == len(entered):
+        line += f"; free from iteration {left[-1].iteration} on"
+    yield line
+
+
+def answer_lines(solve: OneSolve) -> Iterator[str]:
+    """How far the answer is from touching something."""
+    if solve.clearance is None:
+        yield "collision not checked"
+    elif solve.closest is None:
+        yield "nothing there to touch"
+    else:
+        pair = " and ".join(solve.closest)
+        what = "overlap by" if solve.clearance < 0 else "are nearest to touching:"
+        yield f"{pair} {what} {_mm(abs(solve.clearance))}"
+    if CLEARANCE in solve.layout.names and len(solve.rows) and solve.clearance is not None:
+        last = float(solve.rows[CLEARANCE][-1])
+        if solve.success and last < 0 <= solve.clearance:
+            yield f"chosen among other answers; the last iteration touched by {_mm(-last)}"
+
+
+def _mm(value: float) -> str:
+    return f"{1e3 * value:.2f} mm"
+
+
+def within(solve: OneSolve) -> NDArray[np.bool_]:
+    """Whether each finger is within tolerance in each row, (k, f).
+
+    What is free always is; what was not yet measured is not.
+    """
+    position, angle = errors_of(solve)
+    near = (position <= solve.position_tolerance) | np.isnan(solve.position_error)
+    return near & ((angle <= solve.angle_tolerance) | np.isnan(solve.angle_error))
+
+
+def worst(solve: OneSolve) -> Array:
+    """Error of the worst finger in multiples of its tolerance, (k,); inf if not yet measured."""
+    position, angle = errors_of(solve)
+    share = np.fmax(
+        np.nanmax(position / solve.position_tolerance, axis=1, initial=0.0),
+        np.nanmax(angle / solve.angle_tolerance, axis=1, initial=0.0),
+    )
+    share[np.isnan(np.hstack([position, angle])).all(axis=1)] = np.inf
+    return share
+
+
+def errors_of(solve: OneSolve) -> tuple[Array, Array]:
+    """Distances [m] and angles [rad] of all fingers in each row, (k, f) each.
+
+    A row in which they were not measured (NaN) has those of the row before; what is free is NaN.
+    """
+    position, angle = solve.columns("position_error"), solve.columns("angle_error")
+    position[:, np.isnan(solve.position_error)] = np.nan
+    angle[:, np.isnan(solve.angle_error)] = np.nan
+    return _filled(position), _filled(angle)
+
+
+def _filled(matrix: Array) -> Array:
+    rows = np.arange(len(matrix))[:, None]
+    last = np.maximum.accumulate(np.where(np.isnan(matrix), 0, rows), axis=0)
+    return np.take_along_axis(matrix, last, axis=0)

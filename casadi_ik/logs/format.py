@@ -1,0 +1,179 @@
+"""Conventions of a log: topics, schemas as ros2msg text, and log times.
+
+The text of a schema is all a reader needs to get the `Layout` back: each line carries the type and
+the name and, behind "#", the shape if it has more than one axis, the unit and the doc.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.errors import InputError, LogError
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.logs.chunks import check_size
+
+KINDS = ("iteration", "solve", "event")
+"""The kinds of messages, each on a topic of its own per method."""
+
+ITERATION = 1_000_000
+"""Log time between two iterations: 1 ms [ns]."""
+
+_ROS_TYPES = {"f8": "float64", "f4": "float32", "u4": "uint32", "i4": "int32", "u1": "uint8"}
+_ROS_NAME = re.compile(r"(?!.*__)(?!.*_\Z)[a-z][a-z0-9_]*\Z")
+_CONSTANT = re.compile(r"[a-z]+[0-9]*\s+[A-Z][A-Z0-9_]*\s*=")
+_LINE = re.compile(r"(?P<type>[a-z]+[0-9]*)(?P<array>\[\d{1,9}\])?\s+(?P<name>[a-z]\w*)\Z")
+_COMMENT = re.compile(
+    r"(?:\((?P<shape>\d{1,9}(?:, \d{1,9}){0,7})\) )?\[(?P<unit>[^\]]*)\](?: (?P<doc>.*))?\Z"
+)
+
+
+@dataclass(frozen=True)
+class LogClock:
+    """Log times are computed, not measured, so that a solve is a known range of time.
+
+    The default is the same in every log, so that the logs of several workers share one time; true
+    times are publish times.
+
+    Attributes:
+        t0: Log time of solve 0, iteration 0 [ns since the Unix epoch]: the year 2000 begins.
+        slot: Log time between two solves, room for 60,000 iterations [ns].
+
+    Example:
+        >>> ik.logs.LogClock(t0=0).slot > 0
+        True
+    """
+
+    t0: int = 946_684_800_000_000_000
+    slot: int = 60_000_000_000
+
+    def start(self, solve_id: int) -> int:
+        """Log time of a solve's first iteration [ns]."""
+        return self.t0 + solve_id * self.slot
+
+    def check(self, first: int, counts: NDArray[np.int64]) -> None:
+        """Check that there is time for solves from `first` on, of so many iterations (k,).
+
+        Raises:
+            LogError: There are more iterations than the slot has room for, or a solve's number is
+                negative or beyond what 64-bit nanoseconds can tell.
+        """
+        last = first + len(counts) - 1
+        if not (first >= 0 and last < 2**32 and self.start(last + 1) < 2**63):
+            wrong = first if first < 0 else last
+            raise LogError(f"solve {wrong}: the log has no time for a solve of this number")
+        room = self.slot // ITERATION
+        if counts.size and counts.max() > room:
+            raise LogError(
+                f"solve {first + int(counts.argmax())}: {counts.max()} iterations, the log has room"
+                f" for {room} per solve"
+            )
+
+    def times(self, solve_id: NDArray[np.int64], iteration: NDArray[np.int64]) -> np.ndarray:
+        """Log times of iterations, uint64 [ns]; both arguments of the same shape."""
+        return (self.t0 + solve_id * self.slot + iteration * ITERATION).astype(np.uint64)
+
+    def locate(self, log_times: np.ndarray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Solve and iteration of log times: the inverse of `times`, two int64 arrays."""
+        since = log_times.astype(np.int64) - self.t0
+        solve_id = since // self.slot
+        return solve_id, (since - solve_id * self.slot) // ITERATION
+
+
+def topic(method: str, kind: str) -> str:
+    """Topic of a method's messages; kind is one of `KINDS`."""
+    return f"/ik/{method}/{kind}"
+
+
+def schema_name(kind: str, method: str, layout: Layout, fingers: int) -> str:
+    """Schema name of a method's messages: the kind, the method and the robot's shape.
+
+    Q is the number of coordinates, F of fingers, J of singular values that are logged:
+    "casadi_ik/msg/IterationEnhancedDlsQ14F3J4".
+
+    Args:
+        kind: One of `KINDS`.
+        method: Name of the method.
+        layout: Of its iterations.
+        fingers: Number of fingers.
+    """
+    words = "".join(word[:1].upper() + word[1:] for word in re.findall(r"[A-Za-z0-9]+", method))
+    coordinates = next((item.size for item in layout if item.name == "q"), 0)
+    jacobians = sum(item.size for item in layout if item.name.startswith("sigma_"))
+    return f"casadi_ik/msg/{kind.capitalize()}{words}Q{coordinates}F{fingers}J{jacobians}"
+
+
+def schema_text(layout: Layout, labels: Mapping[str, tuple[str, ...]] | None = None) -> str:
+    """The ros2msg text of a record layout.
+
+    Args:
+        layout: Fields by falling width, as `Layout.record` sorts them.
+        labels: Names of the codes of integer scalars become constants right before the field,
+            where viewers take them for its enum names.
+
+    Raises:
+        LogError: The layout cannot be a message: a field would need padding, is empty, or has a
+            name that ROS forbids.
+    """
+    _check_widths(layout, f"layout of {layout.names}")
+    lines: list[str] = []
+    for item in layout:
+        if not _ROS_NAME.match(item.name):
+            raise LogError(f"field {item.name!r}: a ROS field name is lower_snake_case")
+        if item.size == 0 or "]" in item.unit:
+            raise LogError(f"field {item.name!r}: shape {item.shape}, unit {item.unit!r}")
+        ros_type = _ROS_TYPES[item.dtype]
+        if item.shape == () and item.dtype[0] in "ui" and not item.name.endswith("_mask"):
+            for code, name in enumerate((labels or {}).get(item.name, ())):
+                words = re.findall(r"[A-Z0-9]+", f"{item.name} {name}".upper())
+                lines += [f"{ros_type} {'_'.join(words)}={code}"] if name else []
+        length = f"[{item.size}]" if item.shape else ""
+        shape = f"({', '.join(map(str, item.shape))}) " if len(item.shape) > 1 else ""
+        comment = f"{shape}[{item.unit}] {' '.join(item.doc.split())}".rstrip()
+        lines.append(f"{ros_type}{length} {item.name} # {comment}")
+    return "\n".join(lines) + "\n"
+
+
+def parse_layout(text: str) -> Layout:
+    """The layout that `schema_text` was given.
+
+    Raises:
+        LogError: Not such a text.
+    """
+    lines = (line.partition("#") for line in text.splitlines())
+    coded = ((code.strip(), comment.strip()) for code, _, comment in lines)
+    wanted = [each for each in coded if each[0] and not _CONSTANT.match(each[0])]
+    try:
+        layout = Layout(tuple(_field(*each) for each in wanted))
+    except InputError as error:
+        raise LogError(f"schema: {error}") from error
+    _check_widths(layout, "schema: its layout")
+    size = sum(item.size * np.dtype(item.dtype).itemsize for item in layout)
+    check_size("schema: a message", size)
+    return layout
+
+
+def _check_widths(layout: Layout, what: str) -> None:
+    widths = [np.dtype(item.dtype).itemsize for item in layout]
+    if not widths or widths != sorted(widths, reverse=True):
+        raise LogError(f"{what} is not sorted by falling width, or empty")
+
+
+def _field(code: str, comment: str) -> Field:
+    """The field that a line of a schema describes."""
+    line, about = _LINE.match(code), _COMMENT.match(comment)
+    storage = {ros: dtype for dtype, ros in _ROS_TYPES.items()}
+    if line is None or line["type"] not in storage or about is None:
+        raise LogError(f"schema: the line {code[:60]!r} is no part of a record layout")
+    shape = (int(line["array"][1:-1]),) if line["array"] else ()
+    size = shape[0] if shape else 1
+    if about["shape"]:
+        shape = tuple(int(number) for number in about["shape"].split(", "))
+    found = Field(line["name"], shape, storage[line["type"]], about["unit"], about["doc"] or "")
+    if found.size != size:
+        raise LogError(f"schema: field {found.name!r}: its shape has not {size} elements")
+    return found

@@ -1,1 +1,0 @@
-"""The MCAP format: records, files, chunks, messages."""

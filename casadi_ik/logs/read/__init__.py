@@ -1,1 +1,0 @@
-"""Logs read back."""

@@ -1,0 +1,383 @@
+"""Logs made whole: the end of one whose writer was killed, and the shards of a study as one log.
+
+What the reader would refuse is not joined: every chunk is unpacked and verified on its way. A chunk
+goes into the new log as it is, compressed, unless its solves get other numbers or its channels
+others ids (see `logs.shards`): then its messages are changed accordingly and compressed anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
+from mcap.summary import Summary
+
+from casadi_ik.arrays import Counts
+from casadi_ik.errors import LogError
+from casadi_ik.files.writing import written_whole
+from casadi_ik.logs.chunks import COMPRESSORS, Run, Unpacked, packed_chunk
+from casadi_ik.logs.container import (
+    Contents,
+    add_chunk,
+    beginning,
+    check_magic,
+    counts_of,
+    ending,
+    note_index,
+    read_attachment,
+    read_chunk,
+    read_summary,
+    reading,
+    scan,
+)
+from casadi_ik.logs.format import KINDS
+from casadi_ik.logs.provenance import CHECKSUM, METADATA_NAME, SHARDS, signed
+from casadi_ik.logs.reader import Log
+from casadi_ik.logs.shards import Paths, Shard, open_shards
+from casadi_ik.logs.writer import locked
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The result of repairing a log.
+
+    Attributes:
+        path: The file.
+        changed: False if it was whole already.
+        chunks: Complete chunks in it.
+        messages: Messages in it.
+        cut: Bytes of the torn tail that were cut away.
+    """
+
+    path: Path
+    changed: bool
+    chunks: int
+    messages: int
+    cut: int
+
+
+def finish_log(path: str | os.PathLike[str]) -> Finished:
+    """Repair a truncated log in place.
+
+    Every complete chunk is verified by its checksum; what is torn behind the last of them is cut,
+    and the end that was never written is written. A log that is whole is left as it is.
+
+    Args:
+        path: An MCAP file.
+
+    Raises:
+        LogError: The file is missing, cannot be written, is still being written, is no MCAP file,
+            or is damaged elsewhere than at its end. Then it has not been changed.
+
+    Example:
+        >>> finished = ik.logs.finish_log("cup.mcap")  # whole already: nothing is changed
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            contents = scan(stream, path)
+            whole = contents.complete and _ends_well(stream, contents)
+        cut = 0 if whole else _close(contents)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LogError(f"{path}: cannot finish the log: {reason}") from error
+    except LogError as error:
+        raise type(error)(f"{path}: {error}") from error
+    return Finished(path, not whole, len(contents.chunks), sum(contents.counts.values()), cut)
+
+
+def _close(contents: Contents) -> int:
+    """Cut what is torn and write the end; gives the bytes that were cut."""
+    tail = b""
+    for channel, index in list(contents.owed.items()):
+        note_index(contents, channel, contents.end + len(tail))
+        tail += index
+    tail += ending(contents.summary, contents.end + len(tail))
+    with contents.path.open("r+b") as stream:
+        if not locked(stream.fileno(), contents.path) or (
+            stream.seek(0, os.SEEK_END) != contents.size
+        ):
+            raise LogError("cannot finish the log: its writer is still at it")
+        stream.truncate(contents.end)
+        stream.seek(contents.end)
+        stream.write(tail)
+        stream.flush()
+        os.fsync(stream.fileno())
+    return contents.size - contents.end
+
+
+def _ends_well(stream: IO[bytes], contents: Contents) -> bool:
+    """Whether the file ends with a summary that says what it holds."""
+    with suppress(LogError):
+        return check_magic(stream)[1] and read_summary(stream).chunk_indexes == contents.chunks
+    return False
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The result of joining logs.
+
+    Attributes:
+        path: The new log.
+        shards: How many were joined.
+        solves: Solves in it, by method.
+        messages: Messages in it.
+        size: Its size [bytes].
+        left_out: Files in which nothing is whole.
+    """
+
+    path: Path
+    shards: int
+    solves: Mapping[str, int]
+    messages: int
+    size: int
+    left_out: tuple[Path, ...] = ()
+
+
+def merge_logs(shards: Paths, target: str | os.PathLike[str]) -> Merged:
+    """Join shards to one log.
+
+    Args:
+        shards: Complete logs (see `finish_log`) or folders of them: same robot, seed and clock,
+            and the methods of one kind in all.
+        target: The log to write; it is there when it is complete.
+
+    Returns:
+        What was joined.
+
+    Raises:
+        LogError: A shard is missing, damaged or incomplete, contradicts the first, or holds a
+            solve that another holds too; or the target cannot be written.
+
+    Example:
+        >>> merged = ik.logs.merge_logs(["cup.mcap"], "all.mcap")
+        >>> ik.logs.open("all.mcap").methods
+        ('hand-first',)
+    """
+    if not isinstance(shards, str | os.PathLike) and not shards:
+        raise LogError("merge: found no shards, expected at least one")
+    path = Path(target)
+    opened, left_out = open_shards(shards)
+    for shard in opened:
+        _check_alike(shard, opened[0])
+    merge = _Merge(Log(opened, left_out))
+    solves = {part.method: len(part) for part in merge.log.solves().parts}
+    try:
+        with written_whole(path) as part, part.open("xb") as stream:
+            merge.write(stream)
+            size = stream.tell()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LogError(f"{path}: cannot write the merged log: {reason}") from error
+    messages = sum(counts_of(merge.summary).values())
+    return Merged(path, len(opened), solves, messages, size, tuple(left_out))
+
+
+def _check_alike(shard: Shard, first: Shard) -> None:
+    """Check that a shard can be joined to another; in all other metadata they may differ."""
+    if not shard.contents.complete:
+        raise LogError(
+            f"{shard.path}: the log is truncated or damaged at its end (`casadi-ik log finish`"
+            " repairs what was torn)"
+        )
+    for key in ("robot", "seed", "t0_ns", "slot_ns"):
+        found, expected = shard.record.get(key), first.record.get(key)
+        if found != expected:
+            raise LogError(
+                f"{shard.path}: {key}: found {found}, expected {expected} as in {first.path}"
+            )
+
+
+class _Merge:
+    """A log on its way into one file.
+
+    Attributes:
+        log: The shards.
+        summary: Of the new file.
+    """
+
+    def __init__(self, log: Log) -> None:
+        """Put channels together; each topic has the number of its first appearance.
+
+        Raises:
+            LogError: A topic is not of one kind in all shards, or there are too many.
+        """
+        self.log = log
+        self.summary = Summary()
+        self._ids: list[dict[int, int]] = []
+        self._same: list[bool] = []
+        self._holders: dict[str, tuple[int, Shard]] = {}
+        for shard in log.shards:
+            ids, same = dict[int, int](), True
+            for method in shard.methods:
+                for kind in KINDS:
+                    own = shard.contents.summary.channels[shard.topic(method, kind).channel]
+                    ids[own.id] = self._joined(shard, method, own)
+                    same &= own.id == own.schema_id == ids[own.id]
+            self._ids.append(ids)
+            self._same.append(same)
+
+    def _joined(self, shard: Shard, method: str, own: Channel) -> int:
+        """The number of a shard's channel and schema in the new log."""
+        new = len(self._holders) + 1
+        if new >= 2**16:
+            raise LogError("more topics than a log has numbers for")
+        number, holder = self._holders.setdefault(own.topic, (new, shard))
+        schema = replace(shard.contents.summary.schemas[own.schema_id], id=number)
+        channel = replace(own, id=number, schema_id=number)
+        known = self.summary.schemas.setdefault(number, schema)
+        if known != schema or self.summary.channels.setdefault(number, channel) != channel:
+            raise LogError(
+                f"{shard.path}: method {method!r} has other fields or names than in"
+                f" {holder.path} ({own.topic})"
+            )
+        return number
+
+    def write(self, stream: IO[bytes]) -> None:
+        """Write the new log.
+
+        Raises:
+            LogError: A shard is damaged.
+            OSError: It cannot be written.
+        """
+        log, record = self.log, self._metadata()
+        library = f"casadi_ik {record['code_version']}"
+        attachments = _attachments(log.shards)
+        head = beginning(self.summary, library, Metadata(METADATA_NAME, record), attachments)
+        builder = RecordBuilder()
+        definitions: list[Schema | Channel] = [
+            *self.summary.schemas.values(),
+            *self.summary.channels.values(),
+        ]
+        for definition in definitions:
+            definition.write(builder)
+        stream.write(head + builder.end())
+        chunks = [
+            (index.message_start_time + offset * shard.clock.slot, i, index)
+            for i, (shard, offset) in enumerate(zip(log.shards, log.sources.offsets, strict=True))
+            for index in shard.contents.chunks
+        ]
+        counts = [dict[int, int]() for _ in log.shards]
+        for _, i, index in sorted(chunks, key=lambda chunk: chunk[:2]):
+            with reading(log.shards[i].path) as source:
+                chunk = read_chunk(source, index)
+                found = self._copied(chunk, i, stream.tell()) if chunk.runs else None
+            if found is not None:
+                data, moved, runs = found
+                stream.write(data)
+                add_chunk(self.summary, moved, runs)
+                for run in runs:
+                    counts[i][run.channel] = counts[i].get(run.channel, 0) + len(run.log_time)
+        for shard, ids, found in zip(log.shards, self._ids, counts, strict=True):
+            said = {ids.get(channel): n for channel, n in shard.contents.counts.items() if n}
+            if found != said:
+                raise LogError(
+                    f"{shard.path}: the log is damaged: its summary counts other messages"
+                )
+        stream.write(ending(self.summary, stream.tell()))
+
+    def _copied(
+        self, chunk: Unpacked, i: int, position: int
+    ) -> tuple[bytes, ChunkIndex, Sequence[Run]]:
+        """A chunk of a shard as the new log has it at an offset: bytes, index, messages.
+
+        Raises:
+            LogError: It holds what is no part of a log of casadi_ik.
+        """
+        shard, ids, offset = self.log.shards[i], self._ids[i], self.log.sources.offsets[i]
+        topics = {
+            shard.topic(method, kind).channel: (kind, shard.topic(method, kind).layout)
+            for method in shard.methods
+            for kind in KINDS
+        }
+        for run in chunk.runs:
+            if run.channel not in topics:
+                raise LogError(
+                    f"a message of channel {run.channel}, which is no topic of casadi_ik"
+                )
+        names = {name: key for key, (name, _) in COMPRESSORS.items()}
+        compression, runs = names[chunk.packed.compression], chunk.runs
+        if offset == 0 and self._same[i]:
+            data, packed = chunk.data, chunk.packed.data
+        else:
+            later = np.uint64(offset * shard.clock.slot)
+            pieces, runs, start, packed = [], [], 0, None
+            for run in chunk.runs:
+                kind, layout = topics[run.channel]
+                messages = chunk.messages(run, layout.dtype).copy()
+                last = int(shard.clock.locate(run.log_time)[0].max()) + offset
+                shard.clock.check(last, np.zeros(1, np.int64))
+                messages["head"]["channel"] = ids[run.channel]
+                messages["head"]["log_time"] += later
+                if kind == "solve":
+                    messages["head"]["sequence"] += np.uint32(offset)
+                if "solve_id" in layout.names:
+                    messages["row"]["solve_id"] += np.uint32(offset)
+                pieces.append(messages.tobytes())
+                runs.append(Run(ids[run.channel], start, run.size, run.log_time + later))
+                start += len(pieces[-1])
+            data = b"".join(pieces)
+        return *packed_chunk(memoryview(data), runs, compression, position, packed), runs
+
+    def _metadata(self) -> dict[str, str]:
+        """The metadata: of the first shard, and in what each of them differs from it."""
+        base = {key: text for key, text in self.log.shards[0].record.items() if key != SHARDS}
+        parts, origins = self.log.solves().parts, []
+        for i, source in enumerate(self.log.sources.sources):
+            differs = {
+                key: _text(value)
+                for key, value in source.metadata.items()
+                if key not in (CHECKSUM, SHARDS) and _text(value) != _text(_value(base.get(key)))
+            }
+            solves = {
+                part.method: _ranges(part.solve_id[part.shard == i])
+                for part in parts
+                if part.shard is not None and (part.shard == i).any()
+            }
+            origins.append(
+                {"file": source.name, "first": source.first, "solves": solves, "differs": differs}
+            )
+        return signed({**base, SHARDS: json.dumps(origins)})
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _value(text: str | None) -> Any:
+    """Structured values as what they say, so that they compare."""
+    with suppress(ValueError):
+        found = json.loads(text or "")
+        if isinstance(found, dict):
+            return found
+    return text or ""
+
+
+def _ranges(numbers: Counts) -> list[list[int]]:
+    """Sorted numbers, at least one, as first and last of every run."""
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+    return [[int(run[0]), int(run[-1])] for run in runs]
+
+
+def _attachments(shards: Sequence[Shard]) -> list[Attachment]:
+    """The attachments of all shards, which must be the same where they have one name."""
+    joint: dict[str, Attachment] = {}
+    for shard in shards:
+        with reading(shard.path) as stream:
+            found = [read_attachment(stream, item) for item in shard.contents.attachments]
+        for attachment in found:
+            known = joint.setdefault(attachment.name, attachment)
+            if known.data != attachment.data:
+                raise LogError(
+                    f"{shard.path}: the attachment {attachment.name!r} is not the same as in"
+                    f" {shards[0].path}"
+                )
+    return list(joint.values())

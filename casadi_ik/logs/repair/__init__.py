@@ -1,1 +1,0 @@
-"""Torn logs made whole, shards joined."""

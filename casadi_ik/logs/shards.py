@@ -1,0 +1,543 @@
+"""The files of a log, one by one, and how their solves are numbered when they are read as one.
+
+The shards of a study may each count from 0. If two of them use a number for different solves of a
+method, the numbers go on from shard to shard, in the order in which the files were named and
+below a folder in the order of their paths: solve n of a shard becomes n plus, for every shard
+before it, its largest number plus one. Otherwise every number stays as it is.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from mcap.records import Channel, ChunkIndex, Schema
+from numpy.lib.recfunctions import repack_fields
+from numpy.typing import NDArray
+
+from casadi_ik.arrays import Counts
+from casadi_ik.errors import LogError, UnknownNameError, printable
+from casadi_ik.kernels.layout import Field, Layout
+from casadi_ik.kernels.rows import opaque
+from casadi_ik.logs.container import (
+    NothingWrittenError,
+    read_attachment,
+    read_chunk,
+    read_contents,
+    reading,
+)
+from casadi_ik.logs.events import event_layout
+from casadi_ik.logs.format import KINDS, parse_layout, topic
+from casadi_ik.logs.provenance import SHARDS, clock_of, own_record, parsed_json, values_of
+from casadi_ik.logs.rows import solve_layout
+from casadi_ik.logs.tables import Labels, MethodRows
+from casadi_ik.problem.trace import CONDITION, SIGMA, STANDARD, Elements
+
+logger = logging.getLogger(__name__)
+
+Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """Messages of one kind of one method.
+
+    Attributes:
+        channel: Channel id.
+        layout: Fields of a row.
+        labels: Names that make a field readable.
+    """
+
+    channel: int
+    layout: Layout
+    labels: Labels
+
+
+class Shard:
+    """One file. It is opened anew for each question.
+
+    Attributes:
+        path: The file.
+        name: Its name among the files of its log.
+        contents: Its chunks, attachments and counts.
+        record: Its provenance, as it stands in the file.
+        metadata: The same, structured values as what they say.
+        robot: Name of the robot.
+        methods: The methods it holds.
+        clock: Rule of its log times.
+    """
+
+    def __init__(self, path: Path, name: str = "") -> None:
+        """Read the summary of the file.
+
+        Raises:
+            NothingWrittenError: Its writer was killed before anything was whole.
+            LogError: It is missing, no MCAP file, damaged, or no log of casadi_ik.
+        """
+        self.path = path
+        self.name = name or path.name
+        self.contents = read_contents(path)
+        with naming(path):
+            contents = self.contents
+            if not (contents.complete or contents.chunks or contents.records):
+                raise NothingWrittenError("the log is truncated before its metadata")
+            self.record: Mapping[str, str] = own_record(contents.records)
+            self.metadata: Mapping[str, Any] = values_of(self.record)
+            self.robot: str = self.metadata["robot"]
+            self.clock = clock_of(self.metadata)
+            if not contents.chunks and any(contents.counts.values()):
+                raise LogError("the messages are not in chunks, which casadi_ik does not read")
+            self._topics = self._described()
+            self.methods: tuple[str, ...] = tuple(dict.fromkeys(name for name, _ in self._topics))
+        self._solves: dict[str, MethodRows] = {}
+
+    def topic(self, method: str, kind: str) -> Topic:
+        """The messages of a kind of one of the `methods`."""
+        return self._topics[method, kind]
+
+    def count(self, method: str, kind: str) -> int:
+        """Number of messages of a kind that a method has; 0 if it is not in this file."""
+        found = self._topics.get((method, kind))
+        return 0 if found is None else self.contents.counts.get(found.channel, 0)
+
+    def attachment(self, name: str) -> bytes:
+        """An attached file.
+
+        Raises:
+            UnknownNameError: Nothing of that name is attached.
+            LogError: It is damaged.
+        """
+        for item in self.contents.attachments:
+            if item.name == name:
+                with reading(self.path) as stream:
+                    return read_attachment(stream, item).data
+        names = ", ".join(item.name for item in self.contents.attachments) or "none"
+        raise UnknownNameError(f"{self.path}: no attachment {name!r}; attached: {names}")
+
+    def solves(self, method: str) -> MethodRows:
+        """All solves of a method, in the order of the file; they are read once.
+
+        Raises:
+            LogError: The file is damaged.
+        """
+        if method not in self._solves:
+            self._solves[method] = self.read(method, "solve")
+        return self._solves[method]
+
+    def read(
+        self,
+        method: str,
+        kind: str,
+        solves: Counts | None = None,
+        fields: Sequence[str] | None = None,
+    ) -> MethodRows:
+        """Rows in the order of the file.
+
+        Args:
+            method: One of `methods`.
+            kind: "solve", "iteration" or "event".
+            solves: Numbers of the solves wanted, sorted; None: all.
+            fields: Names of the fields wanted; None: all.
+
+        Raises:
+            UnknownNameError: No such field.
+            LogError: The file is damaged.
+        """
+        found, name = self._topics[method, kind], topic(method, kind)
+        for each in fields or ():
+            if each not in found.layout.names:
+                names = ", ".join(found.layout.names)
+                raise UnknownNameError(f"no field {each!r}; there are: {names}")
+        with reading(self.path):
+            pairs = list(self._rows(found, solves, fields))
+            times = np.concatenate([np.zeros(0, np.uint64), *(each for each, _ in pairs)])
+            none = _chosen(np.zeros(0, found.layout.dtype), fields)
+            rows = np.concatenate([opaque(each) for each in (none, *(rows for _, rows in pairs))])
+            rows = rows.view(none.dtype)
+            if solves is None and len(times) != self.count(method, kind):
+                raise LogError(
+                    f"{len(times)} messages on {name!r}, but the summary counts"
+                    f" {self.count(method, kind)}"
+                )
+            solve_id, iteration = self.clock.locate(times)
+            if len(solve_id) and (solve_id.min() < 0 or solve_id.max() >= 2**32):
+                raise LogError(f"{name!r}: a message before the log began, or late")
+            if "solve_id" in (rows.dtype.names or ()) and np.any(rows["solve_id"] != solve_id):
+                raise LogError(f"{name!r}: a solve's number is not that of its time")
+        units = {item.name: item.unit for item in found.layout}
+        return MethodRows(method, rows, solve_id, iteration, found.labels, units)
+
+    def _rows(
+        self, found: Topic, solves: Counts | None, fields: Sequence[str] | None
+    ) -> Iterator[tuple[NDArray[np.uint64], NDArray[Any]]]:
+        """Log times and rows, chunk by chunk; views where nothing had to be left out."""
+        with reading(self.path) as stream:
+            for index in self.contents.chunks:
+                if not self._may_hold(index, found.channel, solves):
+                    continue
+                chunk = read_chunk(stream, index)
+                for run in chunk.runs:
+                    if run.channel == found.channel:
+                        times = run.log_time
+                        rows = chunk.messages(run, found.layout.dtype)["row"]
+                        if solves is not None:
+                            wanted = np.isin(self.clock.locate(times)[0], solves)
+                            times, rows = times[wanted], rows[wanted]
+                        yield times, _chosen(rows, fields)
+
+    def _may_hold(self, index: ChunkIndex, channel: int, solves: Counts | None) -> bool:
+        """Whether a chunk may hold messages of a channel and of some solves."""
+        if index.message_index_offsets and channel not in index.message_index_offsets:
+            return False
+        if solves is None:
+            return True
+        times = np.array([index.message_start_time, index.message_end_time], np.uint64)
+        low, high = self.clock.locate(times)[0]
+        return bool(np.searchsorted(solves, low) < np.searchsorted(solves, high, "right"))
+
+    def _described(self) -> dict[tuple[str, str], Topic]:
+        """The topics by method and kind.
+
+        Raises:
+            LogError: One is missing, or is not such as a log of ours has.
+        """
+        summary = self.contents.summary
+        by_name = {channel.topic: channel for channel in summary.channels.values()}
+        found: dict[tuple[str, str], Topic] = {}
+        for channel in summary.channels.values():
+            method = channel.metadata.get("method")
+            if method is None or channel.topic != topic(method, KINDS[0]):
+                continue
+            if not 0 < len(method) <= 200:
+                raise LogError(f"a method's name has {len(method)} characters")
+            for kind in KINDS:
+                own = by_name.get(topic(method, kind))
+                if own is None or own.schema_id not in summary.schemas:
+                    raise LogError(f"no topic {topic(method, kind)!r}, or no schema of it")
+                layout, labels = described(kind, own, summary.schemas[own.schema_id])
+                found[method, kind] = Topic(own.id, layout, labels)
+        return found
+
+
+def log_files(path: Paths) -> list[tuple[Path, str]]:
+    """Files of a log, and the name of each among them.
+
+    Args:
+        path: A file, a folder (all .mcap files in it and below, by the order of their paths;
+            hidden ones are unfinished work of others), or several of these.
+
+    Raises:
+        LogError: A folder holds no log, or nothing was named.
+    """
+    given = [path] if isinstance(path, str | os.PathLike) else list(path)
+    files: list[tuple[Path, str]] = []
+    for item in map(Path, given):
+        if not item.is_dir():
+            files.append((item, item.name))
+            continue
+        try:
+            inside = sorted(file for file in item.rglob("*.mcap") if file.name[0] != ".")
+        except OSError as error:
+            raise LogError(f"{item}: cannot be read: {error.strerror or error}") from error
+        if not inside:
+            raise LogError(f"{item}: no log in this folder")
+        files += [(file, file.relative_to(item).as_posix()) for file in inside]
+    if not files:
+        raise LogError("no log was named")
+    return files
+
+
+def open_shards(path: Paths) -> tuple[list[Shard], list[Path]]:
+    """The shards of a log, and the files that were left out: those in which nothing is whole.
+
+    A writer that is killed before its first chunk leaves an empty or torn file, with which
+    nothing is lost. Among others it is named and left out.
+
+    Raises:
+        LogError: A file is missing, is no MCAP file, is damaged, or is not a log of casadi_ik; or
+            nothing is whole in any.
+    """
+    files = log_files(path)
+    shards: list[Shard] = []
+    empty: list[Path] = []
+    for file, name in files:
+        try:
+            shards.append(Shard(file, name))
+        except NothingWrittenError as error:
+            if len(files) == 1:
+                raise
+            empty.append(file)
+            logger.warning("%s; left out, nothing in it is whole", printable(str(error)))
+    if not shards:
+        raise LogError(f"{files[0][0]}: nothing in it is whole, nor in {len(files) - 1} others")
+    return shards, empty
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A shard, as it was written; a merged log has several in one file.
+
+    Attributes:
+        file: Number of the file in which its solves stand now.
+        name: Of its own file; below a folder the path from there.
+        first: What its solves' numbers were raised by.
+        metadata: Its provenance.
+        ranges: (m, 2) first and last numbers of its solves here, by method; empty: all of the file.
+    """
+
+    file: int
+    name: str
+    first: int
+    metadata: Mapping[str, Any]
+    ranges: Mapping[str, Counts] = field(default_factory=dict)
+
+
+class Merged(msgspec.Struct):
+    """What a merged log says of one of its shards."""
+
+    file: str
+    first: int = 0
+    solves: dict[str, list[tuple[int, int]]] = {}
+    differs: dict[str, str] = {}
+
+
+class Sources:
+    """Where the solves of a log come from.
+
+    Attributes:
+        offsets: What the numbers of each file's solves are raised by.
+        sources: The shards as they were written.
+    """
+
+    def __init__(self, shards: Sequence[Shard]) -> None:
+        """Number the solves of some files.
+
+        Raises:
+            LogError: One and the same solve is in two files, there are too many, or what a merged
+                log says of its shards is malformed.
+        """
+        self.offsets = _offsets(shards) if _overlapping(shards) else [0] * len(shards)
+        self.sources: list[Source] = []
+        for i, (shard, offset) in enumerate(zip(shards, self.offsets, strict=True)):
+            with naming(shard.path):
+                merged = _merged(shard.record.get(SHARDS, "[]"))
+                if not merged:
+                    self.sources.append(Source(i, shard.name, offset, shard.metadata))
+                for each in merged:
+                    ranges = {
+                        method: np.array(pairs, np.int64).reshape(-1, 2) + offset
+                        for method, pairs in each.solves.items()
+                    }
+                    metadata = values_of({**shard.record, **each.differs})
+                    first = offset + each.first
+                    self.sources.append(Source(i, each.file, first, metadata, ranges))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sources."""
+        return tuple(source.name for source in self.sources)
+
+    def differences(self) -> dict[str, tuple[Any, ...]]:
+        """Entries of the metadata in which they differ, and all that is said there."""
+        found: dict[str, tuple[Any, ...]] = {}
+        for key in dict.fromkeys(key for each in self.sources for key in each.metadata):
+            values: list[Any] = []
+            for each in self.sources:
+                if each.metadata.get(key) not in values:
+                    values.append(each.metadata.get(key))
+            if len(values) > 1:
+                found[key] = tuple(values)
+        return found
+
+    def of(self, file: int, method: str, numbers: Counts) -> Counts:
+        """The source that each of the solves (k,) of a file comes from, by their numbers here."""
+        own = [i for i, source in enumerate(self.sources) if source.file == file]
+        found = np.full(len(numbers), own[0])
+        for i in own:
+            ranges = self.sources[i].ranges.get(method, np.zeros((0, 2), np.int64))
+            if len(ranges):
+                place = np.searchsorted(ranges[:, 0], numbers, "right") - 1
+                found[(place >= 0) & (numbers <= ranges[place, 1])] = i
+        return found
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Put the file's name before what is wrong with it."""
+    try:
+        yield
+    except LogError as error:
+        raise type(error)(f"{path}: {error}") from error
+
+
+def described(kind: str, channel: Channel, schema: Schema) -> tuple[Layout, Labels]:
+    """Layout and labels of the messages of a channel.
+
+    A log may come from anybody. Its schemas and labels are checked once, when it is opened, against
+    those that a recorder writes; behind that, whoever works with its rows can rely on them.
+
+    Args:
+        kind: "iteration", "solve" or "event".
+        channel: The channel.
+        schema: Its schema.
+
+    Raises:
+        LogError: They are not such as a log of ours has.
+    """
+    where = f"{channel.topic[:200]!r}"
+    try:
+        layout = _layout(kind, schema.data.decode())
+        labels = _labels(channel.metadata.get("labels", "{}"))
+        for item in layout if kind == "solve" else ():
+            count = len(labels.get(item.name, ()))
+            if item.name in ("position_error", "events", "phase_iterations") and (
+                count != item.shape[0]
+            ):
+                raise LogError(f"labels of {item.name}: {count} names for {item.shape[0]} elements")
+    except UnicodeDecodeError as error:
+        raise LogError(f"{where}: its schema is not UTF-8 text") from error
+    except LogError as error:
+        raise LogError(f"{where}: {error}") from error
+    return layout, labels
+
+
+@lru_cache(maxsize=64)
+def _layout(kind: str, text: str) -> Layout:
+    layout = parse_layout(text)
+    fields = {item.name: item for item in layout}
+
+    def size(name: str) -> int:
+        item = fields.get(name)
+        return item.shape[0] if item is not None and len(item.shape) == 1 else 1
+
+    n, f = size("q"), size("position_error")
+    if kind == "solve":
+        sizes = n, f, size("phase_iterations"), size("events"), size("lowest_sigma")
+        expected: Iterable[Field] = solve_layout(*sizes, "clearance" in fields)
+        optional = {name for name in layout.names if name.startswith("target_")} | {"lowest_sigma"}
+    elif kind == "event":
+        expected, optional = event_layout(size("joint_mask")), set()
+    else:
+        words = -(-n // 32)
+        shapes = {
+            Elements.ACTUATORS: (n,),
+            Elements.ACTUATOR_BITS: () if words == 1 else (words,),
+            Elements.FINGERS: (f,),
+        }
+        expected = [
+            Field(each.name, shapes.get(each.elements, ()), each.dtype) for each in STANDARD
+        ]
+        measured = [item for item in layout if item.name.startswith((SIGMA, CONDITION))]
+        expected += [
+            item if item.dtype[0] == "f" else replace(item, dtype="f4") for item in measured
+        ]
+        optional = {item.name for item in expected}
+    for item in expected:
+        found = fields.get(item.name)
+        if found is None and item.name not in optional:
+            raise LogError(f"schema: no field {item.name!r}")
+        if found is not None and (found.dtype, found.shape) != (item.dtype, item.shape):
+            raise LogError(
+                f"schema: field {item.name!r}: found {found.dtype} {found.shape}, expected"
+                f" {item.dtype} {item.shape}"
+            )
+    return layout
+
+
+@lru_cache(maxsize=256)
+def _labels(text: str) -> Labels:
+    labels = parsed_json("labels", text, dict[str, tuple[str, ...]])
+    for name, names in labels.items():
+        if len(names) > 4096 or max(map(len, (name, *names))) > 200:
+            raise LogError(
+                f"labels of {name[:200]!r}: more than 4096 names, or one of over 200 characters"
+            )
+    return labels
+
+
+def _chosen(rows: NDArray[Any], fields: Sequence[str] | None) -> NDArray[Any]:
+    """Some fields of rows, in the order of the log."""
+    if fields is None:
+        return rows
+    return repack_fields(rows[[name for name in rows.dtype.names or () if name in fields]])
+
+
+def _merged(text: str) -> list[Merged]:
+    what = f"metadata: {SHARDS}"
+    found: list[Merged] = parsed_json(what, text, list[Merged])
+    for each in found:
+        pairs = [number for ranges in each.solves.values() for pair in ranges for number in pair]
+        if not all(0 <= number < 2**32 for number in (each.first, *pairs)):
+            raise LogError(f"{what}: a number of a solve is negative or too large")
+    return found
+
+
+def _overlapping(shards: Sequence[Shard]) -> bool:
+    """Whether two shards may hold a solve of the same number, by the times of their chunks."""
+    spans = []
+    for shard in shards:
+        chunks = shard.contents.chunks
+        if chunks:
+            times = (
+                min(c.message_start_time for c in chunks),
+                max(c.message_end_time for c in chunks),
+            )
+            spans.append(tuple(shard.clock.locate(np.array(times, np.uint64))[0].tolist()))
+    spans.sort()
+    return any(after[0] <= before[1] for before, after in pairwise(spans))
+
+
+def _offsets(shards: Sequence[Shard]) -> list[int]:
+    """What the numbers of each shard's solves are raised by: see above.
+
+    Raises:
+        LogError: One and the same solve is in two shards, or there are too many.
+    """
+    clash = False
+    for method in dict.fromkeys(method for shard in shards for method in shard.methods):
+        holders = [shard for shard in shards if method in shard.methods]
+        numbers = np.concatenate([shard.solves(method).solve_id for shard in holders])
+        if len(np.unique(numbers)) < len(numbers):
+            _refuse_same(method, holders)
+            clash = True
+    if not clash:
+        return [0] * len(shards)
+    numbers = [
+        [int(shard.solves(method).solve_id.max(initial=-1)) for method in shard.methods]
+        for shard in shards
+    ]
+    *offsets, total = accumulate((max(each, default=-1) + 1 for each in numbers), initial=0)
+    if total >= 2**32:
+        raise LogError(f"{shards[0].path} and others: more solves than can be numbered")
+    return offsets
+
+
+def _refuse_same(method: str, shards: Sequence[Shard]) -> None:
+    """Check that no solve is in two shards, whatever its number.
+
+    Raises:
+        LogError: One is.
+    """
+    seen: dict[bytes, Shard] = {}
+    for shard in shards:
+        rows = shard.solves(method).rows.copy()
+        numbers = rows["solve_id"].copy()
+        rows["solve_id"] = 0
+        own = [row.tobytes() for row in opaque(rows)]
+        same = [i for i, row in enumerate(own) if row in seen]
+        if same:
+            first = min(same, key=lambda i: numbers[i])
+            raise LogError(
+                f"{shard.path}: solve {numbers[first]} of {method} is in"
+                f" {seen[own[first]].path} too ({len(same)} such solves)"
+            )
+        seen.update(dict.fromkeys(own, shard))

@@ -1,0 +1,298 @@
+"""Answers of a log: rows of solves, iterations or events, as arrays, records and dataframes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError
+from casadi_ik.kernels.rows import opaque
+from casadi_ik.logs.detect import as_matrix, bits_of
+from casadi_ik.logs.events import SINGULAR, EventKind, Happening
+
+if TYPE_CHECKING:
+    import polars as pl
+
+Labels = Mapping[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class MethodRows:
+    """Rows of one method.
+
+    Attributes:
+        method: The method.
+        rows: (k,) structured, by solve and iteration.
+        solve_id: (k,) the solve that each row belongs to.
+        iteration: (k,) its number within the solve from 0; of a solve the last.
+        labels: Names that make a field readable, as in `TraceFormat.labels`.
+        units: Unit by field, "" if dimensionless.
+        shard: (k,) which of `shards` each row comes from; None where that is not told.
+        shards: Names of the shards of the log.
+
+    Example:
+        >>> part = ik.logs.open("cup.mcap").iterations().part
+        >>> part.method, bool(len(part.rows) == solution.iterations)
+        ('hand-first', True)
+    """
+
+    method: str
+    rows: NDArray[Any]
+    solve_id: NDArray[np.int64]
+    iteration: NDArray[np.int64]
+    labels: Labels
+    units: Mapping[str, str]
+    shard: NDArray[np.int64] | None = None
+    shards: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Fields of a row."""
+        return self.rows.dtype.names or ()
+
+    @property
+    def origins(self) -> list[str] | None:
+        """(k,) name of the shard of each row, if the log has several."""
+        if self.shard is None or len(self.shards) < 2:
+            return None
+        return [self.shards[i] for i in self.shard.tolist()]
+
+    def where(self, wanted: NDArray[Any]) -> MethodRows:
+        """Some of the rows, by flags (k,) or numbers."""
+        if wanted.dtype == bool and wanted.all():
+            return self
+        return replace(
+            self,
+            rows=self.rows[wanted],
+            solve_id=self.solve_id[wanted],
+            iteration=self.iteration[wanted],
+            shard=None if self.shard is None else self.shard[wanted],
+        )
+
+    def readable(self, name: str) -> list[Any]:
+        """A field as a person would have it: names for codes and bits."""
+        values, labels = self.rows[name], self.labels.get(name, ())
+        if name.endswith("_mask") and values.dtype.kind == "u":
+            return [
+                tuple(
+                    labels[i] if i < len(labels) else f"coordinate {i}"
+                    for i in np.flatnonzero(bits)
+                )
+                for bits in bits_of(as_matrix(values))
+            ]
+        if values.ndim == 1 and values.dtype.kind in "iu" and labels:
+            known, place = np.unique(values, return_inverse=True)
+            names = [label_of(labels, code) for code in known.tolist()]
+            return [names[i] for i in place.tolist()]
+        return values.tolist() if values.ndim == 1 else list(values)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Rows of one kind: of one method, or of several one after the other.
+
+    What belongs to one method (`rows`, `labels`, ...) can be asked for if there is but one.
+
+    Attributes:
+        kind: "solve", "iteration" or "event".
+        parts: The rows by method.
+
+    Example:
+        >>> table = ik.logs.open("cup.mcap").solves()
+        >>> table.kind, len(table.array())
+        ('solve', 1)
+    """
+
+    kind: str
+    parts: tuple[MethodRows, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.parts))
+
+    @property
+    def part(self) -> MethodRows:
+        """The rows of the only method.
+
+        Raises:
+            UnknownNameError: There is none, or there are several.
+        """
+        if len(self.parts) != 1:
+            known = ", ".join(part.method for part in self.parts) or "none"
+            raise UnknownNameError(f"{self.kind}s: of which method? There are: {known}")
+        return self.parts[0]
+
+    @property
+    def method(self) -> str:
+        """The only method."""
+        return self.part.method
+
+    @property
+    def rows(self) -> NDArray[Any]:
+        """(k,) the rows as they stand in the log."""
+        return self.part.rows
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Fields of a row."""
+        return self.part.names
+
+    @property
+    def solve_id(self) -> NDArray[np.int64]:
+        """(k,) the solve that each row belongs to."""
+        return self.part.solve_id
+
+    @property
+    def iteration(self) -> NDArray[np.int64]:
+        """(k,) number within the solve."""
+        return self.part.iteration
+
+    @property
+    def labels(self) -> Labels:
+        """Names that make a field readable."""
+        return self.part.labels
+
+    def array(self) -> NDArray[Any]:
+        """The rows of the only method, (k,) structured, with "solve_id" (and "iteration") first."""
+        part = self.part
+        keys = [key for key in self._keys if key not in part.names]
+        extra, rows = [(key, "<u4") for key in keys], opaque(part.rows)
+        result = np.empty(len(part), [*extra, ("row", rows.dtype)])
+        result["row"] = rows
+        for key in keys:
+            result[key] = getattr(part, key)
+        return result.view(extra + part.rows.dtype.descr)
+
+    def frame(self) -> pl.DataFrame:
+        """The rows as a polars DataFrame: a column per number, codes as their names.
+
+        A field with several numbers becomes several columns ("q.lwr_joint_1", "target_points.
+        thumb.x"). Of a log of several shards "shard" names that of each row. Methods stand one
+        below the other; what a method does not record is null.
+
+        Raises:
+            MissingExtraError: polars is not installed.
+        """
+        try:
+            import polars as pl
+        except ImportError as error:
+            raise MissingExtraError(
+                "dataframes need polars: pip install 'casadi-ik[dataframes]'"
+            ) from error
+        frames = [pl.DataFrame(_columns(part, self._keys)) for part in self.parts]
+        return pl.concat(frames, how="diagonal") if frames else pl.DataFrame()
+
+    def write_parquet(self, path: str | os.PathLike[str]) -> None:
+        """Write `frame` to a Parquet file, for queries that come again.
+
+        Raises:
+            MissingExtraError: polars is not installed.
+            LogError: It cannot be written.
+        """
+        frame = self.frame()
+        try:
+            frame.write_parquet(Path(path))
+        except OSError as error:
+            raise LogError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+    def records(self) -> Iterator[dict[str, Any]]:
+        """The rows one by one, for people: codes and masks as names, events with a "subject"."""
+        for part in self.parts:
+            columns = {name: getattr(part, name).tolist() for name in self._keys}
+            columns |= {name: part.readable(name) for name in part.names}
+            if (origins := part.origins) is not None:
+                columns["shard"] = origins
+            if self.kind == "event":
+                columns["subject"] = _subjects(part)
+            for values in zip(*columns.values(), strict=True):
+                yield {"method": part.method, **dict(zip(columns, values, strict=True))}
+
+    @property
+    def _keys(self) -> tuple[str, ...]:
+        return ("solve_id",) if self.kind == "solve" else ("solve_id", "iteration")
+
+
+def happening(record: Mapping[str, Any]) -> Happening:
+    """An event as `Table.records` gives it."""
+    singular = record["kind"] in [kind.name for kind in SINGULAR]
+    return Happening(
+        iteration=record["iteration"],
+        kind=record["kind"],
+        jacobian=record["subject"] if singular else "",
+        joints=tuple(record["joint_mask"]),
+        phase=record["phase"],
+        value=record["value"],
+        threshold=record["threshold"],
+    )
+
+
+def element_name(labels: Sequence[str], index: int) -> str:
+    """The name of an element, or its number."""
+    return labels[index] if index < len(labels) else str(index)
+
+
+def label_of(labels: Sequence[str], code: int) -> str:
+    """The name of a code, or the code."""
+    return (labels[code] if 0 <= code < len(labels) else "") or str(code)
+
+
+def _columns(part: MethodRows, keys: Sequence[str]) -> dict[str, Any]:
+    """The columns of a dataframe by name."""
+    columns: dict[str, Any] = {"method": [part.method] * len(part)}
+    columns |= {name: getattr(part, name).astype(np.uint32) for name in keys}
+    for name in part.names:
+        values, labels = part.rows[name], part.labels.get(name, ())
+        if values.ndim > 1:
+            matrix = np.ascontiguousarray(as_matrix(values).T)
+            for column, index in zip(matrix, np.ndindex(values.shape[1:]), strict=True):
+                rest = ("xyz"[i] if values.shape[-1] == 3 else str(i) for i in index[1:])
+                columns[".".join((name, element_name(labels, index[0]), *rest))] = column
+        elif labels and not name.endswith("_mask"):
+            columns[name] = part.readable(name)
+        else:
+            columns[name] = np.ascontiguousarray(values)
+    if (origins := part.origins) is not None:
+        columns["shard"] = origins
+    if "joint_mask" in part.names:
+        columns["joints"] = [", ".join(names) for names in part.readable("joint_mask")]
+        columns["subject"] = _subjects(part)
+    return columns
+
+
+def _subjects(part: MethodRows) -> list[str]:
+    """What each event is about: the Jacobian, the joints, the phases."""
+    phases = part.labels.get("phase", ())
+    joints, jacobian = part.readable("joint_mask"), part.readable("jacobian")
+    subjects = []
+    for i, kind in enumerate(part.readable("kind")):
+        known = EventKind.__members__.get(kind)
+        subject = "{joints}" if known is None else known.subject
+        if subject == "{joints}":
+            subjects.append(", ".join(joints[i]))
+            continue
+        before, after = part.rows["threshold"][i], part.rows["value"][i]
+        phase = int(part.rows["phase"][i])
+        subjects.append(
+            subject.format(
+                jacobian=jacobian[i],
+                phase=label_of(phases, phase) if phase or phases else "whole solve",
+                before=_label_of_float(phases, before),
+                after=_label_of_float(phases, after),
+                threshold=f"{before:.0f}",
+                value=f"{after:.0f}",
+            )
+        )
+    return subjects
+
+
+def _label_of_float(labels: Sequence[str], code: float) -> str:
+    """The name of a code that is kept as a float, or the number."""
+    return label_of(labels, int(code)) if np.isfinite(code) else str(code)

@@ -1,1 +1,0 @@
-"""A solve for Foxglove and Lichtblick."""

@@ -1,1 +1,0 @@
-"""Solves on their way into a log."""
