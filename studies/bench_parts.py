@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from samplers import SAMPLERS, random_arm_targets, suits
+from samplers import SAMPLERS, grasps_of, random_arm_targets, suits
 
 import casadi_ik as ik
 
@@ -42,8 +42,8 @@ SCENE = {
     "table": {"kind": "box", "size": [1.6, 1.6, 0.04], "xyz": [0.0, 0.0, -0.1]},
     "post": {"kind": "cylinder", "radius": 0.06, "length": 0.6, "xyz": [0.45, 0.25, 0.3]},
 }
-CHOSEN = 50
-"""Candidates of a choice."""
+CHOSEN, OF_OBJECT = 50, 500
+"""Candidates of a choice: those of a scene's batch, and in an object's frame."""
 
 CYCLES, PERIOD = 500, 1e-3
 """Of following, and their length [s]."""
@@ -52,14 +52,6 @@ CYCLES, PERIOD = 500, 1e-3
 def drawn(robot: ik.ArmHand, sampler: str, count: int) -> Targets:
     """Contacts of a sampler, the same in every process."""
     return robot.contacts(SAMPLERS[sampler][1](robot, np.random.default_rng(0), count))
-
-
-def grasps_of(robot: ik.ArmHand, points: Any, normals: Any) -> list[ik.Grasp]:
-    """Contacts as grasps."""
-    return [
-        ik.Grasp({n: ik.Contact(*c) for n, *c in zip(robot.fingers, p, m, strict=True)})
-        for p, m in zip(points, normals, strict=True)
-    ]
 
 
 @contextlib.contextmanager
@@ -140,6 +132,35 @@ def scene(robot: str, count: int) -> Callable[[], Found]:
                 plain.solve_all(grasp)
         counts = {"not free": float((~solved.success).sum()), "answered": float(ranked.answered)}
         return found | counts
+
+    measure()
+    return measure
+
+
+def choose(robot: str, given: str, around: str) -> Callable[[], Found]:
+    """Choosing among grasps in an object's frame, hands at random about it, from any side."""
+    arm_hand, rng = ik.load_robot(robot), np.random.default_rng(0)
+    solver = ik.Solver(arm_hand, scene=ik.Scene(SCENE) if around == "scene" else None)
+    pose, q = np.eye(4), arm_hand.random(rng, OF_OBJECT)
+    pose[:3, 3] = 0.5, 0.1, 0.3
+    turns = np.linalg.qr(rng.normal(size=(OF_OBJECT, 3, 3)))[0]
+    turns[:, :, 0] *= np.linalg.det(turns)[:, None]
+    points, normals = arm_hand.contacts(q)
+    palms, middle = arm_hand.palm(q), points.mean(axis=1, keepdims=True)
+    # Turned about the middle of the fingertips, which is put where the object is.
+    palms[:, :3, 3] = ((palms[:, None, :3, 3] - middle) @ turns)[:, 0]
+    palms[:, :3, :3] = np.swapaxes(turns, 1, 2) @ palms[:, :3, :3]
+    moving = {i for name in arm_hand.fingers for i in arm_hand.description.finger_actuators(name)}
+    postures = [{arm_hand.actuators[i]: float(row[i]) for i in moving} for row in q]
+    grasps = grasps_of(arm_hand, (points - middle) @ turns, normals @ turns)
+    if given == "palms":
+        grasps = [ik.Grasp(palm=p, posture=h) for p, h in zip(palms, postures, strict=True)]
+
+    def measure() -> Found:
+        found: Found = {}
+        with clock(found, "us a candidate", OF_OBJECT):
+            ranked = solver.choose(grasps, pose, arm_hand.home)
+        return found | {"answered": float(ranked.answered)}
 
     measure()
     return measure
@@ -484,6 +505,7 @@ MEASUREMENTS: dict[str, Callable[..., Callable[[], Found]]] = {
     "fast": fast,
     "single": single,
     "scene": scene,
+    "choose": choose,
     "follow": follow,
     "diagnosis": diagnosis,
     "methods": methods,
@@ -548,6 +570,12 @@ CASES: dict[str, Callable[[list[str], int, str], list[Case]]] = {
     "fast": lambda robots, *_: [("fast", robot, FAST) for robot in robots],
     "single": lambda robots, *_: [("single", robot, SINGLE) for robot in robots],
     "scene": lambda robots, count, _: [("scene", name, min(count, 200)) for name in robots],
+    "choose": lambda robots, *_: [
+        ("choose", robot, given, around)
+        for robot in robots
+        for given in ("palms", "contacts")
+        for around in ("free", "scene")
+    ],
     "follow": lambda robots, *_: [("follow", robot) for robot in robots],
     "diagnosis": lambda robots, *_: [
         ("diagnosis", robot, kind, 60) for robot in robots for kind in ("far", "moved", "turned")

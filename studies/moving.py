@@ -1,8 +1,8 @@
-"""Moving targets: followed cycle by cycle, along known paths, and as it was done before.
+"""Moving targets: followed cycle by cycle, along known paths, and each solved anew.
 
 Random smooth paths (at rest first, then at up to half the velocity limits), targets that leap, and
 the same paths solved target by target from the solution before. What is done stays done: a second
-run with more paths adds to them::
+run with more paths adds to them. What choosing among grasps takes: `bench.py --part choose`::
 
     python studies/moving.py --count 100 --report studies/results/moving
 """
@@ -10,279 +10,375 @@ run with more paths adds to them::
 from __future__ import annotations
 
 import argparse
-import json
 import time
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from moving_study.choosing import TEXT as CHOOSING
-from moving_study.choosing import choice_table, chosen
-from moving_study.goals import goal_table
-from moving_study.lost import TEXT as LOST
-from moving_study.lost import again, lost_table
-from moving_study.one_path import (
-    EVERY,
-    LEAPS,
-    PERIOD,
-    SHARE,
-    STEPS,
-    TIMES,
-    WAIT,
-    calls,
-    measure,
+from runner import (
+    Metric,
+    command,
+    markdown_table,
+    mean_metric,
+    median_metric,
+    program,
+    provenance,
+    rate_metric,
+    write_metrics,
+    write_page,
 )
-from moving_study.paths import smooth_path
-from rich.console import Console
-from runner import markdown_table, write_page
-from runner.metric import Metric, mean_metric, median_metric, rate_metric, write_metrics
+from runner.parts import read_parts, run_parts
+from samplers import grasps_of, palm_slopes, smooth_path
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+shadow")
-TRACKS = 5
-"""Paths that are also followed as known ones."""
+PERIOD = 1e-3
+STEPS = 2000
+SHARE = 0.5
+"""Of the velocity limits, and of the accelerations that reach them in 0.25 s, that paths need."""
+
+EVERY = 20
+"""Of so many targets one is solved anew, as it was done before there was a follower."""
+
+LEAPS = 4
+"""Targets that leap, each given so many cycles:"""
+
+WAIT = 2000
+
+TIMES = 3
+"""So often a path is followed for the time of its calls."""
+
+SINGULAR = 0.05
+"""Smallest singular value of an arm that counts as near singular, see `palm_slopes`."""
 
 
-def rows_of(robot: str, count: int, folder: Path, done: bool = False) -> list[dict[str, Any]]:
-    """Figures of a robot's paths, those that are there already among them (or only those)."""
-    place = folder / robot
-    place.mkdir(parents=True, exist_ok=True)
-    solver, rows = None, []
-    for number in range(count):
-        file = place / f"{number:04d}.json"
-        if not file.exists():
-            if done:
-                break
-            if solver is None:
-                solver = ready(robot)
-            part = file.with_suffix(".part")
-            part.write_text(json.dumps(measure(solver, number)))
-            part.replace(file)
-        rows.append(json.loads(file.read_text()))
-    return rows
+FASTER = ((1.0, 10.0), (3.0, 10.0))
+"""Times the velocity and the acceleration limits."""
+
+LOST = """The paths that are not wholly within tolerance, followed again with the same code by
+motors that may be faster. A robot has more motors than a grasp needs, so it follows in another
+posture than the one that made the path, and there the motors may need more than the path's own did.
+*Largest difference:* of a motor of the arm from the path's own posture, when it is lost.
+"""
 
 
-def ready(robot: str) -> ik.Solver:
+def measure(solver: ik.Solver, number: int) -> dict[str, Any]:
+    """Figures of one path.
+
+    Args:
+        solver: On the robot.
+        number: Of the path, also its seed.
+    """
+    robot = solver.robot
+    path = smooth_path(robot, number, STEPS, PERIOD, SHARE)
+    return {
+        "number": number,
+        **_smooth(solver, path),
+        **_leaping(solver, number),
+        **_anew(solver, path[::EVERY]),
+    }
+
+
+def _smooth(solver: ik.Solver, path: Array) -> dict[str, Any]:
+    robot = solver.robot
+    points, normals = robot.contacts(path)
+    follower = solver.follow(path[0], PERIOD)
+    q, seconds = np.empty_like(path), np.empty(len(path))
+    for i, target in enumerate(zip(points, normals, strict=True)):
+        begin = time.perf_counter()
+        q[i] = follower(*target)
+        seconds[i] = time.perf_counter() - begin
+    position, angle = robot.errors(q, points, normals)
+    met = ((position <= 5e-3) & (angle <= np.radians(3))).all(axis=1)
+    lost = int(np.argmin(met)) if not met.all() else -1
+    return {
+        "median": float(np.median(seconds)),
+        "met": float(met.mean()),
+        "error": float(position.max()),
+        "singular": lost >= 0
+        and bool((palm_slopes(robot, path[max(lost - 300, 0) : lost + 1 : 10]) < SINGULAR).any()),
+        **_kept("smooth", follower, np.concatenate([path[:1], q])),
+    }
+
+
+def track(solver: ik.Solver, number: int) -> dict[str, Any]:
+    """A path as a known one, and processor time of each call of a follower on it.
+
+    The same calls do the same: the least of `TIMES` runs counts, since what differs is where the
+    processor was taken away and had to come back to its caches, which falls on other calls.
+    """
+    path = smooth_path(solver.robot, number, STEPS, PERIOD, SHARE)
+    points, normals = solver.robot.contacts(path)
+    calls = np.full(len(path), np.inf)
+    for _ in range(TIMES):
+        follower = solver.follow(path[0], PERIOD)
+        for i, target in enumerate(zip(points, normals, strict=True)):
+            begin = time.thread_time()
+            follower(*target)
+            calls[i] = min(calls[i], time.thread_time() - begin)
+    grasps = grasps_of(solver.robot, points, normals)
+    solver.track(grasps[:2], q0=path[0])
+    begin = time.process_time()
+    found = solver.track(grasps, q0=path[0])
+    spent = time.process_time() - begin
+    met = float(found.success.mean())
+    return {"time": spent, "met": met, "jumps": len(found.jumps), "calls": calls.tolist()}
+
+
+def _leaping(solver: ik.Solver, number: int) -> dict[str, Any]:
+    """Targets that leap: limits are kept, and what can be met on the branch is met at rest."""
+    robot, rng = solver.robot, np.random.default_rng([number, 1])
+    start = smooth_path(robot, number, STEPS, PERIOD, SHARE)[0]
+    follower, q, met = solver.follow(start, PERIOD), [start], 0
+    for _ in range(LEAPS):
+        goal = start + 0.2 * (robot.random(rng, 1)[0] - start)
+        target = robot.contacts(goal)
+        q += [follower(*target) for _ in range(WAIT)]
+        met += follower.state.status is ik.FollowStatus.FOLLOWING
+    return {"leaps_met": met / LEAPS, **_kept("leaping", follower, np.array(q))}
+
+
+def _anew(solver: ik.Solver, path: Array) -> dict[str, Any]:
+    """Every target solved from the solution before: the steps between, and their time."""
+    robot = solver.robot
+    q, steps, seconds = path[0], [], []
+    for points, normals in zip(*robot.contacts(path), strict=True):
+        (grasp,) = grasps_of(robot, points[None], normals[None])
+        begin = time.perf_counter()
+        found = solver.solve(grasp, q0=q, diagnose=False).q
+        seconds.append(time.perf_counter() - begin)
+        steps.append(np.abs(found - q))
+        q = found
+    own = np.abs(np.diff(path, axis=0)).max()
+    return {
+        "anew_step": float(np.max(steps)),
+        "own_step": float(own),
+        "anew_time": float(np.median(seconds)),
+    }
+
+
+def _kept(what: str, follower: ik.Follower, q: Array) -> dict[str, float]:
+    """Largest velocity and acceleration as parts of their limits, and how far beyond a limit."""
+    steps = np.diff(q, axis=0)
+    changes = np.diff(steps, axis=0, prepend=np.zeros((1, q.shape[1])))
+    return {
+        f"{what}_velocity": float((np.abs(steps) / (follower.velocity * PERIOD)).max()),
+        f"{what}_acceleration": float(
+            (np.abs(changes) / (follower.acceleration * PERIOD**2)).max()
+        ),
+        f"{what}_step": float(np.abs(steps).max()),
+    }
+
+
+def again(solver: ik.Solver, number: int) -> dict[str, Any]:
+    """A lost path with other limits: the shares of cycles within tolerance.
+
+    Args:
+        solver: On the robot.
+        number: Of the path.
+    """
+    robot = solver.robot
+    path = smooth_path(robot, number, STEPS, PERIOD, SHARE)
+    points, normals = robot.contacts(path)
+    usual = solver.follow(path[0], PERIOD)
+    met = _met(robot, usual, points, normals)
+    shares, first = [], int(np.argmin(met[0])) if not met[0].all() else -1
+    for velocity, acceleration in FASTER:
+        more = solver.follow(
+            path[0],
+            PERIOD,
+            velocity=velocity * usual.velocity,
+            acceleration=acceleration * usual.acceleration,
+        )
+        shares.append(float(_met(robot, more, points, normals)[0].mean()))
+    arm = list(robot.description.arm_actuators)
+    off = float(np.abs(met[1][first] - path[first])[arm].max()) if first >= 0 else 0.0
+    return {
+        "number": number,
+        "met": float(met[0].mean()),
+        "first": first,
+        "off": off,
+        "faster": shares,
+    }
+
+
+def _met(
+    robot: ik.ArmHand, follower: ik.Follower, points: Array, normals: Array
+) -> tuple[Array, Array]:
+    """(k,) whether each cycle is within tolerance, and (k, n) where the motors were."""
+    q = np.array([follower(*target) for target in zip(points, normals, strict=True)])
+    position, angle = robot.errors(q, points, normals)
+    return ((position <= 5e-3) & (angle <= np.radians(3))).all(axis=1), q
+
+
+@dataclass(frozen=True)
+class Part:
+    """A path of a robot and what is asked of it: "path", "track" or "lost", see `solve`."""
+
+    robot: str
+    what: str
+    number: int
+    size: int = 1
+
+    @property
+    def path(self) -> Path:
+        """Where its figures are."""
+        return Path(self.robot) / f"{self.what}_{self.number:04d}.json"
+
+
+@cache
+def _ready(robot: str) -> ik.Solver:
     """A solver whose kernels are compiled."""
     solver = ik.Solver(ik.load_robot(robot))
     measure(solver, 0)
     return solver
 
 
-def spent(robot: str, count: int, folder: Path) -> list[float]:
-    """CPU seconds of each call on some paths."""
-    file = folder / robot / f"least_calls_{count}.json"
-    if not file.exists():
-        solver = ik.Solver(ik.load_robot(robot))
-        file.write_text(json.dumps([one for i in range(count) for one in calls(solver, i)]))
-    return json.loads(file.read_text())
+def solve(part: Part) -> dict[str, Any]:
+    """Figures of a part."""
+    return {"path": measure, "track": track, "lost": again}[part.what](
+        _ready(part.robot), part.number
+    )
 
 
-def lost(robot: str, rows: list[dict[str, Any]], folder: Path) -> list[dict[str, Any]]:
-    """The paths that are not wholly within tolerance, with other limits."""
-    found, solver = [], None
-    for number in [row["number"] for row in rows if row["met"] < 1]:
-        file = folder / robot / f"lost_{number:04d}.json"
-        if not file.exists():
-            solver = solver or ik.Solver(ik.load_robot(robot))
-            file.write_text(json.dumps(again(solver, number)))
-        found.append(json.loads(file.read_text()))
-    return found
-
-
-def choices(robot: str, folder: Path) -> list[dict[str, Any]]:
-    """Figures of choosing."""
-    file = folder / robot / "choices.json"
-    if not file.exists():
-        file.write_text(json.dumps(chosen(ik.load_robot(robot))))
-    return json.loads(file.read_text())
-
-
-def tracked(robot: str, count: int, folder: Path) -> list[dict[str, float]]:
-    """Time and errors of known paths."""
-    file = folder / robot / f"tracks_{count}.json"
-    if file.exists():
-        return json.loads(file.read_text())
-    solver, found = ik.Solver(ik.load_robot(robot)), []
-    for number in range(count):
-        path = smooth_path(solver.robot, number, STEPS, PERIOD, SHARE)
-        grasps = [
-            ik.Grasp({n: ik.Contact(*c) for n, *c in zip(solver.robot.fingers, *pair, strict=True)})
-            for pair in zip(*solver.robot.contacts(path), strict=True)
-        ]
-        solver.track(grasps[:2], q0=path[0])
-        begin = time.process_time()
-        track = solver.track(grasps, q0=path[0])
-        spent = time.process_time() - begin
-        found.append({"time": spent, "met": float(track.success.mean()), "jumps": len(track.jumps)})
-    file.write_text(json.dumps(found))
-    return found
-
-
-def figures(robot: str, rows: list[dict[str, Any]]) -> list[Metric]:
+def figures(robot: str, rows: dict[str, Array]) -> list[Metric]:
     """Of a robot, with their confidence."""
-
-    def values(key: str) -> np.ndarray:
-        return np.array([row[key] for row in rows], dtype=float)
-
-    whole = int((values("met") == 1).sum())
+    met = rows["met"]
     return [
-        rate_metric(f"{robot}/paths within tolerance", whole, len(rows)),
-        mean_metric(f"{robot}/cycles within tolerance", 100 * values("met"), "%", "higher"),
-        median_metric(f"{robot}/largest error", 1e3 * values("error"), "mm"),
-        median_metric(f"{robot}/cycle", 1e6 * values("median"), "us"),
-        mean_metric(f"{robot}/leaps met", 100 * values("leaps_met"), "%", "higher"),
+        rate_metric(f"{robot}/paths within tolerance", int((met == 1).sum()), len(met)),
+        mean_metric(f"{robot}/cycles within tolerance", 100 * met, "%", "higher"),
+        median_metric(f"{robot}/largest error", 1e3 * rows["error"], "mm"),
+        median_metric(f"{robot}/cycle", 1e6 * rows["median"], "us"),
+        mean_metric(f"{robot}/leaps met", 100 * rows["leaps_met"], "%", "higher"),
     ]
 
 
-def tables(
-    found: dict[str, list[dict[str, Any]]], tracks: dict[str, Any], times: dict[str, list[float]]
-) -> list[str]:
-    """The parts of the report."""
-    cycle, limits, before, known = [], [], [], []
-    for robot, rows in found.items():
-        value = {key: np.array([row[key] for row in rows], dtype=float) for key in rows[0]}
-        lost = value["met"] < 1
-        cycle.append(
-            [
-                robot,
-                str(len(rows)),
-                f"{(~lost).sum()}",
-                f"{100 * value['met'].mean():.2f}",
-                f"{int(value['singular'][lost].sum())} of {int(lost.sum())}",
-                f"{1e3 * np.median(value['error']):.2f}",
-                f"{1e6 * np.median(value['median']):.0f}",
-                *(f"{1e6 * np.percentile(times[robot], part):.0f}" for part in (50, 99)),
-            ]
-        )
-        limits.append(
-            [
-                robot,
-                *(
-                    f"{value[f'{w}_{k}'].max():.6f}"
-                    for w in ("smooth", "leaping")
-                    for k in ("velocity", "acceleration")
-                ),
-                f"{100 * value['leaps_met'].mean():.0f}",
-            ]
-        )
-        before.append(
-            [
-                robot,
-                f"{np.degrees(value['own_step'].max()):.2f}",
-                f"{np.degrees(value['anew_step'].max()):.1f}",
-                f"{np.degrees(np.median(value['anew_step'])):.1f}",
-                f"{np.degrees(EVERY * value['smooth_step'].max()):.2f}",
-                f"{1e6 * np.median(value['anew_time']):.0f}",
-            ]
-        )
-        some = tracks[robot]
-        known.append(
-            [
-                robot,
-                str(len(some)),
-                f"{np.median([one['time'] for one in some]):.2f}",
-                f"{100 * np.mean([one['met'] for one in some]):.1f}",
-                str(sum(one["jumps"] for one in some)),
-            ]
-        )
-    return [
-        f"Random smooth paths of {STEPS} cycles of {1e3 * PERIOD:g} ms, from rest, at up to "
-        f"{100 * SHARE:g} % of the velocity limits, seeds 0 on. Default tolerances (5 mm, 3 deg) "
-        "and accelerations (full speed in a quarter of a second). Times are from Python; the "
-        "machine was busy with other work, so beside the median of what a cycle takes there is the "
-        "processor's time of single calls on some of the paths, the least of "
-        f"{TIMES} runs of each call.",
-        "## Followed cycle by cycle",
-        markdown_table(
-            [
-                "robot",
-                "paths",
-                "wholly within tolerance",
-                "cycles within %",
-                "lost near a singular arm",
-                "largest error, median [mm]",
-                "cycle [us]",
-                "CPU [us]",
-                "CPU p99 [us]",
-            ],
-            cycle,
-        ),
-        "*Lost near a singular arm*: of the paths that are not wholly within tolerance, those "
-        "whose own postures had a smallest singular value of the arm below 0.05 within the 300 "
-        "cycles before; the postures there are the path's own, which the follower does not know, "
-        "and from others the motors would have to be faster. See also below.",
-        "## Limits",
-        f"Largest values as parts of the limits, on the smooth paths and on {LEAPS} targets a path "
-        f"that leap and then wait {WAIT} cycles.",
-        markdown_table(
-            [
-                "robot",
-                "velocity",
-                "acceleration",
-                "velocity, leaping",
-                "acceleration, leaping",
-                "leaps met %",
-            ],
-            limits,
-        ),
-        "## Before and after",
-        f"Every {EVERY}th target solved anew from the solution before (`solve(q0=previous)`): the "
-        "largest step of a motor between two of them; the follower's is its largest step of a "
-        f"cycle times {EVERY}.",
-        markdown_table(
-            [
-                "robot",
-                "the path's own step [deg]",
-                "solved anew, largest [deg]",
-                "median of paths [deg]",
-                "followed, at most [deg]",
-                "a solve [us]",
-            ],
-            before,
-        ),
-        "## Known paths",
-        markdown_table(
-            ["robot", "paths", f"{STEPS} grasps [s CPU]", "grasps met %", "jumps"], known
-        ),
+FOLLOWED = """
+Random smooth paths of {steps} cycles of {period:g} ms, from rest, at up to {share:g} % of the
+velocity limits, seeds 0 on. Default tolerances (5 mm, 3 deg) and accelerations (full speed in a
+quarter of a second). Times are from Python; the machine was busy with other work, so beside the
+median of what a cycle takes there is the processor's time of single calls on some of the paths, the
+least of {times} runs of each call. *Lost near a singular arm:* of the paths that are not wholly
+within tolerance, those whose own postures had a smallest singular value of the arm below {singular}
+(lengths in units of 0.1 m) within the 300 cycles before; the postures there are the path's own,
+which the follower does not know, and from others the motors would have to be faster.
+"""
+
+LEAPING = """
+Largest values as parts of the limits, on the smooth paths and on {leaps} targets a path that leap
+and then wait {wait} cycles.
+"""
+
+ANEW = """
+Every {every}th target solved anew from the solution before (`solve(q0=previous)`): the largest step
+of a motor between two of them; the follower's is its largest step of a cycle times {every}.
+"""
+
+
+def tables(robot: str, rows: dict[str, Array], tracks: list[dict[str, Any]]) -> list[list[str]]:
+    """A robot's rows of the tables: followed, limits, solved anew, known paths."""
+    lost = rows["met"] < 1
+    calls = 1e6 * np.concatenate([one["calls"] for one in tracks]) if tracks else np.full(1, np.nan)
+    limits = [
+        f"{way}_{what}" for way in ("smooth", "leaping") for what in ("velocity", "acceleration")
     ]
+    return [
+        [
+            *(robot, f"{len(lost)}", f"{(~lost).sum()}", f"{100 * rows['met'].mean():.2f}"),
+            f"{int(rows['singular'][lost].sum())} of {int(lost.sum())}",
+            f"{1e3 * np.median(rows['error']):.2f}",
+            f"{1e6 * np.median(rows['median']):.0f}",
+            *(f"{np.percentile(calls, part):.0f}" for part in (50, 99)),
+        ],
+        [
+            robot,
+            *(f"{rows[name].max():.6f}" for name in limits),
+            f"{100 * rows['leaps_met'].mean():.0f}",
+        ],
+        [
+            *(robot, f"{np.degrees(rows['own_step'].max()):.2f}"),
+            f"{np.degrees(rows['anew_step'].max()):.1f}",
+            f"{np.degrees(np.median(rows['anew_step'])):.1f}",
+            f"{np.degrees(EVERY * rows['smooth_step'].max()):.2f}",
+            f"{1e6 * np.median(rows['anew_time']):.0f}",
+        ],
+        [
+            *(robot, f"{len(tracks)}", f"{np.median([one['time'] for one in tracks]):.2f}"),
+            f"{100 * np.mean([one['met'] for one in tracks]):.1f}",
+            f"{sum(one['jumps'] for one in tracks)}",
+        ],
+    ]
+
+
+HEADS = (
+    "robot|paths|wholly within tolerance|cycles within %|lost near a singular arm|"
+    "largest error, median [mm]|cycle [us]|CPU [us]|CPU p99 [us]",
+    "robot|velocity|acceleration|velocity, leaping|acceleration, leaping|leaps met %",
+    "robot|the path's own step [deg]|solved anew, largest [deg]|median of paths [deg]|"
+    "followed, at most [deg]|a solve [us]",
+    f"robot|paths|{STEPS} grasps [s CPU]|grasps met %|jumps",
+)
+
+
+def lost_row(robot: str, one: dict[str, Any], singular: bool) -> list[str]:
+    """Of the table of lost paths."""
+    first = f"{1e3 * PERIOD * one['first']:.0f}" if one["first"] >= 0 else "-"
+    cells = [robot, str(one["number"]), first, f"{100 * one['met']:.1f}"]
+    cells += [f"{np.degrees(one['off']):.0f}", "yes" if singular else "no"]
+    return cells + [f"{100 * share:.1f}" for share in one["faster"]]
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure and write the report."""
+    """Measure what is missing and write the report."""
     parser = argparse.ArgumentParser(description="Targets that move.")
     parser.add_argument("--count", type=int, default=100, help="paths of each robot")
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS))
-    parser.add_argument("--done", action="store_true", help="report the paths that are done")
-    parser.add_argument("--tracks", type=int, default=TRACKS, help="known paths of each robot")
+    parser.add_argument("--tracks", type=int, default=5, help="those also followed as known ones")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--folder", type=Path, default=Path("out/moving"), help="of what is done")
     parser.add_argument("--report", type=Path, default=Path("out/moving/report"), help="folder")
     options = parser.parse_args(arguments)
-    found, tracks, times, missed, taken = {}, {}, {}, {}, {}
+    rows: list[list[list[str]]] = [[], [], [], []]
+    lost, metrics, codes = list[list[str]](), list[Metric](), set[str]()
+
+    def done(robot: str, what: str, numbers: list[int]) -> list[dict[str, Any]]:
+        parts = [Part(robot, what, number) for number in numbers]
+        run_parts(solve, parts, options.folder, jobs=options.jobs, title=f"{robot}, {what}")
+        found, code = read_parts(options.folder, parts)
+        codes.update([code] if code else [])
+        return [one for _, one in found]
+
     for robot in options.robots:
-        found[robot] = rows_of(robot, options.count, options.folder, options.done)
-        tracks[robot] = tracked(robot, options.tracks, options.folder)
-        times[robot] = spent(robot, options.tracks, options.folder)
-        missed[robot] = lost(robot, found[robot], options.folder)
-        taken[robot] = choices(robot, options.folder)
-        Console().print(robot, "done")
+        paths = done(robot, "path", list(range(options.count)))
+        values = {key: np.array([row[key] for row in paths], dtype=float) for key in paths[0]}
+        tracks = done(robot, "track", list(range(options.tracks)))
+        for table, row in zip(rows, tables(robot, values, tracks), strict=True):
+            table.append(row)
+        missed = {row["number"]: row["singular"] for row in paths if row["met"] < 1}
+        again_ = done(robot, "lost", list(missed))
+        lost += [lost_row(robot, one, missed[one["number"]]) for one in again_]
+        metrics += figures(robot, values)
+    heads = ["robot", "path", "lost at [ms]", "within tolerance %", "largest difference [deg]"]
+    heads += ["near a singular arm", "accelerations x10 %", "velocities x3 too %"]
+    followed, limits, anew, known = (
+        markdown_table(head.split("|"), table) for head, table in zip(HEADS, rows, strict=True)
+    )
+    times = {"steps": STEPS, "period": 1e3 * PERIOD, "share": 100 * SHARE, "times": TIMES}
     parts = [
-        *tables(found, tracks, times),
-        "## Paths that are lost",
-        LOST,
-        lost_table(missed, found),
-        "## Choosing",
-        CHOOSING,
-        choice_table(taken),
-        "## Goals",
-        "From the figures above; times are the processor's, of one thread.",
-        goal_table(found, times, tracks, taken, missed),
+        *("## Followed cycle by cycle", FOLLOWED.format(singular=SINGULAR, **times), followed),
+        *("## Limits", LEAPING.format(leaps=LEAPS, wait=WAIT), limits),
+        *("## Solved anew", ANEW.format(every=EVERY), anew, "## Known paths", known),
+        *("## Paths that are lost", LOST, markdown_table(heads, lost)),
+        f"`{command(__file__, arguments)}`",
+        provenance({"moving": ", ".join(sorted(codes))}),
     ]
     write_page("Moving targets", parts, options.report)
-    metrics = [one for robot, rows in found.items() for one in figures(robot, rows)]
     write_metrics(metrics, options.report / "metrics.json")
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

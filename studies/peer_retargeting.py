@@ -20,8 +20,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from moving_study.paths import smooth_path
 from runner import markdown_table
+from samplers import smooth_path
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

@@ -188,6 +188,43 @@ def finger_sets(robot: ik.ArmHand, asked: list[str]) -> dict[str, list[int]]:
     return sets
 
 
+def grasps_of(robot: ik.ArmHand, points: Array, normals: Array) -> list[ik.Grasp]:
+    """Contacts (k, f, 3) as grasps."""
+    return [
+        ik.Grasp({n: ik.Contact(*c) for n, *c in zip(robot.fingers, p, m, strict=True)})
+        for p, m in zip(points, normals, strict=True)
+    ]
+
+
+def smooth_path(robot: ik.ArmHand, seed: int, count: int, period: float, share: float) -> Array:
+    """(count, n) sums of slow sines about a posture, within limits, that begin at rest.
+
+    Args:
+        robot: The robot.
+        seed: Of the path.
+        count: Of its postures.
+        period: Time between two of them [s].
+        share: Most of any motor's velocity, and of the acceleration that reaches it in 0.25 s.
+    """
+    rng = np.random.default_rng(seed)
+    middle, half = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
+    centre = middle + 0.4 * half * rng.uniform(-1, 1, len(middle))
+    # From rest: the first half second passes slowly.
+    share_of_time = np.minimum(period * np.arange(count) / 0.5, 1.0)
+    time = np.cumsum(period * share_of_time**2 * (3 - 2 * share_of_time))[:, None]
+    path = np.zeros((count, len(middle)))
+    for _ in range(3):
+        rate = rng.uniform(0.2, 1.0, len(middle))
+        path += np.sin(2 * np.pi * rate * time + rng.uniform(0, 2 * np.pi, len(middle)))
+    room = np.minimum(robot.upper - centre, centre - robot.lower)
+    path *= 0.5 * room / np.abs(path).max(axis=0)
+    stated = np.array([actuator.velocity for actuator in robot.description.actuators])
+    limits = np.where(np.isfinite(stated), stated, robot.upper - robot.lower)
+    speed = (np.abs(np.diff(path, axis=0)) / (period * limits)).max(axis=0)
+    change = (np.abs(np.diff(path, 2, axis=0)) / (period**2 * limits / 0.25)).max(axis=0)
+    return centre + path * np.minimum(1.0, share / np.maximum(speed, change))
+
+
 def palm_slopes(robot: ik.ArmHand, q: Array) -> Array:
     """(k,) smallest singular value of how the palm moves with the arm, metres by `LENGTH`."""
     here = robot.palm(q)

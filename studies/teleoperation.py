@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from moving_study.paths import smooth_path
 from peer_retargeting import beside
 from rich.console import Console
 from runner import markdown_table, write_page
+from samplers import smooth_path
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

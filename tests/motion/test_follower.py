@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from moving_study.paths import smooth_path
+from samplers import smooth_path
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from dense_ways import dense
-from moving_study.paths import smooth_path
+from samplers import smooth_path
 
 import casadi_ik as ik
 from casadi_ik.motion.clear_between import RESOLUTION, between
