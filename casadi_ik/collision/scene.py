@@ -544,7 +544,6 @@ def load_scene(name_or_path: str | Path) -> Scene:
     Raises:
         UnknownNameError: No shipped scene has that name.
         DescriptionError: The file is missing or malformed; the message names file and key.
-        MissingExtraError: It has a mesh, and what builds hulls is not installed.
 
     Example:
         >>> ik.load_scene("table")

@@ -12,14 +12,13 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from importlib import import_module
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.errors import DescriptionError, MissingExtraError
+from casadi_ik.errors import DescriptionError
 from casadi_ik.grasps.objects import load_object
 from casadi_ik.grasps.shapes import (
     BentCapsule,
@@ -279,7 +278,7 @@ def thinned(points: Array, edge: float) -> tuple[Array, float]:
 
 
 def hull(points: Array, where: str) -> Solid:
-    """The convex hull of points (k, 3) [m], by coal, which comes with pinocchio.
+    """The convex hull of points (k, 3) [m].
 
     Args:
         points: The points.
@@ -287,7 +286,6 @@ def hull(points: Array, where: str) -> Solid:
 
     Raises:
         DescriptionError: The points are too few, not finite, or in a plane.
-        MissingExtraError: coal is not installed.
     """
     if points.ndim != 2 or len(points) < 4:
         raise DescriptionError(f"{where}: found {len(points)} points, expected at least 4")
@@ -295,27 +293,16 @@ def hull(points: Array, where: str) -> Solid:
         raise DescriptionError(f"{where}: holds NaN or infinity, expected finite numbers")
     if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-9) < 3:
         raise DescriptionError(f"{where}: all points are in a plane, expected a body")
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
-        coal: Any = import_module("coal")
-    except ImportError as error:
-        raise MissingExtraError(f"{where}: convex hulls need coal: pip install pin") from error
-    model = coal.BVHModelOBBRSS()
-    model.beginModel(0, len(points))
-    model.addVertices(points)
-    model.endModel()
-    model.buildConvexHull(True, "Qt")
-    shape = model.convex
-    corners = np.array([shape.point(i) for i in range(shape.num_points)])
-    faces = [shape.polygons(i) for i in range(shape.num_polygons)]
-    a, b, c = (corners[[face[i] for face in faces]] for i in range(3))
-    normals, middles = np.cross(b - a, c - a), (a + b + c) / 3
-    kept = np.linalg.norm(normals, axis=1) > 1e-12
-    normals, middles = normals[kept], middles[kept]
-    # Whichever way a triangle winds, outward is away from the hull's middle.
-    outward = np.sum(normals * (middles - corners.mean(axis=0)), axis=1)
-    normals *= np.where(outward < 0, -1.0, 1.0)[:, None]
-    if float(np.abs(outward).sum()) < 1e-9:  # six times its volume [m^3]
+        faces = ConvexHull(points)
+    except QhullError as error:
+        raise DescriptionError(f"{where}: encloses no volume, expected a body") from error
+    if faces.volume < 1e-9 / 6:  # [m^3]
         raise DescriptionError(f"{where}: encloses no volume, expected a body")
+    # Triangles of one face have one normal.
+    normals = np.unique(np.round(faces.equations[:, :3], 9), axis=0)
     return convex(points, normals)
 
 
@@ -324,7 +311,6 @@ def hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
 
     Raises:
         DescriptionError: A piece is flat.
-        MissingExtraError: coal is not installed.
     """
     found: list[tuple[Solid, Array]] = []
     for number, (points, _) in enumerate(shape.pieces):
@@ -344,7 +330,6 @@ def object_solids(name: str) -> list[tuple[Solid, Array]]:
     Raises:
         UnknownNameError: No shipped object has that name.
         DescriptionError: Its file is missing or malformed.
-        MissingExtraError: It is a mesh, and coal is not installed.
     """
     shape = load_object(name).shape
     return hulls(shape, name) if isinstance(shape, MeshShape) else of_object(shape)

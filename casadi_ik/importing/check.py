@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.errors import MissingExtraError
 from casadi_ik.importing.robot_shapes import hand_links
 from casadi_ik.robots.parts import PREFIX
 from casadi_ik.robots.robot_files.mjcf_file import joint_name
 from casadi_ik.robots.robot_files.tree import RobotTree
-from casadi_ik.robots.robot_files.urdf_file import bare, pinocchio
 
 
 class Oracle(Protocol):
@@ -114,10 +115,40 @@ def _value(
     return 0.0
 
 
+def _bare(element: Element) -> Element:
+    """The links and joints alone: no masses, shapes, transmissions; every joint with its limits."""
+    plain = ElementTree.Element("robot", name=element.get("name") or "robot")
+    for link in element.findall("link"):
+        ElementTree.SubElement(plain, "link", name=link.get("name", ""))
+    for joint in element.findall("joint"):
+        copy = ElementTree.SubElement(plain, "joint", dict(joint.attrib))
+        for kind in ("origin", "parent", "child", "axis", "limit"):
+            for part in joint.findall(kind)[:1]:
+                if kind == "axis" and not part.get("xyz"):  # as if it were not there
+                    continue
+                if kind == "limit":  # what URDF demands beside the range
+                    part = Element("limit", {"effort": "0", "velocity": "0"} | part.attrib)
+                copy.append(part)
+        if joint.get("type") in ("revolute", "prismatic") and joint.find("limit") is None:
+            ElementTree.SubElement(copy, "limit", lower="0", upper="0", effort="0", velocity="0")
+    return plain
+
+
+def _pinocchio() -> Any:
+    try:
+        import pinocchio as module
+    except ImportError as error:
+        raise MissingExtraError(
+            "URDF files are checked by pinocchio, which is not installed (there is none for "
+            "Windows): pip install pin"
+        ) from error
+    return module
+
+
 class _Pinocchio:
     def __init__(self, element: ElementTree.Element) -> None:
-        self._pin: Any = pinocchio()
-        text = ElementTree.tostring(bare(element), encoding="unicode")
+        self._pin: Any = _pinocchio()
+        text = ElementTree.tostring(_bare(element), encoding="unicode")
         self._model = self._pin.buildModelFromXML(text)
         self._data = self._model.createData()
 
