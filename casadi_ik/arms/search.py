@@ -148,7 +148,7 @@ def is_allowed(score: Expr) -> Expr:
 
 
 @dataclass(frozen=True, eq=False)
-class ArmSearch:
+class ArmTrials:
     """The trials for an arm of a family.
 
     Attributes:

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.arms.search import arms_graph
+from casadi_ik.arms.search import PARAMETERS, arms_graph
+from casadi_ik.arrays import Array
 from casadi_ik.collision.model import CollisionModel, own_solids
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import C_NAMES, EXPORTED
@@ -23,12 +24,10 @@ from casadi_ik.kernels.constants import define_arrays, number
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.robot_kernels import RobotKernels
-from casadi_ik.kernels.swing_kernel import ArmPlaces
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import ROUNDING, SceneCheck
-from casadi_ik.solving.alternatives.arm_places import arm_places
-from casadi_ik.solving.alternatives.free_search import ALIKE, LEAST_RANGE, ROUNDS
-from casadi_ik.solving.alternatives.idle_fingers import CLOSER, NEAR, PARTS, PLACES
+from casadi_ik.solving.alternatives.arm_search import SearchValues
+from casadi_ik.solving.alternatives.free import PARAMETERS as FREE
 from casadi_ik.symbolic.even_spread import even_steps
 
 MOST = 1000
@@ -81,10 +80,15 @@ class SceneSources:
         return self.check.model
 
     @cached_property
-    def places(self) -> ArmPlaces | None:
-        """Where arms are looked at; None where they have no closed form."""
-        arm = self.method.step.arm
-        return None if arm is None else arm_places(self.robot, arm)
+    def values(self) -> SearchValues | None:
+        """Values of the redundancy at which arms are looked at; None for an arm of no family."""
+        family = self.method.step.arm
+        return None if family is None else SearchValues.of(family, *self._arm_limits)
+
+    @property
+    def _arm_limits(self) -> tuple[Array, Array]:
+        columns = list(self.robot.description.arm_actuators)
+        return self.robot.lower[columns], self.robot.upper[columns]
 
     @property
     def near(self) -> tuple[FunctionKernel, str, int]:
@@ -115,12 +119,13 @@ class SceneSources:
 
     @property
     def room(self) -> int:
-        """Eights of bytes that the choice among arms works with (`room` of drivers/swings.c)."""
-        if self.places is None:
+        """Eights of bytes that the search among arms works with, `room` of drivers/arm_search.c."""
+        values, family = self.values, self.method.step.arm
+        if values is None or family is None:
             return 1
-        p, n = self.places, len(self.robot.actuators)
-        most = max(*map(len, p.levels), len(p.closer)) * p.sides + 1
-        free, arm = p.levels[0].shape[1], len(p.columns)
+        n, arm = len(self.robot.actuators), len(family.screws)
+        most = max(*map(len, values.levels), len(values.closer)) * family.rows + 1
+        free = family.size
         whole = 6 * most + 2
         numbers = 2 * most * (arm + 2) + most * (12 + free) + (most + 1) * n + 1
         size = 8 if self.single is None else 4
@@ -134,9 +139,7 @@ class SceneSources:
     @property
     def allowed(self) -> float:
         """How far within its bounds an arm has to be, [rad] negative: rounding at a limit."""
-        places = self.places
-        assert places is not None
-        return places.allowed if self.single is None else -ARM_ROUNDING
+        return PARAMETERS.allowed if self.single is None else -ARM_ROUNDING
 
     @property
     def margin(self) -> dict[str, str]:
@@ -227,7 +230,7 @@ class SceneSources:
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
             "SCENE_CONSTANTS": self._constants(),
-            "SWINGS": "" if self.places is None else driver_text("swings"),
+            "ARM_SEARCH": "" if self.values is None else driver_text("arm_search"),
         }
         return filled("scene.c", marks)
 
@@ -264,15 +267,15 @@ class SceneSources:
     @property
     def _rounds(self) -> int:
         """Rounds of other hands that are looked at."""
-        return min(ROUNDS, self.method.options.rounds)
+        return min(FREE.rounds, self.method.options.rounds)
 
     def _look_constants(self) -> str:
         """What the search for hands that are free knows."""
-        closed = int(self.places is not None)
-        ranges = np.maximum(self.robot.upper - self.robot.lower, LEAST_RANGE)
+        closed = int(self.values is not None)
+        ranges = np.maximum(self.robot.upper - self.robot.lower, FREE.least_range)
         return (
             define({"LOOK_ROUNDS": self._rounds, "HAS_CLOSED_ARM": closed})
-            + f"#define LOOK_ALIKE {number(ALIKE)}\n"
+            + f"#define LOOK_ALIKE {number(FREE.alike)}\n"
             + define_arrays({"LOOK_RANGES": ranges})
         )
 
@@ -282,18 +285,18 @@ class SceneSources:
         hand = list(about.hand_actuators)
         fingers = [about.finger_actuators(name) for name in robot.fingers]
         moved = [about.links_moved([motor]) for motor in hand]
-        whole = {"N_HAND": len(hand), "N_PARTS": len(PARTS)}
-        whole |= {"N_IDLE": PLACES, "N_IDLE_CLOSER": CLOSER}
+        whole = {"N_HAND": len(hand), "N_PARTS": len(FREE.idle_parts)}
+        whole |= {"N_IDLE": FREE.idle_postures, "N_IDLE_CLOSER": FREE.idle_closer}
         return (
             define(whole)
-            + f"#define IDLE_NEAR {number(NEAR)}\n"
+            + f"#define IDLE_NEAR {number(FREE.idle_near)}\n"
             + define_arrays(
                 {
                     "HAND": np.array(hand),
                     "HAND_LOWER": robot.lower[hand],
                     "HAND_RANGE": (robot.upper - robot.lower)[hand],
                     "HAND_SPREAD": even_steps(len(robot.lower))[hand],
-                    "IDLE_PARTS": np.array(PARTS),
+                    "IDLE_PARTS": np.array(FREE.idle_parts),
                     "FINGER_MOVED": np.array([[int(m in some) for m in hand] for some in fingers]),
                     "LINK_MOVED": np.array(
                         [[int(link in some) for some in moved] for link in self.links]
@@ -333,27 +336,30 @@ class SceneSources:
             "N_OWN": len(own),
             "N_KINDS": len(EXPORTED),
             "N_PAIRS": len(pairs),
-            "HAS_CLOSED_ARM": int(self.places is not None),
+            "HAS_CLOSED_ARM": int(self.values is not None),
         }
         text = f"#define ROUNDING {number(self.rounding)}\n"
-        if self.places is not None:
-            p = self.places
+        values, family = self.values, self.method.step.arm
+        if values is not None and family is not None:
+            grid, between = values.levels
+            low, high = self._arm_limits
             whole |= {
-                "N_ARM": len(p.columns),
-                "N_FREE": p.levels[0].shape[1],
-                "N_SIDES": p.sides,
-                "N_PLACES": len(p.levels[0]),
-                "N_MORE_PLACES": len(p.levels[1]),
-                "N_CLOSER": len(p.closer),
+                "N_ARM": len(low),
+                "N_REDUNDANCY": family.size,
+                "N_ROWS": family.rows,
+                "N_PLACES": len(grid),
+                "N_MORE_PLACES": len(between),
+                "N_CLOSER": len(values.closer),
             }
             text += f"#define ALLOWED {number(self.allowed)}\n"
-            text += f"#define ARM_COLUMNS {{{', '.join(map(str, p.columns.tolist()))}}}\n"
+            columns = ", ".join(map(str, self.robot.description.arm_actuators))
+            text += f"#define ARM_COLUMNS {{{columns}}}\n"
             arrays |= {
-                "PLACES": p.levels[0].ravel(),
-                "MORE_PLACES": p.levels[1].ravel() if p.levels[1].size else np.zeros(1),
-                "CLOSER": p.closer if len(p.closer) else np.zeros(1),
-                "ARM_LOW": p.low,
-                "ARM_RANGE": p.high - p.low,
+                "PLACES": grid.ravel(),
+                "MORE_PLACES": between.ravel() if between.size else np.zeros(1),
+                "CLOSER": values.closer if len(values.closer) else np.zeros(1),
+                "ARM_LOW": low,
+                "ARM_RANGE": high - low,
             }
         return define(whole) + text + define_arrays(arrays) + self._idle_constants()
 

@@ -18,8 +18,8 @@ from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.status import Status
 from casadi_ik.registry import build_method
+from casadi_ik.solving.alternatives.free import resolve_at_once
 from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.freeing import freed_at_once
 
 DRAWN = 64
 """Random configurations, at whose fingertips solids are put."""
@@ -103,7 +103,7 @@ class SceneTargets:
         assert around is not None
         clear = around.check(q[None])
         if not clear.free[0]:
-            found = freed_at_once(engine, problems, around, q, questions.start(q0), others=True)
+            found = resolve_at_once(engine, problems, around, q, questions.start(q0), others=True)
             if found is None:
                 return None
             q, _, clear = found

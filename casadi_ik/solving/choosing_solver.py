@@ -13,7 +13,7 @@ from casadi_ik.grasps.pose import checked_pose
 from casadi_ik.problem.palm_targets import hand_postures
 from casadi_ik.problem.questions import Questions
 from casadi_ik.solving.alternatives.finder import APART, Alternative
-from casadi_ik.solving.choice import Judgement, choose
+from casadi_ik.solving.choose import Judgement, choose
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 

@@ -30,12 +30,16 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
-from casadi_ik.solving.alternatives.free import FreeFinder
+from casadi_ik.solving.alternatives.free import (
+    RANKED,
+    FreeFinder,
+    resolve_at_once,
+    resolve_collisions,
+)
 from casadi_ik.solving.alternatives.way_out import with_way_out
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
-from casadi_ik.solving.freeing import RANKED, freed, freed_at_once
 from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.solved_part import SolvedPart, judged
@@ -214,7 +218,7 @@ class Engine:
         if (around := self.around(problems)) is not None:
             clear = around.check(q[None])
             if not clear.free[0]:
-                if (other := freed_at_once(self, problems, around, q, start)) is None:
+                if (other := resolve_at_once(self, problems, around, q, start)) is None:
                     return None
                 q, verdict, clear = other
                 seconds = time.perf_counter() - begin
@@ -285,7 +289,9 @@ class Engine:
             batch = judged(self.robot, self.method.name, asked, outcome, around)
             if around is not None and self._own_hands is not None:
                 q0, seed = starts[rows], run.seed
-                batch = freed(self.kinds_of, asked, around, q0, seed, outcome, batch, diagnose)
+                batch = resolve_collisions(
+                    self.kinds_of, asked, around, q0, seed, outcome, batch, diagnose
+                )
                 outcome = replace(outcome, q=batch.q, time=batch.time)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)

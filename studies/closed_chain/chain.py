@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import casadi_ik as ik
 from casadi_ik.arms.recognise import srs_arm
-from casadi_ik.arms.search import PARAMETERS, ArmSearch, Farthest
+from casadi_ik.arms.search import PARAMETERS, ArmTrials, Farthest
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.symbolic.actuated import actuated
@@ -48,7 +48,7 @@ class HeldThumb:
         lower, upper = (ca.MX(ca.DM(x[self.arm].tolist())) for x in (robot.lower, robot.upper))
         arm, elbow = srs_arm(robot.description), self.arm[3]
         assert arm is not None
-        self._srs, self._search = arm, ArmSearch(arm, Farthest())
+        self._srs, self._search = arm, ArmTrials(arm, Farthest())
         self._reach = [float(x) for x in arm.reach(robot.lower[elbow], robot.upper[elbow])]
         best = lower, trial
         _, margin, _ = self._search.trial(palm, (lower, upper), trial, best, trial)

@@ -12,7 +12,7 @@
 enum { DONE = 0, SLICE_OVER = 1, NO_MEMORY = -1 };
 
 @SCENE_CONSTANTS@
-@SWINGS@
+@ARM_SEARCH@
 void @PREFIX@_scene_init(@PREFIX@_solver *solver) {
   int i, k;
   for (i = 0; i < N_OWN; ++i) {
@@ -152,11 +152,11 @@ double @PREFIX@_clearance(@PREFIX@_solver *solver, const double *q) {
 
 #if HAS_CLOSED_ARM
 /* The preferred arm that touches nothing, for the hand of an answer; 0 if there is none. */
-static int swing_arm(@PREFIX@_solver *solver, const double *lower, const double *upper, int near,
+static int choose_arm(@PREFIX@_solver *solver, const double *lower, const double *upper, int near,
                      double *q) {
   clearance_job clear = about(solver, 0);
   static const int64_t columns[] = ARM_COLUMNS;
-  swings_job job = {0};
+  arm_search_job job = {0};
   map_job map = {0};
   const double *inputs[1];
   double *outputs[1], palm[16], low[N_ARM], high[N_ARM], arm[N_ARM], score = 0;
@@ -185,8 +185,8 @@ static int swing_arm(@PREFIX@_solver *solver, const double *lower, const double 
   job.order = near ? NEAR_START : FAR_FROM_LIMITS;
   job.n_q = @GUARD@_MOTORS;
   job.n_arm = N_ARM;
-  job.n_free = N_FREE;
-  job.n_sides = N_SIDES;
+  job.n_redundancy = N_REDUNDANCY;
+  job.n_rows = N_ROWS;
   job.n_groups = 1;
   job.n_places[0] = N_PLACES;
   job.n_places[1] = N_MORE_PLACES;
@@ -211,7 +211,7 @@ static int swing_arm(@PREFIX@_solver *solver, const double *lower, const double 
   job.score = &score;
   job.tried = &tried;
   job.memory = &solver->memory;
-  if (casadi_ik_swings(&job) != DONE || !(score > -INFINITY)) return 0;
+  if (casadi_ik_arm_search(&job) != DONE || !(score > -INFINITY)) return 0;
   for (i = 0; i < N_ARM; ++i) q[columns[i]] = arm[i];
   return 1;
 }
@@ -271,7 +271,7 @@ int @PREFIX@_hand_is_free(@PREFIX@_solver *solver, const double *lower, const do
 int @PREFIX@_arm_is_free(@PREFIX@_solver *solver, const double *lower, const double *upper, int near,
                          double *q) {
 #if HAS_CLOSED_ARM
-  return swing_arm(solver, lower, upper, near, q);
+  return choose_arm(solver, lower, upper, near, q);
 #else
   (void) lower, (void) upper, (void) near;
   return @PREFIX@_clearance(solver, q) - solver->scene.margin >= -ROUNDING;

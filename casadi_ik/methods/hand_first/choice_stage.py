@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from casadi_ik.arms.family import ArmFamily
-from casadi_ik.arms.search import PARAMETERS, ArmSearch, Nearest, is_allowed
+from casadi_ik.arms.search import PARAMETERS, ArmTrials, Nearest, is_allowed
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.kinematics import Pose
@@ -19,7 +19,7 @@ def choice_stage(layouts: HandFirstLayouts, family: ArmFamily) -> ca.Function:
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
     columns = list(layouts.robot.arm_actuators)
     ranges = (layouts.robot.upper - layouts.robot.lower)[columns]
-    search = ArmSearch(family, Nearest.by_ranges(ranges))
+    search = ArmTrials(family, Nearest.by_ranges(ranges))
     palm = Pose(s["palm_rotation"], s["palm_origin"])
     bounds = p["lower"][columns], p["upper"][columns]
     best, near = (s["arm"], s["swivel"]), p["start"][columns]
@@ -28,7 +28,7 @@ def choice_stage(layouts: HandFirstLayouts, family: ArmFamily) -> ca.Function:
     return ca.Function("choice", [state, parameters], list(outputs))
 
 
-def _taken(layouts: HandFirstLayouts, search: ArmSearch) -> ca.Function:
+def _taken(layouts: HandFirstLayouts, search: ArmTrials) -> ca.Function:
     """Keep the best arm; after the last trial it is the answer if the hand fits.
 
     A nominal arm that is not the real one is refined.

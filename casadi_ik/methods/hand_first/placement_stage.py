@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from casadi_ik.arms.family import ArmFamily
-from casadi_ik.arms.search import PARAMETERS, ArmSearch, Farthest
+from casadi_ik.arms.search import PARAMETERS, ArmTrials, Farthest
 from casadi_ik.methods.common.numeric_arm import newton_polish
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
@@ -21,7 +21,7 @@ def placement_stage(layouts: HandFirstLayouts, family: ArmFamily) -> ca.Function
     columns = list(layouts.robot.arm_actuators)
     pose = s["palm_rotation"], s["palm_origin"]
     bounds = p["lower"][columns], p["upper"][columns]
-    search = ArmSearch(family, Farthest())
+    search = ArmTrials(family, Farthest())
     visit = s["candidate"] + s["earlier"]
     best = s["arm"], s["swivel"]
     arm, margin, swivel = search.trial(Pose(*pose), bounds, s["spent"], best, visit)
@@ -33,7 +33,7 @@ def placement_stage(layouts: HandFirstLayouts, family: ArmFamily) -> ca.Function
     return ca.Function("placement", [state, parameters], list(outputs))
 
 
-def _placed(layouts: HandFirstLayouts, search: ArmSearch) -> ca.Function:
+def _placed(layouts: HandFirstLayouts, search: ArmTrials) -> ca.Function:
     """Keep the best arm so far; take it if it is within limits.
 
     The last input says whether a nominal arm brings the palm where it was asked for.

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.arms.family import ArmFamily
-from casadi_ik.arms.search import ArmSearch, Farthest, Nearest
+from casadi_ik.arms.search import ArmTrials, Farthest, Nearest
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.methods.common.balance import NEAR, differs
@@ -150,7 +150,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         ranges = (self.robot.upper - self.robot.lower)[columns]
         inputs, cases = [rotation, origin, here, lower, upper], []
         for score in (Nearest.by_ranges(ranges), Farthest()):
-            search = ArmSearch(family, score)
+            search = ArmTrials(family, score)
             arm, *_ = search.trial(palm, (lower, upper), first, best, first, here)
             cases.append(ca.Function("near_or_far", inputs, [arm]))
         return ca.Function.if_else("arm_start", *cases)

@@ -22,7 +22,6 @@ from casadi_ik.problem.preference import CLEARANCE, preference
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
-from casadi_ik.solving.alternatives.distinct import checked_distance, distinct
 from casadi_ik.solving.trials import Bounds, Descent, HandMethod, Trials, repeated
 from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.measures import manipulability
@@ -350,3 +349,26 @@ class AlternativeFinder:
             manipulability=float(self._measured(q)[0]),
             distance=float(-self.score(q, q0, "q0")[0]),
         )
+
+
+def distinct(parts: Array, apart: float, limit: int | None = None) -> list[int]:
+    """Rows of parts (k, n) that differ from all chosen before them, in their order."""
+    kept: list[int] = []
+    for i in range(len(parts)):
+        if len(kept) == limit:
+            break
+        if (np.abs(parts[i] - parts[kept]).max(axis=1, initial=0.0) >= apart).all():
+            kept.append(i)
+    return kept
+
+
+def checked_distance(apart: float) -> float:
+    """A least difference of configurations.
+
+    Raises:
+        InputError: It is none.
+    """
+    number = isinstance(apart, (int, float, np.integer, np.floating))
+    if not number or isinstance(apart, bool) or not 0 <= apart <= 1:
+        raise InputError(f"apart: found {apart!r}, expected a number from 0 to 1")
+    return float(apart)

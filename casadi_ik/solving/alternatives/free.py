@@ -1,24 +1,114 @@
-"""Answers that touch nothing, for batches of targets and at once for one."""
+"""Answers that touch nothing: other arms for the same hand, other hands, and steps away.
+
+What is looked at, until one is free: all branches of the arm over all of its redundancy with the
+hand as it is; the hand postures of every round, each with all its arms; descents from random arms;
+and steps away from what is nearest, each brought back to the contacts. A hand that touches
+something by itself, wherever its unconstrained fingers are put, is discarded before any of its arms
+is looked at.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from casadi_ik.arrays import Array
-from casadi_ik.problem.clearance import Surroundings
+from casadi_ik.answers.solution import BatchSolution, CollisionReport
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array, Bools
+from casadi_ik.problem.clearance import ROUNDING, Clearances, Surroundings
+from casadi_ik.problem.contacts.arrays import by_kinds
+from casadi_ik.problem.method import Outcome
+from casadi_ik.problem.palm_targets import free_palms
+from casadi_ik.problem.preference import CLEARANCE
 from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.status import Status
+from casadi_ik.problem.verdict import SolvedVerdict, judge_one
+from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
-from casadi_ik.solving.alternatives.free_search import FreeAnswers, FreeSearch, score_of
-from casadi_ik.solving.alternatives.swings import ArmSwings, Preference
-
-TOGETHER = 128
-"""Targets that are worked on at once."""
+from casadi_ik.solving.solved_part import judged
+from casadi_ik.solving.trials import Descent
+from casadi_ik.symbolic.even_spread import even_steps
 
 USUAL = "limits"
 """What is preferred where nothing is said."""
+
+RANKED = ("manipulability", CLEARANCE)
+"""Preferences for which an answer that is free already has to compete with all others."""
+
+
+@dataclass(frozen=True)
+class FreeSearchParameters:
+    """How far answers that touch nothing are looked for.
+
+    Attributes:
+        together: Targets that are worked on at once.
+        rounds: Of hand postures.
+        alike: Hands all of whose motors differ by less [of their ranges] have the same arms.
+        starts: Random arms that a target is solved from, where the arm is of no family.
+        hands: As many where it is: then it is other hands that are looked for.
+        escapes: Steps away from what is nearest.
+        steps: Lengths of such a step, the best is taken; motions as parts of motors' ranges.
+        nudge: Difference [of a motor's range] from which it is taken which way there is more room.
+        deep: What is farther inside something [m] is not got out of by such steps.
+        gain: What a step away has to gain at least, of what there is to gain.
+        hopeful: Hands with most room that are looked at for why there is no answer.
+        least_range: What stands for the range of a motor that has none [rad or m].
+        idle_postures: Of unconstrained fingers that are looked at, evenly spread over their limits.
+        idle_closer: As many about the best of them, where they have too little room, ever closer.
+        idle_parts: How far about [of the motors' ranges].
+        idle_near: Room [m] that can be gained about a posture.
+    """
+
+    together: int = 128
+    rounds: int = 3
+    alike: float = 0.02
+    starts: int = 24
+    hands: int = 8
+    escapes: int = 4
+    steps: tuple[float, ...] = (0.1, 0.02)
+    nudge: float = 1e-5
+    deep: float = 0.02
+    gain: float = 0.1
+    hopeful: int = 4
+    least_range: float = 1e-9
+    idle_postures: int = 48
+    idle_closer: int = 24
+    idle_parts: tuple[float, ...] = (0.5, 0.25, 0.12)
+    idle_near: float = 0.02
+
+
+PARAMETERS = FreeSearchParameters()
+
+
+@dataclass(frozen=True, eq=False)
+class FreeAnswers:
+    """What was found for k targets.
+
+    Attributes:
+        q: (k, n) a free answer; where there is none, the one that is nearest to it.
+        free: (k,) whether it is.
+        reports: Why there is none; None where there is.
+    """
+
+    q: Array
+    free: NDArray[np.bool_]
+    reports: tuple[CollisionReport | None, ...]
+
+    def with_free(self, rows: NDArray[np.intp], others: FreeAnswers) -> FreeAnswers:
+        """With the free answers that others are to some of the targets."""
+        taken = rows[others.free]
+        q, free, reports = self.q.copy(), self.free.copy(), list(self.reports)
+        q[taken], free[taken] = others.q[others.free], True
+        for row in taken.tolist():
+            reports[row] = None
+        return FreeAnswers(q, free, tuple(reports))
 
 
 class FreeFinder:
@@ -38,12 +128,12 @@ class FreeFinder:
         self._compiled = compiled
 
     @cached_property
-    def swings(self) -> ArmSwings | None:
+    def arm_search(self) -> ArmSearch | None:
         """All arms of hands; None for an arm without a closed form, and without an arm."""
         arm = self.trials.method.step.arm
         if arm is None:
             return None
-        return ArmSwings(self.robot, arm, lambda: self._finder.manipulability, self._compiled)
+        return ArmSearch(self.robot, arm, lambda: self._finder.manipulability, self._compiled)
 
     def find(
         self,
@@ -96,11 +186,11 @@ class FreeFinder:
         if not len(q):
             return FreeAnswers(q, np.zeros(0, dtype=bool), ())
         parts = []
-        for first in range(0, len(q), TOGETHER):
-            rows = np.arange(first, min(first + TOGETHER, len(q)))
+        for first in range(0, len(q), PARAMETERS.together):
+            rows = np.arange(first, min(first + PARAMETERS.together, len(q)))
             search = FreeSearch(
                 self._finder,
-                self.swings,
+                self.arm_search,
                 problems.rows(rows),
                 around.rows(rows),
                 starts[rows],
@@ -134,11 +224,11 @@ class FreeFinder:
             starts: (1, n) where the robot is.
             others: Whether to look at what comes next, too: the hands of further rounds.
         """
-        search = FreeSearch(self._finder, self.swings, problems, around, starts, 0)
-        search.swing(q, np.zeros(1, dtype=np.intp))
+        search = FreeSearch(self._finder, self.arm_search, problems, around, starts, 0)
+        search.try_hands(q, np.zeros(1, dtype=np.intp))
         if others:
-            for hands, owner in search.of_rounds():
-                search.swing(hands, owner)
+            for hands, owner in search.other_hands():
+                search.try_hands(hands, owner)
         return search.best[0] if search.free[0] else None
 
     def arm_margins(self, q: Array) -> Array:
@@ -163,3 +253,493 @@ class FreeFinder:
             columns: Motors whose distance from the limits counts; None: all.
         """
         return score_of(self._finder, q, starts, prefer, room, columns)
+
+
+class FreeSearch:
+    """The search for some targets.
+
+    Attributes:
+        best: (k, n) the preferred of what is free so far.
+        free: (k,) whether there is any.
+    """
+
+    def __init__(
+        self,
+        finder: AlternativeFinder,
+        arm_search: ArmSearch | None,
+        problems: Problems,
+        around: Surroundings,
+        starts: Array,
+        seed: int,
+    ) -> None:
+        self.finder, self.arm_search = finder, arm_search
+        self.problems, self.around = problems, around
+        self.starts, self.seed = starts, seed
+        self.trials = finder.trials
+        self.limits = self.trials.limits(problems)
+        count, n = starts.shape
+        self.best, self.score = np.full((count, n), np.nan), np.full(count, -np.inf)
+        self.nearest, self.room = np.full((count, n), np.nan), np.full(count, -np.inf)
+        self.free = np.zeros(count, dtype=bool)
+        self.tried = np.zeros(count, dtype=np.int64)
+        self.hands: list[tuple[Array, NDArray[np.intp], Array]] = []
+        robot, hand = finder.robot, finder.hand
+        self._idle = UnconstrainedFingers(robot, problems)
+        self._ranges = np.maximum(robot.upper - robot.lower, PARAMETERS.least_range)
+        self._palms = free_palms(robot, problems)
+        size = len(hand) + 12 * bool(self._palms.any())
+        self._known, self._searched = (
+            Deduplicator(count, size, PARAMETERS.alike) for _ in range(2)
+        )
+        self._fresh = np.ones(count, dtype=bool)
+
+    @cached_property
+    def _descent(self) -> Descent:
+        return Descent(self.trials, self.problems)
+
+    def run(self, q: Array, every: bool = False) -> None:
+        """Look until all are free; or first, if asked, at the hands of a round whether or not."""
+        self.try_hands(q, np.arange(len(q)))
+        for hands, owner in chain(self.other_hands(every), self._from_anywhere()):
+            self.try_hands(hands, owner)
+        blocked = np.flatnonzero(~self.free)
+        if len(blocked):
+            self._find_nearest(blocked)
+            self._escape()
+
+    def take(self, q: Array, owner: NDArray[np.intp]) -> Array:
+        """Keep the preferred free ones of configurations (m, n), and the nearest; their room."""
+        if not len(q):
+            return np.zeros(0)
+        room = self.around.rows(owner).check(q).room
+        rows = best_of_each(owner, room, self.room)
+        self.nearest[owner[rows]], self.room[owner[rows]] = q[rows], room[rows]
+        kept = np.flatnonzero(room >= -ROUNDING)
+        if len(kept):
+            some, mine = q[kept], owner[kept]
+            score = score_of(self.finder, some, self.starts[mine], self.problems.prefer, room[kept])
+            rows = best_of_each(mine, score, self.score)
+            self.best[mine[rows]], self.score[mine[rows]] = some[rows], score[rows]
+            self.free[mine[rows]] = True
+        return room
+
+    def try_hands(self, q: Array, owner: NDArray[np.intp]) -> None:
+        """The preferred free arms of hands (m, n) of targets."""
+        if not len(q):
+            return
+        q = self._idle.aside(q, owner, self.around.held)
+        if self.arm_search is None:
+            self.take(q, owner)
+            self.hands.append((q, owner, np.zeros(len(q))))
+            np.add.at(self.tried, owner, 1)
+            self._fresh[owner] = True
+            return
+        room = self.around.rows(owner).held.check(q).room
+        parts = self.finder.hand_parts(q, self._palms[owner])
+        fresh = self._known.add(parts, owner)
+        self._fresh[owner[fresh]] = True
+        self.hands.append((q[fresh], owner[fresh], room[fresh]))
+        kept = np.flatnonzero(room >= -ROUNDING)
+        np.add.at(self.tried, owner[room < -ROUNDING], 1)
+        kept = kept[self._searched.add(parts[kept], owner[kept])]
+        kept = kept[self._in_order(q[kept], owner[kept])]
+        found, mine, tried = self._arms(q[kept], owner[kept], room[kept], self.around)
+        np.add.at(self.tried, owner[kept], tried)
+        self.take(found, mine)
+
+    def _in_order(self, q: Array, owner: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Hands target by target, the preferred ones first as far as the hand goes."""
+        hand = self.finder.hand
+        if self.problems.prefer == "q0":
+            off = ((q - self.starts[owner]) / self._ranges)[:, hand]
+            return np.lexsort((np.square(off).sum(axis=1), owner))
+        return np.lexsort((-self.finder.score(q, q, "limits", hand), owner))
+
+    def _arms(
+        self,
+        q: Array,
+        owner: NDArray[np.intp],
+        room: Array,
+        around: Surroundings,
+        prefer: Preference | None = None,
+    ) -> tuple[Array, NDArray[np.intp], NDArray[np.int64]]:
+        """Preferred arms of hands, their targets, and how many were tried for each hand."""
+        arms = self.arm_search
+        assert arms is not None
+        asked = prefer or self.problems.prefer
+        found = arms.choose(
+            q,
+            self.starts[owner],
+            (self.limits.first.lower, self.limits.first.upper),
+            asked,
+            around.rows(owner),
+            room,
+            of_one=owner if asked in ("limits", "q0") else None,
+        )
+        return *self._solved(found.q, owner[found.owner]), found.tried
+
+    def other_hands(self, every: bool = False) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+        """Answers with other hands, of the targets that are not free, round by round."""
+        method = self.trials.method
+        for number in range(min(PARAMETERS.rounds, method.options.rounds, method.rounds)):
+            # Where a round has brought no other hand, the next will not either.
+            rows = np.flatnonzero((~self.free | (every and not number)) & self._fresh)
+            if not len(rows):
+                break
+            self._fresh[:] = False
+            some = self.problems.rows(rows)
+            postures = method.postures(some, number)
+            count = postures.shape[1]
+            owner = np.repeat(rows, count)
+            starts = self.limits.of(owner).clip(self.starts[owner])
+            flat = postures.reshape(len(owner), postures.shape[2])
+            asked = self.problems.rows(owner)
+            turns = number * count + np.tile(np.arange(count), len(rows))
+            ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat, turns))
+            yield self._solved(ends, owner)
+
+    def _from_anywhere(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+        """Answers with other hands and arms, of the targets that are not free."""
+        rows, robot, hand = np.flatnonzero(~self.free), self.finder.robot, self.finder.hand
+        if not len(rows):
+            return
+        count = PARAMETERS.starts if self.arm_search is None else PARAMETERS.hands
+        owner = np.repeat(rows, count)
+        numbers = np.array([self.problems.number(int(row)) for row in rows])
+        starts = np.concatenate(_shifted(robot, self.seed, numbers, count))
+        last = self.hands[0][0]
+        starts[::2, hand] = last[owner[::2]][:, hand]
+        ends = self._descent.run(owner, self.limits.of(owner).clip(starts))
+        yield self._solved(ends, owner)
+
+    def _solved(self, q: Array, owner: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+        if not len(q):
+            return q, owner
+        asked = self.problems.rows(owner)
+        good = self.trials.solved(asked, q, asked.enforce_limits)
+        return q[good], owner[good]
+
+    def _find_nearest(self, rows: NDArray[np.intp]) -> None:
+        """The answers with most room, of the hands with most."""
+        q, owner, room = self._hands_of(rows)
+        if self.arm_search is None:
+            return
+        kept = first_of_each(owner, np.lexsort((-room, owner)), 1)
+        found, mine, _ = self._arms(q[kept], owner[kept], room[kept], self.around, CLEARANCE)
+        self.take(np.concatenate([found, q[kept]]), np.concatenate([mine, owner[kept]]))
+
+    def _hands_of(self, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp], Array]:
+        """All hands of some targets, their owners and their room."""
+        q, owner, room = (np.concatenate(each) for each in zip(*self.hands, strict=True))
+        mine = np.isin(owner, rows)
+        return q[mine], owner[mine], room[mine]
+
+    def _escape(self) -> None:
+        """Steps away from what is nearest, brought back to the contacts."""
+        ranges, n = self._ranges, len(self._ranges)
+        rows = np.flatnonzero(~self.free & (self.room > -PARAMETERS.deep))
+        for _ in range(PARAMETERS.escapes):
+            if not len(rows):
+                return
+            before = self.room[rows].copy()
+            nudged = self.nearest[rows][:, None] + np.diag(PARAMETERS.nudge * ranges)
+            around = self.around.rows(np.repeat(rows, n))
+            room = around.check(nudged.reshape(-1, n)).room.reshape(-1, n)
+            way = (room - before[:, None]) / PARAMETERS.nudge
+            way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+            owner = np.repeat(rows, len(PARAMETERS.steps))
+            steps = np.tile(PARAMETERS.steps, len(rows))[:, None]
+            there = self.nearest[owner] + steps * (way * ranges).repeat(
+                len(PARAMETERS.steps), axis=0
+            )
+            ends = self._descent.run(owner, self.limits.of(owner).clip(there))
+            self.take(*self._solved(ends, owner))
+            rows = rows[~self.free[rows] & (self.room[rows] > (1 - PARAMETERS.gain) * before)]
+
+    def found(self, reasons: bool) -> FreeAnswers:
+        """What it came to; whether it would work without the scene or the robot, if asked."""
+        q = np.where(self.free[:, None], self.best, self.nearest)
+        reports: list[CollisionReport | None] = [None] * len(q)
+        blocked = np.flatnonzero(~self.free)
+        if not len(blocked):
+            return FreeAnswers(q, self.free, tuple(reports))
+        clear = self.around.rows(blocked).check(q[blocked])
+        alone = self._possible(blocked, self.around.robot_alone) if reasons else None
+        passing = self._possible(blocked, self.around.scene_alone) if reasons else None
+        for i, row in enumerate(blocked.tolist()):
+            pair = clear.pair(i)
+            assert pair is not None
+            reports[row] = CollisionReport(
+                pair,
+                -float(clear.room[i]),
+                int(self.tried[row]),
+                None if alone is None else bool(alone[row]),
+                None if passing is None else bool(passing[row]),
+            )
+        return FreeAnswers(q, self.free, tuple(reports))
+
+    def _possible(self, rows: NDArray[np.intp], around: Surroundings) -> NDArray[np.bool_]:
+        """(all targets,) whether one of the hands is free of some of the pairs alone."""
+        q, owner, room = self._hands_of(rows)
+        possible = np.zeros(len(self.free), dtype=bool)
+        if self.arm_search is None:
+            possible[owner[around.rows(owner).free(q)]] = True
+            return possible
+        kept = np.flatnonzero(around.rows(owner).held.free(q))
+        kept = kept[
+            first_of_each(owner[kept], np.lexsort((-room[kept], owner[kept])), PARAMETERS.hopeful)
+        ]
+        any_room = np.full(len(kept), np.inf)
+        _, mine, _ = self._arms(q[kept], owner[kept], any_room, around, "limits")
+        possible[mine] = True
+        return possible
+
+
+def _shifted(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -> Array:
+    """(k, count, n) configurations, spread over the limits for each target in its own way.
+
+    A random cloud, for each target shifted around in the limits, by its number alone: whichever
+    others are looked at with it.
+    """
+    cloud = np.random.default_rng(seed).random((count, len(robot.lower)))
+    shift = numbers[:, None] * even_steps(len(robot.lower))
+    part = (cloud + shift[:, None]) % 1.0
+    return robot.lower + part * (robot.upper - robot.lower)
+
+
+def score_of(
+    finder: AlternativeFinder,
+    q: Array,
+    starts: Array,
+    prefer: Preference,
+    room: Array,
+    columns: list[int] | None = None,
+) -> Array:
+    """(m,) what is preferred of configurations, see `FreeFinder.score`."""
+    if callable(prefer):
+        return np.asarray(prefer(q), dtype=float)
+    if prefer == CLEARANCE:
+        return room
+    return finder.score(q, starts, prefer, columns)
+
+
+class UnconstrainedFingers:
+    """The motors of k targets' hands that move no finger with a contact."""
+
+    def __init__(self, robot: ArmHand, problems: Problems) -> None:
+        self._description = description = robot.description
+        free = np.isnan(problems.points[..., 0]) & np.isnan(problems.normals[..., 0])
+        for more in problems.more.values():
+            free &= np.isnan(more[..., 0])
+        busy = np.zeros((len(description.finger_names), len(robot.lower)), dtype=bool)
+        for finger, name in enumerate(description.finger_names):
+            busy[finger, list(description.finger_actuators(name))] = True
+        hand = np.zeros(len(robot.lower), dtype=bool)
+        hand[list(description.hand_actuators)] = True
+        self._motors: Bools = hand & ~(~free[:, :, None] & busy).any(axis=1)
+        if problems.fixed is not None:
+            self._motors &= np.isnan(problems.fixed)
+        parts = (
+            0.5 + np.arange(PARAMETERS.idle_postures)[:, None] * even_steps(len(robot.lower))
+        ) % 1.0
+        ranges = robot.upper - robot.lower
+        self._limits = robot.lower, robot.upper
+        self._places = robot.lower + parts * ranges
+        about = (parts[: PARAMETERS.idle_closer] - 0.5) * ranges
+        self._spread = (None, *(part * about for part in PARAMETERS.idle_parts))
+
+    def aside(self, q: Array, owner: NDArray[np.intp], around: Surroundings) -> Array:
+        """Hands, those that touch something by themselves with their idle fingers elsewhere.
+
+        Args:
+            q: (m, n) configurations.
+            owner: (m,) their targets.
+            around: What hands by themselves are checked against.
+
+        Returns:
+            (m, n) each as it is, or with the idle fingers where they have most room.
+        """
+        some = np.flatnonzero(self._motors[owner].any(axis=1))
+        if not len(some):
+            return q
+        of_idle, others = around.parted(self._links)
+        # What the idle fingers have no part in they do not help.
+        some = some[others.rows(owner[some]).free(q[some])]
+        before = of_idle.rows(owner[some]).check(q[some]).room
+        touching = before < -ROUNDING
+        some, before = some[touching], before[touching]
+        if not len(some):
+            return q
+        moved = q.copy()
+        for places in self._spread:
+            motors = self._motors[owner[some]]
+            about = moved[some][:, None]
+            there = self._places if places is None else about + places
+            tried = np.where(motors[:, None], np.clip(there, *self._limits), about)
+            count = tried.shape[1]
+            rows = np.repeat(owner[some], count)
+            room = of_idle.rows(rows).check(tried.reshape(-1, q.shape[1])).room.reshape(-1, count)
+            best = room.argmax(axis=1)
+            each = np.arange(len(some))
+            most = room[each, best]
+            better = most > before
+            moved[some[better]] = tried[each, best][better]
+            before = np.maximum(before, most)
+            near = (before < -ROUNDING) & (before > -PARAMETERS.idle_near)
+            some, before = some[near], before[near]
+            if not len(some):
+                break
+        return moved
+
+    @cached_property
+    def _links(self) -> frozenset[str]:
+        """Links that a motor moves which is idle in one of the targets."""
+        idle = np.flatnonzero(self._motors.any(axis=0)).tolist()
+        return self._description.links_moved(idle)
+
+
+def best_of_each(owner: NDArray[np.intp], value: Array, than: Array) -> NDArray[np.intp]:
+    """The row of the largest value (m,) of each owner (m,), where it exceeds what that has (k,)."""
+    order = np.lexsort((value, owner))
+    last = order[np.append(owner[order][1:] != owner[order][:-1], True)]
+    return last[value[last] > than[owner[last]]]
+
+
+def first_of_each(owner: NDArray[np.intp], order: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """So many rows of each owner, the first in an order that goes owner by owner."""
+    sorted_owner = owner[order]
+    rank = np.arange(len(order)) - np.searchsorted(sorted_owner, sorted_owner)
+    return order[rank < count]
+
+
+class Deduplicator:
+    """The rows that each of k owners has had so far, none like another."""
+
+    def __init__(self, count: int, size: int, apart: float) -> None:
+        """Begin with none.
+
+        Args:
+            count: Owners.
+            size: Numbers of a row.
+            apart: Rows all of whose numbers differ by less are alike.
+        """
+        self._rows = np.full((count, 0, size), np.nan)
+        self._apart = apart
+
+    def add(self, rows: Array, owner: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Take rows (m, size) in; (m,) whether each is unlike all before it."""
+        order = np.argsort(owner, kind="stable")
+        mine = owner[order]
+        rank = np.arange(len(order)) - np.searchsorted(mine, mine)
+        whose, place = np.unique(mine, return_inverse=True)
+        most, before = int(rank.max(initial=-1)) + 1, self._rows.shape[1]
+        if not before and most <= 1:
+            self._rows = np.full((len(self._rows), most, rows.shape[1]), np.nan)
+            self._rows[whose, :1] = rows[order][:, None]
+            return np.ones(len(rows), dtype=bool)
+        new = np.full((len(whose), most, rows.shape[1]), np.nan)
+        new[place, rank] = rows[order]
+        every = np.concatenate([self._rows[whose], new], axis=1)
+        # Of rows that are not there the distance is NaN, which is not near. Number by number: the
+        # largest along a short last axis costs several times as much.
+        near = np.ones((len(whose), most, before + most), dtype=bool)
+        for one, known in zip(np.moveaxis(new, 2, 0), np.moveaxis(every, 2, 0), strict=True):
+            near &= np.abs(one[:, :, None] - known[:, None]) < self._apart
+        fresh = np.asarray(~near[:, :, :before].any(axis=2))
+        for i in range(1, most):
+            fresh[:, i] &= ~(near[:, i, before : before + i] & fresh[:, :i]).any(axis=1)
+        added = np.full((len(self._rows), most, rows.shape[1]), np.nan)
+        added[whose] = np.where(fresh[:, :, None], new, np.nan)
+        self._rows = np.concatenate([self._rows, added], axis=1)
+        found = np.zeros(len(rows), dtype=bool)
+        found[order] = fresh[place, rank]
+        return found
+
+
+class Freeing(Protocol):
+    """An engine that has a finder of free answers."""
+
+    @cached_property
+    def freer(self) -> FreeFinder:
+        """Finds them."""
+        ...
+
+
+def resolve_collisions(
+    engine: Callable[[Problems], Freeing],
+    problems: Problems,
+    around: Surroundings,
+    starts: Array,
+    seed: int,
+    outcome: Outcome,
+    batch: BatchSolution,
+    reasons: bool = True,
+) -> BatchSolution:
+    """The verdicts on a batch after other answers were looked for where they touch something.
+
+    Args:
+        engine: By targets of one kind the engine for them.
+        problems: k targets.
+        around: What they are checked against.
+        starts: (k, n) where the robot is.
+        seed: Of all random numbers.
+        outcome: What the method came to.
+        batch: The verdicts on it.
+        reasons: Whether the reports say what else would do, see `FreeFinder.find`.
+    """
+    every = problems.prefer in RANKED
+    touching = batch.status == Status.COLLISION
+    rows = np.flatnonzero(touching | batch.success if every else touching)
+    if not len(rows):
+        return batch
+    begin, q = time.perf_counter(), batch.q.copy()
+    reports = list(batch.collisions)
+    numbers = np.array([problems.number(row) for row in rows.tolist()], dtype=np.intp)
+    # A target's random numbers are its own, whichever others are looked at with it.
+    asked = replace(problems.rows(rows), picked=numbers)
+    robot = engine(asked.rows(slice(0, 1))).freer.robot
+    for _, of_kinds, some in by_kinds(asked):
+        chosen = rows if of_kinds is None else rows[of_kinds]
+        found = engine(some).freer.find(
+            some, around.rows(chosen), q[chosen], starts[chosen], seed, every, reasons
+        )
+        q[chosen] = found.q
+        for row, report in zip(chosen.tolist(), found.reports, strict=True):
+            reports[row] = report
+    seconds = batch.time.copy()
+    seconds[rows] += (time.perf_counter() - begin) / len(rows)
+    status = np.where(touching, int(Status.SOLVED), outcome.status)
+    ended = replace(outcome, q=q, time=seconds, status=status)
+    return replace(
+        judged(robot, batch.method, problems, ended, around),
+        collisions=tuple(reports),
+    )
+
+
+def resolve_at_once(
+    engine: Freeing,
+    problems: Problems,
+    around: Surroundings,
+    q: Array,
+    start: Array,
+    others: bool = False,
+) -> tuple[Array, SolvedVerdict, Clearances] | None:
+    """Another arm for the hand of one answer that touches something, judged; None: look further.
+
+    What it gives is what `resolve_collisions` gives, which looks there first.
+
+    Args:
+        engine: The engine for the target.
+        problems: One target.
+        around: What it is checked against.
+        q: (n,) the answer.
+        start: (n,) where the robot is.
+        others: Whether to look at the hands of further rounds, too, as an exported solver does.
+    """
+    finder = engine.freer
+    found = finder.beside(problems, around, q[None], start[None], others)
+    verdict = None if found is None else judge_one(finder.robot, problems, found)
+    if found is None or verdict is None:
+        return None
+    clear = around.check(found[None])
+    return (found, verdict, clear) if clear.free[0] else None

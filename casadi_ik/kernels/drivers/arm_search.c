@@ -33,16 +33,16 @@ enum { PALM = 12, LEVELS = 2 };
 #define TURN 6.283185307179586
 
 typedef struct {
-  KERNEL(arms, map_job);       /* rotation, origin, freedom -> the arm of every side, their slacks */
+  KERNEL(arms, map_job);       /* rotation, origin, redundancy -> the arm of every side, their slacks */
   KERNEL(measure, map_job);    /* q -> how good it is; for MEASURED */
   KERNEL(check, clearance_job);
   clearance_job *clear;        /* what is checked; NULL: nothing is */
   int64_t lanes;               /* configurations that are checked side by side */
   int64_t order;
-  int64_t n_q, n_arm, n_free, n_sides;
+  int64_t n_q, n_arm, n_redundancy, n_rows;
   int64_t n_groups;            /* 1: one arm is wanted; else one of every branch, and the given one */
   int64_t n_places[LEVELS], n_closer;
-  const double *places[LEVELS]; /* rows of n_free, the last of which may be varied */
+  const double *places[LEVELS]; /* rows of n_redundancy, the last of which may be varied */
   const double *closer;        /* by how much, about what was chosen */
   const int64_t *columns;      /* of the arm in q */
   const double *lower, *upper; /* bounds of the arm */
@@ -60,9 +60,9 @@ typedef struct {
   double *score;               /* rows of n_groups: of the arm alone; -inf: there is none */
   int64_t *tried;              /* arms within bounds */
   OWN_MEMORY
-} swings_job;
+} arm_search_job;
 
-/* Arms that were found, and what becomes of them. */
+/* Arms that were found, and their scores. */
 typedef struct {
   int64_t count;
   double *found, *score;
@@ -76,25 +76,25 @@ typedef struct {
   int64_t *closest, *picked;
 } scratch;
 
-static int64_t most_arms(const swings_job *job, int near) {
+static int64_t most_arms(const arm_search_job *job, int near) {
   int64_t places = near ? job->n_closer : job->n_places[0];
   if (!near && job->n_places[1] > places) places = job->n_places[1];
-  return places * job->n_sides + 1;
+  return places * job->n_rows + 1;
 }
 
-static int64_t more_arms(const swings_job *job) {
+static int64_t more_arms(const arm_search_job *job) {
   return most_arms(job, 0) > most_arms(job, 1) ? most_arms(job, 0) : most_arms(job, 1);
 }
 
-static size_t room(const swings_job *job) {
+static size_t room(const arm_search_job *job) {
   const int64_t wide = job->n_arm + 1, most = more_arms(job);
   const int64_t whole = 6 * most + 2 * job->lanes;
-  const int64_t numbers = 2 * most * (wide + 1) + most * (PALM + job->n_free)
+  const int64_t numbers = 2 * most * (wide + 1) + most * (PALM + job->n_redundancy)
                         + (most + job->lanes) * job->n_q + job->lanes;
   return (size_t) whole * sizeof(int64_t) + (size_t) numbers * sizeof(double) + 2 * (size_t) most;
 }
 
-static void lay_out(const swings_job *job, scratch *space, char *next) {
+static void lay_out(const arm_search_job *job, scratch *space, char *next) {
   const int64_t wide = job->n_arm + 1, most = more_arms(job);
   pool *pools[] = {&space->all, &space->near};
   int i;
@@ -113,7 +113,7 @@ static void lay_out(const swings_job *job, scratch *space, char *next) {
     TAKE(pools[i]->found, double, most * wide);
     TAKE(pools[i]->score, double, most);
   }
-  TAKE(space->samples, double, most * (PALM + job->n_free));
+  TAKE(space->samples, double, most * (PALM + job->n_redundancy));
   TAKE(space->rows, double, (most + job->lanes) * job->n_q);
   TAKE(space->least, double, job->lanes);
   for (i = 0; i < 2; ++i) {
@@ -122,7 +122,7 @@ static void lay_out(const swings_job *job, scratch *space, char *next) {
 #undef TAKE
 }
 
-static int mapped(const swings_job *job, KERNEL(kernel, map_job), const double *in, int64_t wide,
+static int mapped(const arm_search_job *job, KERNEL(kernel, map_job), const double *in, int64_t wide,
                   double *out, int64_t wide_out, int64_t count) {
   const double *inputs[1];
   double *outputs[1];
@@ -144,7 +144,7 @@ static int mapped(const swings_job *job, KERNEL(kernel, map_job), const double *
 
 /* Puts an arm into its bounds and the asked turn, that of a held joint where it is held; whether it
  * was within, as far as rounding goes. */
-static int admit(const swings_job *job, double *arm, const double *start) {
+static int clamp_and_check(const arm_search_job *job, double *arm, const double *start) {
   int64_t j;
   for (j = 0; j < job->n_arm; ++j) {
     const double low = job->lower[j], high = job->upper[j];
@@ -161,7 +161,7 @@ static int admit(const swings_job *job, double *arm, const double *start) {
   return 1;
 }
 
-static double rated(const swings_job *job, const double *arm, const double *start) {
+static double rated(const arm_search_job *job, const double *arm, const double *start) {
   double value = job->order == NEAR_START ? 0.0 : INFINITY;
   int64_t j;
   for (j = 0; j < job->n_arm; ++j) {
@@ -178,18 +178,18 @@ static double rated(const swings_job *job, const double *arm, const double *star
   return value;
 }
 
-static void configuration(const swings_job *job, int64_t hand, const double *arm, double *q) {
+static void configuration(const arm_search_job *job, int64_t hand, const double *arm, double *q) {
   int64_t j;
   memcpy(q, job->q + hand * job->n_q, (size_t) job->n_q * sizeof(double));
   for (j = 0; j < job->n_arm; ++j) q[job->columns[j]] = arm[j];
 }
 
-static void add(const swings_job *job, int64_t hand, pool *to, int64_t arm, int64_t place,
+static void add(const arm_search_job *job, int64_t hand, pool *to, int64_t arm, int64_t place,
                 int64_t group) {
   const double *start = job->starts + hand * job->n_q;
   double *found = to->found + arm;
   const int64_t i = to->count;
-  if (!admit(job, found, start)) return;
+  if (!clamp_and_check(job, found, start)) return;
   to->score[i] = rated(job, found, start);
   to->arm[i] = arm;
   to->place[i] = place;
@@ -199,9 +199,9 @@ static void add(const swings_job *job, int64_t hand, pool *to, int64_t arm, int6
 }
 
 /* The arms of so many samples; those of one side only if it is not negative. */
-static int look(const swings_job *job, scratch *space, int64_t hand, pool *to, int64_t count,
+static int look(const arm_search_job *job, scratch *space, int64_t hand, pool *to, int64_t count,
                 int64_t side) {
-  const int64_t wide = PALM + job->n_free, size = job->n_sides * (job->n_arm + 1);
+  const int64_t wide = PALM + job->n_redundancy, size = job->n_rows * (job->n_arm + 1);
   const double *palm = job->palms + 16 * hand;
   int64_t i, k, s;
   int code;
@@ -216,8 +216,8 @@ static int look(const swings_job *job, scratch *space, int64_t hand, pool *to, i
   code = mapped(job, job->arms, space->samples, wide, to->found, size, count);
   if (code != DONE) return code;
   for (s = 0; s < count; ++s) {
-    const double *slack = to->found + s * size + job->n_sides * job->n_arm;
-    for (k = 0; k < job->n_sides; ++k) {
+    const double *slack = to->found + s * size + job->n_rows * job->n_arm;
+    for (k = 0; k < job->n_rows; ++k) {
       if ((side < 0 || k == side) && slack[k] >= 0) {
         add(job, hand, to, s * size + k * job->n_arm, s, k);
       }
@@ -226,7 +226,7 @@ static int look(const swings_job *job, scratch *space, int64_t hand, pool *to, i
   return DONE;
 }
 
-static int measured(const swings_job *job, scratch *space, int64_t hand, pool *of) {
+static int measured(const arm_search_job *job, scratch *space, int64_t hand, pool *of) {
   int64_t i;
   if (job->order != MEASURED) return DONE;
   for (i = 0; i < of->count; ++i) {
@@ -237,7 +237,7 @@ static int measured(const swings_job *job, scratch *space, int64_t hand, pool *o
 }
 
 /* The first in the asked order that is free, of a group, and better than what is there; or -1. */
-static int pick(const swings_job *job, scratch *space, int64_t hand, pool *from, int64_t group,
+static int pick(const arm_search_job *job, scratch *space, int64_t hand, pool *from, int64_t group,
                 double *better, int64_t *chosen) {
   const int clearest = job->order == CLEAREST;
   clearance_job *clear = job->clear;
@@ -296,14 +296,14 @@ static int pick(const swings_job *job, scratch *space, int64_t hand, pool *from,
 }
 
 /* Places about the one that an arm was found at, its branch only. */
-static int refine(const swings_job *job, scratch *space, int64_t hand, const double *place,
+static int refine(const arm_search_job *job, scratch *space, int64_t hand, const double *place,
                   int64_t group, double *better, double *arm) {
   int64_t i, chosen;
   int code;
   for (i = 0; i < job->n_closer; ++i) {
-    double *freedom = space->samples + i * (PALM + job->n_free) + PALM;
-    memcpy(freedom, place, (size_t) job->n_free * sizeof(double));
-    freedom[job->n_free - 1] += job->closer[i];
+    double *redundancy = space->samples + i * (PALM + job->n_redundancy) + PALM;
+    memcpy(redundancy, place, (size_t) job->n_redundancy * sizeof(double));
+    redundancy[job->n_redundancy - 1] += job->closer[i];
   }
   code = look(job, space, hand, &space->near, job->n_closer, group);
   if (code == DONE) code = measured(job, space, hand, &space->near);
@@ -314,15 +314,15 @@ static int refine(const swings_job *job, scratch *space, int64_t hand, const dou
   return code;
 }
 
-static int swing(const swings_job *job, scratch *space, int64_t hand, int level, int *any) {
-  const int64_t count = job->n_places[level], wide = PALM + job->n_free;
-  const int64_t size = job->n_sides * (job->n_arm + 1);
+static int search_level(const arm_search_job *job, scratch *space, int64_t hand, int level, int *any) {
+  const int64_t count = job->n_places[level], wide = PALM + job->n_redundancy;
+  const int64_t size = job->n_rows * (job->n_arm + 1);
   pool *all = &space->all;
   int64_t i, group, chosen;
   int code, most;
   for (i = 0; i < count; ++i) {
-    memcpy(space->samples + i * wide + PALM, job->places[level] + i * job->n_free,
-           (size_t) job->n_free * sizeof(double));
+    memcpy(space->samples + i * wide + PALM, job->places[level] + i * job->n_redundancy,
+           (size_t) job->n_redundancy * sizeof(double));
   }
   code = look(job, space, hand, all, count, -1);
   if (code != DONE) return code;
@@ -344,14 +344,14 @@ static int swing(const swings_job *job, scratch *space, int64_t hand, int level,
     if (job->order != CLEAREST || most || *score >= -job->rounding) *any = 1;
     memcpy(arm, all->found + all->arm[chosen], (size_t) job->n_arm * sizeof(double));
     if (all->place[chosen] < 0 || !job->n_closer || most) continue;
-    code = refine(job, space, hand, job->places[level] + all->place[chosen] * job->n_free,
+    code = refine(job, space, hand, job->places[level] + all->place[chosen] * job->n_redundancy,
                   all->group[chosen], score, arm);
     if (code != DONE) return code;
   }
   return DONE;
 }
 
-EXPORT int casadi_ik_swings(swings_job *job) {
+EXPORT int casadi_ik_arm_search(arm_search_job *job) {
   scratch space;
   int64_t hand, i;
   char *block = ROOM(room(job));
@@ -364,7 +364,7 @@ EXPORT int casadi_ik_swings(swings_job *job) {
     for (i = 0; i < job->n_groups; ++i) job->score[hand * job->n_groups + i] = -INFINITY;
     if (job->owner && hand && job->owner[hand] == job->owner[hand - 1] && done) continue;
     for (level = 0; level < LEVELS && !any && code == DONE; ++level) {
-      if (job->n_places[level]) code = swing(job, &space, hand, level, &any);
+      if (job->n_places[level]) code = search_level(job, &space, hand, level, &any);
     }
     done = any;
   }

@@ -1,0 +1,508 @@
+"""Which of many grasps to take: candidates of all kinds, ranked together.
+
+For candidates of which one answer is enough every hand, branch and value of the redundancy is
+looked at, for many at once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from casadi_ik.answers.solution import Choice, Ranking, Solution
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array, Bools
+from casadi_ik.errors import InputError
+from casadi_ik.grasps import Grasp
+from casadi_ik.grasps.pose import inverse, moved, one_pose
+from casadi_ik.problem.clearance import ROUNDING, Surroundings
+from casadi_ik.problem.contacts.arrays import by_kinds
+from casadi_ik.problem.method import Outcome
+from casadi_ik.problem.palm_targets import free_palms
+from casadi_ik.problem.preference import CLEARANCE
+from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.status import Status
+from casadi_ik.solving.alternatives.arm_search import Preference
+from casadi_ik.solving.alternatives.finder import APART, DISTINCT, checked_distance
+from casadi_ik.solving.alternatives.free import FreeFinder
+from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.solved_part import judged
+
+Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
+"""One of `PREFERENCES`, or what gives configurations (m, n) of a robot their scores (m,)."""
+
+
+@dataclass(frozen=True)
+class ChooseParameters:
+    """How many candidates are looked at, and how far.
+
+    Attributes:
+        together: Candidates that are worked on at once.
+        rounds: Of hands that a candidate gets at most: hands of many motors go on much longer for a
+            single grasp, and most of many candidates are out of reach.
+        closer: So many times as many answers as are wanted are looked at closer.
+    """
+
+    together: int = 1024
+    rounds: int = 51
+    closer: int = 8
+
+
+PARAMETERS = ChooseParameters()
+
+
+class Look(Enum):
+    """Which hands of a candidate are looked at.
+
+    Attributes:
+        QUICK: Those that one round leads to.
+        THOROUGH: All that a single grasp would get, after `ChooseParameters.rounds` of rounds.
+        OWN: The one that a solve comes to.
+    """
+
+    QUICK = auto()
+    THOROUGH = auto()
+    OWN = auto()
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """Answers to some of k candidates.
+
+    Attributes:
+        q: (m, n) configurations, free of collision where that was asked for.
+        owner: (m,) candidate of each.
+        score: (m,) what they are ranked by, higher is better.
+        margin: (m,) smallest distance of the arm from its limits: where scores are equal.
+        reasons: Why there is none, by candidate; "" where there is one.
+    """
+
+    q: Array
+    owner: NDArray[np.intp]
+    score: Array
+    margin: Array
+    reasons: NDArray[np.object_]
+
+    @property
+    def answered(self) -> Bools:
+        """(k,) which candidates have one."""
+        return np.asarray(self.reasons == "", dtype=bool)
+
+    @classmethod
+    def joined(cls, parts: list[tuple[NDArray[np.intp], Answers]], count: int) -> Answers:
+        """Those of all candidates; of one that is there twice the last reason holds.
+
+        Args:
+            parts: Numbers of some candidates, and their answers.
+            count: How many candidates there are.
+        """
+        reasons = np.full(count, "", dtype=object)
+        for numbers, part in parts:
+            reasons[numbers] = part.reasons
+        return cls(
+            np.concatenate([part.q for _, part in parts]),
+            np.concatenate([numbers[part.owner] for numbers, part in parts]),
+            np.concatenate([part.score for _, part in parts]),
+            np.concatenate([part.margin for _, part in parts]),
+            reasons,
+        )
+
+
+def choose(
+    engine: Engine,
+    questions: Questions,
+    grasps: Sequence[Grasp],
+    object_pose: ArrayLike | None = None,
+    q0: ArrayLike | None = None,
+    limit: int = 10,
+    prefer: Judgement | None = None,
+    seed: int = 0,
+    fixed: Mapping[str, float] | None = None,
+    apart: float = APART,
+    per_candidate: int | None = 1,
+) -> Ranking:
+    """Rank answers to many grasps, see `Solver.choose`.
+
+    Raises:
+        InputError: See there.
+        UnsupportedError: The method is not hand-first.
+    """
+    begin = time.perf_counter()
+    limit = _count(limit, "limit")
+    most = None if per_candidate is None else _count(per_candidate, "per_candidate")
+    apart, start = checked_distance(apart), questions.start(q0)
+    word = "own" if callable(prefer) else engine.preference(prefer, q0 is not None)
+    pose = None if object_pose is None else one_pose(object_pose, "object_pose")
+
+    def placed(number: int) -> Grasp:
+        grasp = grasps[number]
+        return grasp if pose is None else grasp.in_object_frame().at(pose)
+
+    asked = list(_asked(questions, grasps, pose, fixed))
+    wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
+    parts: list[tuple[NDArray[np.intp], Answers]] = []
+
+    def look(candidates: NDArray[np.bool_], which: Look, near: bool = False) -> Answers:
+        """What all looks so far have come to, after one more at some candidates."""
+        for rows, some in asked:
+            left = rows[candidates[rows]]
+            if not len(left):
+                continue
+            mine = some.rows(np.searchsorted(rows, left))
+            mine = replace(mine, picked=left, prefer="q0" if near else "limits")
+            found = answers_of(
+                engine.kinds_of(mine).freer,
+                mine,
+                engine.around(mine),
+                start if near else engine.robot.home,
+                start,
+                wanted,
+                limit,
+                seed,
+                which,
+            )
+            if near:
+                found = replace(found, reasons=np.full(len(left), "", dtype=object))
+            parts.append((left, found))
+        return Answers.joined(parts, len(grasps))
+
+    # Neither what is preferred nor where the robot is decides which candidates have an answer.
+    answers = look(np.ones(len(grasps), dtype=bool), Look.QUICK)
+    if answers.answered.sum() < min(limit, len(grasps)):
+        answers = look(~answers.answered, Look.THOROUGH)
+    if q0 is not None:
+        answers = look(answers.answered, Look.OWN, near=True)
+    entries = _Ranked(engine, asked, answers, apart, placed).best(limit, most)
+    seconds = (time.perf_counter() - begin) / len(grasps)
+    reasons = [reason for reason in answers.reasons.tolist() if reason]
+    return Ranking(
+        entries=tuple(
+            replace(one, solution=replace(one.solution, time=seconds)) for one in entries
+        ),
+        candidates=len(grasps),
+        answered=len(grasps) - len(reasons),
+        failures=dict(Counter(reasons).most_common()),
+        prefer=word,
+    )
+
+
+def _count(value: int, name: str) -> int:
+    """A number of answers.
+
+    Raises:
+        InputError: It is none.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise InputError(f"{name}: found {value!r}, expected an integer >= 1")
+    return int(value)
+
+
+def _own(prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand) -> Callable[[Array], Array]:
+    """A preference of one's own, its answers checked."""
+
+    def score(q: Array) -> Array:
+        found = np.asarray(prefer(robot, q.copy()), dtype=float)
+        if found.shape != (len(q),):
+            raise InputError(f"prefer: gave shape {found.shape}, expected ({len(q)},)")
+        if np.isnan(found).any():
+            raise InputError("prefer: gave NaN, expected numbers")
+        return found
+
+    return score
+
+
+def _asked(
+    questions: Questions,
+    grasps: Sequence[Grasp],
+    pose: Array | None,
+    fixed: Mapping[str, float] | None,
+) -> Iterator[tuple[NDArray[np.intp], Problems]]:
+    """Candidates with the same fingers, tolerances, kinds and object, in the base frame."""
+    if not len(grasps):
+        raise InputError("grasps: found none, expected at least one")
+    groups: dict[object, list[int]] = {}
+    for number, grasp in enumerate(grasps):
+        if not isinstance(grasp, Grasp):
+            raise InputError(f"grasps[{number}]: found {type(grasp).__name__}, expected a Grasp")
+        own = tuple((name, one.tolerance) for name, one in grasp.contacts.items())
+        key = own, grasp.object, grasp.object_pose is None, grasp.palm is None
+        groups.setdefault(key, []).append(number)
+    for numbers in groups.values():
+        some = [grasps[number] for number in numbers]
+        rows = np.array(numbers, dtype=np.intp)
+        problems = _placed(questions.of_grasps(some, fixed), some, pose)
+        for _, of_kinds, alike in by_kinds(problems):
+            yield (rows if of_kinds is None else rows[of_kinds]), alike
+
+
+def _placed(problems: Problems, grasps: Sequence[Grasp], pose: Array | None) -> Problems:
+    """Targets moved as a whole with the object they are on, see `Grasp.at`."""
+    if pose is None:
+        return problems
+    places = [grasp.object_pose for grasp in grasps if grasp.object_pose is not None]
+    arrays = {"points": problems.points, "normals": problems.normals, **problems.more}
+    for name, array in arrays.items() if places else ():
+        # Seen from the object first.
+        stack = np.stack(places)
+        shift = stack[:, None, :3, 3] if name == "points" else 0.0
+        arrays[name] = (array - shift) @ stack[:, :3, :3]
+    arrays = moved(arrays, pose)
+    points, normals = arrays.pop("points"), arrays.pop("normals")
+    named = grasps[0].object
+    at = np.broadcast_to(pose, (len(grasps), 4, 4)) if named or places else None
+    palms = problems.palms
+    if palms is not None:
+        palms = pose @ (np.stack([inverse(place) for place in places]) @ palms if places else palms)
+    return replace(
+        problems, points=points, normals=normals, more=arrays, object_pose=at, palms=palms
+    )
+
+
+class _Ranked:
+    """All answers to all candidates, best first."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        asked: Sequence[tuple[NDArray[np.intp], Problems]],
+        answers: Answers,
+        apart: float,
+        placed: Callable[[int], Grasp],
+    ) -> None:
+        self.engine, self.asked, self.answers, self.apart = engine, asked, answers, apart
+        self.placed = placed
+
+    def best(self, limit: int, most: int | None) -> list[Choice]:
+        """The best that differ from each other, at most so many of a candidate."""
+        answers, robot = self.answers, self.engine.robot
+        # Of equals that whose arm is farther from its limits, then the first candidate.
+        left = np.lexsort((answers.owner, -answers.margin, -answers.score))
+        parts = answers.q / (robot.upper - robot.lower)
+        places = np.full(len(answers.reasons), limit if most is None else most)
+        found: list[Choice] = []
+
+        def others(rows: NDArray[np.intp], row: int, places: NDArray[np.intp]) -> NDArray[np.intp]:
+            off = np.abs(parts[rows] - parts[row]).max(axis=1)
+            room = places[answers.owner[rows]] > 0
+            return rows[(off >= self.apart) & (off > 0) & room]
+
+        while len(left) and len(found) < limit:
+            chosen, rest, free = list[int](), left, places.copy()
+            while len(rest) and len(found) + len(chosen) < limit:
+                row = int(rest[0])
+                chosen.append(row)
+                free[answers.owner[row]] -= 1
+                rest = others(rest, row, free)
+            solutions = self._judged(np.array(chosen))
+            left = left[~np.isin(left, chosen)]
+            for row in chosen:
+                if solutions[row].success:
+                    owner = int(answers.owner[row])
+                    score, grasp = float(answers.score[row]), self.placed(owner)
+                    found.append(Choice(owner, solutions[row], score, grasp))
+                    places[owner] -= 1
+                    left = others(left, row, places)
+        return found
+
+    def _judged(self, rows: NDArray[np.intp]) -> dict[int, Solution]:
+        """Answers with the verdict on them, which has the last word."""
+        found: dict[int, Solution] = {}
+        owner = self.answers.owner[rows]
+        for numbers, problems in self.asked:
+            mine = rows[np.isin(owner, numbers)]
+            if not len(mine):
+                continue
+            some = problems.rows(np.searchsorted(numbers, self.answers.owner[mine]))
+            none = np.zeros(len(mine), dtype=np.int64)
+            status = np.full(len(mine), int(Status.SOLVED), dtype=np.int64)
+            q = self.answers.q[mine]
+            outcome = Outcome(q, status, none, none, np.zeros(len(mine)), {})
+            around, method = self.engine.around(some), self.engine.method.name
+            batch = judged(self.engine.robot, method, some, outcome, around)
+            found |= {int(row): batch.solution(i) for i, row in enumerate(mine.tolist())}
+        return found
+
+
+def answers_of(
+    finder: FreeFinder,
+    problems: Problems,
+    around: Surroundings | None,
+    begin: Array,
+    start: Array,
+    prefer: Preference,
+    limit: int,
+    seed: int,
+    look: Look,
+) -> Answers:
+    """Answers to k candidates.
+
+    Args:
+        finder: Of the robot, for the kinds of their contacts.
+        problems: The candidates.
+        around: What answers must not touch; None: nothing is checked.
+        begin: (n,) where hands are looked for from.
+        start: (n,) where the robot is; with `prefer` it says which arms are better.
+        prefer: What is preferred.
+        limit: How many answers are wanted.
+        seed: Of random arms.
+        look: Which hands are looked at.
+    """
+    parts = []
+    for first in range(0, len(problems), PARAMETERS.together):
+        rows = np.arange(first, min(first + PARAMETERS.together, len(problems)))
+        nearby = None if around is None else around.rows(rows)
+        part = _Part(finder, problems.rows(rows), nearby, begin, start, prefer, limit)
+        parts.append((rows, part.run(seed, look)))
+    return Answers.joined(parts, len(problems))
+
+
+class _Part:
+    """Some candidates."""
+
+    def __init__(
+        self,
+        finder: FreeFinder,
+        problems: Problems,
+        around: Surroundings | None,
+        begin: Array,
+        start: Array,
+        prefer: Preference,
+        limit: int,
+    ) -> None:
+        self.finder, self.problems, self.around = finder, problems, around
+        self.prefer, self.limit, self.trials = prefer, limit, finder.trials
+        self.begin, self.starts = (np.tile(q, (len(problems), 1)) for q in (begin, start))
+        self.limits = self.trials.limits(problems)
+        fixed = np.full(len(begin), np.nan) if problems.fixed is None else problems.fixed
+        # What is given has no part in what is better.
+        self.columns = np.flatnonzero(np.isnan(np.atleast_2d(fixed)).any(axis=0)).tolist()
+
+    def run(self, seed: int, look: Look) -> Answers:
+        """Their answers."""
+        method = self.trials.method
+        rounds = PARAMETERS.rounds if look is Look.THOROUGH else 1
+        outcome = method.run(self.problems, self.begin, seed, False, rounds)
+        good = self.trials.solved(self.problems, outcome.q, self.problems.enforce_limits)
+        rows = np.flatnonzero(good)
+        hands = outcome.q[rows], rows
+        q, owner, pairs = self._answers(*(hands if look is Look.OWN else self._hands(*hands)))
+        if look is Look.THOROUGH and self.around is not None:
+            left = rows[~np.isin(rows, owner)]
+            more, whose = self._further(outcome.q, left, seed)
+            q, owner = np.concatenate([q, more]), np.concatenate([owner, whose])
+        reasons = np.array([Status(int(code)).name for code in outcome.status], dtype=object)
+        # A method that is content with what the verdict refuses has come to a standstill.
+        reasons[~good & (outcome.status == Status.SOLVED)] = Status.STALLED.name
+        for row, pair in pairs.items():
+            reasons[row] = f"{Status.COLLISION.name}: {pair[0]} and {pair[1]}"
+        reasons[owner] = ""
+        return Answers(q, owner, self._score(q, owner), self.finder.arm_margins(q), reasons)
+
+    def _hands(self, q: Array, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+        """Different hands that meet the contacts of candidates, with an arm for each.
+
+        Args:
+            q: (m, n) first answers.
+            rows: (m,) the candidates that have them.
+        """
+        if not len(rows) or self.problems.palms is not None:
+            return q, rows  # a hand that is given has no other posture
+        some = self.problems.rows(rows)
+        postures = self.trials.method.postures(some, 0)
+        count, n = postures.shape[1], q.shape[1]
+        owner = np.repeat(rows, count)
+        asked = self.problems.rows(owner)
+        starts = self.limits.of(owner).clip(self.begin[owner])
+        flat = postures.reshape(len(owner), postures.shape[2])
+        turns = np.tile(np.arange(count), len(rows))
+        ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat, turns))
+        ends[~self.trials.solved(asked, ends, asked.enforce_limits)] = np.nan
+        every = np.concatenate([q[:, None], ends.reshape(len(rows), count, n)], axis=1)
+        kept: Bools = np.all(np.isfinite(every), axis=2)
+        free = np.repeat(free_palms(self.finder.robot, some), count + 1)
+        parts = self.finder.hand_parts(np.nan_to_num(every).reshape(-1, n), free)
+        parts = parts.reshape(len(rows), count + 1, -1)
+        for i in range(1, count + 1):
+            apart = np.abs(parts[:, i, None] - parts[:, :i]).max(axis=2, initial=0) >= DISTINCT
+            kept[:, i] &= (apart | ~kept[:, :i]).all(axis=1)
+        place, which = np.nonzero(kept)
+        return every[place, which], rows[place]
+
+    def _answers(
+        self, q: Array, owner: NDArray[np.intp]
+    ) -> tuple[Array, NDArray[np.intp], dict[int, tuple[str, str]]]:
+        """The preferred free arm of every branch of hands; and what is in the way of the others."""
+        arms, around = self.finder.arm_search, self.around
+        room = np.full(len(q), np.inf)
+        if not len(q):
+            return q, owner, {}
+        if around is not None:
+            nearby = around.rows(owner)
+            room = (nearby if arms is None else nearby.held).check(q).room
+        kept = np.flatnonzero(room >= -ROUNDING)
+        found, targets = q[kept], owner[kept]
+        if arms is not None:
+            found, hand = self._arms(found, targets, room[kept])
+            targets = targets[hand]
+        if around is None:
+            return found, targets, {}
+        left = np.flatnonzero(~np.isin(owner, targets))
+        # The last word has the hand with most room.
+        left = left[np.argsort(room[left], kind="stable")]
+        clear = around.rows(owner[left]).check(q[left])
+        named = ((row, clear.pair(i)) for i, row in enumerate(owner[left].tolist()))
+        return found, targets, {row: pair for row, pair in named if pair is not None}
+
+    def _arms(
+        self, q: Array, owner: NDArray[np.intp], room: Array
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Free arms of hands, and whose hand it is; closer where the best of them are."""
+        found, hand = self._preferred(q, owner, room, False)
+        score = self._score(found, owner[hand])
+        best = np.argsort(-score, kind="stable")[: PARAMETERS.closer * self.limit]
+        again = np.unique(hand[best])
+        more, mine = self._preferred(q[again], owner[again], room[again], True)
+        others = ~np.isin(hand, again)
+        return np.concatenate([found[others], more]), np.concatenate([hand[others], again[mine]])
+
+    def _preferred(
+        self, q: Array, owner: NDArray[np.intp], room: Array, closer: bool
+    ) -> tuple[Array, NDArray[np.intp]]:
+        arms = self.finder.arm_search
+        assert arms is not None
+        around = None if self.around is None else self.around.rows(owner)
+        bounds = self.limits.first.lower, self.limits.first.upper
+        starts = self.starts[owner]
+        found = arms.choose(q, starts, bounds, self.prefer, around, room, True, closer)
+        if around is None or self.prefer != CLEARANCE:
+            return found.q, found.owner
+        free = around.rows(found.owner).free(found.q)
+        return found.q[free], found.owner[free]
+
+    def _further(
+        self, q: Array, rows: NDArray[np.intp], seed: int
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """What a single grasp would get."""
+        assert self.around is not None
+        if not len(rows):
+            return q[rows], rows
+        around = self.around.rows(rows)
+        some = self.problems.rows(rows)
+        found = self.finder.find(some, around, q[rows], self.begin[rows], seed)
+        return found.q[found.free], rows[found.free]
+
+    def _score(self, q: Array, owner: NDArray[np.intp]) -> Array:
+        if not len(q):
+            return np.zeros(0)
+        room = np.zeros(len(q))
+        if self.prefer == CLEARANCE and self.around is not None:
+            room = self.around.rows(owner).check(q).room
+        return self.finder.score(q, self.starts[owner], self.prefer, room, self.columns)

@@ -1,0 +1,212 @@
+"""The search for preferred free arms of hands, and for where unconstrained fingers have room."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.problem.clearance import SceneCheck
+from casadi_ik.problem.preference import PREFERENCES
+from casadi_ik.problem.problems import Problems
+from casadi_ik.solving.alternatives.arm_search import ArmSearch
+from casadi_ik.solving.alternatives.free import (
+    Deduplicator,
+    UnconstrainedFingers,
+    best_of_each,
+    first_of_each,
+)
+
+
+@pytest.fixture(scope="module")
+def robot() -> ik.ArmHand:
+    return ik.load_robot("kuka_lwr_barrett")
+
+
+@pytest.fixture(scope="module")
+def solver(robot) -> ik.Solver:
+    pole = {"kind": "capsule", "radius": 0.05, "length": 1.0, "xyz": [0.3, 0.25, 0.5]}
+    return ik.Solver(robot, scene=ik.Scene({"pole": pole}))
+
+
+@pytest.fixture(scope="module")
+def hands(robot, solver):
+    """Hands in reach, where the arms stand, and what they are checked against."""
+    rng = np.random.default_rng(5)
+    q = robot.random(rng, 60)
+    around = solver._engine.around(solver._questions.of_arrays(*robot.contacts(q), None))
+    room = around.held.check(q).room
+    kept = np.flatnonzero(room >= 0)
+    return q[kept], robot.random(rng, len(kept)), around.rows(kept), room[kept]
+
+
+@pytest.fixture(scope="module")
+def search(solver) -> ArmSearch:
+    found = solver._engine.freer.arm_search
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def plain(robot, search, solver) -> ArmSearch:
+    finder = solver._engine.freer._finder
+    return ArmSearch(robot, search._family, lambda: finder.manipulability, compiled=False)
+
+
+def chosen(search, robot, hands, prefer, branches=False, **words):
+    q, starts, around, room = hands
+    return search.choose(
+        q, starts, (robot.lower, robot.upper), prefer, around, room, branches, **words
+    )
+
+
+def scores(search, hands, found, prefer):
+    if prefer == "clearance":
+        return np.minimum(hands[2].rows(found.owner).check(found.q).room, hands[3][found.owner])
+    return search.scores(found.q, hands[1][found.owner], prefer)
+
+
+@pytest.mark.parametrize("branches", [False, True])
+@pytest.mark.parametrize("prefer", PREFERENCES)
+def test_without_a_compiler_the_same_hands_have_arms_no_better(
+    search, plain, robot, hands, prefer, branches
+):
+    """It looks at the same values and those between, and no closer."""
+    compiled, simple = (chosen(one, robot, hands, prefer, branches) for one in (search, plain))
+    assert len(compiled.q) > 20
+    assert set(compiled.owner) == set(simple.owner)
+    for one in (compiled, simple):
+        np.testing.assert_allclose(robot.palm(one.q), robot.palm(hands[0][one.owner]), atol=1e-9)
+        assert (one.q >= robot.lower).all()
+        assert (one.q <= robot.upper).all()
+        if prefer != "clearance":
+            assert hands[2].rows(one.owner).free(one.q).all()
+    if not branches:
+        np.testing.assert_array_equal(compiled.owner, simple.owner)
+        better = scores(search, hands, compiled, prefer) - scores(search, hands, simple, prefer)
+        # What is between the values may be better than what is about the best of them.
+        assert np.mean(better >= -1e-9) > 0.7
+
+
+def test_a_preference_of_ones_own_is_asked_by_the_compiled_search(search, robot, hands):
+    """And its error comes through."""
+
+    def high(q):
+        return robot.palm(q)[:, 2, 3] - np.abs(q[:, 3] - 1.0)
+
+    found = chosen(search, robot, hands, high)
+    other = chosen(search, robot, hands, "limits")
+    np.testing.assert_array_equal(found.owner, other.owner)
+    assert (high(found.q) >= high(other.q) - 1e-9).mean() > 0.9
+    assert (high(found.q) > high(other.q)).any()
+
+    def broken(q):
+        raise RuntimeError("no opinion")
+
+    with pytest.raises(RuntimeError, match="no opinion"):
+        chosen(search, robot, hands, broken)
+
+
+def test_what_is_chosen_is_the_best_free_arm(search, robot, hands):
+    """Any free arm of the same hand found by other means is no farther from its limits."""
+    q, _, around, _ = hands
+    found = chosen(search, robot, hands, "limits")
+    given = around.free(q)[found.owner]
+    best, own = (
+        search.scores(each[given], each[given], "limits") for each in (found.q, q[found.owner])
+    )
+    assert (best >= own - 1e-12).all()
+    assert given.sum() > 5
+
+
+def test_each_hand_is_looked_at_alone(search, robot, hands):
+    together, some = chosen(search, robot, hands, "limits"), np.array([7, 3, 11])
+    q, starts, around, room = hands
+    alone = chosen(search, robot, (q[some], starts[some], around.rows(some), room[some]), "limits")
+    for i, hand in enumerate(some.tolist()):
+        np.testing.assert_array_equal(alone.q[alone.owner == i], together.q[together.owner == hand])
+
+
+def test_pairs_are_those_of_the_hand_or_of_the_arm(search, robot, hands):
+    table = hands[2].table
+    assert len(table.held.pairs) + len(table.swung.pairs) == len(table.pairs)
+    for first, second in table.held.names:
+        assert not {first, second} & {f"lwr_link_{i}" for i in range(1, 6)}
+    # With the hand where it is, the first do not change while the arm does.
+    found = chosen(search, robot, hands, "q0")
+    one = hands[2].rows(found.owner).held.check(found.q).room
+    np.testing.assert_allclose(one, hands[3][found.owner], atol=1e-8)
+
+
+def test_the_first_hand_of_a_target_with_an_arm_is_enough(search, plain, robot, hands):
+    whose = np.arange(len(hands[0])) // 3
+    every = chosen(search, robot, hands, "limits")
+    targets = whose[every.owner]
+    firsts = every.owner[np.append(True, targets[1:] != targets[:-1])]
+    for one in (search, plain):
+        found = chosen(one, robot, hands, "limits", of_one=whose)
+        np.testing.assert_array_equal(found.owner, firsts)
+        assert (found.tried[firsts] > 0).all()
+
+
+@pytest.mark.parametrize(("name", "rows"), [("ur5e+shadow", 8), ("xarm6+shadow", 32)])
+def test_an_arm_with_a_wrist_is_looked_at_with_the_wrist_anywhere(name, rows):
+    robot = ik.load_robot(name)
+    family = ik.Solver(robot)._engine.method.step.arm
+    assert family.rows == rows
+    search = ArmSearch(robot, family, lambda: None, compiled=False)
+    columns = list(robot.description.arm_actuators)
+    wrist = [columns[joint] for joint in family.locked]
+    for level in search.values.levels:
+        assert level.shape[1] == 2
+        assert (level >= robot.lower[wrist]).all()
+        assert (level <= robot.upper[wrist]).all()
+
+
+def test_what_is_like_an_earlier_row_of_the_same_owner_is_not_new():
+    """As one comparison after the other has it."""
+    rng = np.random.default_rng(2)
+    kept, seen = Deduplicator(5, 3, 0.3), [list[np.ndarray]() for _ in range(5)]
+    for count in (9, 0, 14, 30):
+        rows, owner = rng.random((count, 3)), rng.integers(0, 5, count)
+        expected = []
+        for row, one in zip(rows, owner, strict=True):
+            new = all(np.abs(row - other).max() >= 0.3 for other in seen[one])
+            expected.append(new)
+            if new:
+                seen[one].append(row)
+        np.testing.assert_array_equal(kept.add(rows, owner), np.array(expected, dtype=bool))
+    assert sum(map(len, seen)) > 10
+
+
+def test_the_best_and_the_first_of_each():
+    owner, value = np.array([2, 0, 2, 0, 1]), np.array([3.0, 1.0, 5.0, 4.0, 2.0])
+    rows = best_of_each(owner, value, np.array([0.0, 7.0, 0.0]))
+    assert rows.tolist() == [3, 2]
+    order = np.lexsort((-value, owner))
+    assert first_of_each(owner, order, 1).tolist() == [3, 4, 2]
+
+
+def test_only_motors_of_unconstrained_fingers_move_and_only_for_more_room():
+    robot = ik.load_robot("panda+shadow")
+    rng, idle = np.random.default_rng(2), [robot.fingers.index(name) for name in ("ring", "little")]
+    q = robot.random(rng, 120)
+    points, normals = robot.contacts(q)
+    points[:90, idle] = normals[:90, idle] = np.nan  # of the last thirty no finger is free
+    fixed = np.full(len(robot.actuators), np.nan)
+    motor = robot.actuators.index("shadow_rfj3")
+    for given in (None, fixed):
+        fixed[motor] = 0.0
+        problems = Problems(points, normals, ik.Tolerance(), True, fixed=given)
+        around = SceneCheck(robot, ik.Scene({})).around(problems).held
+        moved = UnconstrainedFingers(robot, problems).aside(q, np.arange(120), around)
+        before, after = around.check(q).room, around.check(moved).room
+        changed = (moved != q).any(axis=1)
+        assert changed[:90].sum() > 5
+        assert not changed[90:].any()
+        assert (before[changed] < 0).all()
+        assert (after[changed] > before[changed]).all()
+        kept = [np.delete(robot.contacts(each)[0], idle, axis=1) for each in (moved, q)]
+        np.testing.assert_array_equal(*kept)
+        if given is not None:
+            np.testing.assert_array_equal(moved[:, motor], q[:, motor])
