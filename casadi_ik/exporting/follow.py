@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.exporting.generated import standing_alone
 from casadi_ik.exporting.template import filled
-from casadi_ik.kernels.codegen import define, row_major
+from casadi_ik.kernels.codegen import define, row_major, standing_alone
 from casadi_ik.kernels.constants import define_arrays, number
+from casadi_ik.kernels.emitter import Form
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.motion.asked import contact_weights
 from casadi_ik.motion.cycle import Cycle
@@ -40,19 +40,14 @@ class FollowSources:
     def files(self) -> tuple[dict[str, str], dict[str, str]]:
         """The C file by path, and what stands for the marks of the other templates."""
         cycle = Cycle(self.robot.description, usual(len(self.robot.fingers)))
-        function = row_major(cycle.graph.function)
         marks = {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
-            "CYCLE": standing_alone(function),
+            "CYCLE": standing_alone(row_major(cycle.graph.function), Form()),
             "FOLLOW_CONSTANTS": self._constants(cycle),
             "FOLLOW_STATE": str(cycle.state.size),
             "FOLLOW_ASKED": str(cycle.parameters.size),
             "FOLLOW_RECORD": str(cycle.record.size),
-            "FOLLOW_W": str(max(function.sz_w(), 1)),
-            "FOLLOW_IW": str(max(function.sz_iw(), 1)),
-            "FOLLOW_ARG": str(function.sz_arg()),
-            "FOLLOW_RES": str(function.sz_res()),
         }
         about = {
             "FOLLOW_CALLS": filled("follow.h", marks),

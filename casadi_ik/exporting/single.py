@@ -41,10 +41,11 @@ ARM_ROUNDING = 16 * ROUNDING
 """What rounding makes of the joints of an arm that is found again from where its palm is [rad]:
 one that stands at a limit is beyond it by as much, and put back."""
 
-FOLLOWING = {EXACT * EXACT: ARM_ROUNDING * ARM_ROUNDING}
-"""Numbers in the graphs that say what is nought but for rounding, by their value in double: the
-cost at which a fit, or an arm that is searched for, is exact. Single precision would never come to
-it, and an arm would be searched for from every start, in thirteen times as many iterations."""
+FOLLOWING = ((EXACT * EXACT, ARM_ROUNDING * ARM_ROUNDING),)
+"""Numbers in the graphs that say what is zero but for rounding, and what they are in single
+precision: the cost at which a fit, or an arm that is searched for, is exact. Single precision would
+never come to it, and an arm would be searched for from every start, in thirteen times as many
+iterations."""
 
 NUDGE = EPSILON**0.5
 """Difference [rad or m] from which slopes are taken: its own rounding and that of what it causes
@@ -80,9 +81,7 @@ def _exchanged(match: re.Match[str]) -> str:
 def _number(text: str) -> str:
     """A number as C writes it in single precision."""
     value = float(text)
-    if value in FOLLOWING:
-        text = repr(FOLLOWING[value])
-    elif value > float(FLOAT.max):
+    if value > float(FLOAT.max):
         text = repr(float(FLOAT.max))
     elif 0 < value < float(FLOAT.tiny):
         text = repr(float(FLOAT.tiny))

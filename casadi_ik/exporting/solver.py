@@ -13,15 +13,15 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.exporting.follow import NO_FOLLOWER
-from casadi_ik.exporting.generated import standing_alone
 from casadi_ik.exporting.palms import palm_marks
 from casadi_ik.exporting.precision import IN_DOUBLE, in_single
 from casadi_ik.exporting.scene import SceneSources, without_scene
-from casadi_ik.exporting.single import SinglePrecision, in_single_precision
+from casadi_ik.exporting.single import FOLLOWING, SinglePrecision, in_single_precision
 from casadi_ik.exporting.template import filled
 from casadi_ik.kernels import FunctionKernel, LoopKernel
-from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.codegen import define, driver_text, row_major, standing_alone
 from casadi_ik.kernels.constants import define_arrays
+from casadi_ik.kernels.emitter import Form
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.lookup import TILE
 from casadi_ik.methods.hand_first.beginning import terms
@@ -42,13 +42,13 @@ class Part:
         name: Of its file and function.
         job: What it works on.
         text: Its file.
-        work: Numbers of each kind of memory: doubles, inputs, outputs, whole numbers.
+        work: Numbers that it works with.
     """
 
     name: str
     job: str
     text: str
-    work: tuple[int, int, int, int]
+    work: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,22 +135,23 @@ class SolverSources:
         body = "".join(
             (
                 f'#include "{self.prefix}_parts.h"\n\n',
-                standing_alone(function, self.single is not None),
+                standing_alone(function, self.form),
                 driver_text("freestanding"),
-                define({"N_W": function.sz_w()}),
-                filled("take.c", {"PREFIX": self.prefix}),
                 constants,
                 text,
             )
         )
-        work = (function.sz_w() + extra, function.sz_arg(), function.sz_res(), function.sz_iw())
-        return Part(name, f"{driver}_job", body, work)
+        return Part(name, f"{driver}_job", body, extra)
+
+    @property
+    def form(self) -> Form:
+        """What the code of graphs is for."""
+        return Form() if self.single is None else Form(single=True, replaced=FOLLOWING)
 
     @property
     def substitutes(self) -> dict[str, str]:
         """What stands for the marks of the templates."""
         robot, sizes = self.robot, self.plan.sizes
-        w, arg, res, iw = (max(sizes) for sizes in zip(*(p.work for p in self.parts), strict=True))
         jobs = "".join(driver_text(f"{name}_job") for name in ("loop", "map", "lookup"))
         jobs += self.scene.jobs() if self.scene else ""
         parts = "".join(
@@ -177,10 +178,7 @@ class SolverSources:
             "MOTOR_LIST": ", ".join(map(plain, robot.actuators)),
             "FINGER_NAMES": _strings(robot.fingers),
             "MOTOR_NAMES": _strings(robot.actuators),
-            "W": str(w),
-            "ARG": str(arg),
-            "RES": str(res),
-            "IW": str(max(iw, 1)),
+            "W": str(max(1, *(part.work for part in self.parts))),
             "STRUCT": self.plan.members().rstrip(),
             "JOBS": jobs,
             "PARTS": parts,
@@ -224,13 +222,8 @@ class SolverSources:
 
     def judge(self) -> dict[str, str]:
         """Files of the kinematics in double precision that answers are judged by."""
-        function = self.plan.judge.function
         marks = {
-            "KINEMATICS": standing_alone(function),
-            "JUDGE_W": str(max(function.sz_w(), 1)),
-            "JUDGE_IW": str(max(function.sz_iw(), 1)),
-            "JUDGE_ARG": str(function.sz_arg()),
-            "JUDGE_RES": str(function.sz_res()),
+            "KINEMATICS": standing_alone(self.plan.judge.function, Form()),
             "POSITION_TOLERANCE": repr(self.tolerance.position),
             "ANGLE_TOLERANCE": repr(self.tolerance.angle),
             "LIMIT_SLACK": repr(LIMIT_SLACK),

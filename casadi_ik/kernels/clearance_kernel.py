@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import logging
 import math
 from functools import cached_property, partial
 from typing import Any
@@ -19,17 +18,13 @@ from casadi_ik.collision.solids import C_NAMES
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
 from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel
-from casadi_ik.kernels.lanes import lanes_source
-from casadi_ik.kernels.lanes_lines import UnsuitedError
 from casadi_ik.kernels.machine_lanes import machine_lanes
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.robots import RobotDescription
-
-logger = logging.getLogger(__name__)
 
 SYMBOL = "casadi_ik_clearance"
 
@@ -98,18 +93,14 @@ class ClearanceKernel:
         shapes = self._robot.shapes
         constants = {"N_Q": self._n, "N_CAPSULES": len(shapes.capsules)}
         constants |= {"N_OWN": len(shapes.solids), **C_NAMES}
-        try:
-            library = load_library(
-                f"{self._graph.name}_lanes{lanes}",
-                lambda: row_major(self._graph.function),
-                define(constants) + driver_text("clearance_job") + driver_text("clearance"),
-                SYMBOL,
-                f"{self._graph.recipe} lanes {lanes}",
-                partial(lanes_source, lanes=lanes),
-            )
-        except UnsuitedError as error:
-            logger.info("%s: distances by numpy: %s", self._graph.name, error)
-            return None
+        library = load_library(
+            f"{self._graph.name}_lanes{lanes}",
+            lambda: row_major(self._graph.function),
+            define(constants) + driver_text("clearance_job") + driver_text("clearance"),
+            SYMBOL,
+            f"{self._graph.recipe} lanes {lanes}",
+            partial(library_source, lanes=lanes),
+        )
         return None if library is None else library[SYMBOL]
 
     @cached_property

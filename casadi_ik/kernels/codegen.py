@@ -13,10 +13,7 @@ from typing import Any
 
 import casadi as ca
 
-from casadi_ik.errors import KernelError
-from casadi_ik.kernels.arguments import looked_at_once
-from casadi_ik.kernels.some_at_once import some_at_once
-from casadi_ik.kernels.wanted_outputs import wanted_outputs
+from casadi_ik.kernels.emitter import Form, emit
 
 
 @cache
@@ -65,32 +62,6 @@ def row_major(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), symbols, outputs, names_in, names_out)
 
 
-def function_source(function: ca.Function) -> str:
-    """The C code of a function and of everything it calls.
-
-    Raises:
-        KernelError: The graph holds a node without C code (a Python callback, an Ipopt call).
-    """
-    name = function.name()
-    options = {"with_header": False, "mex": False, "main": False}
-    generator = ca.CodeGenerator(name, options)
-    try:
-        generator.add(function)
-        text = generator.dump()
-    except RuntimeError as error:
-        raise KernelError(f"kernel {name!r}: no C code can be generated: {error}") from error
-    for line in text.splitlines():
-        if line.lstrip().startswith("#error"):
-            raise KernelError(f"kernel {name!r}: {line.strip().removeprefix('#error').strip()}")
-    return wanted_outputs(looked_at_once(text))
-
-
-OWN = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")
-"""Functions of the C library that generated code does not call (drivers/elementary.c)."""
-
-EXTREMES = ("fmax", "fmin")
-"""Likewise (drivers/extremes.c): a call takes as long as ten operations."""
-
 LOOPS = """\
 #if defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize ("O3")
@@ -107,58 +78,64 @@ WIDE = """\
 
 
 @cache
-def own_functions() -> str:
-    """Their forms for one number, and for some at once."""
+def meaning(form: Form) -> str:
+    """C text that says what the emitter's code means: types, operations, elementary functions."""
     forms = driver_text("elementary")
+    if form.single:
+        return "#define SINGLE\n" + driver_text("elementary_single") + driver_text("real")
+    alone = driver_text("elementary_alone") + forms
+    if form.lanes > 1:
+        own = driver_text("lanes") + driver_text("elementary_lanes") + forms
+        return alone + define({"LANES": form.lanes}) + own
     few = driver_text("elementary_few") + forms
     return "".join(
         (
-            driver_text("elementary_alone") + forms,
+            alone,
             f"#define FEW 2\n{few}#undef FEW\n",
             f"#ifdef __AVX2__\n#define FEW 4\n{few}#undef FEW\n#endif\n",
-            driver_text("elementary_calls") + driver_text("extremes"),
+            driver_text("elementary_calls") + driver_text("real"),
         )
     )
 
 
-def with_own_functions(text: str) -> str:
-    """Generated code that calls the elementary functions of the drivers."""
-    return "\n".join(
+def step_source(function: ca.Function, form: Form) -> str:
+    """C code of a function, which drivers call by the macro `STEP(arg, res, wanted)`."""
+    text, (name,) = emit([function], form)
+    n_in, n_out = function.n_in(), function.n_out()
+    given = [*(f"(arg)[{i}]" for i in range(n_in)), *(f"(res)[{i}]" for i in range(n_out))]
+    wanted = ["wanted"] if form.lanes > 1 else []
+    return "".join(
         (
-            own_functions(),
-            *(f"#define {name} own_{name}" for name in (*OWN, *EXTREMES)),
             text,
-            *(f"#undef {name}" for name in (*OWN, *EXTREMES)),
+            f"#define STEP(arg, res, wanted) {name}({', '.join(given + wanted)})\n",
+            define({"STEP_IN": n_in, "STEP_OUT": n_out}),
         )
     )
 
 
-def step_names(name: str) -> str:
-    """The macros by which drivers name a function's symbols."""
-    suffixes = ("", "_work", "_checkout", "_release", "_incref")
-    return "".join(f"#define STEP{suffix} {name}{suffix}\n" for suffix in suffixes)
+def standing_alone(function: ca.Function, form: Form) -> str:
+    """C code of a function and of all it needs."""
+    return meaning(form) + step_source(function, form)
 
 
 def library_source(
-    function: ca.Function, driver: str, wide: bool = False, loops: bool = False
+    function: ca.Function, driver: str, lanes: int = 1, wide: bool = False, loops: bool = False
 ) -> str:
-    """The text of a whole library: the function's code, its names, what drivers share, a driver.
+    """The text of a whole library: the function's code, what drivers share, a driver.
 
     Args:
         function: Dense and row-major.
         driver: C text of the driver, with its constants.
+        lanes: How many solves are made side by side.
         wide: Whether the machine has wide registers.
         loops: Whether loops over tables are most of the work.
     """
-    # More than one thread at once may hold memory of a function that needs some.
-    header = "#define CASADI_MAX_NUM_THREADS 64\n"
+    form = Form(lanes)
     return "\n".join(
         (
             WIDE if wide else "",
             LOOPS if loops else "",
-            header,
-            with_own_functions(some_at_once(function_source(function))),
-            step_names(function.name()),
+            standing_alone(function, form),
             driver_text("common"),
             driver,
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from casadi_ik.errors import KernelError
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 
 SLICE = 0.2
@@ -20,8 +19,6 @@ class DriverCode(IntEnum):
     GOES_ON = 3
     FEW_LEFT = 4
     NO_MEMORY = -1
-    NO_CHECKOUT = -2
-    STEP_FAILED = -3
 
 
 def check(name: str, code: int) -> None:
@@ -29,13 +26,8 @@ def check(name: str, code: int) -> None:
 
     Raises:
         MemoryError: No work memory.
-        KernelError: The function failed, or too many threads use one that needs memory objects.
         CancelledError: This thread has been told to stop.
     """
     stop_if_cancelled()
     if code == DriverCode.NO_MEMORY:
         raise MemoryError(f"{name}: no work memory")
-    if code == DriverCode.NO_CHECKOUT:
-        raise KernelError(f"{name}: too many calls at once of a function with memory objects")
-    if code == DriverCode.STEP_FAILED:
-        raise KernelError(f"{name}: the function reports a failure")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import logging
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -19,11 +18,8 @@ from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
 from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
-from casadi_ik.kernels.lanes import lanes_source
-from casadi_ik.kernels.lanes_lines import UnsuitedError
 from casadi_ik.kernels.loop_result import (
     CODE_LIMIT,
-    FAILED,
     FIRST_MARK,
     FIRST_ROWS,
     NON_FINITE,
@@ -35,8 +31,6 @@ from casadi_ik.kernels.loop_vm import run_vm
 from casadi_ik.kernels.machine_lanes import machine_lanes
 from casadi_ik.kernels.rows import opaque, row_driver
 from casadi_ik.kernels.step_graph import RUNNING, StepGraph
-
-logger = logging.getLogger(__name__)
 
 SYMBOL = "casadi_ik_loop"
 
@@ -276,12 +270,9 @@ class LoopKernel:
                 self._driver(),
                 SYMBOL,
                 f"{self.step.recipe} lanes {lanes}" if self.step.recipe else "",
-                partial(lanes_source, lanes=lanes),
+                partial(library_source, lanes=lanes),
                 at_hand=at_hand,
             )
-        except UnsuitedError as error:
-            logger.info("%s: one solve at a time: %s", self.step.name, error)
-            return None
         except KernelError as error:
             warnings.warn(f"one solve at a time: {error}", RuntimeWarning, stacklevel=2)
             return None
@@ -295,7 +286,6 @@ class LoopKernel:
             "N_PARAMETERS": self.step.parameters.size,
             "RUNNING": RUNNING,
             "NON_FINITE": NON_FINITE,
-            "FAILED": FAILED,
             "REPEATED": REPEATED,
             "CODE_LIMIT": CODE_LIMIT,
             "SLOTS": SLOTS,

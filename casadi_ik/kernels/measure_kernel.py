@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 from casadi_ik.errors import KernelError
 from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
 from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.function_kernel import FunctionKernel, MapJob
-from casadi_ik.kernels.lanes import lanes_source
-from casadi_ik.kernels.lanes_lines import UnsuitedError
 from casadi_ik.kernels.machine_lanes import machine_lanes
 
 logger = logging.getLogger(__name__)
@@ -71,11 +69,8 @@ class MeasureKernel:
                 driver,
                 SYMBOL,
                 f"{self._graph.recipe} lanes {lanes}" if self._graph.recipe else "",
-                partial(lanes_source, lanes=lanes),
+                partial(library_source, lanes=lanes),
             )
-        except UnsuitedError as error:
-            logger.info("%s: one sample at a time: %s", self._graph.name, error)
-            return None
         except KernelError as error:
             logger.warning("%s: one sample at a time: %s", self._graph.name, error)
             return None

@@ -13,7 +13,6 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.errors import InputError
-from casadi_ik.exporting.generated import standing_alone
 from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
 from casadi_ik.exporting.scene_targets import SceneTargets
 from casadi_ik.exporting.solver import plain
@@ -291,18 +290,6 @@ def test_names_of_robots_become_names_of_c(name, prefix):
 
 def test_names_from_files_end_no_comment():
     assert plain("arm */ #include <x>\n") == "arm __ _include _x__"
-
-
-def test_generated_code_has_no_symbol_of_its_own(robot):
-    import casadi as ca
-
-    x = ca.SX.sym("x", 2)
-    text = standing_alone(ca.Function("own", [x], [ca.sin(x) * ca.fmax(x[0], 0)]))
-    heads = [
-        line for line in text.splitlines() if line.startswith(("int ", "casadi_real ", "void "))
-    ]
-    assert heads == []
-    assert "static int casadi_whole(" in text
 
 
 def test_kernels_compiled_ahead_with_progress(capsys):

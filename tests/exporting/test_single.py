@@ -14,7 +14,6 @@ import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.exporting.project import c_project, write_folder
 from casadi_ik.exporting.single import (
-    ARM_ROUNDING,
     ROUNDING,
     SinglePrecision,
     in_single_precision,
@@ -66,7 +65,6 @@ def compiled(place: Path, *words: str) -> None:
         ("far = 1e300, near = 0.0;", "far = 3.4028234663852886e+38f, near = 0.0f;"),
         ("i = 7 + 0x1e5 + n1e3; /* 1.0 double */", "i = 7 + 0x1e5 + n1e3; /* 1.0 double */"),
         ('#include "arm.h"\nprintf("double 1.5");', '#include "arm.h"\nprintf("double 1.5");'),
-        ("done = cost<1.0000000000000001e-16;", f"done = cost<{ARM_ROUNDING**2!r}f;"),
         ("own_sqrt(x) + 1.5f", "own_sqrt(x) + 1.5f"),
     ],
 )

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from casadi_ik.kernels import (
-    FAILED,
     NON_FINITE,
     REPEATED,
     RUNNING,
@@ -20,8 +19,6 @@ from casadi_ik.kernels import (
     LoopResult,
     StepGraph,
 )
-from casadi_ik.kernels.lanes import lanes_source
-from casadi_ik.kernels.lanes_lines import UnsuitedError
 from casadi_ik.kernels.loop import FEWEST, ROOM_BYTES, SLOTS, WORTH
 from casadi_ik.kernels.machine_lanes import machine_lanes
 
@@ -154,95 +151,6 @@ def test_shared_parameters_and_time() -> None:
     np.testing.assert_array_equal(result.states[:, 0], 500.0)
     np.testing.assert_array_equal(result.iterations, 500 - np.arange(10))
     assert (result.time > 0).all()
-
-
-SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 1e-310, 1e300, np.inf, -np.inf, np.nan])
-
-
-def test_operations_on_special_numbers() -> None:
-    """Every operation the rewriting knows, on every pair of special numbers."""
-    x, y = ca.SX.sym("x"), ca.SX.sym("y")
-    unary = [ca.sqrt, ca.floor, ca.ceil, ca.sin, ca.cos, ca.tan, ca.asin, ca.acos, ca.atan]
-    unary += [ca.exp, ca.log, ca.tanh, ca.fabs, ca.logic_not, lambda v: v * v]
-    binary = [ca.atan2, ca.fmod, ca.hypot, ca.fmin, ca.fmax, ca.logic_and, ca.logic_or]
-    values = [-x, x + y, x - y, x * y, x / y, 2 / x, x < y, x <= y, x == y, x != y, x**3.7]
-    values += [f(x) for f in unary] + [f(x, y) for f in binary]
-    values += [ca.if_else(x, y, -1), ca.if_else(x > 0, ca.inf, y)]
-    record = Layout.record(Field("values", (len(values),), "f8"))
-    # The state stays as it is, so that the operations may give anything.
-    state, p = ca.SX.sym("state"), ca.SX.sym("p", 2)
-    results = ca.substitute(ca.vertcat(*values), ca.vertcat(x, y), p)
-    function = ca.Function("operations", [state, p], [state, results, ca.SX(DONE)])
-    step = StepGraph(
-        "operations", function, Layout((Field("x"),)), Layout((Field("p", (2,)),)), record
-    )
-    pairs = np.stack(np.meshgrid(SPECIAL, SPECIAL), axis=-1).reshape(-1, 2)
-    kernel = LoopKernel(step)
-    assert kernel.lanes > 1
-    states = np.zeros((len(pairs), 1))
-    found = kernel.run(states, pairs, 1, trace=True).rows
-    expected = LoopKernel(step, compiled=False).run(states, pairs, 1, trace=True).rows
-    assert found is not None
-    assert expected is not None
-    # Compiled sines and arcs are not those of the C library, to the last place; two infinite
-    # coordinates have no direction here.
-    given, asked = found["values"], expected["values"].copy()
-    asked[np.isinf(pairs).all(axis=1), len(values) - len(binary) - 2] = np.nan
-    np.testing.assert_allclose(given, asked, rtol=1e-15, atol=0)
-    alone = [kernel.run(states[:1], pair[None], 1, trace=True).rows["values"] for pair in pairs]
-    # Of two zeros the virtual machine takes another as minimum than the C library does.
-    same = np.signbit(found["values"]) == np.signbit(np.concatenate(alone))
-    assert (same | np.isnan(found["values"])).all()
-    assert np.isfinite(found["values"]).any(axis=0).all()
-
-
-def test_inner_function_without_vector_form_is_called_for_each() -> None:
-    """One with named, sparse and matrix arguments, taken by some of the four only."""
-    x, p = ca.SX.sym("x"), ca.SX.sym("p")
-    turn = ca.SX.sym("turn", ca.Sparsity.lower(3))
-    results = [ca.sinh(x) * p / 9, ca.mtimes(turn, ca.vertcat(x, p, 1)), ca.SX(x + 1)]
-    names = ["state", "gain", "turn"], ["new", "turned", "unused"]
-    alone = ca.Function("alone", [x, p, turn], results, *names)
-    plain = ca.Function("plain", [x, p, turn], [x / 2, ca.vertcat(p, x, x), p], *names)
-    xm, pm = ca.MX.sym("x"), ca.MX.sym("p")
-    matrix = ca.Function("matrix", [x], [ca.tril(ca.SX.ones(3, 3)) * x])(xm)
-    which = ca.Function("which", [x], [ca.sin(40 * x) > 0])(xm)
-    new, turned, _ = ca.Function.if_else("either", alone, plain)(which, xm, pm, matrix)
-    done = ca.Function("done", [x], [ca.if_else(ca.fabs(x) < 1e-3, DONE, RUNNING)])(new)
-    function = ca.Function("calls_alone", [xm, pm], [new, turned, done])
-    step = step_of("calls_alone", function, Layout.record(Field("turned", (3,))))
-    assert "lanes_one_by_one(&alone" in lanes_source(function, "", 4)
-    for count in COUNTS:
-        rng = np.random.default_rng(count)
-        states, parameters = rng.normal(size=(count, 1)), rng.uniform(5, 12, size=(count, 1))
-        found = assert_as_alone(step, states, parameters, 60)
-        assert count < COUNTS[-1] or len(np.unique(found.iterations)) > 2
-
-
-def test_a_step_that_fails_ends_its_solve_only() -> None:
-    x, p = ca.MX.sym("x"), ca.MX.sym("p")
-    low = ca.Function(
-        "low", [x, p], [x.attachAssert(x < p, "too large") + 1], {"never_inline": True}
-    )
-    function = ca.Function("fails_inside", [x, p], [low(x, p), x, 0])
-    with pytest.raises(UnsuitedError, match="can fail"):
-        lanes_source(function, "", 4)
-    result = LoopKernel(step_of("fails_inside", function, COUNT)).run(
-        np.zeros((9, 1)), np.arange(9.0)[:, None], 5
-    )
-    assert result.status.tolist() == [FAILED] * 5 + [RUNNING] * 4
-
-
-def test_unforeseen_code_is_refused_and_runs_one_by_one() -> None:
-    x, p = ca.SX.sym("x"), ca.SX.sym("p")
-    function = ca.Function("unforeseen", [x, p], [ca.sinh(x) + p, x, ca.SX(RUNNING)])
-    with pytest.raises(UnsuitedError, match="sinh"):
-        lanes_source(function, "", 4)
-    kernel = LoopKernel(step_of("unforeseen", function, COUNT))
-    assert kernel.compiled
-    assert kernel.lanes == 1
-    result = kernel.run(np.full((9, 1), 0.1), [0.0], 1)
-    np.testing.assert_array_equal(result.states, np.sinh(0.1))
 
 
 def test_traces_of_other_lengths_than_the_last_one() -> None:

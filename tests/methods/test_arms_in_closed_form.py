@@ -8,7 +8,6 @@ from samplers import near_limits
 
 import casadi_ik as ik
 from casadi_ik.arms.recognise import arm_family
-from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.problems import Problems, target_arrays
@@ -148,14 +147,6 @@ def test_what_is_near_an_arm_whose_last_joint_is_searched_is_found(name):
     assert batch.success.all()
     moved, known = (np.abs(each - start)[:, :6].max(axis=1) for each in (batch.q, q))
     assert (moved < 1.5 * known + 0.05).mean() > 0.9
-
-
-@pytest.mark.parametrize(("arm", "alone"), [("panda", 0), ("sawyer", 1)])
-def test_all_its_stages_go_side_by_side(arm, alone):
-    """But for the table that the search of later rounds begins with."""
-    method = HandFirstMethod(robot_of(arm).description, HandFirstParameters())
-    source = lanes_source(method.graph.function, "", 4)
-    assert source.count("lanes_one_by_one(&alone") == alone
 
 
 @pytest.mark.parametrize("arm", ["panda", "kinova_gen3", "xarm7"])

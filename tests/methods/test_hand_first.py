@@ -12,7 +12,6 @@ from samplers import HARD, near_limits
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnknownNameError
-from casadi_ik.kernels.lanes import lanes_source
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.problems import Problems, fixed_array, target_arrays
@@ -242,11 +241,6 @@ def test_optimisation_changes_no_bit(robot, rng, monkeypatch):
     plain = answers()
     monkeypatch.delenv("CASADI_IK_CFLAGS")
     assert answers() == plain
-
-
-def test_every_stage_goes_side_by_side(method):
-    """The arm nearest to q0 was chosen for one solve after the other: three times the time."""
-    assert "lanes_one_by_one(&alone" not in lanes_source(method.graph.function, "", 4)
 
 
 def test_parameters_are_checked():

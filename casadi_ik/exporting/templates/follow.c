@@ -101,11 +101,9 @@ static void ask_rest(@PREFIX@_follower *follower) {
 
 /* One step; 0: a number was out of range, and the state is what it was. */
 static int step(@PREFIX@_follower *follower) {
-  follower->arg[0] = follower->state;
-  follower->arg[1] = follower->asked;
-  follower->res[0] = follower->after;
-  follower->res[1] = follower->record;
-  if (STEP(follower->arg, follower->res, follower->iw, follower->w, 0)) return 0;
+  const double *arg[] = {follower->state, follower->asked};
+  double *res[] = {follower->after, follower->record};
+  STEP(arg, res, 0);
   if (!is_finite(follower->record[RECORD_SOUND])) return 0;
   memcpy(follower->state, follower->after, sizeof follower->state);
   return 1;

@@ -15,10 +15,7 @@ typedef struct {
   int64_t status;
   double period, change[@GUARD@_MOTORS];
   double state[@FOLLOW_STATE@], after[@FOLLOW_STATE@];
-  double asked[@FOLLOW_ASKED@], record[@FOLLOW_RECORD@], w[@FOLLOW_W@];
-  const double *arg[@FOLLOW_ARG@];
-  double *res[@FOLLOW_RES@];
-  long long int iw[@FOLLOW_IW@];
+  double asked[@FOLLOW_ASKED@], record[@FOLLOW_RECORD@];
 } @PREFIX@_follower;
 
 /* Begins at rest: at q0, or at home if that is a null pointer. period: time from cycle to cycle [s].

@@ -42,9 +42,6 @@ extern const double @PREFIX@_lower[@GUARD@_MOTORS], @PREFIX@_upper[@GUARD@_MOTOR
 /* Room that the parts of a solver work in, one after the other. */
 typedef struct {
   double w[@W@];
-  const double *arg[@ARG@];
-  double *res[@RES@];
-  long long int iw[@IW@];
 @SCENE_ROOM@} @PREFIX@_memory;
 
 /* A solver. Read the answer: q, position_error, angle_error, beyond (by how much the worst motor or

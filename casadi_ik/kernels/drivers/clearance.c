@@ -297,10 +297,7 @@ EXPORT LANES_TARGET int casadi_ik_clearance(clearance_job *job) {
     }
     space.arg[0] = q;
     space.res[0] = placed;
-    if (STEP(space.arg, space.res, space.iw, space.w, (1 << LANES) - 1)) {
-      outcome = STEP_FAILED;
-      break;
-    }
+    STEP(space.arg, space.res, (1 << LANES) - 1);
     /* What was in the way last may be in the way again. */
     for (k = -RECENT; k < job->n_pairs; ++k) {
       const int64_t pair = k < 0 ? job->recent[RECENT + k] : k;

@@ -11,7 +11,7 @@
  * entries are such as can be reduced here, and LIBRARY(f, x) for the others; without LIBRARY only what
  * needs neither is defined.
  */
-#define K(number) ((REAL) {0} + (number))
+#define ALL(number) ((REAL) {0} + (number))
 #define PICK(mask, yes, no) REAL_OF(((mask) & BITS(yes)) | (~(mask) & BITS(no)))
 
 /* The nearest whole number, as the last bits of a sum: without a call in either form. */
@@ -63,6 +63,14 @@ INNER void NAME(both)(REAL x, REAL *sine, REAL *cosine) {
 QUALIFIERS REAL NAME(sin)(REAL x) { return SMALL(x) ? NAME(turned)(x, 0) : LIBRARY(sin, x); }
 QUALIFIERS REAL NAME(cos)(REAL x) { return SMALL(x) ? NAME(turned)(x, 1) : LIBRARY(cos, x); }
 QUALIFIERS REAL NAME(tan)(REAL x) { return NAME(sin)(x) / NAME(cos)(x); }
+QUALIFIERS void NAME(turns)(REAL x, REAL *sine, REAL *cosine) {
+  if (SMALL(x)) {
+    NAME(both)(x, sine, cosine);
+  } else {
+    *sine = LIBRARY(sin, x);
+    *cosine = LIBRARY(cos, x);
+  }
+}
 #endif
 
 /* Angle of (x, y): that of the smaller coordinate over the larger, which is at most 1, or by
@@ -73,27 +81,27 @@ QUALIFIERS REAL NAME(atan2)(REAL y, REAL x) {
   const REAL large = PICK(steep, high, wide), less = PICK(steep, wide, high);
   const INTEGER beyond = MASK(less > large * 0.66), none = MASK(large == 0.0);
   const REAL above = PICK(beyond, less - large, less);
-  const REAL below = PICK(beyond, less + large, PICK(none, K(1.0), large));
+  const REAL below = PICK(beyond, less + large, PICK(none, ALL(1.0), large));
   const REAL t = above / below, z = t * t;
   const REAL p = (((-8.750608600031904122785e-1 * z - 1.615753718733365076637e1) * z
       - 7.500855792314704667340e1) * z - 1.228866684490136173410e2) * z - 6.485021904942025371773e1;
   const REAL q = ((((z + 2.485846490142306297962e1) * z + 1.650270098316988542046e2) * z
       + 4.328810604912902668951e2) * z + 4.853903996359136964868e2) * z + 1.945506571482613964425e2;
   /* What pi has beyond a double is added with the small part. */
-  const REAL rest = t * (z * p / q) + REAL_OF(beyond & BITS(K(3.0616169978683830e-17)));
-  REAL angle = REAL_OF(beyond & BITS(K(0.78539816339744830962))) + (t + rest);
+  const REAL rest = t * (z * p / q) + REAL_OF(beyond & BITS(ALL(3.0616169978683830e-17)));
+  REAL angle = REAL_OF(beyond & BITS(ALL(0.78539816339744830962))) + (t + rest);
   angle = PICK(steep, 1.57079632679489661923 - (angle - 6.123233995736766e-17), angle);
   angle = PICK(BITS(x) >> 63, 3.14159265358979323846 - (angle - 1.2246467991473532e-16), angle);
   return REAL_OF(BITS(angle) | (BITS(y) & SIGN));
 }
 
-QUALIFIERS REAL NAME(atan)(REAL x) { return NAME(atan2)(x, K(1.0)); }
+QUALIFIERS REAL NAME(atan)(REAL x) { return NAME(atan2)(x, ALL(1.0)); }
 #ifdef LIBRARY
 QUALIFIERS REAL NAME(asin)(REAL x) { return NAME(atan2)(x, ROOT((1.0 - x) * (1.0 + x))); }
 QUALIFIERS REAL NAME(acos)(REAL x) { return NAME(atan2)(ROOT((1.0 - x) * (1.0 + x)), x); }
 #endif
 
-#undef K
+#undef ALL
 #undef PICK
 #undef SHIFT
 #undef SIGN

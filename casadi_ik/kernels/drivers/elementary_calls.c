@@ -1,14 +1,7 @@
-/* Sines and cosines, and angles, of several numbers in one call: what `some_at_once.py` calls. */
+/* Sines and cosines, and angles, of several numbers in one call: what `emitter.py` writes. */
 #define FEW_QUALIFIERS static __attribute__((noinline, unused))
 
-FEW_QUALIFIERS void own_turns_1(double x, double *sines, double *cosines) {
-  if (fabs(x) < 5e8) {
-    own_both(x, sines, cosines);
-  } else {
-    *sines = own_sin(x);
-    *cosines = own_cos(x);
-  }
-}
+#define own_turns_1(x, sines, cosines) own_turns(x, sines, cosines)
 
 FEW_QUALIFIERS void own_turns_2(double x0, double x1, double *sines, double *cosines) {
   const own_reals_2 x = {x0, x1};
@@ -39,7 +32,7 @@ FEW_QUALIFIERS void own_turns_4(double x0, double x1, double x2, double x3,
   own_turns_2(x2, x3, sines + 2, cosines + 2);
 }
 
-FEW_QUALIFIERS void own_arcs_1(double y, double x, double *angles) { *angles = own_atan2(y, x); }
+#define own_arcs_1(y, x, angles) (*(angles) = own_atan2(y, x))
 
 FEW_QUALIFIERS void own_arcs_2(double y0, double y1, double x0, double x1, double *angles) {
   const own_reals_2 y = {y0, y1}, x = {x0, x1}, angle = own_atan2_2(y, x);

@@ -66,6 +66,9 @@ QUALIFIERS float own_atan(float x) { return own_atan2(x, 1.0f); }
 QUALIFIERS float own_asin(float x) { return own_atan2(x, sqrtf((1.0f - x) * (1.0f + x))); }
 QUALIFIERS float own_acos(float x) { return own_atan2(sqrtf((1.0f - x) * (1.0f + x)), x); }
 
+#define own_turns_1(x, sine, cosine) (*(sine) = own_sin(x), *(cosine) = own_cos(x))
+#define own_arcs_1(y, x, angle) (*(angle) = own_atan2(y, x))
+
 #undef QUALIFIERS
 #undef MASK
 #undef PICK

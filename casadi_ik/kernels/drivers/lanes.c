@@ -1,9 +1,7 @@
-/* The step's arithmetic on vectors whose entries belong to LANES solves, four or eight.
- *
- * Stands between the code as CasADi generated it and the same rewritten to call what is here
- * (`lanes.py`).
- * Every entry is computed as one double would be (no contraction, the same library functions), so
- * a solve's iterates are bit for bit those it has alone. Vectors are those of gcc and clang.
+/* What the emitter writes (`emitter.py`), for vectors whose entries belong to LANES solves, four or
+ * eight. Every entry is computed as one double would be (no contraction, the same elementary
+ * functions), so a solve's iterates are bit for bit those it has alone. Vectors are those of gcc and
+ * clang. Needs the elementary functions for one number.
  */
 #include <math.h>
 #include <stdint.h>
@@ -14,6 +12,9 @@
 
 typedef double lanes __attribute__((vector_size(LANES * sizeof(double))));
 typedef int64_t lane_mask __attribute__((vector_size(LANES * sizeof(double))));
+typedef lanes real;
+typedef lane_mask mask;
+typedef double number; /* of constants */
 
 #if !defined(__x86_64__)
 #define LANES_TARGET
@@ -22,56 +23,58 @@ typedef int64_t lane_mask __attribute__((vector_size(LANES * sizeof(double))));
 #else
 #define LANES_TARGET __attribute__((target("avx2")))
 #endif
-#define LANES_INLINE static inline __attribute__((always_inline)) LANES_TARGET
-
-#undef casadi_real
-#define casadi_real lanes
+#define LANES_INLINE static inline __attribute__((always_inline, unused)) LANES_TARGET
+#define CODE static __attribute__((noinline, unused)) LANES_TARGET
 
 #if LANES == 8
 #define SPREAD(x) ((lanes) {(x), (x), (x), (x), (x), (x), (x), (x)})
 #else
 #define SPREAD(x) ((lanes) {(x), (x), (x), (x)})
 #endif
-#define TRUTH(mask) ((lanes) ((lane_mask) (mask) & (lane_mask) SPREAD(1.0)))
-#define IS(x) ((lane_mask) ((x) != SPREAD(0.0)))
 #define lanes_not(mask) (~(mask))
 #define lanes_at(x, lane) ((x)[lane])
+
+#define R(x) SPREAD(x)
+#define LESS(x, y) ((mask) ((x) < (y)))
+#define AT_MOST(x, y) ((mask) ((x) <= (y)))
+#define EQUAL(x, y) ((mask) ((x) == (y)))
+#define UNEQUAL(x, y) ((mask) ((x) != (y)))
+#define NOT(holds) (~(holds))
+#define TRUTH(holds) ((lanes) ((holds) & (mask) SPREAD(1.0)))
+#define IF(holds, x) ((lanes) ((holds) & (mask) (x)))
 
 LANES_INLINE lanes lanes_select(lane_mask mask, lanes yes, lanes no) {
   return (lanes) ((mask & (lane_mask) yes) | (~mask & (lane_mask) no));
 }
 
-LANES_INLINE lanes lanes_if_else_zero(lanes condition, lanes value) {
-  return (lanes) (IS(condition) & (lane_mask) value);
+LANES_INLINE lanes lanes_sq(lanes x) { return x * x; }
+LANES_INLINE lanes lanes_fabs(lanes x) { return (lanes) ((lane_mask) x & INT64_MAX); }
+LANES_INLINE lanes lanes_sign(lanes x) {
+  return lanes_select(x < SPREAD(0.0), SPREAD(-1.0), lanes_select(x > SPREAD(0.0), SPREAD(1.0), x));
 }
 
-LANES_INLINE lanes lanes_sq(lanes x) { return x * x; }
+/* As in real.c. */
+LANES_INLINE lanes lanes_fmax(lanes x, lanes y) {
+  return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x > y), x, y));
+}
 
-LANES_INLINE lanes lanes_fabs(lanes x) { return (lanes) ((lane_mask) x & INT64_MAX); }
+LANES_INLINE lanes lanes_fmin(lanes x, lanes y) {
+  return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x < y), x, y));
+}
 
 /* One lane after the other, each as it would be alone. */
-#define LANES_ALONE(NAME)                                       \
-  static __attribute__((noinline)) LANES_TARGET                 \
-  lanes lanes_alone_##NAME(lanes x) {                           \
-    lanes value;                                                \
-    int i;                                                      \
-    for (i = 0; i < LANES; ++i) value[i] = own_##NAME(x[i]);    \
-    return value;                                               \
-  }
-
-LANES_ALONE(sin)
-LANES_ALONE(cos)
-
-#define LANES_OF_ONE(NAME)                               \
-  LANES_INLINE lanes lanes_##NAME(lanes x) {             \
-    lanes value;                                         \
-    int i;                                               \
-    for (i = 0; i < LANES; ++i) value[i] = NAME(x[i]);   \
-    return value;                                        \
+#define LANES_OF_ONE(NAME, ALONE)                              \
+  static __attribute__((noinline, unused)) LANES_TARGET        \
+  lanes lanes_##NAME(lanes x) {                                \
+    lanes value;                                               \
+    int i;                                                     \
+    for (i = 0; i < LANES; ++i) value[i] = ALONE(x[i]);        \
+    return value;                                              \
   }
 
 #define LANES_OF_TWO(NAME)                                     \
-  LANES_INLINE lanes lanes_##NAME(lanes x, lanes y) {          \
+  static __attribute__((noinline, unused)) LANES_TARGET        \
+  lanes lanes_##NAME(lanes x, lanes y) {                       \
     lanes value;                                               \
     int i;                                                     \
     for (i = 0; i < LANES; ++i) value[i] = NAME(x[i], y[i]);   \
@@ -89,9 +92,9 @@ LANES_INLINE lanes lanes_floor(lanes x) { return _mm256_floor_pd(x); }
 LANES_INLINE lanes lanes_ceil(lanes x) { return _mm256_ceil_pd(x); }
 LANES_INLINE int lanes_all(lane_mask mask) { return _mm256_movemask_pd((__m256d) mask) == 15; }
 #else
-LANES_OF_ONE(sqrt)
-LANES_OF_ONE(floor)
-LANES_OF_ONE(ceil)
+LANES_OF_ONE(sqrt, sqrt)
+LANES_OF_ONE(floor, floor)
+LANES_OF_ONE(ceil, ceil)
 
 LANES_INLINE int lanes_all(lane_mask mask) {
   int i, all = 1;
@@ -99,50 +102,74 @@ LANES_INLINE int lanes_all(lane_mask mask) {
   return all;
 }
 #endif
-LANES_OF_ONE(exp)
-LANES_OF_ONE(log)
-LANES_OF_ONE(tanh)
+LANES_OF_ONE(alone_sin, own_sin)
+LANES_OF_ONE(alone_cos, own_cos)
+LANES_OF_ONE(exp, exp)
+LANES_OF_ONE(log, log)
+LANES_OF_ONE(log1p, log1p)
+LANES_OF_ONE(expm1, expm1)
+LANES_OF_ONE(erf, erf)
+LANES_OF_ONE(sinh, sinh)
+LANES_OF_ONE(cosh, cosh)
+LANES_OF_ONE(tanh, tanh)
+LANES_OF_ONE(asinh, asinh)
+LANES_OF_ONE(acosh, acosh)
+LANES_OF_ONE(atanh, atanh)
 LANES_OF_TWO(fmod)
 LANES_OF_TWO(hypot)
 LANES_OF_TWO(pow)
+LANES_OF_TWO(copysign)
 
-/* As in extremes.c. */
-LANES_INLINE lanes lanes_fmax(lanes x, lanes y) {
-  return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x > y), x, y));
-}
+/* The names of the emitter. */
+#define real_sq(x) lanes_sq(x)
+#define real_sign(x) lanes_sign(x)
+#define real_fmax(x, y) lanes_fmax(x, y)
+#define real_fmin(x, y) lanes_fmin(x, y)
+#define real_fabs(x) lanes_fabs(x)
+#define real_sqrt(x) lanes_sqrt(x)
+#define real_floor(x) lanes_floor(x)
+#define real_ceil(x) lanes_ceil(x)
+#define real_exp(x) lanes_exp(x)
+#define real_log(x) lanes_log(x)
+#define real_log1p(x) lanes_log1p(x)
+#define real_expm1(x) lanes_expm1(x)
+#define real_erf(x) lanes_erf(x)
+#define real_sinh(x) lanes_sinh(x)
+#define real_cosh(x) lanes_cosh(x)
+#define real_tanh(x) lanes_tanh(x)
+#define real_asinh(x) lanes_asinh(x)
+#define real_acosh(x) lanes_acosh(x)
+#define real_atanh(x) lanes_atanh(x)
+#define real_pow(x, y) lanes_pow(x, y)
+#define real_fmod(x, y) lanes_fmod(x, y)
+#define real_hypot(x, y) lanes_hypot(x, y)
+#define real_copysign(x, y) lanes_copysign(x, y)
+#define real_sin(x) lanes_sin(x)
+#define real_cos(x) lanes_cos(x)
+#define real_tan(x) lanes_tan(x)
+#define real_asin(x) lanes_asin(x)
+#define real_acos(x) lanes_acos(x)
+#define real_atan(x) lanes_atan(x)
+#define real_atan2(y, x) lanes_atan2(y, x)
+#define own_turns_1(x, sine, cosine) lanes_turns(x, sine, cosine)
+#define own_arcs_1(y, x, angle) (*(angle) = lanes_atan2(y, x))
 
-LANES_INLINE lanes lanes_fmin(lanes x, lanes y) {
-  return lanes_select((lane_mask) (y != y), x, lanes_select((lane_mask) (x < y), x, y));
-}
-
-static inline void lanes_copy(const lanes *from, casadi_int count, lanes *to) {
-  if (!to) return;
-  if (from) memcpy(to, from, (size_t) count * sizeof(lanes));
-  else memset(to, 0, (size_t) count * sizeof(lanes));
-}
-
-static inline void lanes_clear(lanes *to, casadi_int count) {
-  if (to) memset(to, 0, (size_t) count * sizeof(lanes));
-}
-
-/* Which branch each lane takes, `last` for all numbers that are not 0 ... last - 1: converted as
- * casadi_to_int does it; of two branches everything but 0 takes the last. */
-static void lanes_branch(const lanes *index, int last, int *branch) {
+/* Which branch each lane takes, `last` for all numbers that are not 0 ... last - 1. */
+LANES_INLINE void lanes_branches(lanes index, int last, int *branch) {
   int i;
   for (i = 0; i < LANES; ++i) {
-    const casadi_int k = index ? (casadi_int) ((const double *) index)[i] : 0;
-    branch[i] = k >= 0 && k < last ? (int) k : last;
+    branch[i] = index[i] > -1.0 && index[i] < last ? (int) index[i] : last;
   }
 }
 
 /* A bit for each lane that takes branch b. */
-static int lanes_in(const int *branch, int b) {
+static __attribute__((unused)) int lanes_in(const int *branch, int b) {
   int i, bits = 0;
   for (i = 0; i < LANES; ++i) bits |= (branch[i] == b) << i;
   return bits;
 }
 
-static void lanes_keep(int mine, const lanes *own, int count, lanes *result) {
+static __attribute__((unused)) void lanes_keep(int mine, const lanes *own, int count, lanes *result) {
   int i, k;
   if (!result) return;
   for (i = 0; i < LANES; ++i) {
@@ -151,37 +178,4 @@ static void lanes_keep(int mine, const lanes *own, int count, lanes *result) {
       ((double *) result)[k * LANES + i] = ((const double *) own)[k * LANES + i];
     }
   }
-}
-
-/* A function of plain doubles and memory for a call of it. */
-typedef struct {
-  int (*function)(const double **, double **, casadi_int *, double *, int);
-  int n_in, n_out;
-  const int *sizes;            /* numbers of each input, then of each output */
-  double *numbers;             /* their sum */
-  const double **arg;
-  double **res;
-} lanes_alone;
-
-static int lanes_one_by_one(const lanes_alone *alone, const lanes **arg, lanes **res,
-                            casadi_int *iw, double *w, int wanted) {
-  int lane, i, k;
-  for (lane = 0; lane < LANES; ++lane) {
-    double *number = alone->numbers;
-    const int *size = alone->sizes;
-    if (!(wanted >> lane & 1)) continue;
-    for (i = 0; i < alone->n_in; ++i, number += *size++) {
-      alone->arg[i] = arg[i] ? number : NULL;
-      for (k = 0; arg[i] && k < *size; ++k) number[k] = ((const double *) arg[i])[k * LANES + lane];
-    }
-    for (i = 0; i < alone->n_out; ++i, number += *size++) alone->res[i] = res[i] ? number : NULL;
-    if (alone->function(alone->arg, alone->res, iw, w, 0)) return 1;
-    size = alone->sizes + alone->n_in;
-    for (i = 0; i < alone->n_out; ++i, ++size) {
-      for (k = 0; res[i] && k < *size; ++k) {
-        ((double *) res[i])[k * LANES + lane] = alone->res[i][k];
-      }
-    }
-  }
-  return 0;
 }

@@ -236,10 +236,7 @@ EXPORT int casadi_ik_lookup(lookup_job *job) {
     }
     for (i = 0; i < N_IN; ++i) space.arg[i] = job->inputs[i] + job->next * job->input_steps[i];
     space.res[0] = space.extra;
-    if (STEP(space.arg, space.res, space.iw, space.w, space.mem)) {
-      outcome = STEP_FAILED;
-      break;
-    }
+    STEP(space.arg, space.res, 0);
     ask(space.extra, pairs);
     find(job, pairs, distance, nearest, job->found + job->next * job->wanted);
   }

@@ -16,7 +16,7 @@
  * such iteration in it that is no smaller than its length. It begins at FIRST_MARK: most solves end
  * before, and keeping states for a comparison costs.
  *
- * Expects the macros N_STATE, N_PARAMETERS, N_RECORD, ROW_BYTES, RUNNING, NON_FINITE, FAILED,
+ * Expects the macros N_STATE, N_PARAMETERS, N_RECORD, ROW_BYTES, RUNNING, NON_FINITE,
  * REPEATED, CODE_LIMIT, SLOTS, FIRST_MARK, STAGE (the place in the state of the number that tells
  * the stages apart, -1 if there is none) and the function store_row(record, row). Everything that
  * must survive a pause lives in the job's arrays: a call that returns SLICE_OVER or ROWS_FULL is
@@ -31,9 +31,6 @@
 #define LANES_TARGET
 #define SPREAD(x) (x)
 typedef double lanes;
-#define TAKE_STEP(wanted) STEP(space.arg, space.res, space.iw, space.w, space.mem)
-#else
-#define TAKE_STEP(wanted) STEP(space.arg, space.res, space.iw, space.w, wanted)
 #endif
 #define LANE(pack, k, lane) (((double *) (pack))[(k) * LANES + (lane)])
 
@@ -297,19 +294,12 @@ EXPORT LANES_TARGET int casadi_ik_loop(loop_job *job) {
       if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) b.outcome = SLICE_OVER;
       if (job->left <= 0) b.outcome = SLICE_OVER;
       if (b.outcome != DONE) break;
-      space.arg[0] = (const casadi_real *) b.now;
-      space.arg[1] = (const casadi_real *) b.parameters;
-      space.res[0] = (casadi_real *) b.next;
-      space.res[1] = job->rows ? (casadi_real *) b.record : NULL;
-      space.res[2] = (casadi_real *) &code;
-      if (TAKE_STEP(wanted)) {
-        if (LANES > 1) {
-          b.outcome = STEP_FAILED;
-          break;
-        }
-        end(&b, &all, job, 0, FAILED, b.now);
-        break;
-      }
+      space.arg[0] = (const real *) b.now;
+      space.arg[1] = (const real *) b.parameters;
+      space.res[0] = (real *) b.next;
+      space.res[1] = job->rows ? (real *) b.record : NULL;
+      space.res[2] = (real *) &code;
+      STEP(space.arg, space.res, wanted);
       --job->left;
       examine(&b, finite);
       last = b.now;

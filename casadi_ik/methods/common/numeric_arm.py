@@ -67,7 +67,7 @@ def nearest_start(robot: RobotDescription) -> ca.Function:
     wanted = _features(rotation, origin)
     distances = ca.DM((table**2).sum(axis=1)) - 2 * ca.DM(table) @ wanted
     index, distance = _next_nearest(distances + ca.sumsqr(wanted), passed)
-    arm = ca.MX(ca.DM(arms.T))[:, index]
+    arm = ca.DM(arms.T) @ (ca.DM(range(TABLE)) == index)
     return ca.Function("nearest_start", [rotation, origin, passed], [ca.densify(arm), distance])
 
 

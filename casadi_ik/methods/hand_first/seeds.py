@@ -237,7 +237,8 @@ def _each_finger(name: str, robot: RobotDescription, options: HandFirstParameter
         for finger, table in enumerate(tables):
             distances = ca.DM(table.features) @ wanted[:, finger]
             least = ca.mmin(distances)
-            row = ca.MX(ca.DM(table.postures.T))[:, ca.find(distances <= least)]
+            nearest = ca.DM(range(len(table.postures))) == ca.find(distances <= least)
+            row = ca.DM(table.postures.T) @ nearest
             places = list(table.places)
             mended[places] = ca.if_else(least < own[finger], row, q[places])
         q = mended
