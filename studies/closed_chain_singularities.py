@@ -17,8 +17,7 @@ from runner import command, program
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.symbolic.active_joints import mobility, pivoted
-from casadi_ik.symbolic.closed_chain import VIRTUAL, split
+from casadi_ik.symbolic.closed_chain import VIRTUAL, mobility, pivoted, split
 
 
 def conditions(

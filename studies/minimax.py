@@ -21,8 +21,8 @@ import numpy as np
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.couplings import joint_positions
+from casadi_ik.symbolic.kinematics import actuated
 
 ITERATIONS = 300
 """Of Ipopt, from one start."""

@@ -20,8 +20,7 @@ from casadi_ik.arms.screws import Screws
 from casadi_ik.arms.subproblems import Turn
 from casadi_ik.arrays import Array
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import Expr, shared
 
 SIGNS = tuple(product((1, -1), (1, -1), (1, -1)))
 """The three signs of a branch, in the order of the branches."""

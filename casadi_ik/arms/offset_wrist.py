@@ -30,8 +30,7 @@ from casadi_ik.arms.six_joints import SphericalArm
 from casadi_ik.arms.subproblems import Turn
 from casadi_ik.arrays import Array
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import Expr, shared
 
 TURN = 2 * np.pi
 

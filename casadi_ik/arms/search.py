@@ -21,8 +21,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.symbolic.even_spread import even_steps
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import Expr, shared
 
 TURN = 2 * np.pi
 

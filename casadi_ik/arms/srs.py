@@ -21,10 +21,9 @@ from casadi_ik.arms.family import Bend, ClosedForm, Redundancy, Sphere
 from casadi_ik.arms.screws import Screws
 from casadi_ik.arms.subproblems import subproblem_4
 from casadi_ik.arrays import Array
-from casadi_ik.symbolic.directions import rotation_between
 from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.se3 import rotation_between, skew
 from casadi_ik.symbolic.smooth import Expr, safe_norm
-from casadi_ik.symbolic.so3 import skew
 
 SHORTEST = 1e-12
 """Length [m] below which a vector has no direction."""

@@ -15,7 +15,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.files.limits import RAISED, limit
 from casadi_ik.files.npz import UNREADABLE
-from casadi_ik.problem.contacts.arrays import NAMES
+from casadi_ik.problem.contacts import NAMES
 from casadi_ik.problem.problems import DIRECTIONS
 
 KEYS = ("points", "normals")

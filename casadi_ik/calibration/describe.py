@@ -16,7 +16,7 @@ from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.shipped import resolve
 from casadi_ik.robots.load import load_description
 from casadi_ik.symbolic.couplings import joint_positions
-from casadi_ik.symbolic.so3 import exp_so3, matrix_to_rpy
+from casadi_ik.symbolic.se3 import exp_so3, matrix_to_rpy
 
 TAG = "calibration"
 """Source of the numbers that were estimated."""

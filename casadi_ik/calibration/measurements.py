@@ -19,7 +19,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
-from casadi_ik.symbolic.tip_motion import finger_chain
+from casadi_ik.symbolic.screws import finger_chain
 
 POINT = ("x", "y", "z")
 TURN = ("qw", "qx", "qy", "qz")

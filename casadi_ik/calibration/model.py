@@ -21,10 +21,8 @@ from casadi_ik.kernels import FunctionKernel
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
 from casadi_ik.symbolic.couplings import follow
-from casadi_ik.symbolic.directions import perpendicular
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.so3 import exp_so3
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.se3 import exp_so3, perpendicular
+from casadi_ik.symbolic.smooth import Expr, shared
 
 GROUPS = ("linkage", "axes", "tips")
 """Numbers of the couplings; origins and directions of the joint axes; contact frames."""

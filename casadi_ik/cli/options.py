@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from casadi_ik.problem.preference import PREFERENCES
+from casadi_ik.problem.questions import PREFERENCES
 
 PROGRAM = "casadi-ik"
 """What the command is called."""

@@ -18,8 +18,7 @@ from casadi_ik.collision.solids import Solid, box, cylinder
 from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.robots.collision import LinkCapsule, Shapes, Touching
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.kinematics import Pose, actuated
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from casadi_ik.motion.follower import PALM_WEIGHT
 from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
 from casadi_ik.motion.plan import FADING
 from casadi_ik.motion.rates import RUN_UP, own_velocities
-from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.contacts import usual
 from casadi_ik.problem.problems import Tolerance
 from casadi_ik.problem.verdict import TOLERANCE_SLACK
 

@@ -7,7 +7,7 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.exporting.template import filled
 from casadi_ik.kernels.constants import define_arrays, number
-from casadi_ik.problem.palm_targets import ROUNDING, touched
+from casadi_ik.problem.questions import BEYOND, touched
 
 MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")
 
@@ -20,7 +20,7 @@ def palm_marks(robot: ArmHand, prefix: str) -> dict[str, str]:
     if not robot.description.arm_actuators or touched(robot, home[None], own[None])[2]:
         return dict.fromkeys(MARKS, "")
     pose = np.concatenate([home[:3, :3].ravel(), home[:3, 3]])
-    constants = f"#define POSTURE_ROUNDING {number(ROUNDING)}\n" + define_arrays(
+    constants = f"#define POSTURE_ROUNDING {number(BEYOND)}\n" + define_arrays(
         {"HOME_PALM": pose, "OF_HAND": np.isin(robot.actuators, motors).astype(int)}
     )
     marks = {"PREFIX": prefix, "GUARD": prefix.upper()}

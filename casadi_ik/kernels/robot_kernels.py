@@ -12,9 +12,8 @@ from casadi_ik.kernels.function_graph import FunctionGraph, Shape
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.robots import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.couplings import joint_positions, toggle_margins
-from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.kinematics import Pose, actuated
 
 
 class RobotKernels:

@@ -13,7 +13,7 @@ from casadi_ik.logs.events import errors_text, number, plain_name
 from casadi_ik.logs.explanation import limits_held, within, worst
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.solve import OneSolve
-from casadi_ik.problem.contacts.arrays import NAMES
+from casadi_ik.problem.contacts import NAMES
 
 SAME = 1e-9
 """How far targets may be apart and be the same [m, or parts of a unit normal]."""

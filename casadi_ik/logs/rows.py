@@ -13,8 +13,8 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.rows import opaque
 from casadi_ik.logs.detect import as_matrix, words_of
 from casadi_ik.logs.events import EventKind, jacobian_names, measured_jacobians
-from casadi_ik.problem.contacts.arrays import NAMES
-from casadi_ik.problem.preference import NO_PREFERENCE, PREFERENCES
+from casadi_ik.problem.contacts import NAMES
+from casadi_ik.problem.questions import NO_PREFERENCE, PREFERENCES
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import CLEARANCE, TraceFormat
 

@@ -39,7 +39,7 @@ from casadi_ik.logs.chunks import CDR_HEADER
 from casadi_ik.logs.events import SERIOUS, errors_text, told
 from casadi_ik.logs.format import schema_name, schema_text
 from casadi_ik.logs.solve import OneSolve
-from casadi_ik.symbolic.so3 import quaternion_from_matrix
+from casadi_ik.symbolic.se3 import quaternion_from_matrix
 
 try:
     from foxglove import Schema

@@ -14,8 +14,7 @@ from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.recurrence import Recurrence
 from casadi_ik.motion.cycle import Cycle
 from casadi_ik.motion.plan import FollowPlan
-from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.contacts import LENGTH, Kinds
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.verdict import deviations
 

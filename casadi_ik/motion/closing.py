@@ -9,7 +9,7 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.motion.asked import ANY, Asked
 from casadi_ik.motion.plan import FollowPlan
-from casadi_ik.problem.contacts.kinds import usual
+from casadi_ik.problem.contacts import usual
 from casadi_ik.problem.problems import Problems
 
 POSTURES = 40

@@ -31,14 +31,18 @@ from casadi_ik.kernels.recipe import recipe
 from casadi_ik.methods.common.bounded_step import Bounded, damped_step
 from casadi_ik.methods.common.whole_contacts import whole_jacobian, whole_residual
 from casadi_ik.motion.limiter import chased, share_within, step_bounds
-from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.contacts.kinds import Kinds, suffix
-from casadi_ik.problem.contacts.rows import ContactRows, tip_vectors, within_tolerance
+from casadi_ik.problem.contacts import (
+    LENGTH,
+    ContactRows,
+    Kinds,
+    suffix,
+    tip_vectors,
+    within_tolerance,
+)
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import actuated, motor_scales
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.so3 import skew
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.kinematics import actuated, motor_scales
+from casadi_ik.symbolic.se3 import skew
+from casadi_ik.symbolic.smooth import Expr, shared
 
 STEPS = 2
 """Gauss-Newton steps of a cycle; the second goes on with the motors that the first held."""

@@ -14,8 +14,7 @@ from casadi_ik.motion.following import FollowState, FollowStatus
 from casadi_ik.motion.guard import OBSTACLES, Guard
 from casadi_ik.motion.plan import FollowPlan
 from casadi_ik.motion.stopping import stopping_way
-from casadi_ik.problem.contacts.arrays import by_kinds
-from casadi_ik.problem.contacts.kinds import Kinds, usual
+from casadi_ik.problem.contacts import Kinds, by_kinds, usual
 from casadi_ik.problem.verdict import TOLERANCE_SLACK
 
 NO_FRAME = "no frame yet"

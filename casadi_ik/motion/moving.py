@@ -23,7 +23,7 @@ from casadi_ik.motion.rates import Rates, a_direction, length, rates_of, seconds
 from casadi_ik.motion.reaching import Pace, Reach, ReachPlan, move, reach
 from casadi_ik.motion.tracking import Track, track
 from casadi_ik.motion.walker import Walker
-from casadi_ik.problem.contacts.arrays import by_kinds
+from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.verdict import LIMIT_SLACK, judge

@@ -8,7 +8,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.motion.asked import Asked, contact_rows, tolerance_rows
 from casadi_ik.motion.guard import OBSTACLES, Guard
 from casadi_ik.motion.plan import FollowPlan
-from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.contacts import Kinds
 from casadi_ik.problem.problems import Problems
 
 CYCLES = 2

@@ -24,7 +24,7 @@ from casadi_ik.kernels.cancellation import interrupt_afterwards, is_cancelled, s
 from casadi_ik.kernels.forks import ForkSafeLock
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.kernels.stepper import Stepper
-from casadi_ik.problem.contacts.kinds import Kinds, usual
+from casadi_ik.problem.contacts import Kinds, usual
 from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Problems
@@ -44,9 +44,8 @@ from casadi_ik.problem.trace import (
     trace_format,
 )
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.couplings import joint_positions
-from casadi_ik.symbolic.kinematics import Kinematics
+from casadi_ik.symbolic.kinematics import Kinematics, actuated
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
-"""Whether a robot in a configuration is clear of itself and of a scene, and by how much."""
+"""Whether a robot in a configuration is clear of itself and of a scene, by how much, and where."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,18 +13,13 @@ from numpy.typing import NDArray
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.collision.distances import Table
+from casadi_ik.collision.distances import Table, from_solid, pose_row
 from casadi_ik.collision.model import CollisionModel, check_base, collision_model, pair_table
 from casadi_ik.collision.scene import Item, Scene
+from casadi_ik.collision.solids import Solid, capsule
 from casadi_ik.kernels.clearance_kernel import ClearanceKernel
 from casadi_ik.problem.problems import Problems
 from casadi_ik.robots.collision import Touching
-
-SAMPLES = 256
-"""Random configurations (seed 0) in all of which links touch that are said to touch always."""
-
-SLACK = 0.5e-3
-"""How much more than at home shapes may overlap that overlap there [m]."""
 
 ROUNDING = 1e-9
 """What a distance may be below the margin [m]."""
@@ -171,14 +167,14 @@ class SceneCheck:
         other._table(other.scene, frozenset())
         return other
 
-    def _as_it_stands(self, model: CollisionModel) -> CollisionModel:
+    def _as_it_stands(self, model: CollisionModel, samples: int = 256) -> CollisionModel:
         """Without links that touch always; those that touch at home may overlap as much as there.
 
         Shapes are larger than what they hold: where fingers lie side by side they overlap though
-        the fingers do not.
+        the fingers do not. Links that overlap at home may do so by half a millimetre more.
         """
         table = pair_table(model, Scene(), ())
-        drawn = self.robot.random(np.random.default_rng(0), SAMPLES)
+        drawn = self.robot.random(np.random.default_rng(0), samples)
         q = np.concatenate([self.robot.home[None], drawn])
         distances = self.kernel.every(q, np.zeros((0, 12)), table)
         nearest_of: dict[Pair, Array] = {}
@@ -186,12 +182,12 @@ class SceneCheck:
             known = nearest_of.get(names)
             here = distances[:, i]
             nearest_of[names] = here if known is None else np.minimum(known, here)
-        why = f"their shapes touch in all of {SAMPLES} random configurations, seed 0"
+        why = f"their shapes touch in all of {samples} random configurations, seed 0"
         always = [Touching(names, why) for names, d in nearest_of.items() if (d < 0).all()]
         why = "their shapes overlap at home, where the robot is taken to be free"
         given = {frozenset(one.links): one.depth for one in model.allowed}
         home = [
-            Touching(names, why, SLACK - float(d[0]) + given.get(frozenset(names), 0.0))
+            Touching(names, why, 0.5e-3 - float(d[0]) + given.get(frozenset(names), 0.0))
             for names, d in nearest_of.items()
             if d[0] < 0
         ]
@@ -250,3 +246,83 @@ class SceneCheck:
 
 NOTHING = math.inf
 """Clearance where there is nothing to hit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Closest:
+    """What is nearest.
+
+    Attributes:
+        ends: (2, 3) the nearest points of the first and of the second shape, base frame [m]; where
+            the shapes overlap, as far beyond each other as they do.
+        distance: Between them [m], negative where shapes overlap.
+        shapes: The two, each with its (4, 4) pose in the base frame.
+    """
+
+    ends: Array
+    distance: float
+    shapes: tuple[tuple[Solid, Array], tuple[Solid, Array]]
+
+
+def closest_points(robot: ArmHand, q: Array, scene: Scene, pair: tuple[str, str]) -> Closest | None:
+    """The nearest points of a pair.
+
+    Args:
+        robot: With shapes.
+        q: (n,) actuator positions [rad or m].
+        scene: With what is grasped.
+        pair: Two links, or a link and an item of the scene.
+
+    Returns:
+        None if one of them has no shape.
+    """
+    best: Closest | None = None
+    others = link_capsules(robot, q, pair[1]) or [
+        (solid, pose) for name, solid, pose in scene_solids(scene) if name == pair[1]
+    ]
+    for one, pose in link_capsules(robot, q, pair[0]):
+        radius, half = one.size[:2]
+        segment = np.append(pose[:3, 3], half * pose[:3, 2])
+        for solid, place in others:
+            found = from_solid(solid, segment[None, None], pose_row(place)[None])
+            apart, along = found[0].item() - radius, found[1].item()
+            if best is None or apart < best.distance:
+                nearest = segment[:3] + along * segment[3:]
+                way = _outward(solid, place, nearest)
+                start = nearest - radius * way
+                ends = np.stack([start, start - apart * way])
+                best = Closest(ends, apart, ((one, pose), (solid, place)))
+    return best
+
+
+def _outward(solid: Solid, pose: Array, point: Array) -> Array:
+    """(3,) the way in which the distance of a solid at a pose grows, at a point."""
+    steps = 1e-6 * np.concatenate([np.eye(3), -np.eye(3)])
+    local = (point + steps - pose[:3, 3]) @ pose[:3, :3]
+    ahead, behind = solid.distance(local).reshape(2, 3)
+    way = ahead - behind
+    return way / max(float(np.linalg.norm(way)), 1e-30)
+
+
+def scene_solids(scene: Scene) -> Iterator[tuple[str, Solid, Array]]:
+    """Every solid of a scene: the name of its item, itself, and its (4, 4) pose."""
+    for name, item in scene.items.items():
+        for solid, place in item.parts:
+            yield name, solid, item.pose @ place
+
+
+def link_capsules(robot: ArmHand, q: Array, link: str) -> list[tuple[Solid, Array]]:
+    """The capsules of a link, each along z at its (4, 4) pose in the base frame."""
+    found = []
+    for one in robot.description.shapes.capsules:
+        if one.link == link:
+            half = float(np.linalg.norm(one.half))
+            place = np.eye(4)
+            if half > 0:
+                z = one.half / half
+                x = np.cross(z, np.eye(3)[np.abs(z).argmin()])
+                x /= np.linalg.norm(x)
+                place[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+            place[:3, 3] = one.center
+            found.append((capsule(one.radius, half), robot.links(q)[link] @ place))
+    return found

@@ -32,13 +32,13 @@ from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.layout import Field
 from casadi_ik.kernels.measure_kernel import MeasureKernel
 from casadi_ik.kernels.recipe import recipe
-from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import CONDITION, PHASE, SIGMA, Q, RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated, motor_scales
-from casadi_ik.symbolic.directions import perpendicular
-from casadi_ik.symbolic.extreme_singular_values import extreme_singular_values
+from casadi_ik.symbolic.kinematics import ActuatedKinematics, actuated, motor_scales
+from casadi_ik.symbolic.se3 import perpendicular
+from casadi_ik.symbolic.singular_values import extreme_singular_values
 from casadi_ik.symbolic.smooth import Expr
 
 LARGEST_CONDITION = 1e7

@@ -40,8 +40,7 @@ from casadi_ik.kernels.recipe import recipe
 from casadi_ik.proofs.boxes import SLACK, BoxContact, HandSpace, box_contacts
 from casadi_ik.proofs.premises import ArmCones, ArmSpan
 from casadi_ik.symbolic.linear_algebra import solve_spd
-from casadi_ik.symbolic.smooth import Expr, safe_norm
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import Expr, safe_norm, shared
 
 ANGLE_SLACK = 1e-7
 """What angles and cosines of the arm's cones are let off by."""

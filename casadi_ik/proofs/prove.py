@@ -11,7 +11,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array, Bools, Counts, Rows
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.problem.contacts.conditions import CONDITIONS, PLACE
+from casadi_ik.problem.contacts import CONDITIONS, PLACE
 from casadi_ik.problem.problems import Problems
 from casadi_ik.proofs.box_tests import BoxTest
 from casadi_ik.proofs.boxes import HandSpace

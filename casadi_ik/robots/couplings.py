@@ -159,7 +159,7 @@ class LeadScrew(CouplingKind, frozen=True, tag="lead-screw"):
         return f"|b - c| = {low:.6g} and b + c = {high:.6g} m"
 
     def followed(self, source: Array) -> Array:
-        """Positions (k,) of the joint; see `symbolic.lead_screw.angle_from_slider`."""
+        """Positions (k,) of the joint; see `symbolic.mechanisms.angle_from_slider`."""
         short, long, flat = self.b - self.c, self.b + self.c, FLAT * self.b * self.c
         low = np.maximum((source - short) * (source + short), flat)
         high = np.maximum((long - source) * (long + source), flat)
@@ -217,7 +217,7 @@ class FourBar(CouplingKind, frozen=True, tag="four-bar"):
         return self._theta3(self.phi_0 + source, branch) - self.theta_3_0
 
     def _theta3(self, phi: Array, branch: int) -> Array:
-        """Eq. (9), within pi of `theta_3_0`; see `symbolic.four_bar.theta3`."""
+        """Eq. (9), within pi of `theta_3_0`; see `symbolic.mechanisms.theta3`."""
         p, q, g, h = self.p, self.q, self.g, self.h
         cosine, sine = np.cos(phi), np.sin(phi)
         a, b = 2 * q * (p * cosine - g), 2 * p * q * sine

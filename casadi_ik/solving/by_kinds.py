@@ -7,8 +7,7 @@ from threading import Lock
 from typing import Generic, TypeVar
 
 from casadi_ik.arrays import Array
-from casadi_ik.problem.contacts.arrays import by_kinds
-from casadi_ik.problem.contacts.kinds import Kinds
+from casadi_ik.problem.contacts import Kinds, by_kinds
 from casadi_ik.problem.method import Method, Outcome
 from casadi_ik.problem.problems import Problems
 

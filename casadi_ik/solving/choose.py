@@ -23,10 +23,10 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import inverse, moved, one_pose
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
-from casadi_ik.problem.contacts.arrays import by_kinds
+from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.palm_targets import free_palms
-from casadi_ik.problem.preference import CLEARANCE
+from casadi_ik.problem.questions import free_palms
+from casadi_ik.problem.questions import CLEARANCE
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.status import Status

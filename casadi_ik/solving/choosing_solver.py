@@ -10,8 +10,7 @@ from casadi_ik.answers.solution import BatchSolution, Ranking
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import checked_pose
-from casadi_ik.problem.palm_targets import hand_postures
-from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.questions import Questions, hand_postures
 from casadi_ik.solving.alternatives.finder import APART, Alternative
 from casadi_ik.solving.choose import Judgement, choose
 from casadi_ik.solving.engine import Engine

@@ -22,11 +22,10 @@ from casadi_ik.made import made
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.clearance import SceneCheck, Surroundings
-from casadi_ik.problem.contacts.arrays import by_kinds
-from casadi_ik.problem.contacts.kinds import Kinds, usual
+from casadi_ik.problem.contacts import Kinds, by_kinds, usual
 from casadi_ik.problem.method import Method, Outcome, PreferringMethod, Quick, QuickMethod
-from casadi_ik.problem.preference import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.questions import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder

@@ -11,9 +11,8 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.grasps.grasp import real_array
 from casadi_ik.methods.hand_first.driver import Searches
-from casadi_ik.problem.preference import preference
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.questions import Questions, preference
 from casadi_ik.problem.status import Status
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run

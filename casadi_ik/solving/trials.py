@@ -17,7 +17,7 @@ from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.method import UNBOUNDED
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.step import HandFirstStep
-from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase

@@ -6,6 +6,10 @@ reversed thumb (virtual joint, the thumb's motors from tip to palm, and some of 
 motors), the other leg the rest of the arm. Both move the same platform, so their twists agree,
 eq. (6). The coordinates of the reversed leg are the negative of the motors' own, because it is
 read from tip to palm.
+
+A chain with k coordinates and the constraint C qdot = 0 of eq. (6) moves in k - rank(C) ways. Any
+choice of that many active coordinates commands it as long as the columns of the passive ones, H_p,
+are regular; which choice is good depends on the configuration (`pivoted`).
 """
 
 from __future__ import annotations
@@ -14,10 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
+from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import ActuatedKinematics
+from casadi_ik.symbolic.kinematics import ActuatedKinematics
 from casadi_ik.symbolic.linear_algebra import solve
 
 VIRTUAL = -1
@@ -179,3 +185,38 @@ def _column(robot_kinematics: ActuatedKinematics, index: int, length: float) -> 
         linear, angular = robot_kinematics.twist(link, palm.origin, [index])
     rotation = palm.rotation
     return ca.densify(ca.vertcat(rotation.T @ linear / length, rotation.T @ angular))
+
+
+def pivoted(constraint: Array) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Active and passive coordinates at one configuration.
+
+    QR with column pivoting (Businger & Golub 1965) takes as passive the columns that are farthest
+    from one another; one counts as dependent if less than 1e-9 of the largest is left of it.
+
+    Args:
+        constraint: C (r, k); rows should be scaled so that lengths and angles compare.
+
+    Returns:
+        Positions of the active columns, as many as the mobility, and of the passive ones, as many
+        as the rank; both in rising order.
+    """
+    left = np.array(constraint, dtype=float)
+    k = left.shape[1]
+    floor = 1e-9 * np.linalg.norm(left, axis=0).max(initial=0.0)
+    passive: list[int] = []
+    for _ in range(min(left.shape)):
+        lengths = np.linalg.norm(left, axis=0)
+        best = int(lengths.argmax())
+        if lengths[best] <= floor:
+            break
+        passive.append(best)
+        direction = left[:, best] / lengths[best]
+        left -= np.outer(direction, direction @ left)
+        left[:, best] = 0.0
+    active = tuple(i for i in range(k) if i not in passive)
+    return active, tuple(sorted(passive))
+
+
+def mobility(constraint: Array) -> int:
+    """In how many ways a chain moves at one configuration: its coordinates less the rank of C."""
+    return len(pivoted(constraint)[0])

@@ -20,7 +20,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.robots.couplings import Coupling, FourBar, LeadScrew, Linear, Polynomial
 from casadi_ik.robots.description import Joint, RobotDescription
-from casadi_ik.symbolic import four_bar, lead_screw
+from casadi_ik.symbolic import mechanisms
 from casadi_ik.symbolic.smooth import Expr
 
 OUTWARDS = 1e-12
@@ -79,17 +79,17 @@ class CouplingRow:
     toggle: Callable[[Any, Expr, Any], Expr] | None = None
 
 
-def linkage(numbers: Any, known: FourBar) -> four_bar.Linkage:
+def linkage(numbers: Any, known: FourBar) -> mechanisms.Linkage:
     """A four-bar with the branch of the known pose (phi_0, theta_3_0) of its description."""
-    described = four_bar.Linkage(known.p, known.q, known.g, known.h)
-    branch = four_bar.branch_from_pose(described, known.phi_0, known.theta_3_0)
-    return four_bar.Linkage(numbers.p, numbers.q, numbers.g, numbers.h, branch)
+    described = mechanisms.Linkage(known.p, known.q, known.g, known.h)
+    branch = mechanisms.branch_from_pose(described, known.phi_0, known.theta_3_0)
+    return mechanisms.Linkage(numbers.p, numbers.q, numbers.g, numbers.h, branch)
 
 
 def _bent(numbers: Any, source: Expr, known: FourBar) -> Expr:
     # Continuous about the known pose, whatever the estimate of its angle.
     bar, phi = linkage(numbers, known), numbers.phi_0 + source
-    return four_bar.theta3(phi, bar, known.theta_3_0) - numbers.theta_3_0
+    return mechanisms.theta3(phi, bar, known.theta_3_0) - numbers.theta_3_0
 
 
 def _horner(coefficients: Sequence[float], source: Expr) -> Expr:
@@ -285,11 +285,11 @@ ROWS: dict[type[Any], CouplingRow] = {
         bounds=lambda c, lower, upper: polynomial_bounds((c.offset, c.ratio), lower, upper),
     ),
     LeadScrew: CouplingRow(
-        follow=lambda c, s, _: lead_screw.angle_from_slider(s, c.b, c.c) - c.theta_0,
-        rate=lambda c, s, _: lead_screw.angle_rate(s, c.b, c.c),
+        follow=lambda c, s, _: mechanisms.angle_from_slider(s, c.b, c.c) - c.theta_0,
+        rate=lambda c, s, _: mechanisms.angle_rate(s, c.b, c.c),
         interval=_screwed_interval,
         bounds=_screwed_bounds,
-        toggle=lambda c, s, _: lead_screw.toggle(s, c.b, c.c),
+        toggle=lambda c, s, _: mechanisms.slider_toggle(s, c.b, c.c),
     ),
     Polynomial: CouplingRow(
         follow=lambda c, x, _: _horner(c.coefficients, x),
@@ -299,10 +299,10 @@ ROWS: dict[type[Any], CouplingRow] = {
     ),
     FourBar: CouplingRow(
         follow=_bent,
-        rate=lambda c, x, known: four_bar.theta3_rate(c.phi_0 + x, linkage(c, known)),
+        rate=lambda c, x, known: mechanisms.theta3_rate(c.phi_0 + x, linkage(c, known)),
         interval=_bent_interval,
         bounds=_bent_bounds,
-        toggle=lambda c, x, known: four_bar.toggle(c.phi_0 + x, linkage(c, known)),
+        toggle=lambda c, x, known: mechanisms.linkage_toggle(c.phi_0 + x, linkage(c, known)),
     ),
 }
 """The kinds of couplings."""

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import casadi as ca
 
-from casadi_ik.symbolic.smooth import Expr, even_function, safe_sqrt
-from casadi_ik.symbolic.so3 import (
+from casadi_ik.symbolic.se3 import (
     angle_over_half_sine,
     half_sinc,
     quaternion_exp,
     quaternion_from_matrix,
     quaternion_to_matrix,
 )
+from casadi_ik.symbolic.smooth import Expr, even_function, safe_sqrt
 
 LEVER_REMAINDER = (2 / 3, 4 / 15, 16 / 105)
 """(2 - theta cot(theta/2)) / sin(theta/2)^2 in powers of sin(theta/2)^2, used below 1e-4."""

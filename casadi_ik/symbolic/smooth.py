@@ -1,4 +1,4 @@
-"""Guards that keep values and first derivatives finite where a formula reads 0/0.
+"""Guards that keep values and first derivatives finite where a formula reads 0/0; shared pieces.
 
 A formula in `s = theta^2` that is analytic at zero is written twice, as its closed form and as
 its Taylor series. Where the series is taken the closed form is evaluated at the fixed point
@@ -52,3 +52,12 @@ def safe_sqrt(s: Expr, floor: float = 1e-300) -> Expr:
 def safe_norm(x: Expr) -> Expr:
     """Euclidean norm of a vector (n, 1); at the zero vector 1e-150 with derivative 0, not NaN."""
     return safe_sqrt(ca.dot(x, x))
+
+
+def shared(*outputs: Expr) -> list[Any]:
+    """The same expressions, every equal piece computed once; to be given to a Function.
+
+    CasADi does not merge equal pieces of an SX graph by itself.
+    """
+    merged: Any = ca.cse(list(outputs))
+    return merged

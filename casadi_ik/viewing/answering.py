@@ -14,9 +14,8 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, UnsupportedError
 from casadi_ik.grasps import Grasp
-from casadi_ik.problem.closest import Closest, closest_points
-from casadi_ik.problem.preference import CLEARANCE
-from casadi_ik.problem.questions import Questions, tolerances_by_finger
+from casadi_ik.problem.clearance import Closest, closest_points
+from casadi_ik.problem.questions import CLEARANCE, Questions, tolerances_by_finger
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.finder import Alternative

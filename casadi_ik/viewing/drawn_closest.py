@@ -6,7 +6,7 @@ import numpy as np
 import viser
 
 from casadi_ik import palette
-from casadi_ik.problem.closest import Closest
+from casadi_ik.problem.clearance import Closest
 
 FAR = 0.25
 """Beyond this nothing is near [m]; the rod would cross the picture."""

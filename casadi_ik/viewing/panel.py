@@ -10,8 +10,8 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Tolerance
-from casadi_ik.problem.preference import CLEARANCE, PREFERENCES
 from casadi_ik.problem.problems import LIMITS
+from casadi_ik.problem.questions import CLEARANCE, PREFERENCES
 from casadi_ik.registry import METHODS
 from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.viewing.answering import Answered

@@ -14,8 +14,8 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import Kind
 from casadi_ik.collision.solids import Solid as CollisionSolid
 from casadi_ik.grasps import Grasp
-from casadi_ik.problem.closest import closest_points
-from casadi_ik.problem.closest import scene_solids as solids_of
+from casadi_ik.problem.clearance import closest_points
+from casadi_ik.problem.clearance import scene_solids as solids_of
 from casadi_ik.views.captions import NEAREST_COLOR
 from casadi_ik.views.shapes import Solid, capsule, with_edges
 

@@ -13,9 +13,8 @@ from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.arms.search import PARAMETERS, ArmTrials, Farthest
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.closed_chain import closed_chain, split
-from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.kinematics import Pose, actuated
 
 LENGTH = 0.1
 """Unit of the constraint's linear rows [m]: about the size of a hand."""

@@ -14,13 +14,10 @@ from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.methods.common.palm_fit import HandContacts, best_palm
 from casadi_ik.papers.qiu import tasks
 from casadi_ik.papers.qiu.tasks import MILLIMETRE, Task, combine, palm_motion
-from casadi_ik.problem.contacts.kinds import USUAL
-from casadi_ik.problem.contacts.rows import ContactRows
-from casadi_ik.problem.target import Target
-from casadi_ik.symbolic import directions, dual_quaternion, four_bar, lead_screw, so3
-from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.problem.contacts import USUAL, ContactRows, Target
+from casadi_ik.symbolic import dual_quaternion, mechanisms, se3
 from casadi_ik.symbolic.closed_chain import closed_chain, split
-from casadi_ik.symbolic.kinematics import Pose
+from casadi_ik.symbolic.kinematics import Pose, actuated
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times, weighted_damped_pinv_times
 from casadi_ik.symbolic.planar_finger import planar_finger
 
@@ -61,9 +58,7 @@ def test_normal_error_and_angle(rng: np.random.Generator) -> None:
     phi = 2 * np.arctan2(np.linalg.norm(current - desired), np.linalg.norm(current + desired))
     across = np.cross(current, desired)
     expected = phi * across / np.linalg.norm(across)
-    assert number(directions.normal_error(ca.SX(current), ca.SX(desired))) == pytest.approx(
-        expected
-    )
+    assert number(se3.normal_error(ca.SX(current), ca.SX(desired))) == pytest.approx(expected)
     assert phi == pytest.approx(np.arccos(current @ desired))
 
 
@@ -141,7 +136,7 @@ def test_palm_motion(robot: ik.ArmHand, rng: np.random.Generator) -> None:
     mean = np.real(logm(U @ V))
     assert number(found[0]) == pytest.approx(np.mean(shifts, axis=0), rel=1e-6)
     assert number(found[1]) == pytest.approx([mean[2, 1], mean[0, 2], mean[1, 0]], rel=1e-6)
-    assert number(so3.mean_rotation(*map(ca.SX, rotations))) == pytest.approx(U @ V)
+    assert number(se3.mean_rotation(*map(ca.SX, rotations))) == pytest.approx(U @ V)
 
 
 def test_best_palm(rng: np.random.Generator) -> None:
@@ -182,9 +177,9 @@ def test_lead_screw() -> None:
     """Chandra (8)."""
     b, c, s = 0.05, 0.014, 0.051
     theta = np.arccos((b**2 + c**2 - s**2) / (2 * b * c))
-    assert number(lead_screw.angle_from_slider(*map(ca.SX, (s, b, c)))) == pytest.approx(theta)
+    assert number(mechanisms.angle_from_slider(*map(ca.SX, (s, b, c)))) == pytest.approx(theta)
     rate = s / (b * c * np.sin(theta))
-    assert number(lead_screw.angle_rate(*map(ca.SX, (s, b, c)))) == pytest.approx(rate)
+    assert number(mechanisms.angle_rate(*map(ca.SX, (s, b, c)))) == pytest.approx(rate)
 
 
 @pytest.mark.parametrize("sigma", [-1, 1])
@@ -200,11 +195,11 @@ def test_four_bar(sigma: int) -> None:
     )
     loop = g + q * np.exp(1j * psi) - p * np.exp(1j * phi) - h * np.exp(1j * (phi + theta))
     assert abs(loop) < 1e-15
-    bar = four_bar.Linkage(*map(ca.SX, (p, q, g, h)), branch=sigma)
-    assert number(four_bar.theta3(ca.SX(phi), bar, theta)) == pytest.approx(theta)
+    bar = mechanisms.Linkage(*map(ca.SX, (p, q, g, h)), branch=sigma)
+    assert number(mechanisms.theta3(ca.SX(phi), bar, theta)) == pytest.approx(theta)
     across = h * np.sin(phi + theta - psi)
     rate = (p * np.sin(psi - phi) - across) / across
-    assert number(four_bar.theta3_rate(ca.SX(phi), bar)) == pytest.approx(rate)
+    assert number(mechanisms.theta3_rate(ca.SX(phi), bar)) == pytest.approx(rate)
 
 
 def test_screws(rng: np.random.Generator) -> None:

@@ -15,10 +15,8 @@ from casadi_ik.methods.thumb_first.closed_chain_step import (
     linearised,
     quadratic_program,
 )
-from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.contacts.kinds import usual
-from casadi_ik.problem.contacts.rows import ContactRows
-from casadi_ik.symbolic.actuated import motor_scales
+from casadi_ik.problem.contacts import LENGTH, ContactRows, usual
+from casadi_ik.symbolic.kinematics import motor_scales
 
 WIDE = 1e3
 ROWS = ContactRows(usual(3))

@@ -14,9 +14,7 @@ import casadi_ik as ik
 from casadi_ik.errors import DescriptionError, InputError, RowError
 from casadi_ik.grasps.grasp import MORE, fault, faulty
 from casadi_ik.logs import one_solve
-from casadi_ik.problem.contacts.arrays import NAMES, by_kinds, more_arrays
-from casadi_ik.problem.contacts.conditions import CONDITIONS
-from casadi_ik.problem.contacts.kinds import ContactKind, usual
+from casadi_ik.problem.contacts import CONDITIONS, NAMES, ContactKind, by_kinds, more_arrays, usual
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 from casadi_ik.proofs.prove import Prover

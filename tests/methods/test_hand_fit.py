@@ -24,9 +24,7 @@ from casadi_ik.methods.hand_first.hand_fit import (
 )
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
-from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.contacts.kinds import usual
-from casadi_ik.problem.contacts.rows import ContactRows, chord, within_tolerance
+from casadi_ik.problem.contacts import LENGTH, ContactRows, chord, usual, within_tolerance
 from casadi_ik.symbolic.kinematics import Pose
 from casadi_ik.symbolic.se3 import compose, exp_se3
 

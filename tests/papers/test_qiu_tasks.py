@@ -23,8 +23,8 @@ from casadi_ik.papers.qiu.tasks import (
     palm_orientation,
     palm_orientation_task,
 )
-from casadi_ik.problem.target import Target
-from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.problem.contacts import Target
+from casadi_ik.symbolic.kinematics import actuated
 
 
 def estimate(robot: ik.ArmHand, points: np.ndarray) -> np.ndarray:

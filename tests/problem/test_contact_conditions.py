@@ -15,9 +15,17 @@ from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.common.whole_contacts import whole_jacobian, whole_residual
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_jacobian, fit_residual
 from casadi_ik.methods.thumb_first.closed_chain_step import contact_errors, linearised
-from casadi_ik.problem.contacts.conditions import CONDITIONS, FACING, LENGTH, PLACE
-from casadi_ik.problem.contacts.kinds import ContactKind, kind_of, suffix, usual
-from casadi_ik.problem.contacts.rows import ContactRows
+from casadi_ik.problem.contacts import (
+    CONDITIONS,
+    FACING,
+    LENGTH,
+    PLACE,
+    ContactKind,
+    ContactRows,
+    kind_of,
+    suffix,
+    usual,
+)
 from casadi_ik.symbolic.se3 import compose, exp_se3
 
 ARM = 7

@@ -9,9 +9,9 @@ from scipy.optimize import brentq
 
 import casadi_ik as ik
 from casadi_ik import robots
-from casadi_ik.symbolic import four_bar, lead_screw
-from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic import mechanisms
 from casadi_ik.symbolic.couplings import linkage
+from casadi_ik.symbolic.kinematics import actuated
 
 FINGERS = ("index", "middle", "ring", "little")
 SLIDERS = (
@@ -127,7 +127,7 @@ def test_slider_to_joint_and_back(ar10):
     for joint in ar10.description.movable:
         coupling, values = joint.coupling, joints[joint.name]
         if isinstance(coupling, robots.LeadScrew):
-            back = lead_screw.slider_from_angle(
+            back = mechanisms.slider_from_angle(
                 ca.DM(values + coupling.theta_0), coupling.b, coupling.c
             )
             expected = q[:, ar10.actuators.index(coupling.of)]
@@ -136,8 +136,8 @@ def test_slider_to_joint_and_back(ar10):
             phi = coupling.phi_0 + joints[coupling.of]
             bar, middle = linkage(coupling, coupling), phi.mean()
             for value, expected in zip(values[20:], phi[20:], strict=True):
-                side = four_bar.inverse_branch_from_pose(bar, expected)
-                back = four_bar.phi_from_theta3(
+                side = mechanisms.inverse_branch_from_pose(bar, expected)
+                back = mechanisms.phi_from_theta3(
                     ca.DM(value + coupling.theta_3_0), bar, side, middle
                 )
                 assert float(back) == pytest.approx(expected, abs=1e-9)
@@ -203,10 +203,10 @@ def test_the_four_bar_keeps_its_branch_to_the_toggle(ar10):
     bar = index.coupling
     assert isinstance(bar, robots.FourBar)
     linked = linkage(bar, bar)
-    end = brentq(lambda phi: float(four_bar.toggle(ca.DM(phi), linked)), 3.33, 6.2)
+    end = brentq(lambda phi: float(mechanisms.linkage_toggle(ca.DM(phi), linked)), 3.33, 6.2)
     phi = np.linspace(bar.phi_0, end, 2000)
-    values = [float(four_bar.theta3(ca.DM(x), linked, bar.theta_3_0)) for x in phi]
+    values = [float(mechanisms.theta3(ca.DM(x), linked, bar.theta_3_0)) for x in phi]
     assert np.isfinite(values).all()
     assert np.abs(np.diff(values)).max() < 0.08
-    rates = [abs(float(four_bar.theta3_rate(ca.DM(x), linked))) for x in phi[[0, 1000, -2]]]
+    rates = [abs(float(mechanisms.theta3_rate(ca.DM(x), linked))) for x in phi[[0, 1000, -2]]]
     assert rates[0] < rates[1] < rates[2]

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from robot_variants import thumb_of
 
-from casadi_ik.symbolic.active_joints import mobility, pivoted
-from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
+from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, mobility, pivoted, split
+from casadi_ik.symbolic.kinematics import actuated
 
 LENGTH = 0.1
 

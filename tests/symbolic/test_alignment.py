@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from casadi_ik.symbolic.alignment import align
+from casadi_ik.symbolic.se3 import align
 
 
 @pytest.fixture(scope="module")

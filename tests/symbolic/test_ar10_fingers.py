@@ -9,9 +9,9 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.robots import FourBar, LeadScrew
 from casadi_ik.symbolic import dual_quaternion as dq
-from casadi_ik.symbolic import four_bar, lead_screw
+from casadi_ik.symbolic import mechanisms
 from casadi_ik.symbolic.couplings import linkage
-from casadi_ik.symbolic.tip_motion import finger_chain, relative_chain
+from casadi_ik.symbolic.screws import finger_chain, relative_chain
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_eq_12_index(ar10, rng):
     motion = tip.at(q)
     bar = joint(ar10, "index_distal").coupling
     assert isinstance(bar, FourBar)
-    f = four_bar.theta3_rate(bar.phi_0 + motion.joints["index_middle"], linkage(bar, bar))
+    f = mechanisms.theta3_rate(bar.phi_0 + motion.joints["index_middle"], linkage(bar, bar))
     s = motion.screws.jacobian
     printed = ca.horzcat(s[:, 0], s[:, 1] + f * s[:, 2])
     rates = []
@@ -40,7 +40,7 @@ def test_eq_12_index(ar10, rng):
         screw = joint(ar10, name).coupling
         assert isinstance(screw, LeadScrew)
         slider = q[ar10.actuators.index(screw.of)]
-        rates.append(lead_screw.angle_rate(slider, screw.b, screw.c))
+        rates.append(mechanisms.angle_rate(slider, screw.b, screw.c))
     sliders = printed @ ca.diag(ca.vertcat(*rates))
     g = ca.Function("g", [q], [motion.joint_jacobian, printed, motion.jacobian, sliders])
     for row in ar10.random(rng, 10):
@@ -73,16 +73,16 @@ def test_round_trips_over_the_full_strokes(ar10):
         if isinstance(coupling, LeadScrew):
             slider = strokes[:, ar10.actuators.index(coupling.of)]
             theta = ca.DM(coupling.theta_0 + joints[each.name]).T
-            back = lead_screw.slider_from_angle(theta, coupling.b, coupling.c)
+            back = mechanisms.slider_from_angle(theta, coupling.b, coupling.c)
             np.testing.assert_allclose(np.array(back).ravel(), slider, atol=1e-15)
             assert (np.diff(joints[each.name]) > 0).all()
         else:
             bar = linkage(coupling, coupling)
             for middle, distal in zip(joints[coupling.of], joints[each.name], strict=True):
                 phi = coupling.phi_0 + middle
-                branch = four_bar.inverse_branch_from_pose(bar, phi)
+                branch = mechanisms.inverse_branch_from_pose(bar, phi)
                 theta_3 = ca.DM(coupling.theta_3_0 + distal)
-                back = four_bar.phi_from_theta3(theta_3, bar, branch, phi)
+                back = mechanisms.phi_from_theta3(theta_3, bar, branch, phi)
                 # Where the rate f passes through zero the inverse loses half the digits.
                 assert float(back) == pytest.approx(phi, abs=1e-7)
                 turned += 1

@@ -15,10 +15,10 @@ from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError
-from casadi_ik.symbolic import couplings, four_bar, lead_screw, screws, se3, tip_motion
+from casadi_ik.symbolic import couplings, mechanisms, screws, se3
 from casadi_ik.symbolic import dual_quaternion as dq
-from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.tip_motion import TipChain, finger_chain, relative_chain
+from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.symbolic.screws import TipChain, finger_chain, relative_chain
 
 EQUATIONS = {
     1: dq.exp_screw,
@@ -28,15 +28,15 @@ EQUATIONS = {
     5: screws.Screws.jacobian,
     6: dq.act_on_line,
     7: screws.Screws.displacements,
-    8: lead_screw.angle_from_slider,
-    9: four_bar.theta3,
+    8: mechanisms.angle_from_slider,
+    9: mechanisms.theta3,
     10: couplings.coupling_rate,
-    11: four_bar.theta3_rate,
-    12: tip_motion.TipMotion.joint_jacobian,
+    11: mechanisms.theta3_rate,
+    12: screws.TipMotion.joint_jacobian,
     13: dq.error,
     14: dq.control_twist,
-    15: tip_motion.TipMotion.joint_jacobian,
-    16: tip_motion.TipMotion.displacement,
+    15: screws.TipMotion.joint_jacobian,
+    16: screws.TipMotion.displacement,
     17: dq.screw_error_norm,
 }
 
@@ -127,8 +127,8 @@ def test_eq_12_is_the_display_of_the_paper(toy, rng):
     tip = finger_chain(toy.description, "left")
     assert tip.drivers == ("left_spread", "left_1", "left_2")
     motion = tip.at(q)
-    bar = four_bar.Linkage(0.0297, 0.0347, 0.0084, 0.0072, -1)
-    f = four_bar.theta3_rate(3.32939008 + motion.joints["left_2"], bar)
+    bar = mechanisms.Linkage(0.0297, 0.0347, 0.0084, 0.0072, -1)
+    f = mechanisms.theta3_rate(3.32939008 + motion.joints["left_2"], bar)
     s = motion.screws.jacobian  # left_spread, left_1, left_2, left_3, left_4
     printed = ca.horzcat(s[:, 0], s[:, 1], s[:, 2] + f * (s[:, 3] - 0.5 * s[:, 4]))
     for row in toy.random(rng, 5):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
+from casadi_ik.symbolic.kinematics import actuated
 
 SPREAD, THUMB_1, THUMB_2 = 7, 8, 9
 

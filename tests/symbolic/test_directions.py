@@ -6,17 +6,14 @@ from algebra_samples import PROPERTY, central_difference, gradient, graph, unit_
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casadi_ik.symbolic import directions
+from casadi_ik.symbolic import se3
 
 V = (3, 1)
-angle = graph(directions.angle_between, V, V)
-error = graph(directions.normal_error, V, V)
-rotation = graph(directions.rotation_between, V, V)
-perpendicular = graph(directions.perpendicular, V)
-gradients = [
-    gradient(f, V, V)
-    for f in (directions.angle_between, directions.normal_error, directions.rotation_between)
-]
+angle = graph(se3.angle_between, V, V)
+error = graph(se3.normal_error, V, V)
+rotation = graph(se3.rotation_between, V, V)
+perpendicular = graph(se3.perpendicular, V)
+gradients = [gradient(f, V, V) for f in (se3.angle_between, se3.normal_error, se3.rotation_between)]
 SPECIAL = [np.array(v, float) for v in ([0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 0])]
 
 

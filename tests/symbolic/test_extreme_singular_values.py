@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.symbolic.extreme_singular_values import extreme_singular_values
+from casadi_ik.symbolic.singular_values import extreme_singular_values
 
 
 def function(m: int, n: int) -> ca.Function:

@@ -6,9 +6,8 @@ import pytest
 from algebra_samples import gradient, graph
 
 from casadi_ik.errors import InputError
-from casadi_ik.symbolic import four_bar
-from casadi_ik.symbolic.four_bar import Linkage
-from casadi_ik.symbolic.lead_screw import angle_from_slider
+from casadi_ik.symbolic import mechanisms
+from casadi_ik.symbolic.mechanisms import Linkage, angle_from_slider
 
 S, B = (1, 1), (5, 1)
 AR10 = Linkage(2.97, 3.47, 0.84, 0.72, -1)
@@ -20,12 +19,12 @@ def bar(b):
     return Linkage(b[0], b[1], b[2], b[3], b[4])
 
 
-psi = graph(lambda phi, b: four_bar.psi(phi, bar(b)), S, B)
-theta3 = graph(lambda phi, b, r: four_bar.theta3(phi, bar(b), r), S, B, S)
-f = graph(lambda phi, b: four_bar.theta3_rate(phi, bar(b)), S, B)
-psi_rate = graph(lambda phi, b: four_bar.psi_rate(phi, bar(b)), S, B)
-toggle = graph(lambda phi, b: four_bar.toggle(phi, bar(b)), S, B)
-inverse = graph(lambda theta, b, s, r: four_bar.phi_from_theta3(theta, bar(b), s, r), S, B, S, S)
+psi = graph(lambda phi, b: mechanisms.psi(phi, bar(b)), S, B)
+theta3 = graph(lambda phi, b, r: mechanisms.theta3(phi, bar(b), r), S, B, S)
+f = graph(lambda phi, b: mechanisms.theta3_rate(phi, bar(b)), S, B)
+psi_rate = graph(lambda phi, b: mechanisms.psi_rate(phi, bar(b)), S, B)
+toggle = graph(lambda phi, b: mechanisms.linkage_toggle(phi, bar(b)), S, B)
+inverse = graph(lambda theta, b, s, r: mechanisms.phi_from_theta3(theta, bar(b), s, r), S, B, S, S)
 
 
 def linkages(count: int, seed: int = 3):
@@ -53,15 +52,15 @@ def test_loop_closes_to_rounding_on_both_branches():
         assert float(toggle(phi, b)) == pytest.approx(np.sin(beta - rod) ** 2, abs=1e-12)
         branches.append(sigma)
         # psi as printed below eq. (9), with sigma for the minus sign
-        A, Bc, C = (float(x) for x in four_bar.coefficients(ca.DM(phi), Linkage(*b)))
+        A, Bc, C = (float(x) for x in mechanisms.coefficients(ca.DM(phi), Linkage(*b)))
         printed = np.arctan2(Bc, A) + sigma * np.arccos(C / np.hypot(A, Bc))
         assert np.cos(printed - rod) == pytest.approx(1, abs=1e-12)
     assert {-1.0, 1.0} == set(branches)
 
 
 def test_rates_match_central_differences_ad_and_eq_11_with_the_crank():
-    theta_ad = gradient(lambda phi, b: four_bar.theta3(phi, bar(b)), S, B)
-    psi_ad = gradient(lambda phi, b: four_bar.psi(phi, bar(b)), S, B)
+    theta_ad = gradient(lambda phi, b: mechanisms.theta3(phi, bar(b)), S, B)
+    psi_ad = gradient(lambda phi, b: mechanisms.psi(phi, bar(b)), S, B)
     step, wrong = 1e-6, []
     for b, phi in linkages(400, seed=4):
         p, _, g, h, _ = b
@@ -121,7 +120,7 @@ def test_inverse_round_trip():
             continue
         count += 1
         theta = float(theta3(phi, b, 0))
-        branch = four_bar.inverse_branch_from_pose(Linkage(*b), phi)
+        branch = mechanisms.inverse_branch_from_pose(Linkage(*b), phi)
         assert float(inverse(theta, b, branch, phi + 0.5)) == pytest.approx(phi, abs=1e-10)
     assert count > 200
 
@@ -129,7 +128,7 @@ def test_inverse_round_trip():
 def test_ar10_inverse_holds_where_the_coupling_is_monotonic():
     """The rate f changes sign at the start of the AR10's range; beyond, the inverse is unique."""
     rates = np.array([float(f(AR10_PHI + x, AR10)) for x in AR10_RANGE])
-    signs = [four_bar.inverse_branch_from_pose(AR10, AR10_PHI + x) for x in AR10_RANGE]
+    signs = [mechanisms.inverse_branch_from_pose(AR10, AR10_PHI + x) for x in AR10_RANGE]
     assert rates[0] < 0
     turn = float(np.interp(0, rates[:20], AR10_RANGE[:20]))
     assert 0 < turn < 0.1
@@ -141,20 +140,20 @@ def test_ar10_inverse_holds_where_the_coupling_is_monotonic():
 
 
 def test_branch_from_a_known_pose():
-    assert four_bar.branch_from_pose(AR10, AR10_PHI, 4.1103) == -1
-    assert four_bar.branch_from_pose(AR10, AR10_PHI, 4.1103 - 2 * np.pi) == -1
-    assert four_bar.branch_from_pose(AR10, AR10_PHI, 2.09) == 1
+    assert mechanisms.branch_from_pose(AR10, AR10_PHI, 4.1103) == -1
+    assert mechanisms.branch_from_pose(AR10, AR10_PHI, 4.1103 - 2 * np.pi) == -1
+    assert mechanisms.branch_from_pose(AR10, AR10_PHI, 2.09) == 1
     for b, phi in linkages(50, seed=6):
         theta = float(theta3(phi, b, 0))
-        assert four_bar.branch_from_pose(Linkage(*b), phi, theta) == b[4]
+        assert mechanisms.branch_from_pose(Linkage(*b), phi, theta) == b[4]
     with pytest.raises(InputError, match="cannot be assembled"):
-        four_bar.branch_from_pose(Linkage(1.0, 0.1, 3.0, 0.1), 3.0, 0.0)
+        mechanisms.branch_from_pose(Linkage(1.0, 0.1, 3.0, 0.1), 3.0, 0.0)
 
 
 def test_beyond_assembly_everything_stays_finite_and_the_measure_says_so():
     gradients = [
         gradient(lambda phi, b, g=g: g(phi, bar(b)), S, B)
-        for g in (four_bar.psi, four_bar.theta3, four_bar.theta3_rate, four_bar.psi_rate)
+        for g in (mechanisms.psi, mechanisms.theta3, mechanisms.theta3_rate, mechanisms.psi_rate)
     ]
     rng = np.random.default_rng(8)
     outside = 0

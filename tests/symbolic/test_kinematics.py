@@ -7,10 +7,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.couplings import joint_positions
-from casadi_ik.symbolic.kinematics import axis_rotation, forward
-from casadi_ik.symbolic.so3 import euler_zyx
+from casadi_ik.symbolic.kinematics import actuated, axis_rotation, forward
+from casadi_ik.symbolic.se3 import euler_zyx
 
 
 @pytest.fixture(params=["shipped", "coupled"])

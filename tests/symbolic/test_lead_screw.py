@@ -6,14 +6,14 @@ from algebra_samples import PROPERTY, central_difference, gradient, graph
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casadi_ik.symbolic import lead_screw
+from casadi_ik.symbolic import mechanisms
 
 S = (1, 1)
-angle = graph(lead_screw.angle_from_slider, S, S, S)
-slider = graph(lead_screw.slider_from_angle, S, S, S)
-rate = graph(lead_screw.angle_rate, S, S, S)
-toggle = graph(lead_screw.toggle, S, S, S)
-angle_gradient = gradient(lead_screw.angle_from_slider, S, S, S)
+angle = graph(mechanisms.angle_from_slider, S, S, S)
+slider = graph(mechanisms.slider_from_angle, S, S, S)
+rate = graph(mechanisms.angle_rate, S, S, S)
+toggle = graph(mechanisms.slider_toggle, S, S, S)
+angle_gradient = gradient(mechanisms.angle_from_slider, S, S, S)
 
 # b, c, shortest and longest slider [mm]; angle there [rad], facts/robots.md section 3.
 AR10 = {

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from algebra_samples import central_difference, gradient, graph
 
-from casadi_ik.symbolic import measures
+from casadi_ik.symbolic import singular_values as sv
 
 SHAPES = [(3, 9), (2, 9), (6, 4), (6, 6), (3, 3), (1, 5), (6, 14)]
-SVD = {shape: graph(measures.svd, shape) for shape in SHAPES}
-VALUES = {shape: graph(measures.singular_values, shape) for shape in SHAPES}
+SVD = {shape: graph(sv.svd, shape) for shape in SHAPES}
+VALUES = {shape: graph(sv.singular_values, shape) for shape in SHAPES}
 
 
 def samples(rng: np.random.Generator, m: int, n: int, count: int):
@@ -51,7 +51,8 @@ def test_default_sweeps_leave_a_margin():
     """One sweep fewer than the default is already good to 1e-4: the last one squares that."""
     for m, n in [(3, 9), (6, 4), (6, 6)]:
         fewer = graph(
-            lambda J: measures.singular_values(J, measures.SWEEPS[min(J.shape)] - 1), (m, n)
+            lambda J: sv.singular_values(J, sv.SWEEPS[min(J.shape)] - 1),
+            (m, n),
         )
         for A in samples(np.random.default_rng(6), m, n, 100):
             expected = np.linalg.svd(A, compute_uv=False)
@@ -60,7 +61,7 @@ def test_default_sweeps_leave_a_margin():
 
 def test_condition_number_is_capped():
     s = ca.SX.sym("s", 3)
-    f = ca.Function("f", [s], [measures.condition_number(s, 1e6)])
+    f = ca.Function("f", [s], [sv.condition_number(s, 1e6)])
     assert float(f([4, 2, 1])) == pytest.approx(4)
     assert float(f([1, 1e-9, 1])) == pytest.approx(1e6)
     assert float(f([0, 0, 0])) == pytest.approx(1e6)
@@ -69,7 +70,10 @@ def test_condition_number_is_capped():
 @pytest.mark.parametrize("shape", [(3, 9), (6, 4), (6, 6)])
 def test_manipulability(shape):
     rng = np.random.default_rng(7)
-    f, df = graph(measures.manipulability, shape), gradient(measures.manipulability, shape)
+    f, df = (
+        graph(sv.manipulability, shape),
+        gradient(sv.manipulability, shape),
+    )
     for _ in range(20):
         A = rng.standard_normal(shape)
         assert float(f(A)) == pytest.approx(np.prod(np.linalg.svd(A)[1]), rel=1e-10)

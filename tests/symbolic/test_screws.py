@@ -8,8 +8,7 @@ import pytest
 
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.symbolic import dual_quaternion as dq
-from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.kinematics import forward
+from casadi_ik.symbolic.kinematics import actuated, forward
 from casadi_ik.symbolic.screws import screw_chain_to_contact, screw_chain_to_link
 
 

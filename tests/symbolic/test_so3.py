@@ -19,25 +19,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from casadi_ik.symbolic import so3
+from casadi_ik.symbolic import se3
 
 V, M, Q, S = (3, 1), (3, 3), (4, 1), (1, 1)
-exp = graph(so3.exp_so3, V)
-log = graph(so3.log_so3, M)
-about = graph(so3.rotation_about_axis, V, S)
-quaternion_exp = graph(so3.quaternion_exp, V)
-quaternion_log = graph(so3.quaternion_log, Q)
-from_matrix = graph(so3.quaternion_from_matrix, M)
-to_matrix = graph(so3.quaternion_to_matrix, Q)
-rpy = graph(so3.rpy_to_matrix, V)
-to_rpy = graph(so3.matrix_to_rpy, M)
-euler = graph(so3.euler_zyx, M)
-euler_matrix = graph(so3.euler_zyx_to_angular_velocity, V)
-euler_inverse = graph(so3.angular_velocity_to_euler_zyx, V)
-mean = graph(so3.mean_rotation, M, M)
-project = graph(so3.project_to_rotation, M)
-log_of_exp_gradient = gradient(lambda w: so3.log_so3(so3.exp_so3(w)), V)
-exp_gradient = gradient(so3.exp_so3, V)
+exp = graph(se3.exp_so3, V)
+log = graph(se3.log_so3, M)
+about = graph(se3.rotation_about_axis, V, S)
+quaternion_exp = graph(se3.quaternion_exp, V)
+quaternion_log = graph(se3.quaternion_log, Q)
+from_matrix = graph(se3.quaternion_from_matrix, M)
+to_matrix = graph(se3.quaternion_to_matrix, Q)
+rpy = graph(se3.rpy_to_matrix, V)
+to_rpy = graph(se3.matrix_to_rpy, M)
+euler = graph(se3.euler_zyx, M)
+euler_matrix = graph(se3.euler_zyx_to_angular_velocity, V)
+euler_inverse = graph(se3.angular_velocity_to_euler_zyx, V)
+mean = graph(se3.mean_rotation, M, M)
+project = graph(se3.project_to_rotation, M)
+log_of_exp_gradient = gradient(lambda w: se3.log_so3(se3.exp_so3(w)), V)
+exp_gradient = gradient(se3.exp_so3, V)
 
 
 def svd_projection(A: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ def test_rotation_about_an_axis_is_the_exponential(axis, angle):
 
 def test_rotation_about_a_coordinate_axis_folds_to_four_entries():
     angle = ca.SX.sym("angle")
-    R = so3.rotation_about_axis(ca.DM([0, 0, 1]), angle)
+    R = se3.rotation_about_axis(ca.DM([0, 0, 1]), angle)
     assert R.is_dense()
     assert str(R[2, 2]) == "1"
     assert str(R[0, 2]) == str(R[2, 1]) == "0"
@@ -84,8 +84,8 @@ def test_rotation_about_a_coordinate_axis_folds_to_four_entries():
 @PROPERTY
 @given(vectors, vectors)
 def test_skew_is_the_cross_product(a, b):
-    assert np.allclose(so3.skew(ca.DM(a)).full() @ b, np.cross(a, b), rtol=0, atol=1e-15)
-    assert np.array_equal(so3.unskew(so3.skew(ca.DM(a))).full()[:, 0], a)
+    assert np.allclose(se3.skew(ca.DM(a)).full() @ b, np.cross(a, b), rtol=0, atol=1e-15)
+    assert np.array_equal(se3.unskew(se3.skew(ca.DM(a))).full()[:, 0], a)
 
 
 @PROPERTY
@@ -114,7 +114,7 @@ def test_gimbal_lock_keeps_the_rotation(pitch):
     found = to_rpy(R).full()[:, 0]
     assert found[0] == 0
     assert np.allclose(rpy(found).full(), R.full(), rtol=0, atol=1e-15)
-    assert gradient(so3.matrix_to_rpy, M)(R).is_regular()
+    assert gradient(se3.matrix_to_rpy, M)(R).is_regular()
     assert euler_inverse([0.4, pitch, 0.1]).is_regular()
 
 
@@ -128,7 +128,7 @@ def test_euler_rates(rpy_angles):
     dR = central_difference(rpy, np.array([gamma, beta, alpha]))[:, ::-1]
     for k in range(3):
         spin = dR[:, k].reshape(3, 3, order="F") @ R.T
-        assert np.allclose(so3.unskew(ca.DM(spin)).full()[:, 0], E[:, k], rtol=0, atol=1e-9)
+        assert np.allclose(se3.unskew(ca.DM(spin)).full()[:, 0], E[:, k], rtol=0, atol=1e-9)
 
 
 @PROPERTY
@@ -165,20 +165,20 @@ def test_derivative_of_log_after_exp_is_the_identity(w):
 
 def test_derivatives_are_finite_at_the_identity_and_at_half_turns():
     rng = np.random.default_rng(1)
-    log_gradient, mean_gradient = gradient(so3.log_so3, M), gradient(so3.mean_rotation, M, M)
+    log_gradient, mean_gradient = gradient(se3.log_so3, M), gradient(se3.mean_rotation, M, M)
     turns = [np.diag(d) for d in ([1.0, 1, 1], [1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])]
     for R in [*turns, *(random_rotation(rng) for _ in range(5))]:
         assert log_gradient(R).is_regular()
         assert mean_gradient(R, turns[0]).is_regular()
-    assert gradient(so3.project_to_rotation, M)(np.eye(3)).is_regular()
-    assert gradient(so3.rotation_about_axis, V, S)([0, 0, 1], 0).is_regular()
-    half_turn = gradient(so3.quaternion_log, Q)
+    assert gradient(se3.project_to_rotation, M)(np.eye(3)).is_regular()
+    assert gradient(se3.rotation_about_axis, V, S)([0, 0, 1], 0).is_regular()
+    half_turn = gradient(se3.quaternion_log, Q)
     assert half_turn([0, 1, 0, 0]).is_regular()
     assert half_turn([-1, 0, 0, 0]).is_regular()
 
 
 def test_graphs_take_mx_and_dm():
     x = ca.MX.sym("x", 3)
-    f = ca.Function("f", [x], [so3.log_so3(so3.exp_so3(x))])
+    f = ca.Function("f", [x], [se3.log_so3(se3.exp_so3(x))])
     assert np.allclose(f([0.1, 0.2, 0.3]).full()[:, 0], [0.1, 0.2, 0.3], rtol=0, atol=1e-15)
-    assert isinstance(so3.exp_so3(ca.DM([0.1, 0.2, 0.3])), ca.DM)
+    assert isinstance(se3.exp_so3(ca.DM([0.1, 0.2, 0.3])), ca.DM)

@@ -22,8 +22,8 @@ import numpy as np
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import GraspObject, Sphere
 from casadi_ik.robots import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.so3 import exp_so3
+from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.symbolic.se3 import exp_so3
 from grasp_synthesis.patches import Patch, primitive
 from grasp_synthesis.programme import Programme
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.robots import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.kinematics import actuated
 from grasp_synthesis.fingertip_pinch import TipPinch
 from grasp_synthesis.programme import OPTIONS
 

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.methods.common.contact_fit import Tried
-from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.contacts.rows import ContactRows, chord, within_tolerance
+from casadi_ik.problem.contacts import LENGTH, ContactRows, chord, within_tolerance
 from casadi_ik.symbolic.smooth import Expr
 
 POWERS = (4.0, 10.0, 24.0, 60.0, 150.0, 400.0)

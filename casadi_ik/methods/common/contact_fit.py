@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi as ca
 
-from casadi_ik.problem.contacts.rows import ContactRows, chord, within_tolerance
+from casadi_ik.problem.contacts import ContactRows, chord, within_tolerance
 from casadi_ik.symbolic.smooth import Expr
 
 DAMPING_START = 1e-3

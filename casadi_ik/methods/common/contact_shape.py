@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.recipe import recipe
-from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts import LENGTH
 
 
 def contact_shape(f: int, scales: Sequence[float] | NDArray = ()) -> FunctionGraph:

@@ -14,14 +14,12 @@ import numpy as np
 
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
 from casadi_ik.methods.common.contact_fit import DAMPING_FLOOR, EXACT, Tried
-from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.even_spread import evenly
-from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.so3 import skew
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.kinematics import Pose, actuated
+from casadi_ik.symbolic.se3 import skew
+from casadi_ik.symbolic.smooth import Expr, shared
 
 TABLE = 1024
 """Configurations of the arm to start from."""

@@ -15,11 +15,10 @@ from casadi_ik.kernels.layout import Layout
 from casadi_ik.methods.common.balance import DAMPING, reweighted
 from casadi_ik.methods.common.bounded_step import in_box
 from casadi_ik.methods.common.contact_fit import Tried
-from casadi_ik.problem.contacts.rows import ContactRows, resting, tip_rates, tip_vectors
+from casadi_ik.problem.contacts import ContactRows, resting, tip_rates, tip_vectors
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.symbolic.smooth import Expr, shared
 
 PASSES = 2
 """Corrections of the active set in a step."""

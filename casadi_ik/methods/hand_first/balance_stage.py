@@ -9,7 +9,7 @@ from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.whole_contacts import WholeStep
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import shared
 
 
 def balance_stage(layouts: HandFirstLayouts) -> ca.Function:

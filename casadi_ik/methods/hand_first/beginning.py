@@ -12,11 +12,10 @@ from casadi_ik.kernels.recipe import recipe
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.common.numeric_arm import SIX
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
-from casadi_ik.problem.contacts.kinds import suffix
+from casadi_ik.problem.contacts import suffix
 from casadi_ik.problem.status import Phase
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import Expr, shared
 
 
 def terms(robot: RobotDescription) -> Layout:

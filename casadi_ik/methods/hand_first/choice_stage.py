@@ -9,7 +9,7 @@ from casadi_ik.arms.search import PARAMETERS, ArmTrials, Nearest, is_allowed
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import shared
 
 
 def choice_stage(layouts: HandFirstLayouts, family: ArmFamily) -> ca.Function:

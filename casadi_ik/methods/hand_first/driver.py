@@ -35,7 +35,7 @@ from casadi_ik.methods.hand_first.beginning import terms
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds
 from casadi_ik.methods.hand_first.state import CARRIED, STAGE_LABELS, STAGES, HandFirstLayouts
-from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status

@@ -16,12 +16,10 @@ from casadi_ik.methods.common.bounded_step import clip, damped_step
 from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.methods.common.palm_fit import HandContacts, hand_contacts
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
-from casadi_ik.problem.contacts.conditions import LENGTH, Vectors
-from casadi_ik.problem.contacts.rows import ContactRows
+from casadi_ik.problem.contacts import LENGTH, ContactRows, Vectors
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.se3 import compose, exp_se3
+from casadi_ik.symbolic.se3 import compose, exp_se3, skew
 from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.so3 import skew
 
 PASSES = 2
 """Corrections of the active set in a step."""

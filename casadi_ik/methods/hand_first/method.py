@@ -22,10 +22,10 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds
 from casadi_ik.methods.hand_first.state import STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
-from casadi_ik.problem.contacts.kinds import Kinds, usual
+from casadi_ik.problem.contacts import Kinds, usual
 from casadi_ik.problem.method import Outcome, Quick
-from casadi_ik.problem.preference import PREFERENCES
 from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.questions import PREFERENCES
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.proofs.premises import ArmSpan, arm_span, palms_in_span

@@ -14,11 +14,10 @@ from casadi_ik.methods.common.numeric_arm import (
     pose_step,
 )
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
-from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import Expr, shared
 
 
 def numeric_stage(layouts: HandFirstLayouts) -> ca.Function:

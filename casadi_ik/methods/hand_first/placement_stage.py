@@ -10,7 +10,7 @@ from casadi_ik.methods.common.numeric_arm import newton_polish
 from casadi_ik.methods.hand_first.state import HandFirstLayouts, with_rows
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import shared
 
 
 def placement_stage(layouts: HandFirstLayouts, family: ArmFamily) -> ca.Function:

@@ -17,14 +17,13 @@ from casadi_ik.kernels import FunctionGraph, FunctionKernel
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.alignment import align
 from casadi_ik.symbolic.even_spread import evenly
+from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.linear_algebra import solve_spd
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.se3 import align
+from casadi_ik.symbolic.smooth import Expr, shared
 
 FEATURES = 8
 """Numbers of a row: point / `LENGTH` and normal in the palm frame, and the square of either."""

@@ -6,10 +6,9 @@ import casadi as ca
 
 from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
-from casadi_ik.problem.contacts.rows import chord, within_tolerance
+from casadi_ik.problem.contacts import chord, within_tolerance
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import Expr, shared
 
 WHOLE = 0.5
 """Cost up to which a start is refined as a whole (three contacts off by 4 cm each)."""

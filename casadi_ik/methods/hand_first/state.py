@@ -14,8 +14,7 @@ from casadi_ik.methods.common.contact_fit import Tried
 from casadi_ik.methods.common.coupling_record import coupling_fields, coupling_values
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.methods.common.whole_contacts import WholeContacts
-from casadi_ik.problem.contacts.kinds import Kinds
-from casadi_ik.problem.contacts.rows import ContactRows
+from casadi_ik.problem.contacts import ContactRows, Kinds
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import (
     ACCEPTED,

@@ -39,11 +39,10 @@ from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
 from casadi_ik.methods.hand_first.placement_stage import placement_stage
 from casadi_ik.methods.hand_first.start_stage import at_start, start_stage
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_rows
-from casadi_ik.problem.contacts.kinds import Kinds, suffix
+from casadi_ik.problem.contacts import Kinds, suffix
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import Expr, shared
 
 OWN_HAND = 0.5
 """Cost, with the best palm, up to which the hand as it is is fitted before other hands."""

@@ -9,7 +9,7 @@ from casadi_ik.methods.common.whole_contacts import WholeContacts, WholeStep
 from casadi_ik.methods.thumb_first.merit import merit
 from casadi_ik.methods.thumb_first.state import ThumbFirstLayouts
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import shared
 
 
 def balance_stage(layouts: ThumbFirstLayouts) -> ca.Function:

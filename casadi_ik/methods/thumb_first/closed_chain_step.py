@@ -18,13 +18,11 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.methods.thumb_first.proxqp import proxqp
-from casadi_ik.problem.contacts.conditions import LENGTH, PLACE
-from casadi_ik.problem.contacts.rows import ContactRows, tip_vectors
+from casadi_ik.problem.contacts import LENGTH, PLACE, ContactRows, tip_vectors
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import ActuatedKinematics, actuated, motor_scales
+from casadi_ik.symbolic.kinematics import ActuatedKinematics, actuated, motor_scales
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times, project_to_null_space
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import Expr, shared
 
 THUMB_DAMPING = 0.01
 """Least damping [-] of the thumb's rows, 1 mm per rad: J_t^# stays finite where J_t is singular."""

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from casadi_ik.methods.thumb_first.closed_chain_step import contact_errors
-from casadi_ik.problem.contacts.conditions import LENGTH
-from casadi_ik.problem.contacts.rows import ContactRows
+from casadi_ik.problem.contacts import LENGTH, ContactRows
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr, safe_norm
 

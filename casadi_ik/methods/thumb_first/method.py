@@ -16,10 +16,9 @@ from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.methods.thumb_first.state import STAGES
 from casadi_ik.methods.thumb_first.step import ThumbFirstStep
-from casadi_ik.problem.contacts.kinds import Kinds, usual
+from casadi_ik.problem.contacts import Kinds, target_values, usual
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
-from casadi_ik.problem.target import target_values
 from casadi_ik.robots.description import RobotDescription
 
 UNBOUNDED = 1e3

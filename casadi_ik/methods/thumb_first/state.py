@@ -11,8 +11,7 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.methods.thumb_first.merit import Merit
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
-from casadi_ik.problem.contacts.kinds import Kinds
-from casadi_ik.problem.contacts.rows import ContactRows
+from casadi_ik.problem.contacts import ContactRows, Kinds
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import (
     ACCEPTED,

@@ -40,13 +40,10 @@ from casadi_ik.methods.thumb_first.closed_chain_step import (
 )
 from casadi_ik.methods.thumb_first.merit import Merit, merit
 from casadi_ik.methods.thumb_first.state import STAGES, ThumbFirstLayouts
-from casadi_ik.problem.contacts.kinds import suffix
-from casadi_ik.problem.contacts.rows import within_tolerance
+from casadi_ik.problem.contacts import suffix, within_tolerance
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.symbolic.actuated import motor_scales
-from casadi_ik.symbolic.kinematics import Pose
-from casadi_ik.symbolic.smooth import Expr
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.kinematics import Pose, motor_scales
+from casadi_ik.symbolic.smooth import Expr, shared
 
 EASED, TIGHTENED = 1 / 3, 4.0
 """Factors of the damping after a step that lowered the cost and after one that did not."""

@@ -28,10 +28,15 @@ from casadi_ik.papers.qiu.tasks import (
     weighted,
     weighted_damped,
 )
-from casadi_ik.problem.contacts.rows import within_tolerance
+from casadi_ik.problem.contacts import (
+    contact_errors,
+    target_fields,
+    target_values,
+    targets,
+    within_tolerance,
+)
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.target import contact_errors, target_fields, target_values, targets
 from casadi_ik.problem.trace import (
     ANGLE_ERROR,
     LIMIT_MASK,
@@ -43,11 +48,10 @@ from casadi_ik.problem.trace import (
     RecordedJacobian,
 )
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
 from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, split
-from casadi_ik.symbolic.measures import condition_number, singular_values
-from casadi_ik.symbolic.smooth import Expr, safe_norm
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.symbolic.singular_values import condition_number, singular_values
+from casadi_ik.symbolic.smooth import Expr, safe_norm, shared
 
 NOT_MEASURED = float("nan")
 

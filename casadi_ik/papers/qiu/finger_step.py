@@ -21,7 +21,7 @@ from typing import Any
 
 import casadi as ca
 
-from casadi_ik.problem.target import Target
+from casadi_ik.problem.contacts import Target
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.planar_finger import PlanarFinger, planar_finger
 from casadi_ik.symbolic.smooth import Expr

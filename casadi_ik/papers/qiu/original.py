@@ -22,10 +22,15 @@ from casadi_ik.papers.qiu.tasks import (
     selective,
     thumb_first,
 )
-from casadi_ik.problem.contacts.rows import within_tolerance
+from casadi_ik.problem.contacts import (
+    contact_errors,
+    target_fields,
+    target_values,
+    targets,
+    within_tolerance,
+)
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
-from casadi_ik.problem.target import contact_errors, target_fields, target_values, targets
 from casadi_ik.problem.trace import (
     ANGLE_ERROR,
     LIMIT_MASK,
@@ -36,9 +41,9 @@ from casadi_ik.problem.trace import (
     Q,
 )
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import actuated
+from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times
-from casadi_ik.symbolic.subexpressions import shared
+from casadi_ik.symbolic.smooth import shared
 
 
 class OriginalStep:

@@ -14,23 +14,25 @@ import casadi as ca
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.problem.contacts.kinds import USUAL
-from casadi_ik.problem.contacts.rows import tip_vectors
-from casadi_ik.problem.target import Target
+from casadi_ik.problem.contacts import USUAL, Target, tip_vectors
 from casadi_ik.robots.description import RobotDescription
-from casadi_ik.symbolic.actuated import ActuatedKinematics
-from casadi_ik.symbolic.directions import rotation_between
-from casadi_ik.symbolic.kinematics import forward, number
+from casadi_ik.symbolic.kinematics import ActuatedKinematics, forward, number
 from casadi_ik.symbolic.linear_algebra import (
     damped_pinv_times,
     project_to_null_space,
     solve_spd,
     weighted_damped_pinv_times,
 )
-from casadi_ik.symbolic.measures import svd
-from casadi_ik.symbolic.se3 import log_se3
+from casadi_ik.symbolic.se3 import (
+    euler_zyx,
+    log_se3,
+    log_so3,
+    mean_rotation,
+    project_to_rotation,
+    rotation_between,
+)
+from casadi_ik.symbolic.singular_values import svd
 from casadi_ik.symbolic.smooth import Expr, safe_norm
-from casadi_ik.symbolic.so3 import euler_zyx, log_so3, mean_rotation, project_to_rotation
 
 MILLIMETRE = 1e-3
 """The paper's solvers work in millimetres and radians: their damping factors say so."""

@@ -30,7 +30,7 @@ from casadi_ik.kernels.machine_lanes import machine_lanes
 from casadi_ik.kernels.measure_kernel import MeasureKernel
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
-from casadi_ik.problem.preference import CLEARANCE
+from casadi_ik.problem.questions import CLEARANCE
 from casadi_ik.symbolic.even_spread import evenly
 
 SYMBOL = "casadi_ik_arm_search"

@@ -17,14 +17,13 @@ from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.problem.clearance import Surroundings
-from casadi_ik.problem.palm_targets import free_palms
-from casadi_ik.problem.preference import CLEARANCE, preference
 from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.questions import CLEARANCE, free_palms, preference
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
 from casadi_ik.solving.trials import Bounds, Descent, HandMethod, Trials, repeated
-from casadi_ik.symbolic.actuated import actuated
-from casadi_ik.symbolic.measures import manipulability
+from casadi_ik.symbolic.kinematics import actuated
+from casadi_ik.symbolic.singular_values import manipulability
 
 PALMS = np.array([0.1, 0.1, 0.1, 2.0])
 """What turns [rad] and shifts [m] of a palm that is free count as, beside parts of ranges."""

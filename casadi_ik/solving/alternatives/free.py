@@ -23,10 +23,10 @@ from casadi_ik.answers.solution import BatchSolution, CollisionReport
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.problem.clearance import ROUNDING, Clearances, Surroundings
-from casadi_ik.problem.contacts.arrays import by_kinds
+from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.palm_targets import free_palms
-from casadi_ik.problem.preference import CLEARANCE
+from casadi_ik.problem.questions import free_palms
+from casadi_ik.problem.questions import CLEARANCE
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one

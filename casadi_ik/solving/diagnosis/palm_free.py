@@ -14,7 +14,7 @@ from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.arms.srs import SrsArm
 from casadi_ik.arrays import Array
 from casadi_ik.methods.common.contact_fit import fresh_fit
-from casadi_ik.problem.contacts.conditions import LENGTH
+from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.verdict import ContactVerdict, judge

@@ -1,16 +1,18 @@
-"""The four-bar that bends a finger's last joint: Chandra et al. 2019, eqs. (9)-(11).
+"""The mechanisms that bend fingers: the slider triangle and the four-bar of Chandra et al. 2019.
 
-Pivots O = (0, 0) and C = (g, 0) are fixed to the proximal phalanx. The crank OP of length p is
-the middle phalanx at the angle phi, the rod CQ of length q stands at psi, and PQ of length h is
-fixed to the distal phalanx at the angle phi + theta3. All angles are in rad, all lengths in one
-unit.
+*Lead screw*, eq. (8): a screw of length s between two arms b and c of a joint, s^2 = b^2 + c^2 -
+2 b c cos(theta). All lengths share one unit (m); theta in (0, pi) is the angle between the arms,
+from which a joint angle differs by an offset. Outside [|b - c|, b + c] there is no triangle;
+there theta stays within 1e-8 rad of 0 or pi, with derivative 0, so that nothing turns into NaN.
 
-The loop closes in two ways. `branch` = sigma = +-1 picks one and is the sign of
-sin(phi + theta3 - psi). The paper prints sigma = -1 only, and an `a` in eq. (11) that is the crank
-p (McCarthy's letter): with a = g the formula fails against finite differences. Both branches share
-one form of (11).
-
-Where the linkage cannot be assembled (`toggle` < 0) rod and coupler stay aligned: values and
+*Four-bar*, eqs. (9) to (11), that bends a finger's last joint. Pivots O = (0, 0) and C = (g, 0)
+are fixed to the proximal phalanx. The crank OP of length p is the middle phalanx at the angle
+phi, the rod CQ of length q stands at psi, and PQ of length h is fixed to the distal phalanx at
+the angle phi + theta3. All angles are in rad, all lengths in one unit. The loop closes in two
+ways. `branch` = sigma = +-1 picks one and is the sign of sin(phi + theta3 - psi). The paper
+prints sigma = -1 only, and an `a` in eq. (11) that is the crank p (McCarthy's letter): with a = g
+the formula fails against finite differences. Both branches share one form of (11). Where the
+linkage cannot be assembled (`linkage_toggle` < 0) rod and coupler stay aligned: values and
 derivatives remain finite, and the measure tells.
 """
 
@@ -45,7 +47,7 @@ def coefficients(phi: Expr, bar: Linkage) -> tuple[Expr, Expr, Expr]:
     return pq2 * c - 2 * g * q, pq2 * s, (g * g + p * p + q * q - h * h) - (2 * p * g) * c
 
 
-def toggle(phi: Expr, bar: Linkage) -> Expr:
+def linkage_toggle(phi: Expr, bar: Linkage) -> Expr:
     """Distance from the singular position: sin^2 of the angle between rod and coupler.
 
     (A^2 + B^2 - C^2) / (2 q h)^2: 1 where rod and coupler stand at right angles, 0 where they
@@ -135,7 +137,7 @@ def branch_from_pose(bar: Linkage, phi: float, theta: float) -> int:
     Raises:
         InputError: the linkage cannot be assembled at phi.
     """
-    if float(toggle(ca.DM(phi), bar)) < 0:
+    if float(linkage_toggle(ca.DM(phi), bar)) < 0:
         raise InputError(f"four-bar {tuple(bar[:4])} cannot be assembled at phi = {phi:g} rad")
 
     def distance(branch: int) -> float:
@@ -158,3 +160,52 @@ def _rod(phi: Expr, bar: Linkage) -> tuple[tuple[Expr, Expr], Expr]:
     # Unit length by construction where the loop closes; elsewhere C^2 + root^2 exceeds A^2 + B^2.
     scale = 1 / ca.sqrt((A * A + B * B) * (C * C + root * root))
     return (scale * (A * C - signed * B), scale * (B * C + signed * A)), root
+
+
+FLAT = 1e-16
+"""The triangle's two slacks are kept above FLAT b c [m^2]."""
+
+
+def angle_from_slider(s: Expr, b: Expr, c: Expr) -> Expr:
+    """Angle theta [rad] of a slider length s [m]: Chandra eq. (8).
+
+    As 2 atan sqrt((s^2 - (b - c)^2) / ((b + c)^2 - s^2)), which unlike acos keeps all digits
+    near the flat triangles.
+
+    Args:
+        s: slider length [m].
+        b: first arm [m].
+        c: second arm [m].
+    """
+    low, high = _slacks(s, b, c)
+    return 2 * ca.atan(ca.sqrt(low / high))
+
+
+def slider_from_angle(theta: Expr, b: Expr, c: Expr) -> Expr:
+    """Slider length s [m] of an angle theta [rad]; arms b, c [m], b != c. Inverts eq. (8)."""
+    half = ca.sin(0.5 * theta)
+    return ca.sqrt((b - c) * (b - c) + (4 * b * c) * (half * half))
+
+
+def angle_rate(s: Expr, b: Expr, c: Expr) -> Expr:
+    """Rate d theta / d s = s / (b c sin theta) [rad/m] at the slider length s [m]."""
+    low, high = _slacks(s, b, c)
+    return 2 * s / ca.sqrt(low * high)
+
+
+def slider_toggle(s: Expr, b: Expr, c: Expr) -> Expr:
+    """Distance from the flat triangle: sin^2(theta).
+
+    1 where the slider pushes at right angles to the crank, 0 where the triangle is flat and the
+    rate blows up, negative where there is no triangle. Smooth.
+    """
+    return ((s * s - (b - c) * (b - c)) * ((b + c) * (b + c) - s * s)) / (4 * b * b * c * c)
+
+
+def _slacks(s: Expr, b: Expr, c: Expr) -> tuple[Expr, Expr]:
+    """s^2 - (b - c)^2 = 4 b c sin^2(theta/2) and (b + c)^2 - s^2 = 4 b c cos^2(theta/2)."""
+    short, long, flat = b - c, b + c, FLAT * b * c
+    return (
+        ca.fmax((s - short) * (s + short), flat),
+        ca.fmax((long - s) * (long + s), flat),
+    )
