@@ -25,10 +25,8 @@ from casadi_ik.grasps.pose import inverse, moved, one_pose
 from casadi_ik.problem.clearance import ROUNDING, Surroundings
 from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.questions import free_palms
-from casadi_ik.problem.questions import CLEARANCE
 from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.questions import CLEARANCE, Questions, free_palms
 from casadi_ik.problem.status import Status
 from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import APART, DISTINCT, checked_distance

@@ -7,8 +7,8 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.questions import PREFERENCES
 from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.questions import PREFERENCES
 from casadi_ik.solving.alternatives.arm_search import ArmSearch
 from casadi_ik.solving.alternatives.free import (
     Deduplicator,

@@ -25,9 +25,8 @@ from casadi_ik.arrays import Array, Bools
 from casadi_ik.problem.clearance import ROUNDING, Clearances, Surroundings
 from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.questions import free_palms
-from casadi_ik.problem.questions import CLEARANCE
 from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.questions import CLEARANCE, free_palms
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
