@@ -12,6 +12,8 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from trimesh.remesh import subdivide_to_size
 
 from casadi_ik.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
@@ -61,10 +63,6 @@ FIT = ShapeFit()
 
 WIDER = np.array([1.0, 1.02, 1.05, 1.1, 1.2, 1.35, 1.5])
 """Radii that are tried, as parts of the least."""
-
-
-BLOCK, SOME = 64, 16
-"""Samples whose distances are taken at once, and which part of the points is looked at first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +126,9 @@ def fit(
         show.
     """
     pieces = cut(triangles)
-    corners, numbers = _apart(pieces)
+    # A corner is one of some six triangles; what is asked of corners takes so much less.
+    corners, numbers = np.unique(pieces.reshape(-1, 3), axis=0, return_inverse=True)
+    numbers = numbers.reshape(-1, 3)
     parts = [np.arange(len(pieces))]
 
     def held(rows: NDArray[np.intp]) -> FittedCapsule:
@@ -158,20 +158,6 @@ def fit(
         volume = least
         parts[i : i + 1], found[i : i + 1], cuts[i : i + 1] = two, pair, [None, None]
     return found, excess(found, np.concatenate([corners, pieces.mean(axis=1)]))
-
-
-def _apart(pieces: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Corners (k, 3) of triangles (t, 3, 3), each once, and which (t, 3) a triangle has.
-
-    A corner is one of some six triangles; what is asked of corners takes so much less.
-    """
-    every = pieces.reshape(-1, 3)
-    order = np.lexsort(every.T)
-    rows = every[order]
-    new = np.concatenate([[True], (rows[1:] != rows[:-1]).any(axis=1)])
-    numbers = np.empty(len(every), np.intp)
-    numbers[order] = np.cumsum(new) - 1
-    return rows[new], numbers.reshape(-1, 3)
 
 
 def around(points: Array, apart: Array) -> FittedCapsule:
@@ -252,19 +238,11 @@ def halves(part: Array) -> list[NDArray[np.bool_]]:
 
 def cut(triangles: Array) -> Array:
     """The same surface in triangles without long edges."""
-    reach = float(np.ptp(triangles.reshape(-1, 3), axis=0).max()) / FIT.pieces
-    done: list[Array] = []
-    while len(triangles):
-        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
-        long = edges.max(axis=1) > reach
-        done.append(triangles[~long])
-        which = edges[long].argmax(axis=1)
-        rows = np.arange(len(which))
-        rest = triangles[long]
-        a, b, c = (rest[rows, (which + i) % 3] for i in range(3))
-        half = (a + b) / 2
-        triangles = np.concatenate([np.stack([a, half, c], 1), np.stack([half, b, c], 1)])
-    return np.concatenate(done)
+    corners = triangles.reshape(-1, 3)
+    reach = float(np.ptp(corners, axis=0).max()) / FIT.pieces
+    rows = np.arange(len(corners)).reshape(-1, 3)
+    finer = subdivide_to_size(corners, rows, reach, max_iter=50)
+    return np.asarray(finer[0][finer[1]], dtype=float)
 
 
 class Holder(Protocol):
@@ -283,26 +261,7 @@ def excess(shapes: Sequence[Holder], points: Array) -> float:
     """By how much shapes stand out beyond a mesh of points [m], as far as samples show."""
     skin = np.concatenate([one.skin() for one in shapes])
     inside = np.min([one.beyond(skin) for one in shapes], axis=0) < -1e-6
-    skin = skin[~inside]
-    squares = (points**2).sum(axis=1)
-    # No sample is farther from all points than from some: those that these say are near are done.
-    most = _squared(skin, points[::SOME], squares[::SOME])
-    worst = 0.0
-    for block in np.split(np.argsort(-most), np.arange(BLOCK, len(skin), BLOCK)):
-        if not len(block) or most[block[0]] <= worst:
-            break
-        worst = max(worst, float(_squared(skin[block], points, squares).max()))
-    return float(np.sqrt(worst))
-
-
-def _squared(samples: Array, points: Array, squares: Array) -> Array:
-    """(k,) squared distances of samples (k, 3) from the nearest of points [m^2]."""
-    least = np.empty(len(samples))
-    turned = np.ascontiguousarray(-2 * points.T)
-    for i in range(0, len(samples), BLOCK):
-        block = samples[i : i + BLOCK]
-        least[i : i + BLOCK] = (block @ turned + squares).min(axis=1) + (block**2).sum(axis=1)
-    return np.maximum(least, 0)
+    return float(KDTree(points).query(skin[~inside])[0].max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
