@@ -10,21 +10,27 @@ with clutter, compared with a dense search of the solutions of each target. What
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import joblib
 import numpy as np
-from collision_study.falsely_free import ROBOT, SIZE, Part, solve_part, the_check
-from collision_study.goals import HEADS
-from collision_study.goals import rows as goal_rows
-from collision_study.mink_peer import PeerPiece, installed, solve_peer
-from collision_study.oracles import MuJoCoOracle
-from collision_study.search import BATCH, MICROMETRE, POSTURES, SAFE, TURNS, Piece, solve_piece
+from collision_study.mink_peer import installed, solve_peer
+from collision_study.oracles import CoalOracle, MuJoCoOracle
+from collision_study.search import (
+    BATCH,
+    MICROMETRE,
+    POSTURES,
+    SAFE,
+    TURNS,
+    Piece,
+    solve_piece,
+    surroundings,
+)
 from runner import (
     Metric,
     command,
@@ -37,12 +43,29 @@ from runner import (
     write_metrics,
     write_page,
 )
-from runner.cluster import backend
-from runner.results import code_version
+from runner.parts import read_parts, run_parts
+from samplers import grasps_of
+
+import casadi_ik as ik
+from casadi_ik.problem.clearance import SceneCheck, Surroundings
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+shadow")
 CLUTTER = (0, 3, 8)
 REPEATS = 7
+
+SIZE = 50_000
+"""Configurations of a part."""
+
+OTHERS = 50
+"""Of so many configurations one that is not free is checked by coal as well: it takes 1.4 ms."""
+
+SCENE = {
+    "table": {"kind": "box", "size": [1.6, 1.6, 0.04], "xyz": [0.0, 0.0, -0.1]},
+    "post": {"kind": "cylinder", "radius": 0.06, "length": 0.6, "xyz": [0.45, 0.25, 0.3]},
+}
+
+ROBOT = "panda+allegro_right"
+
 
 PEER_ROBOTS, PEER_CLUTTER = ("kuka_lwr_barrett",), (0, 8)
 PEERS = """
@@ -54,7 +77,92 @@ one a call. A published figure, measured by others on a graphics processor and n
 one core here: cuRobo's second version states 2.73 ms for a batch of 100 collision-free targets of a
 Franka arm, 27 us a target, all solved.
 """
-"""What is known of others."""
+
+
+CHOICE = """
+Grasps at random places of a table, each turned {turns} times about the vertical, where contacts
+alone can be solved, with so many boxes, cylinders and balls about. Grasps are the robot's shipped
+ones, or of {postures} random hands that do not touch themselves, about the ball that fits between
+their fingertips. *Found:* of those that have a free answer: one was found, or a dense search of
+{searched:,} solutions, each nearest to a random posture, finds one with {safe:g} mm to spare.
+Processor time of a target with everything that is looked at until it is free or given up; *batch:*
+{batch} targets a call, those of a grasp again and again; *with an answer:* the same of these alone;
+*contacts alone:* without a scene; *single:* one, without a diagnosis.
+"""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some work: "coal" (random configurations), "choice" (a place of a table) or "mink" (there).
+
+    Attributes:
+        what: Which of them.
+        piece: The place; of "coal" its number and seed count.
+        size: Configurations, or targets of mink.
+    """
+
+    what: str
+    piece: Piece
+    size: int = 1
+
+    @property
+    def path(self) -> Path:
+        """Where its figures are."""
+        one = self.piece
+        place = f"{one.robot}-{one.clutter}-{one.number}-{one.seed}-{one.searched}"
+        return Path(self.what) / f"{place}-{self.size}.json"
+
+
+@cache
+def the_check() -> tuple[ik.ArmHand, Surroundings, CoalOracle]:
+    """The robot, what it is checked against, and the same by coal; made once in a process."""
+    robot = ik.load_robot(ROBOT)
+    (grasp,) = grasps_of(robot, *robot.contacts(robot.home[None]))
+    around = surroundings(SceneCheck(robot, ik.Scene(SCENE)), robot, grasp)
+    return robot, around, CoalOracle(robot, around)
+
+
+def solve(part: Part) -> dict[str, Any]:
+    """What comes of a part."""
+    if part.what == "choice":
+        return solve_piece(part.piece)
+    if part.what == "mink":
+        return solve_peer(part.piece, part.size)
+    robot, around, coal = the_check()
+    rng = np.random.default_rng([part.piece.seed, part.piece.number])
+    q = robot.random(rng, part.size)
+    free = around.free(q)
+    others = q[~free][: part.size // OTHERS]
+    return {
+        "checked": len(q),
+        "free": int(free.sum()),
+        "falsely_free": int(coal.penetrating(q[free], MICROMETRE).sum()),
+        "others": len(others),
+        "falsely_touching": int((~coal.penetrating(others, MICROMETRE)).sum()),
+    }
+
+
+def parts_of(options: argparse.Namespace) -> list[Part]:
+    """All parts, so that what is done so far is as much of every clutter."""
+    sizes = [min(SIZE, options.checked - start) for start in range(0, options.checked, SIZE)]
+    found = [
+        Part("coal", Piece(ROBOT, 0, number, options.seed, 0), size)
+        for number, size in enumerate(sizes)
+    ]
+    found += [
+        Part("choice", Piece(robot, clutter, number, options.seed, options.searched))
+        for number in range(options.count)
+        for robot in options.robot
+        for clutter in CLUTTER
+    ]
+    if options.peer_targets and installed():
+        found += [
+            Part("mink", Piece(robot, clutter, 0, options.seed, 0), options.peer_targets)
+            for robot in PEER_ROBOTS
+            if robot in options.robot
+            for clutter in PEER_CLUTTER
+        ]
+    return found
 
 
 def least_time(call: Callable[[], object], count: int) -> float:
@@ -99,145 +207,39 @@ def check(count: int, timed: int, seed: int) -> tuple[list[list[str]], str]:
     return rows, sentence
 
 
-def parts(options: argparse.Namespace) -> list[Part]:
-    """The random configurations that coal checks too, in parts."""
-    starts = range(0, options.checked, SIZE)
-    sizes = [min(SIZE, options.checked - start) for start in starts]
-    return [Part(number, options.seed, size) for number, size in enumerate(sizes)]
-
-
-def agreement(options: argparse.Namespace) -> tuple[str, list[Metric]]:
-    """A sentence on agreement with coal, and its figures."""
-    paths = [_path(part, options.out) for part in parts(options)]
-    done = [json.loads(path.read_text(encoding="utf-8")) for path in paths if path.exists()]
-    total = {key: sum(one[key] for one in done) for key in ("checked", "free", "others")}
-    false, touching = (
-        sum(one[key] for one in done) for key in ("falsely_free", "falsely_touching")
-    )
+def agreement(done: list[dict[str, int]]) -> tuple[str, Metric]:
+    """A sentence on agreement with coal, and its figure."""
+    keys = ("checked", "free", "others", "falsely_free", "falsely_touching")
+    total = {key: sum(one[key] for one in done) for key in keys}
     table = the_check()[1].table
     sentence = (
         f"{total['checked']:,} random configurations of {ROBOT}, {len(table.pairs)} pairs of "
         f"{len(table.radii)} capsules and {len(table.solids)} solids; "
         f"{100 * total['free'] / max(total['checked'], 1):.1f} % are free. Called free though coal "
-        f"sees a penetration beyond 1 um: **{false}**. Called touching though coal sees none: "
-        f"{touching} of {total['others']:,}."
+        f"sees a penetration beyond 1 um: **{total['falsely_free']}**. Called touching though coal "
+        f"sees none: {total['falsely_touching']} of {total['others']:,}."
     )
-    name = "collision/falsely_free"
-    return sentence, [Metric(name, false, "", "lower", np.nan, np.nan, total["checked"])]
+    false, name = float(total["falsely_free"]), "collision/falsely_free"
+    return sentence, Metric(name, false, "", "lower", np.nan, np.nan, total["checked"])
 
 
-def pieces(options: argparse.Namespace) -> list[Piece]:
-    """What is asked for, so that what is done so far is as much of every clutter."""
-    return [
-        Piece(robot, clutter, number, options.seed, options.searched)
-        for number in range(options.count)
-        for robot in options.robot
-        for clutter in CLUTTER
-    ]
-
-
-def peer_pieces(options: argparse.Namespace) -> list[PeerPiece]:
-    """What mink is asked; nothing where it is not installed."""
-    if not options.peer_targets or not installed():
-        return []
-    return [
-        PeerPiece(Piece(robot, clutter, 0, options.seed, 0), options.peer_targets)
-        for robot in PEER_ROBOTS
-        if robot in options.robot
-        for clutter in PEER_CLUTTER
-    ]
-
-
-def peers(options: argparse.Namespace) -> str:
-    """The table of what mink did."""
+def peer_rows(done: Iterable[tuple[Part, dict[str, Any]]]) -> list[list[str]]:
+    """What mink did."""
     rows = []
-    for asked in peer_pieces(options):
-        path = _path(asked, options.out)
-        if not path.exists():
-            continue
-        targets = json.loads(path.read_text(encoding="utf-8"))["targets"]
+    for part, found in done:
+        targets = found["targets"]
         times = [[1e3 * one[key] for one in targets] for key in ("seconds", "own")]
-        rows.append(
-            [
-                asked.piece.robot,
-                str(asked.piece.clutter),
-                str(len(targets)),
-                str(sum(one["solved"] for one in targets)),
-                str(sum(one["ours"] for one in targets)),
-                *(f"{np.mean(one):.1f}" for one in times),
-                f"{np.sum(times[0]) / np.sum(times[1]):.0f}",
-            ]
-        )
-    heads = ["robot", "clutter", "targets", "free answers by mink", "ours"]
-    heads += ["mink, mean [ms]", "ours, mean [ms]", "ratio"]
-    return markdown_table(heads, rows) if rows else "mink is not installed (extra `peers`)."
+        cells = [part.piece.robot, f"{part.piece.clutter}", f"{len(targets)}"]
+        cells += [f"{sum(one[key] for one in targets)}" for key in ("solved", "ours")]
+        cells += [f"{np.mean(one):.1f}" for one in times]
+        rows.append([*cells, f"{np.sum(times[0]) / np.sum(times[1]):.0f}"])
+    return rows
 
 
-def _path(piece: Piece | Part | PeerPiece, folder: Path) -> Path:
-    if isinstance(piece, PeerPiece):
-        asked = piece.piece
-        name = f"mink-{asked.robot}-{asked.clutter}-{asked.seed}-{piece.targets}"
-        return folder / f"{name}.json"
-    if isinstance(piece, Part):
-        return folder / f"coal-{piece.number}-{piece.seed}-{piece.size}.json"
-    name = f"{piece.robot}-{piece.clutter}-{piece.number}-{piece.seed}-{piece.searched}"
-    return folder / f"{name}.json"
-
-
-def run(options: argparse.Namespace) -> None:
-    """Solve the pieces that have not been."""
-    every = [*pieces(options), *parts(options), *peer_pieces(options)]
-    todo = [piece for piece in every if not _path(piece, options.out).exists()]
-    options.out.mkdir(parents=True, exist_ok=True)
-    with backend(options.jobs, None):
-        parallel = joblib.Parallel(return_as="generator_unordered")
-        results: Any = parallel(joblib.delayed(solved)(piece) for piece in todo)
-        for piece, found in results:
-            path = _path(piece, options.out)
-            part = path.with_suffix(".part")
-            part.write_text(json.dumps(found), encoding="utf-8")
-            part.replace(path)
-
-
-def solved(
-    piece: Piece | Part | PeerPiece,
-) -> tuple[Piece | Part | PeerPiece, dict[str, Any]]:
-    """A piece, and what came of it."""
-    if isinstance(piece, PeerPiece):
-        found = solve_peer(piece)
-    else:
-        found = solve_part(piece) if isinstance(piece, Part) else solve_piece(piece)
-    return piece, {"code": code_version(), **found}
-
-
-def choices(
-    options: argparse.Namespace,
-) -> tuple[list[list[str]], list[list[str]], list[Metric], str]:
-    """Rows on completeness and time by clutter, on goals, figures, and what code they are of."""
-    rows, goals, metrics, codes = [], [], list[Metric](), set[str]()
-    for robot in options.robot:
-        for clutter in CLUTTER:
-            paths = [_path(p, options.out) for p in pieces(options)]
-            mine = [p for p in paths if p.name.startswith(f"{robot}-{clutter}-") and p.exists()]
-            done = [json.loads(path.read_text(encoding="utf-8")) for path in mine]
-            codes |= {one["code"] for one in done}
-            targets = [target for one in done for target in one["targets"]]
-            if targets:
-                rows.append(_row(robot, clutter, targets, metrics))
-                goals += goal_rows(robot, clutter, targets)
-    return rows, goals, metrics, ", ".join(sorted(codes))
-
-
-def _left(options: argparse.Namespace) -> str:
-    """What was asked for and has not been run."""
-    left = [p for p in pieces(options) if not _path(p, options.out).exists()]
-    named = (f"{p.robot} with clutter {p.clutter}, place {p.number}" for p in left)
-    return f"Not run yet: {'; '.join(named)}." if left else ""
-
-
-def _row(
+def choice_row(
     robot: str, clutter: int, targets: list[dict[str, Any]], metrics: list[Metric]
 ) -> list[str]:
+    """A robot's row at a clutter: completeness and times."""
     statuses = Counter(one["status"] for one in targets)
     found, missed = statuses["SOLVED"], sum(one["missed"] for one in targets)
     name = f"collision/{robot}/{clutter}"
@@ -282,49 +284,45 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--so-far", action="store_true", help="report what is done, run nothing")
     options = parser.parse_args(arguments)
+    parts = parts_of(options)
     if not options.so_far:
-        run(options)
-    found, goals, metrics, codes = choices(options)
-    agrees, more = agreement(options)
+        run_parts(solve, parts, options.out, jobs=options.jobs)
+    done, codes = read_parts(options.out, parts)
+    kinds = {
+        what: [(part, found) for part, found in done if part.what == what]
+        for what in ("coal", "choice", "mink")
+    }
+    agrees, falsely = agreement([found for _, found in kinds["coal"]])
+    places: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for part, found in kinds["choice"]:
+        places.setdefault((part.piece.robot, part.piece.clutter), []).extend(found["targets"])
+    metrics = [falsely]
+    rows = [choice_row(*where, some, metrics) for where, some in sorted(places.items()) if some]
     times, by_mujoco = check(min(options.checked, 20_000), options.timed, options.seed)
+    left = len(parts) - len(done)
     heads = ["configurations", "distance [us]", "free? [us]", "coal, any [us]"]
     heads += ["coal, all distances [us]", "MuJoCo [us]", "coal / distance", "coal / free?"]
-    parts = [
+    body = [
+        "## Check",
         "Microseconds a configuration, kinematics included; one core of a busy machine, the least "
         f"of {REPEATS} repeats in one process, so the ratios count.",
-        "## Check",
-        markdown_table([*heads, "MuJoCo / free?"], times),
-        agrees,
-        by_mujoco,
+        *(markdown_table([*heads, "MuJoCo / free?"], times), agrees, by_mujoco),
     ]
     heads = ["robot", "clutter", "targets", "free without a choice %", "found", "found %"]
     heads += ["status", "false by coal", "batch, mean [us]", "with an answer [us]"]
     heads += ["contacts alone [us]", "single, mean [us]", "median [us]"]
-    parts += [
-        "## Choice",
-        f"Grasps at random places of a table, each turned {TURNS} times about the vertical, where "
-        "contacts alone can be solved, with so many boxes, cylinders and balls about. Grasps are "
-        f"the robot's shipped ones, or of {POSTURES} random hands that do not touch themselves, "
-        "about the ball that fits between their fingertips. *Found:* of those that have a free "
-        f"answer: one was found, or a dense search of {options.searched:,} solutions, each nearest "
-        f"to a random posture, finds one with {1e3 * SAFE:g} mm to spare. Processor time of a "
-        "target with everything that is looked at until it is free or given up; *batch:* "
-        f"{BATCH} targets a call, those of a grasp again and again; *with an answer:* the same of "
-        "these alone; *contacts alone:* without a scene; *single:* one, without a diagnosis.",
-        markdown_table(heads, found),
-        _left(options),
-        "## Goals",
-        markdown_table(HEADS, goals),
-        "## Others",
-        PEERS,
-        peers(options),
-        "## Where this comes from",
-        f"`{command(__file__, arguments)}`",
-        provenance({"collision": codes or None}),
-        f"Seed {options.seed}.",
-    ]
-    write_page("Free of collision", parts, options.report)
-    write_metrics([*more, *metrics], options.report / "metrics.json")
+    asked = {"searched": options.searched, "safe": 1e3 * SAFE, "batch": BATCH}
+    body += ["## Choice", CHOICE.format(turns=TURNS, postures=POSTURES, **asked)]
+    body += [markdown_table(heads, rows), *([f"Not run yet: {left} parts."] if left else [])]
+    heads = ["robot", "clutter", "targets", "free answers by mink", "ours"]
+    heads += ["mink, mean [ms]", "ours, mean [ms]", "ratio"]
+    peers = peer_rows(kinds["mink"])
+    body += ["## Others", PEERS]
+    body += [markdown_table(heads, peers) if peers else "Not run (extra `peers`)."]
+    body += ["## Where this comes from", f"`{command(__file__, arguments)}`"]
+    body += [provenance({"collision": codes or None})]
+    write_page("Free of collision", body, options.report)
+    write_metrics(metrics, options.report / "metrics.json")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """Is the verdict on what cannot be solved right, and what does it cost?
 
 Barely reachable targets are contacts of configurations within limits: none may be called
-unreachable. Impossible ones are made impossible in several ways; their reasons, times and nearest
-contacts can be kept and compared with those of another version::
+unreachable. Impossible ones are made impossible in several ways; their reasons and nearest contacts
+can be kept and compared with those of another version. Times by turns with another version:
+`bench.py --part diagnosis`::
 
     python studies/diagnosis.py                                  # 400 and 20 targets per set
-    python studies/diagnosis.py --count 4000 --impossible 200 --out studies/results/diagnosis
+    python studies/diagnosis.py --count 4000 --impossible 200 --report studies/results/diagnosis
     python studies/diagnosis.py --keep before.npz                # run there, then, here:
     python studies/diagnosis.py --against before.npz
 """
@@ -16,23 +17,21 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_report import Section, write_report
+from impossible_targets import classes_of, impossible, moved
+from runner import command, markdown_table, program, provenance, write_page
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
+from casadi_ik.batches.code import code_version
 
-Targets = tuple[Array, Array]
-# (robot, rng, count) -> (count, n) configurations within limits.
-Configurations = Callable[[ik.ArmHand, np.random.Generator, int], Array]
-TITLE = "The verdict on what cannot be solved"
 Kept = dict[str, Any]
 """Arrays by name of the targets / what they are."""
 
-ROBOT = "kuka_lwr_barrett"
 ALMOST = 0.99
 """Part of the tolerance by which contacts are moved that only the tolerance makes reachable."""
 
@@ -47,107 +46,60 @@ def at_limits(
     return np.where(chance > 1 - part / 2, robot.upper - near, q)
 
 
-def stretched(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
-    """The elbow almost straight: the wrist at 99.9 % to 99.9999 % of the arm's length."""
-    q, a, b = at_limits(robot, rng, count, 0.3), 0.4, 0.39
-    length = (1 - 10.0 ** rng.uniform(-6, -3, count)) * (a + b)
-    elbow = np.arccos((length**2 - a * a - b * b) / (2 * a * b))
-    q[:, robot.actuators.index("lwr_joint_4")] = elbow * rng.choice([-1, 1], count)
+def straight(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
+    """The middle joint of the arm almost at zero, by 1e-3 to 0.03 rad: an elbow is stretched."""
+    q = at_limits(robot, rng, count, 0.3)
+    arm = list(robot.description.arm_actuators)
+    bend = 10.0 ** rng.uniform(-3, -1.5, count) * rng.choice([-1, 1], count)
+    middle = arm[len(arm) // 2]
+    q[:, middle] = np.clip(bend, robot.lower[middle], robot.upper[middle])
     return q
 
 
 def wide_open(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
-    """The hand opened as far as it can, or up to 1e-3 rad from it; any spread."""
-    q = robot.random(rng, count)
-    for i, name in enumerate(robot.actuators):
-        if name.startswith("bh_") and name != "bh_spread":
-            q[:, i] = robot.lower[i] + 1e-3 * rng.random(count)
+    """The hand's motors at their lower limits, or up to 1e-3 of their range from them."""
+    q, hand = robot.random(rng, count), list(robot.description.hand_actuators)
+    near = 1e-3 * rng.random((count, len(hand))) * (robot.upper - robot.lower)[hand]
+    q[:, hand] = robot.lower[hand] + near
     return q
 
 
-REACHABLE: dict[str, Configurations] = {
-    "40 % of the actuators at limits": lambda r, g, n: at_limits(r, g, n, 0.4),
-    "80 % of the actuators at limits": lambda r, g, n: at_limits(r, g, n, 0.8),
-    "80 % within 1e-3 rad of limits": lambda r, g, n: at_limits(r, g, n, 0.8, 1e-3),
-    "arm stretched": stretched,
+REACHABLE: dict[str, Callable[..., Array]] = {
+    "40 % of the actuators at limits": partial(at_limits, part=0.4),
+    "80 % of the actuators at limits": partial(at_limits, part=0.8),
+    "80 % within 1e-3 rad of limits": partial(at_limits, part=0.8, off=1e-3),
+    "arm stretched": straight,
     "hand wide open": wide_open,
 }
 
 
-def moved(targets: Targets, rng: np.random.Generator, metres: float, angle: float) -> Targets:
-    """Every contact moved and every normal turned by so much, any way."""
-    points, normals = targets
-    shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
-    points = points + metres * shift / np.linalg.norm(shift, axis=2, keepdims=True)
-    turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
-    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
-    return points, normals * np.cos(angle) + turn * np.sin(angle)
-
-
-def impossible(robot: ik.ArmHand, count: int, seed: int) -> dict[str, Targets]:
-    """Targets of which most, in some sets all, cannot be reached."""
-    rng = np.random.default_rng(seed)
-    points, normals = hands = robot.contacts(robot.random(rng, count))
-    centred = points - points.mean(axis=1, keepdims=True)
-    beyond = robot.random(rng, count)
-    blocked, wrist = beyond.copy(), robot.actuators.index("lwr_joint_6")
-    blocked[:, wrist] = robot.upper[wrist] + 0.5
-    joint = rng.integers(0, len(robot.actuators), count)
-    beyond[np.arange(count), joint] = robot.upper[joint] + 0.15
-    return {
-        "1.5 m too far": (points + np.array([1.5, 0, 0]), normals),
-        "0.5 m too far": (points + np.array([0.5, 0, 0]), normals),
-        "in the shoulder": (centred + np.array([0, 0, 0.31]), normals),
-        "contacts 250 mm apart": (
-            points + 0.25 * np.array([[0, 1, 0], [1, -1, 0], [-1, -1, 0]]),
-            normals,
-        ),
-        "thumb's normal reversed": (points, normals * np.array([[-1], [1], [1]])),
-        "contacts moved by 30 mm": moved(hands, rng, 0.03, 0.0),
-        "contacts moved by 10 mm": moved(hands, rng, 0.01, 0.0),
-        "normals turned by 30 deg": moved(hands, rng, 0.0, np.deg2rad(30)),
-        "normals turned by 10 deg": moved(hands, rng, 0.0, np.deg2rad(10)),
-        "an actuator 0.15 rad beyond its limit": robot.contacts(beyond),
-        "the wrist 0.5 rad beyond its limit": robot.contacts(blocked),
-    }
-
-
-def false_alarms(robot: ik.ArmHand, count: int, bad: int, seed: int) -> Section:
-    """Targets that can be reached, all of them asked for a diagnosis."""
+def false_alarms(robot: ik.ArmHand, count: int, bad: int, seed: int) -> list[list[str]]:
+    """Rows of targets that can be reached, all of them asked for a diagnosis."""
     solver, tolerance = ik.Solver(robot), ik.Tolerance()
-    rng = np.random.default_rng(seed)
-    sets: dict[str, tuple[Targets, Array]] = {}
-    for name, made in REACHABLE.items():
-        sets[name] = robot.contacts(made(robot, rng, count)), robot.home
-    for name, made in REACHABLE.items():
-        hands = robot.contacts(made(robot, rng, count))
-        away = ALMOST * tolerance.position, ALMOST * tolerance.angle
-        sets[f"{name}, contacts moved by {ALMOST:.0%} of the tolerance"] = (
-            moved(hands, rng, *away),
-            robot.home,
-        )
-    hands = robot.contacts(at_limits(robot, rng, bad, 0.4))
-    sets["40 % at limits, from starts at other limits"] = hands, at_limits(robot, rng, bad, 1.0)
-    rows = []
-    for name, ((points, normals), q0) in sets.items():
+    rng, rows = np.random.default_rng(seed), list[list[str]]()
+    away = ALMOST * tolerance.position, ALMOST * tolerance.angle
+    sets: dict[str, tuple[Callable[..., Array], int, Array, tuple[float, float]]] = {}
+    for by, distance in (("", (0.0, 0.0)), (f", contacts moved by {ALMOST:.0%} of t", away)):
+        sets |= {f"{name}{by}": (x, count, robot.home, distance) for name, x in REACHABLE.items()}
+    name = "40 % at limits, from starts at other limits"
+    sets[name] = partial(at_limits, part=0.4), bad, at_limits(robot, rng, bad, 1.0), (0.0, 0.0)
+    for name, (draw, n, q0, (metres, angle)) in sets.items():
+        points, normals = moved(robot.contacts(draw(robot, rng, n)), rng, metres, angle)
         plain = solver.solve_batch(points, normals, q0)
         batch = solver.solve_batch(points, normals, q0, diagnose=True)
         called = int((batch.status_names == "UNREACHABLE").sum())
         left = int((~batch.success).sum()) - called
         found = int(batch.success.sum() - plain.success.sum())
         counts = len(points), int(plain.success.sum()), found, left, called
-        rows.append((name, *(f"{number:,}" for number in counts)))
-    columns = "targets", "n", "solved", "solved by the diagnosis", "in doubt", "called unreachable"
-    note = "All of these can be reached. In doubt: not solved, and not called unreachable."
-    return Section("False alarms", columns, rows, note)
+        rows.append([name, *(f"{number:,}" for number in counts)])
+    return rows
 
 
-def verdicts(robot: ik.ArmHand, count: int, seed: int) -> tuple[Section, Kept]:
+def verdicts(robot: ik.ArmHand, count: int, seed: int) -> tuple[list[list[str]], Kept]:
     """Reasons and times where there is no solution; and what another version may differ in."""
-    solver = ik.Solver(robot)
-    rows: list[tuple[str, ...]] = []
-    kept: Kept = {}
-    for name, (points, normals) in impossible(robot, count, seed).items():
+    solver, rows, kept = ik.Solver(robot), list[list[str]](), Kept()
+    for name in classes_of(robot):
+        points, normals = impossible(robot, name, np.random.default_rng(seed), count)
         left = ~solver.solve_batch(points, normals).success
         points, normals = points[left], normals[left]
         if not left.any():
@@ -159,43 +111,15 @@ def verdicts(robot: ik.ArmHand, count: int, seed: int) -> tuple[Section, Kept]:
         whys = [why for why in batch.diagnoses if why is not None]
         if not whys:
             continue
-        alone = [_alone(solver, p, m) for p, m in zip(points, normals, strict=True)]
         helped = [_seconds(lambda why=why: why.lines) for why in whys]
         reasons = Counter(why.reason.name for why in whys)
-        sure = np.mean([why.established for why in whys])
-        rows.append(
-            (
-                name,
-                f"{len(points)}",
-                f"{batch.success.sum()}",
-                ", ".join(f"{number} {reason}" for reason, number in reasons.most_common()),
-                f"{100 * sure:.0f}",
-                f"{1e3 * (full - plain) / len(points):.2f}",
-                *(f"{1e3 * np.quantile(alone, part):.2f}" for part in (0.5, 0.95)),
-                f"{1e3 * np.median(helped):.2f}",
-            )
-        )
+        cells = [name, f"{len(points)}", f"{batch.success.sum()}"]
+        cells += [", ".join(f"{number} {reason}" for reason, number in reasons.most_common())]
+        cells += [f"{100 * np.mean([why.established for why in whys]):.0f}"]
+        cells += [f"{1e3 * (full - plain) / len(points):.2f}", f"{1e3 * np.median(helped):.2f}"]
+        rows.append(cells)
         kept |= _kept(name, points, batch.diagnoses)
-    columns = (
-        *("targets", "n", "solved after all", "reasons", "certain %"),
-        *("in a batch", "alone, median", "alone, 95 %", "what would help, median"),
-    )
-    note = (
-        "n: targets that hand-first does not solve. Processor times in ms that the diagnosis adds "
-        "per target, in a batch of all n and target by target; what would help (`lines`) is looked "
-        "for when it is asked for."
-    )
-    return Section("Reasons and times", columns, rows, note), kept
-
-
-def _alone(solver: ik.Solver, points: Array, normals: Array) -> float:
-    """Seconds that the diagnosis of one target adds to its solve, the least of three times."""
-    target = points[None], normals[None]
-    full, plain = (
-        min(_seconds(lambda d=diagnose: solver.solve_batch(*target, diagnose=d)) for _ in range(3))
-        for diagnose in (True, False)
-    )
-    return full - plain
+    return rows, kept
 
 
 def _seconds(call: Callable[[], object]) -> float:
@@ -231,9 +155,9 @@ def _kept(name: str, points: Array, whys: tuple[ik.Diagnosis | None, ...]) -> Ke
     }
 
 
-def agreement(kept: Kept, before: Path) -> Section:
-    """The same targets, diagnosed by another version."""
-    rows = []
+def agreement(kept: Kept, before: Path) -> list[list[str]]:
+    """Rows of the same targets, diagnosed by another version."""
+    rows = list[list[str]]()
     with np.load(before) as old:
         for name in dict.fromkeys(key.split("/")[0] for key in kept):
             was, now = ({part: data[f"{name}/{part}"] for part in PARTS} for data in (old, kept))
@@ -246,60 +170,63 @@ def agreement(kept: Kept, before: Path) -> Section:
                 f"{a or 'solved'} -> {b or 'solved'}"
                 for a, b in zip(was["reason"][~same], now["reason"][~same], strict=True)
             )
-            rows.append(
-                (
-                    name,
-                    f"{len(same)}",
-                    f"{same.sum()}",
-                    ", ".join(f"{number} {change}" for change, number in changes.items()),
-                    f"{was['certain'].sum()} / {now['certain'].sum()}",
-                    f"{np.median(now['nearest'][both] / was['nearest'][both]):.3f}",
-                    f"{100 * helps.mean():.0f}",
-                )
-            )
-    columns = "targets", "n", "same reason", "others", "certain", "nearest", "same remedies %"
-    note = (
-        "Certain: called unreachable, before / now. Nearest: largest distance of the nearest "
-        "contacts, now by before, median."
-    )
-    return Section(f"Against another version ({before.name})", columns, rows, note)
+            cells = [name, f"{len(same)}", f"{same.sum()}"]
+            cells += [", ".join(f"{number} {change}" for change, number in changes.items())]
+            cells += [f"{was['certain'].sum()} / {now['certain'].sum()}"]
+            cells += [f"{np.median(now['nearest'][both] / was['nearest'][both]):.3f}"]
+            rows.append([*cells, f"{100 * helps.mean():.0f}"])
+    return rows
 
 
 PARTS = "points", "reason", "certain", "nearest", "helps"
 
+FALSE = """
+All of these can be reached. *In doubt:* not solved, and not called unreachable.
+"""
+
+REASONS = """
+*n:* targets that hand-first does not solve. *Diagnosis* and *remedies:* processor time [ms] that
+the diagnosis adds per target in a batch of all n, and in the median that of what would help
+(`lines`), which is looked for when it is asked for.
+"""
+
+AGREEMENT = """
+*Certain:* called unreachable, there / here. *Nearest:* largest distance of the nearest contacts,
+here by there, median.
+"""
+
 
 def main(arguments: list[str] | None = None) -> None:
     """Ask, print, write the report."""
-    parser = argparse.ArgumentParser(description=TITLE)
+    parser = argparse.ArgumentParser(description="The verdict on what cannot be solved.")
+    parser.add_argument("--robot", default="kuka_lwr_barrett")
     parser.add_argument("--count", type=int, default=400, help="reachable targets per set")
     parser.add_argument("--bad-starts", type=int, default=1200, help="reachable, from bad starts")
     parser.add_argument("--impossible", type=int, default=20, help="other targets per set")
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--keep", type=Path, metavar="NPZ", help="keep the verdicts")
     parser.add_argument("--against", type=Path, metavar="NPZ", help="compare with kept verdicts")
-    parser.add_argument("--out", type=Path, help="folder for report.md")
+    parser.add_argument("--report", type=Path, default=Path("out/diagnosis"), help="folder")
     options = parser.parse_args(arguments)
-    robot = ik.load_robot(ROBOT)
-    sections = []
+    robot, parts = ik.load_robot(options.robot), list[str]()
     if options.count:
-        sections.append(false_alarms(robot, options.count, options.bad_starts, options.seed))
-    found, kept = verdicts(robot, options.impossible, options.seed)
-    sections.append(found)
+        heads = ["targets", "n", "solved", "solved by the diagnosis", "in doubt"]
+        rows = false_alarms(robot, options.count, options.bad_starts, options.seed)
+        parts += ["## False alarms", FALSE, markdown_table([*heads, "called unreachable"], rows)]
+    rows, kept = verdicts(robot, options.impossible, options.seed)
+    heads = ["targets", "n", "solved after all", "reasons", "certain %", "diagnosis", "remedies"]
+    parts += ["## Reasons and times", REASONS, markdown_table(heads, rows)]
     if options.against:
-        sections.append(agreement(kept, options.against))
-    for section in sections:
-        section.show()
+        rows = agreement(kept, options.against)
+        heads = ["targets", "n", "same reason", "others", "certain", "nearest", "same remedies %"]
+        title = f"## Against another version ({options.against.name})"
+        parts += [title, AGREEMENT, markdown_table(heads, rows)]
     if options.keep:
         np.savez(options.keep, allow_pickle=False, **kept)
-    if options.out:
-        command = (
-            f"python studies/diagnosis.py --count {options.count} --bad-starts "
-            f"{options.bad_starts} --impossible {options.impossible} --seed {options.seed}"
-        )
-        if options.against:
-            command += f" --against {options.against.name}"
-        write_report(options.out / "report.md", command, sections, TITLE)
+    parts += [f"`{command(__file__, arguments)}`", provenance({"diagnosis": code_version()})]
+    write_page("The verdict on what cannot be solved", parts, options.report)
+    print((options.report / "report.md").read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

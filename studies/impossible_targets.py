@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from diagnosis import Targets, moved
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
+
+Targets = tuple[Array, Array]
 
 CLASSES = (
     "too far",
@@ -21,7 +22,22 @@ CLASSES = (
     "an arm joint 0.3 to 1 rad beyond its limit",
     "turned any way",
 )
-"""The last two need an arm."""
+"""The last two need an arm: see `classes_of`."""
+
+
+def classes_of(robot: ik.ArmHand) -> tuple[str, ...]:
+    """Those that a robot can be asked for."""
+    return CLASSES if robot.description.arm_actuators else CLASSES[:-2]
+
+
+def moved(targets: Targets, rng: np.random.Generator, metres: float, angle: float) -> Targets:
+    """Every contact moved and every normal turned by so much, any way."""
+    points, normals = targets
+    shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
+    points = points + metres * shift / np.linalg.norm(shift, axis=2, keepdims=True)
+    turn -= (turn * normals).sum(axis=2, keepdims=True) * normals
+    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    return points, normals * np.cos(angle) + turn * np.sin(angle)
 
 
 def impossible(robot: ik.ArmHand, name: str, rng: np.random.Generator, count: int) -> Targets:

@@ -15,7 +15,6 @@ A run that is killed goes on where it stopped. Every false proof is listed with 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 import zlib
 from collections.abc import Iterator
@@ -24,22 +23,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnosis import moved
-from impossible_targets import CLASSES, impossible
+from impossible_targets import CLASSES, classes_of, impossible, moved
 from misses import ROBOTS as SHIPPED_AND_MADE
 from misses import load
-from rich.console import Console
-from rich.progress import Progress
 from runner import (
     Metric,
+    command,
     markdown_table,
     median_metric,
+    program,
     provenance,
     rate_metric,
     write_metrics,
     write_page,
 )
-from runner.results import code_version
+from runner.parts import read_parts, run_parts
 from samplers import corners, near_limits, random_hands, singular_arms
 
 import casadi_ik as ik
@@ -122,7 +120,7 @@ class Part:
     @property
     def path(self) -> Path:
         """Where its counts are."""
-        return self.folder / self.robot / f"{self.name}-{self.number:05d}.json"
+        return Path(self.robot) / f"{self.name}-{self.number:05d}.json"
 
     @property
     def rng(self) -> np.random.Generator:
@@ -140,7 +138,7 @@ def case_name(case: tuple[str, float, float, bool]) -> str:
 def reachable(part: Part, case: tuple[str, float, float, bool]) -> dict[str, Any]:
     """Look for false proofs."""
     kind, tolerance, share, limits = case
-    robot, rng = load(part.robot, part.folder / "robots"), part.rng
+    robot, rng = load(part.robot, part.folder), part.rng
     q = KINDS[kind](robot, rng, part.size)
     if not limits:
         turning = [a.unit == "rad" for a in robot.description.actuators]
@@ -156,7 +154,7 @@ def reachable(part: Part, case: tuple[str, float, float, bool]) -> dict[str, Any
 
 def clearly_impossible(part: Part) -> dict[str, Any]:
     """Look for proofs of what is impossible."""
-    robot = load(part.robot, part.folder / "robots")
+    robot = load(part.robot, part.folder)
     points, normals = impossible(robot, part.name, part.rng, part.size)
     usual = ik.Tolerance()
     further, turned = 1e-3 * part.beyond[0], float(np.deg2rad(part.beyond[1]))
@@ -184,22 +182,18 @@ def clearly_impossible(part: Part) -> dict[str, Any]:
     return found
 
 
-def solve(part: Part) -> None:
-    """Look for proofs of a part's targets and keep the counts."""
+def solve(part: Part) -> dict[str, Any]:
+    """Look for proofs of a part's targets and count."""
     cases = {case_name(case): case for case in CASES}
     one = cases.get(part.name)
-    found = clearly_impossible(part) if one is None else reachable(part, one)
-    part.path.parent.mkdir(parents=True, exist_ok=True)
-    kept = part.path.with_suffix(".part")
-    kept.write_text(json.dumps({"code": code_version(), "found": found}), encoding="utf-8")
-    kept.replace(part.path)
+    return clearly_impossible(part) if one is None else reachable(part, one)
 
 
 def parts(options: argparse.Namespace) -> Iterator[Part]:
     """All parts, a little of everything first."""
-    robots, where = options.robot or ROBOTS, (options.seed, options.out)
+    robots, where = options.robot or ROBOTS, (options.seed, options.out / "robots")
     for robot in robots if options.impossible else ():
-        for name in CLASSES[:-2] if robot == "ar10" else CLASSES:
+        for name in classes_of(load(robot, options.out / "robots")):
             yield Part(robot, name, 0, options.impossible, *where, options.beyond)
     for number in range(-(-options.count // BLOCK)):
         for robot in robots:
@@ -208,65 +202,45 @@ def parts(options: argparse.Namespace) -> Iterator[Part]:
                     yield Part(robot, case_name(case), number, BLOCK, *where)
 
 
-def found_of(folder: Path, robot: str, name: str) -> tuple[list[dict[str, Any]], set[str]]:
-    """What all parts of a name found, and by which code."""
-    kept = [
-        json.loads(path.read_text(encoding="utf-8"))
-        for path in sorted((folder / robot).glob(f"{name}-?????.json"))
-    ]
-    return [entry["found"] for entry in kept], {entry["code"] for entry in kept}
-
-
-def write_report(options: argparse.Namespace) -> None:
+def write_report(options: argparse.Namespace, run_by: str) -> None:
     """Write the report on all parts there are."""
-    rows, shown, table, metrics, codes = [], [], [], list[Metric](), set[str]()
+    done, codes = read_parts(options.out, parts(options))
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for part, one in done:
+        found.setdefault((part.robot, part.name), []).append(one)
+        if part.name in CLASSES:
+            found.setdefault((part.robot, "all"), []).append(one)
+    rows, shown, table, metrics = [], [], [], list[Metric]()
     whole = 0
-    for robot in ROBOTS:
-        title = robot.replace("_", " ")
-        for case in CASES:
-            found, code = found_of(options.out, robot, case_name(case))
-            codes |= code
-            count, false = (
-                sum(entry["count"] for entry in found),
-                [q for entry in found for q in entry["false"]],
-            )
-            if not count:
-                continue
+    for (robot, name), some in found.items():
+        count = sum(one["count"] for one in some)
+        if "false" in some[0]:
+            false = [q for one in some for q in one["false"]]
             whole += count
-            rows.append([title, case_name(case), f"{count:,}", f"{len(false)}"])
-            metrics.append(
-                rate_metric(f"proofs/{robot}/{case_name(case)}/true", count - len(false), count)
-            )
-            shown += [
-                [title, case_name(case), " ".join(f"{x:.9g}" for x in q)] for q in false[:SHOWN]
-            ]
-        everything = [(name, *found_of(options.out, robot, name)) for name in CLASSES]
-        codes |= {one for _, _, code in everything for one in code}
-        lines = [(name, found) for name, found, _ in everything if found]
-        for name, found in [*lines, ("all", [entry for _, part in lines for entry in part])]:
-            count = sum(entry["count"] for entry in found)
-            if not count:
-                continue
-            times = [ms for entry in found for ms in entry["ms"]]
+            rows.append([robot, name, f"{count:,}", f"{len(false)}"])
+            metrics.append(rate_metric(f"proofs/{robot}/{name}/true", count - len(false), count))
+            shown += [[robot, name, " ".join(f"{x:.9g}" for x in q)] for q in false[:SHOWN]]
+        elif count:
+            times = [ms for one in some for ms in one["ms"]]
             rate = rate_metric(f"proofs/{robot}/{name}/proved", len(times), count)
             metrics += [rate, median_metric(f"proofs/{robot}/{name}/time", times, "ms")]
             quantiles = np.quantile(times, [0.5, 0.99]) if times else [np.nan, np.nan]
-            hand, arm = (sum(entry[key] for entry in found) for key in ("hand", "arm"))
-            cells = [title, name, f"{count}", f"{rate.value:.1f}"]
-            table.append([*cells, *(f"{q:.2f}" for q in quantiles), f"{hand}", f"{arm}"])
+            cells = [robot, name, f"{count}", f"{rate.value:.1f}"]
+            left = [f"{sum(one[key] for one in some)}" for key in ("hand", "arm")]
+            table.append([*cells, *(f"{q:.2f}" for q in quantiles), *left])
     heads = ["robot", "class", "n", "proved %", "median [ms]", "99 % [ms]"]
     body = [
         INTRODUCTION.format(*(f"{x:g}" for x in options.beyond)),
         "## Reachable targets",
         f"{whole:,} targets, {len(shown)} false proofs.",
+        markdown_table(["robot", "targets", "n", "false"], rows),
+        *([markdown_table(["robot", "targets", "q"], shown)] if shown else []),
+        "## Impossible targets",
+        markdown_table([*heads, "not proved: hand", "not proved: arm"], table),
+        "## Where this comes from",
+        f"`{run_by}`",
+        provenance({"proofs": codes or None}),
     ]
-    body += [markdown_table(["robot", "targets", "n", "false"], rows)]
-    if shown:
-        body += [markdown_table(["robot", "targets", "q"], shown)]
-    body += ["## Impossible targets"]
-    body += [markdown_table([*heads, "not proved: hand", "not proved: arm"], table)]
-    body += ["## Where this comes from"]
-    body += [provenance({"proofs": ", ".join(sorted(codes)) or None}), f"Seed {options.seed}."]
     write_page("Proofs of impossibility", body, options.report)
     write_metrics(metrics, options.report / "metrics.json")
 
@@ -278,6 +252,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--impossible", type=int, default=30, help="targets of every class")
     parser.add_argument("--minutes", type=float, default=np.inf, help="stop after so long")
     parser.add_argument("--seed", type=int, default=2026, help="of the targets")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--robot", action="append", choices=ROBOTS, help="only this one")
     parser.add_argument("--out", type=Path, default=Path("out/proofs"), help="counts by block")
     parser.add_argument("--report", type=Path, default=Path("out/proofs/report"), help="folder")
@@ -293,15 +268,10 @@ def main(arguments: list[str] | None = None) -> None:
     options.beyond = tuple(options.beyond)
     if options.beyond != BEYOND:  # other counts, which are not to be mixed
         options.out = options.out / "beyond {:g} mm {:g} deg".format(*options.beyond)
-    todo = [part for part in parts(options) if not part.path.exists()]
-    end = time.monotonic() + 60 * options.minutes
-    with Progress(console=Console(stderr=True)) as progress:
-        for part in progress.track(todo, description="blocks"):
-            if time.monotonic() > end:
-                break
-            solve(part)
-    write_report(options)
+    until = time.monotonic() + 60 * options.minutes
+    run_parts(solve, parts(options), options.out, jobs=options.jobs, until=until)
+    write_report(options, command(__file__, arguments))
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

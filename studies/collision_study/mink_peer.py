@@ -8,18 +8,16 @@ spread ones, until an answer meets the contacts and is free by our check.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 import numpy as np
-from peers import Mink
+from peers import Mink, starts_of
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.collision.solids import Kind
 from casadi_ik.problem.clearance import SceneCheck, Surroundings
-from casadi_ik.symbolic.even_spread import evenly
 from collision_study.search import Piece, grasps_at, surroundings
 
 STARTS, STEPS, CAP, WAIT, STALL = 25, 60, 0.5, 8, 0.98
@@ -106,28 +104,15 @@ class MinkAmong(Mink):
         return self._avoided
 
 
-@dataclass(frozen=True)
-class PeerPiece:
-    """Some targets of a piece.
-
-    Attributes:
-        piece: Of the study.
-        targets: How many.
-    """
-
-    piece: Piece
-    targets: int
-
-
-def solve_peer(asked: PeerPiece) -> dict[str, Any]:
-    """The targets by mink and by us."""
-    robot, rows = ik.load_robot(asked.piece.robot), list[dict[str, Any]]()
-    for scene, grasps in grasps_at(asked.piece):
+def solve_peer(piece: Piece, targets: int) -> dict[str, Any]:
+    """So many of a piece's targets by mink and by us."""
+    robot, rows = ik.load_robot(piece.robot), list[dict[str, Any]]()
+    for scene, grasps in grasps_at(piece):
         check, solver = SceneCheck(robot, scene), ik.Solver(robot, scene=scene)
         if any(part[0].kind is Kind.CONVEX for i in scene.items.values() for part in i.parts):
             continue  # MuJoCo takes planes as corners only
-        for grasp in grasps[: max(1, asked.targets // 3)]:
-            if len(rows) == asked.targets:
+        for grasp in grasps[: max(1, targets // 3)]:
+            if len(rows) == targets:
                 return {"targets": rows}
             around = surroundings(check, robot, grasp).rows(np.zeros(1, dtype=np.intp))
             peer = MinkAmong(robot, around)
@@ -138,15 +123,8 @@ def solve_peer(asked: PeerPiece) -> dict[str, Any]:
             begin = time.process_time()
             ours = solver.solve(grasp, diagnose=False)
             own = time.process_time() - begin
-            rows.append(
-                {
-                    "solved": solved,
-                    "starts": starts,
-                    "seconds": spent,
-                    "ours": ours.success,
-                    "own": own,
-                }
-            )
+            row = {"solved": solved, "starts": starts, "seconds": spent}
+            rows.append(row | {"ours": ours.success, "own": own})
     return {"targets": rows}
 
 
@@ -156,9 +134,7 @@ def _solved(
     """Whether an answer was found, and how many starts it took."""
     points, normals = grasp.arrays(robot.fingers)
     peer.aim(points, normals)
-    spread = evenly(STARTS - 1, len(robot.actuators))
-    starts = np.vstack([robot.home, robot.lower + spread * (robot.upper - robot.lower)])
-    for number, start in enumerate(starts, start=1):
+    for number, start in enumerate(starts_of(robot, STARTS - 1), start=1):
         if _from(peer, robot, points, normals, around, start):
             return True, number
     return False, STARTS

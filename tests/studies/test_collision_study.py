@@ -7,14 +7,15 @@ from pathlib import Path
 
 import collision
 import pytest
-from collision_study import falsely_free, search
+from collision_study import search
 
 
 def test_a_check_is_never_free_where_others_see_a_penetration():
     rows, sentence = collision.check(60, 32, 0)
     assert [row[0] for row in rows] == ["random", "free"]
     assert "1 um: **0**" in sentence
-    found = falsely_free.solve_part(falsely_free.Part(0, 0, 60))
+    part = collision.Part("coal", search.Piece(collision.ROBOT, 0, 0, 0, 0), 60)
+    found = collision.solve(part)
     assert found["checked"] == 60
     assert 0 < found["free"] < 60
     assert found["others"] == 1
@@ -25,29 +26,12 @@ def test_the_choice_is_measured_and_taken_up_again(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(collision, "CLUTTER", (3,))
     monkeypatch.setattr(search, "TURNS", 2)
     monkeypatch.setattr(search, "BATCH", 4)
-    words = [
-        "--robot",
-        "kuka_lwr_barrett",
-        "--checked",
-        "60",
-        "--timed",
-        "32",
-        "--count",
-        "1",
-        "--searched",
-        "64",
-    ]
-    words += [
-        "--searched",
-        "64",
-        "--out",
-        str(tmp_path / "out"),
-        "--report",
-        str(tmp_path / "report"),
-    ]
+    words = ["--robot", "kuka_lwr_barrett", "--checked", "60", "--timed", "32", "--count", "1"]
+    words += ["--searched", "64", "--out", str(tmp_path / "out")]
+    words += ["--report", str(tmp_path / "report")]
     collision.main(words)
-    (path,) = (tmp_path / "out").glob("kuka*.json")
-    targets = json.loads(path.read_text())["targets"]
+    (path,) = (tmp_path / "out" / "choice").glob("kuka*.json")
+    targets = json.loads(path.read_text())["found"]["targets"]
     assert targets
     assert not any(one["false"] for one in targets)
     written = path.stat().st_mtime_ns

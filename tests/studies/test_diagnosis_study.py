@@ -18,14 +18,15 @@ def test_the_study_agrees_with_itself_and_the_committed_report_has_no_false_alar
     kept = tmp_path / "kept.npz"
     small = [sys.executable, STUDIES / "diagnosis.py", "--impossible", "3"]
     for more in (
-        ["--count", "0", "--keep", kept],
-        ["--count", "20", "--bad-starts", "20", "--against", kept, "--out", tmp_path],
+        ["--count", "0", "--keep", kept, "--report", tmp_path],
+        ["--count", "20", "--bad-starts", "20", "--against", kept, "--report", tmp_path],
     ):
         run = subprocess.run([*small, *more], capture_output=True, text=True)
         assert run.returncode == 0, run.stderr
     report = (tmp_path / "report.md").read_text()
-    rows = [line.strip("| ").split(" | ") for line in report.splitlines() if line.startswith("| ")]
-    compared = [row for row in rows if len(row) == 7 and row[0] != "targets"]
+    table = report.partition("## Against")[2]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| ")]
+    compared = [row for row in rows if row[0] not in ("targets", "---")]
     assert len(compared) >= 6
     assert all(row[1] == row[2] and row[5] == "1.000" and row[6] == "100" for row in compared)
 
