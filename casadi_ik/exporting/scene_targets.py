@@ -103,7 +103,9 @@ class SceneTargets:
         assert around is not None
         clear = around.check(q[None])
         if not clear.free[0]:
-            found = resolve_at_once(engine, problems, around, q, questions.start(q0), others=True)
+            found = resolve_at_once(
+                engine.finder, problems, around, q, questions.start(q0), others=True
+            )
             if found is None:
                 return None
             q, _, clear = found

@@ -29,8 +29,13 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import CLEARANCE, Questions, free_palms
 from casadi_ik.problem.status import Status
 from casadi_ik.solving.alternatives.arm_search import Preference
-from casadi_ik.solving.alternatives.finder import APART, DISTINCT, checked_distance
-from casadi_ik.solving.alternatives.free import FreeFinder
+from casadi_ik.solving.alternatives.finder import (
+    APART,
+    DISTINCT,
+    AlternativeFinder,
+    checked_distance,
+)
+from casadi_ik.solving.alternatives.free import Deduplicator, free_answers
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.solved_part import judged
 
@@ -157,7 +162,7 @@ def choose(
             mine = some.rows(np.searchsorted(rows, left))
             mine = replace(mine, picked=left, prefer="q0" if near else "limits")
             found = answers_of(
-                engine.kinds_of(mine).freer,
+                engine.kinds_of(mine).finder,
                 mine,
                 engine.around(mine),
                 start if near else engine.robot.home,
@@ -330,7 +335,7 @@ class _Ranked:
 
 
 def answers_of(
-    finder: FreeFinder,
+    finder: AlternativeFinder,
     problems: Problems,
     around: Surroundings | None,
     begin: Array,
@@ -367,7 +372,7 @@ class _Part:
 
     def __init__(
         self,
-        finder: FreeFinder,
+        finder: AlternativeFinder,
         problems: Problems,
         around: Surroundings | None,
         begin: Array,
@@ -425,14 +430,11 @@ class _Part:
         ends[~self.trials.solved(asked, ends, asked.enforce_limits)] = np.nan
         every = np.concatenate([q[:, None], ends.reshape(len(rows), count, n)], axis=1)
         kept: Bools = np.all(np.isfinite(every), axis=2)
-        free = np.repeat(free_palms(self.finder.robot, some), count + 1)
-        parts = self.finder.hand_parts(np.nan_to_num(every).reshape(-1, n), free)
-        parts = parts.reshape(len(rows), count + 1, -1)
-        for i in range(1, count + 1):
-            apart = np.abs(parts[:, i, None] - parts[:, :i]).max(axis=2, initial=0) >= DISTINCT
-            kept[:, i] &= (apart | ~kept[:, :i]).all(axis=1)
         place, which = np.nonzero(kept)
-        return every[place, which], rows[place]
+        found, owner = every[place, which], rows[place]
+        parts = self.finder.hand_parts(found, free_palms(self.finder.robot, some)[place])
+        fresh = Deduplicator(len(rows), parts.shape[1], DISTINCT).add(parts, place)
+        return found[fresh], owner[fresh]
 
     def _answers(
         self, q: Array, owner: NDArray[np.intp]
@@ -494,7 +496,7 @@ class _Part:
             return q[rows], rows
         around = self.around.rows(rows)
         some = self.problems.rows(rows)
-        found = self.finder.find(some, around, q[rows], self.begin[rows], seed)
+        found = free_answers(self.finder, some, around, q[rows], self.begin[rows], seed)
         return found.q[found.free], rows[found.free]
 
     def _score(self, q: Array, owner: NDArray[np.intp]) -> Array:
@@ -503,4 +505,4 @@ class _Part:
         room = np.zeros(len(q))
         if self.prefer == CLEARANCE and self.around is not None:
             room = self.around.rows(owner).check(q).room
-        return self.finder.score(q, self.starts[owner], self.prefer, room, self.columns)
+        return self.finder.score(q, self.starts[owner], self.prefer, self.columns, room)

@@ -31,7 +31,6 @@ from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.free import (
     RANKED,
-    FreeFinder,
     resolve_at_once,
     resolve_collisions,
 )
@@ -132,15 +131,6 @@ class Engine:
         """
         return AlternativeFinder(self.robot, self._several, self.compiled)
 
-    @cached_property
-    def freer(self) -> FreeFinder:
-        """Finds answers that touch nothing.
-
-        Raises:
-            UnsupportedError: The method gives one.
-        """
-        return FreeFinder(self.finder, self.compiled)
-
     def about(self, check: SceneCheck) -> Engine:
         """The engine with another scene; all that was worked out for the robot stays."""
         other = copy(self)
@@ -217,7 +207,7 @@ class Engine:
         if (around := self.around(problems)) is not None:
             clear = around.check(q[None])
             if not clear.free[0]:
-                if (other := resolve_at_once(self, problems, around, q, start)) is None:
+                if (other := resolve_at_once(self.finder, problems, around, q, start)) is None:
                     return None
                 q, verdict, clear = other
                 seconds = time.perf_counter() - begin
@@ -277,6 +267,9 @@ class Engine:
         def method(kinds: Kinds) -> Method:
             return self.of_kinds(kinds).method
 
+        def finder_of(some: Problems) -> AlternativeFinder:
+            return self.kinds_of(some).finder
+
         def solve(rows: slice) -> SolvedPart:
             started, asked = time.time_ns(), problems.rows(rows)
             outcome = known or run_by_kinds(method, asked, starts[rows], run.seed, trace)
@@ -289,13 +282,13 @@ class Engine:
             if around is not None and self._own_hands is not None:
                 q0, seed = starts[rows], run.seed
                 batch = resolve_collisions(
-                    self.kinds_of, asked, around, q0, seed, outcome, batch, diagnose
+                    finder_of, asked, around, q0, seed, outcome, batch, diagnose
                 )
                 outcome = replace(outcome, q=batch.q, time=batch.time)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
-                if around is not None and len(problems) == 1:
-                    batch = with_way_out(self, asked, starts[0], run.seed, batch)
+                if self.check is not None and len(problems) == 1:
+                    batch = with_way_out(self.solve, self.check, asked, starts[0], run.seed, batch)
             return SolvedPart(asked, starts[rows], started, outcome, batch, around)
 
         if diagnose:

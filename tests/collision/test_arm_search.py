@@ -42,14 +42,14 @@ def hands(robot, solver):
 
 @pytest.fixture(scope="module")
 def search(solver) -> ArmSearch:
-    found = solver._engine.freer.arm_search
+    found = solver._engine.finder.arm_search
     assert found is not None
     return found
 
 
 @pytest.fixture(scope="module")
 def plain(robot, search, solver) -> ArmSearch:
-    finder = solver._engine.freer._finder
+    finder = solver._engine.finder
     return ArmSearch(robot, search._family, lambda: finder.manipulability, compiled=False)
 
 

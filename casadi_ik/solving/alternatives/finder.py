@@ -20,6 +20,7 @@ from casadi_ik.problem.clearance import Surroundings
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import CLEARANCE, free_palms, preference
 from casadi_ik.problem.verdict import ContactVerdict, judge
+from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
 from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
 from casadi_ik.solving.trials import Bounds, Descent, HandMethod, Trials, repeated
 from casadi_ik.symbolic.kinematics import actuated
@@ -107,6 +108,14 @@ class AlternativeFinder:
         """None where locked joints leave more than stretches to enumerate."""
         arm = self.trials.method.step.arm
         return None if arm is None or arm.locked else ArmBranches(arm, self._compiled)
+
+    @cached_property
+    def arm_search(self) -> ArmSearch | None:
+        """All arms of hands; None for an arm of no family, and without an arm."""
+        family = self.trials.method.step.arm
+        if family is None:
+            return None
+        return ArmSearch(self.robot, family, lambda: self.manipulability, self._compiled)
 
     @cached_property
     def manipulability(self) -> FunctionKernel:
@@ -311,11 +320,30 @@ class AlternativeFinder:
         if around is None:
             return self.score(q, q0, prefer, columns)
         room = around.check(q).room
-        score = room if prefer == CLEARANCE else self.score(q, q0, prefer, columns)
+        score = self.score(q, q0, prefer, columns, room)
         return np.where(room >= 0, score, room - BLOCKED)
 
-    def score(self, q: Array, q0: Array, prefer: str, columns: list[int] | None = None) -> Array:
-        """(k,) what is preferred, higher is better; margins over some actuators only."""
+    def score(
+        self,
+        q: Array,
+        q0: Array,
+        prefer: Preference,
+        columns: list[int] | None = None,
+        room: Array | None = None,
+    ) -> Array:
+        """(k,) what is preferred of configurations, higher is better.
+
+        Args:
+            q: (k, n).
+            q0: (n,) or (k, n) where the robot is.
+            prefer: What is preferred.
+            columns: Motors whose distance from the limits counts; None: all.
+            room: (k,) for "clearance".
+        """
+        if callable(prefer):
+            return np.asarray(prefer(q), dtype=float)
+        if prefer == CLEARANCE and room is not None:
+            return room
         every = list(range(q.shape[1]))
         if prefer == "limits":
             return self._margins(q, every if columns is None else columns)

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import CLEARANCE, free_palms
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
-from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
+from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.solved_part import judged
 from casadi_ik.solving.trials import Descent
@@ -110,148 +109,70 @@ class FreeAnswers:
         return FreeAnswers(q, free, tuple(reports))
 
 
-class FreeFinder:
-    """Finds answers that touch nothing, on one robot.
+def free_answers(
+    finder: AlternativeFinder,
+    problems: Problems,
+    around: Surroundings,
+    q: Array,
+    starts: Array,
+    seed: int,
+    every: bool = False,
+    reasons: bool = True,
+) -> FreeAnswers:
+    """Free answers of k targets.
 
-    Attributes:
-        robot: The robot.
-        trials: The loop of hand-first.
-        hand_parts: What tells hands apart, see `AlternativeFinder`.
+    Args:
+        finder: Of the robot.
+        problems: The targets.
+        around: What they are checked against.
+        q: (k, n) answers, whether or not they are free.
+        starts: (k, n) where the robot is.
+        seed: Of random arms.
+        every: Whether an answer that is free already competes with the others for being preferred,
+            instead of being kept.
+        reasons: Whether to find out if those without one would have one without the scene, or if
+            the robot could pass through itself.
     """
+    found = _searched(finder, problems, around, q, starts, seed, every, reasons)
+    home = np.tile(finder.robot.home, (len(q), 1))
+    biased = problems.prefer != USUAL or not np.array_equal(starts, home)
+    left = np.flatnonzero(~found.free)
+    if not biased or not len(left):
+        return found
+    # A preference orders answers; whether there is one it does not decide.
+    some, trials = replace(problems.rows(left), prefer=USUAL), finder.trials
+    ends = trials.method.run(some, home[left], seed, False).q
+    met = trials.solved(some, ends, some.enforce_limits)
+    left, some, ends = left[met], some.rows(np.flatnonzero(met)), ends[met]
+    again = _searched(finder, some, around.rows(left), ends, home[left], seed, False, False)
+    return found.with_free(left, again)
 
-    def __init__(self, finder: AlternativeFinder, compiled: bool = True) -> None:
-        """Take what enumerates solutions."""
-        self._finder = finder
-        self.robot, self.trials = finder.robot, finder.trials
-        self.hand_parts = finder.hand_parts
-        self._compiled = compiled
 
-    @cached_property
-    def arm_search(self) -> ArmSearch | None:
-        """All arms of hands; None for an arm without a closed form, and without an arm."""
-        arm = self.trials.method.step.arm
-        if arm is None:
-            return None
-        return ArmSearch(self.robot, arm, lambda: self._finder.manipulability, self._compiled)
-
-    def find(
-        self,
-        problems: Problems,
-        around: Surroundings,
-        q: Array,
-        starts: Array,
-        seed: int,
-        every: bool = False,
-        reasons: bool = True,
-    ) -> FreeAnswers:
-        """Free answers of k targets.
-
-        Args:
-            problems: The targets.
-            around: What they are checked against.
-            q: (k, n) answers, whether or not they are free.
-            starts: (k, n) where the robot is.
-            seed: Of random arms.
-            every: Whether an answer that is free already competes with the others for being
-                preferred, instead of being kept.
-            reasons: Whether to find out if those without one would have one without the scene, or
-                if the robot could pass through itself.
-        """
-        found = self._look(problems, around, q, starts, seed, every, reasons)
-        home = np.tile(self.robot.home, (len(q), 1))
-        biased = problems.prefer != USUAL or not np.array_equal(starts, home)
-        left = np.flatnonzero(~found.free)
-        if not biased or not len(left):
-            return found
-        # A preference orders answers; whether there is one it does not decide.
-        some = replace(problems.rows(left), prefer=USUAL)
-        ends = self.trials.method.run(some, home[left], seed, False).q
-        met = self.trials.solved(some, ends, some.enforce_limits)
-        left, some, ends = left[met], some.rows(np.flatnonzero(met)), ends[met]
-        again = self._look(some, around.rows(left), ends, home[left], seed)
-        return found.with_free(left, again)
-
-    def _look(
-        self,
-        problems: Problems,
-        around: Surroundings,
-        q: Array,
-        starts: Array,
-        seed: int,
-        every: bool = False,
-        reasons: bool = False,
-    ) -> FreeAnswers:
-        """One search, see `find`."""
-        if not len(q):
-            return FreeAnswers(q, np.zeros(0, dtype=bool), ())
-        parts = []
-        for first in range(0, len(q), PARAMETERS.together):
-            rows = np.arange(first, min(first + PARAMETERS.together, len(q)))
-            search = FreeSearch(
-                self._finder,
-                self.arm_search,
-                problems.rows(rows),
-                around.rows(rows),
-                starts[rows],
-                seed,
-            )
-            if every:
-                search.take(q[rows], np.arange(len(rows)))
-            search.run(q[rows], every)
-            parts.append(search.found(reasons))
-        reports = tuple(report for part in parts for report in part.reports)
-        return FreeAnswers(
-            np.concatenate([part.q for part in parts]),
-            np.concatenate([part.free for part in parts]),
-            reports,
-        )
-
-    def beside(
-        self,
-        problems: Problems,
-        around: Surroundings,
-        q: Array,
-        starts: Array,
-        others: bool = False,
-    ) -> Array | None:
-        """The first that `find` looks at for one target: another arm (n,) for the same hand.
-
-        Args:
-            problems: One target.
-            around: What it is checked against.
-            q: (1, n) an answer that is not free.
-            starts: (1, n) where the robot is.
-            others: Whether to look at what comes next, too: the hands of further rounds.
-        """
-        search = FreeSearch(self._finder, self.arm_search, problems, around, starts, 0)
-        search.try_hands(q, np.zeros(1, dtype=np.intp))
-        if others:
-            for hands, owner in search.other_hands():
-                search.try_hands(hands, owner)
-        return search.best[0] if search.free[0] else None
-
-    def arm_margins(self, q: Array) -> Array:
-        """(m,) smallest distance of the arm from its limits, as a part of half its range."""
-        return self._finder.arm_margins(q)
-
-    def score(
-        self,
-        q: Array,
-        starts: Array,
-        prefer: Preference,
-        room: Array,
-        columns: list[int] | None = None,
-    ) -> Array:
-        """(m,) what is preferred, higher is better.
-
-        Args:
-            q: (m, n) configurations.
-            starts: (m, n) where the robot is.
-            prefer: What is preferred.
-            room: (m,) for "clearance".
-            columns: Motors whose distance from the limits counts; None: all.
-        """
-        return score_of(self._finder, q, starts, prefer, room, columns)
+def _searched(
+    finder: AlternativeFinder,
+    problems: Problems,
+    around: Surroundings,
+    q: Array,
+    starts: Array,
+    seed: int,
+    every: bool,
+    reasons: bool,
+) -> FreeAnswers:
+    """One search, see `free_answers`."""
+    if not len(q):
+        return FreeAnswers(q, np.zeros(0, dtype=bool), ())
+    parts = []
+    for first in range(0, len(q), PARAMETERS.together):
+        rows = np.arange(first, min(first + PARAMETERS.together, len(q)))
+        some = problems.rows(rows), around.rows(rows), starts[rows]
+        search = FreeSearch(finder, *some, seed)
+        if every:
+            search.take(q[rows], np.arange(len(rows)))
+        search.run(q[rows], every)
+        parts.append(search.found(reasons))
+    reports = tuple(report for part in parts for report in part.reports)
+    every_q, free = (np.concatenate([getattr(p, word) for p in parts]) for word in ("q", "free"))
+    return FreeAnswers(every_q, free, reports)
 
 
 class FreeSearch:
@@ -265,13 +186,12 @@ class FreeSearch:
     def __init__(
         self,
         finder: AlternativeFinder,
-        arm_search: ArmSearch | None,
         problems: Problems,
         around: Surroundings,
         starts: Array,
         seed: int,
     ) -> None:
-        self.finder, self.arm_search = finder, arm_search
+        self.finder, self.arm_search = finder, finder.arm_search
         self.problems, self.around = problems, around
         self.starts, self.seed = starts, seed
         self.trials = finder.trials
@@ -316,7 +236,9 @@ class FreeSearch:
         kept = np.flatnonzero(room >= -ROUNDING)
         if len(kept):
             some, mine = q[kept], owner[kept]
-            score = score_of(self.finder, some, self.starts[mine], self.problems.prefer, room[kept])
+            score = self.finder.score(
+                some, self.starts[mine], self.problems.prefer, room=room[kept]
+            )
             rows = best_of_each(mine, score, self.score)
             self.best[mine[rows]], self.score[mine[rows]] = some[rows], score[rows]
             self.free[mine[rows]] = True
@@ -506,22 +428,6 @@ def _shifted(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -
     return robot.lower + part * (robot.upper - robot.lower)
 
 
-def score_of(
-    finder: AlternativeFinder,
-    q: Array,
-    starts: Array,
-    prefer: Preference,
-    room: Array,
-    columns: list[int] | None = None,
-) -> Array:
-    """(m,) what is preferred of configurations, see `FreeFinder.score`."""
-    if callable(prefer):
-        return np.asarray(prefer(q), dtype=float)
-    if prefer == CLEARANCE:
-        return room
-    return finder.score(q, starts, prefer, columns)
-
-
 class UnconstrainedFingers:
     """The motors of k targets' hands that move no finger with a contact."""
 
@@ -655,17 +561,8 @@ class Deduplicator:
         return found
 
 
-class Freeing(Protocol):
-    """An engine that has a finder of free answers."""
-
-    @cached_property
-    def freer(self) -> FreeFinder:
-        """Finds them."""
-        ...
-
-
 def resolve_collisions(
-    engine: Callable[[Problems], Freeing],
+    finder_of: Callable[[Problems], AlternativeFinder],
     problems: Problems,
     around: Surroundings,
     starts: Array,
@@ -677,14 +574,14 @@ def resolve_collisions(
     """The verdicts on a batch after other answers were looked for where they touch something.
 
     Args:
-        engine: By targets of one kind the engine for them.
+        finder_of: By targets of one kind the finder for them.
         problems: k targets.
         around: What they are checked against.
         starts: (k, n) where the robot is.
         seed: Of all random numbers.
         outcome: What the method came to.
         batch: The verdicts on it.
-        reasons: Whether the reports say what else would do, see `FreeFinder.find`.
+        reasons: Whether the reports say what else would do, see `free_answers`.
     """
     every = problems.prefer in RANKED
     touching = batch.status == Status.COLLISION
@@ -696,12 +593,11 @@ def resolve_collisions(
     numbers = np.array([problems.number(row) for row in rows.tolist()], dtype=np.intp)
     # A target's random numbers are its own, whichever others are looked at with it.
     asked = replace(problems.rows(rows), picked=numbers)
-    robot = engine(asked.rows(slice(0, 1))).freer.robot
+    robot = finder_of(asked.rows(slice(0, 1))).robot
     for _, of_kinds, some in by_kinds(asked):
         chosen = rows if of_kinds is None else rows[of_kinds]
-        found = engine(some).freer.find(
-            some, around.rows(chosen), q[chosen], starts[chosen], seed, every, reasons
-        )
+        nearby, begun = around.rows(chosen), (q[chosen], starts[chosen])
+        found = free_answers(finder_of(some), some, nearby, *begun, seed, every, reasons)
         q[chosen] = found.q
         for row, report in zip(chosen.tolist(), found.reports, strict=True):
             reports[row] = report
@@ -716,7 +612,7 @@ def resolve_collisions(
 
 
 def resolve_at_once(
-    engine: Freeing,
+    finder: AlternativeFinder,
     problems: Problems,
     around: Surroundings,
     q: Array,
@@ -728,17 +624,23 @@ def resolve_at_once(
     What it gives is what `resolve_collisions` gives, which looks there first.
 
     Args:
-        engine: The engine for the target.
+        finder: For the target's kinds.
         problems: One target.
         around: What it is checked against.
         q: (n,) the answer.
         start: (n,) where the robot is.
         others: Whether to look at the hands of further rounds, too, as an exported solver does.
     """
-    finder = engine.freer
-    found = finder.beside(problems, around, q[None], start[None], others)
-    verdict = None if found is None else judge_one(finder.robot, problems, found)
-    if found is None or verdict is None:
+    search = FreeSearch(finder, problems, around, start[None], 0)
+    search.try_hands(q[None], np.zeros(1, dtype=np.intp))
+    if others:
+        for hands, owner in search.other_hands():
+            search.try_hands(hands, owner)
+    if not search.free[0]:
+        return None
+    found = search.best[0]
+    verdict = judge_one(finder.robot, problems, found)
+    if verdict is None:
         return None
     clear = around.check(found[None])
     return (found, verdict, clear) if clear.free[0] else None

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.answers.solution import BatchSolution, SuggestedFix
-from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Item, Scene
@@ -41,48 +39,36 @@ Free = Callable[[Problems], NDArray[np.bool_]]
 """Of k targets, which have a free answer."""
 
 
-class Solving(Protocol):
-    """An engine."""
-
-    @property
-    def robot(self) -> ArmHand:
-        """The robot."""
-        ...
-
-    @property
-    def check(self) -> SceneCheck | None:
-        """The scene about it."""
-        ...
-
-    def solve(self, problems: Problems, run: Run) -> BatchSolution:
-        """Solve targets."""
-        ...
-
-
 def with_way_out(
-    engine: Solving, problems: Problems, start: Array, seed: int, batch: BatchSolution
+    solve: Callable[[Problems, Run], BatchSolution],
+    check: SceneCheck,
+    problems: Problems,
+    start: Array,
+    seed: int,
+    batch: BatchSolution,
 ) -> BatchSolution:
     """The answer to one target that touches something, with what else would do in its report.
 
     Args:
-        engine: Solves.
+        solve: Solves targets.
+        check: The scene about the robot.
         problems: The target.
         start: (n,) where the robot is.
         seed: Of all random numbers.
         batch: The answer.
     """
-    (report,), check = batch.collisions, engine.check
-    if report is None or check is None:
+    (report,) = batch.collisions
+    if report is None:
         return batch
     scene, known = check.scene, problems
     if problems.object_pose is None and scene.grasped in scene.items:
         known = problems.holding(scene.grasped or "", scene.items[scene.grasped or ""].pose)
 
     def free(asked: Problems) -> NDArray[np.bool_]:
-        return engine.solve(asked, Run(start, seed)).success
+        return solve(asked, Run(start, seed)).success
 
     moved = _moved(known, _standing(check, known), free)
-    found = SuggestedFix(moved, STEPS[-1], _fewer(known, engine.robot.fingers, free))
+    found = SuggestedFix(moved, STEPS[-1], _fewer(known, check.robot.fingers, free))
     return replace(batch, collisions=(replace(report, way_out=found),))
 
 
