@@ -1,4 +1,4 @@
-"""A solve one iteration at a time, to look at it; the loop in compiled code is the fast way."""
+"""A solve one iteration at a time, to look at it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.kernels.step_graph import RUNNING, StepGraph
+from casadi_ik.errors import KernelError
+from casadi_ik.kernels.loop import LoopKernel
+from casadi_ik.kernels.step_graph import RUNNING
 
 Vector = NDArray[np.float64]
 
@@ -18,7 +20,7 @@ next one; None if the solve is over."""
 
 
 class Stepper:
-    """Runs a step graph in CasADi's virtual machine: the compiled loop's iterates up to rounding.
+    """Makes the iterations of a loop one by one.
 
     Iterating over it steps until the solve is over, however long that takes; a budget is the
     caller's.
@@ -31,7 +33,7 @@ class Stepper:
 
     def __init__(
         self,
-        graph: StepGraph,
+        loop: LoopKernel,
         state: Vector,
         parameters: Vector,
         next_round: NextRound | None = None,
@@ -39,14 +41,15 @@ class Stepper:
         """Start.
 
         Args:
-            graph: The step.
+            loop: What makes the steps.
             state: (ns,) the first state.
             parameters: (np,) targets, tolerances, gains.
             next_round: How a solve of several rounds goes on; None: there is one round.
         """
-        self.graph = graph
+        self.graph = loop.step
         self.iteration = 0
         self.status = RUNNING
+        self._loop = loop
         self._state = np.array(state, dtype=float)
         self._parameters = np.array(parameters, dtype=float)
         self._next_round = next_round
@@ -68,25 +71,20 @@ class Stepper:
             What is logged of it, by name: the fields of `StepGraph.record`. After the end it
             steps on from where the solve ended.
         """
-        state, record, status = self.graph.function(self._state, self._parameters)
-        self._state = _flat(state)
-        self.status = int(status)
+        result = self._loop.run(self._state[None], self._parameters[None], 1, trace=True)
+        if not len(result.trace[0]):
+            raise KernelError(f"{self.graph.name}: the function reports a failure")
+        (self._state,), (row,) = result.states, result.trace[0]
+        self.status = int(result.status[0])
         self.iteration += 1
         if self.status != RUNNING and self._next_round is not None:
             following = self._next_round(self.status, self._state)
             if following is not None:
                 self._state, self._parameters = following
                 self.status = RUNNING
-        values = self.graph.record.unpack(_flat(record))
-        return {
-            field.name: values[field.name].astype(field.dtype)[()] for field in self.graph.record
-        }
+        return {field.name: row[field.name] for field in self.graph.record}
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         """The records from here to the end."""
         while self.status == RUNNING:
             yield self.step()
-
-
-def _flat(vector: Any) -> Vector:
-    return np.array(vector, dtype=float).reshape(-1)

@@ -207,7 +207,7 @@ class ScrewControl:
         start = np.clip(self._posture(q0, "q0"), self.robot.lower, self.robot.upper)
         numbers = {**self._numbers, "tolerance": 0.0}
         vector = self._step.parameter_vector(self._checked(target), numbers)
-        return Stepper(self.kernel.step, start, vector)
+        return Stepper(self.kernel, start, vector)
 
     def _posture(self, q: ArrayLike | None, name: str) -> Array:
         array = self.robot.configuration(q, name)

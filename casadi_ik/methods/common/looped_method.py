@@ -146,7 +146,7 @@ class LoopedMethod(ABC):
         """One target, one iteration at a time; see `Method.stepper`."""
         self._check(problems)
         states, parameters = self.begin(problems, q0[None])
-        return Stepper(self.graph, states[0], parameters[0])
+        return Stepper(self.kernel, states[0], parameters[0])
 
     def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch; see `Method.run`. No random numbers are drawn."""

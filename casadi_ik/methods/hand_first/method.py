@@ -159,7 +159,7 @@ class HandFirstMethod(LoopedMethod):
             return search.state.copy(), search.parameters.copy()
 
         search.decide(UNBEGUN, rounds)
-        return Stepper(self.graph, search.state, search.parameters, following)
+        return Stepper(self.kernel, search.state, search.parameters, following)
 
     def postures(self, problems: Problems, number: int) -> Array:
         """Candidates (k, candidates, hand) of a round whose postures look like the targets.
