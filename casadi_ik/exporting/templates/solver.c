@@ -20,7 +20,7 @@ void @PREFIX@_init(@PREFIX@_solver *solver) {
   memset(solver, 0, sizeof *solver);
   memcpy(solver->terms, TERMS, sizeof TERMS);
   memcpy(solver->ranges, TERMS + TERMS_LOWER, sizeof solver->ranges);
-  solver->most = ROUNDS;
+  solver->most = ALL_ROUNDS;
   solver->status = @GUARD@_BAD_INPUT;
 @SCENE_INIT@}
 

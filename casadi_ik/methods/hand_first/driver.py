@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -50,15 +50,6 @@ FOREVER = 2**62
 
 SMALLEST = 1e-9
 """Smallest range [rad or m] a motion is measured by."""
-
-NUDGE = 1e-6
-"""Difference [rad or m] from which slopes are taken."""
-
-AT_END = 1e-6
-"""A motor this near to a limit [rad or m] stays there while its hand moves along a valley."""
-
-HELD = 1e6
-"""What holds a motor at its limit, in a matrix of squared slopes of order one."""
 
 KERNELS = {
     "look_up": "lookup_job",
@@ -225,10 +216,9 @@ class SearchPlan:
         return define(self._whole_numbers()) + "".join(lines) + define_arrays(tables)
 
     def _whole_numbers(self) -> dict[str, int]:
-        layouts, options = self.layouts, self.options
-        many = options.is_many(layouts.robot)
+        layouts, robot = self.layouts, self.layouts.robot
         places = {f"STATE_{name.upper()}": layouts.state.slice(name).start for name in STATE}
-        for label, layout in (("PARAMETERS", layouts.parameters), ("TERMS", terms(layouts.robot))):
+        for label, layout in (("PARAMETERS", layouts.parameters), ("TERMS", terms(robot))):
             for name in ("lower", "upper", "nearest"):
                 places[f"{label}_{name.upper()}"] = layout.slice(name).start
         return {
@@ -236,42 +226,34 @@ class SearchPlan:
             "REPEATED": REPEATED,
             "UNBEGUN": UNBEGUN,
             "BUDGET": self.budget,
-            "TABLE_ROUNDS": options.rounds,
-            "ROUNDS": self.rounds,
-            "VALLEYS": options.valley_rounds,
-            "FIRST_RUGGED": options.first_rugged,
-            "VARIED": options.varied_rounds,
-            "RETURNS": options.same_minimum[many],
-            "RETURNS_OF_HELD": options.same_minimum[1],
-            "POOL": options.pool,
+            "ALL_ROUNDS": self.rounds,
+            "FIRST_RUGGED": self.options.first_rugged,
             "MENDS": int(self.mends),
-            "FRESH_POOL": options.fresh_pool,
-            "LATE_POOL": options.late_pool,
-            "LATE_ROUND": options.late_round,
             "ENFORCE_LIMITS": int(self.enforce_limits),
-            "HAS_ARM": int(bool(layouts.robot.arm_actuators)),
-            "SOLVED_STATUS": int(Status.SOLVED),
-            "STALLED_STATUS": int(Status.STALLED),
-            "LIMIT_STATUS": int(Status.ITERATION_LIMIT),
-            "INVALID_STATUS": int(Status.INVALID),
-            "CANDIDATE_PHASE": int(Phase.CANDIDATE),
-            "REFINEMENT_PHASE": int(Phase.REFINEMENT),
+            "HAS_ARM": int(bool(robot.arm_actuators)),
             "N_CARRIED": len(self._carried),
             "N_FRESH": len(fresh_fit()),
             "N_COUNTS": len(STAGES),
+            **{f"{status.name}_STATUS": int(status) for status in Status},
+            **{f"{phase.name}_PHASE": int(phase) for phase in Phase},
+            **{k: v for k, v in self._options.items() if isinstance(v, int)},
             **places,
         }
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        """Those that are numbers; of the two for few and many motors the robot's and the other."""
+        many, found = self.options.is_many(self.layouts.robot), dict[str, Any]()
+        for name, value in asdict(self.options).items():
+            if isinstance(value, int | float):
+                found[name.upper()] = value
+            elif name in ("same_minimum", "far_cost"):
+                found |= {name.upper(): value[many], f"{name.upper()}_MANY": value[1]}
+        return found
 
     def _real_numbers(self) -> dict[str, float]:
         options, hand = self.options, len(self.layouts.robot.hand_actuators)
         return {
-            "SURE": options.flat_cost,
-            "NEAR_COST": options.far_cost[options.is_many(self.layouts.robot)],
-            "NEAR_OF_HELD": options.far_cost[1],
-            "NEAR_SHRINKS": options.far_cost_shrinks,
-            "AT_END": AT_END,
-            "HELD": HELD,
-            "NUDGE": NUDGE,
             "LENGTH": LENGTH,
             "ALIKE": options.similar * options.similar * hand,
             "UNIT": UNIT,
@@ -280,6 +262,7 @@ class SearchPlan:
             "TOLERANCE_SLACK": TOLERANCE_SLACK,
             "LIMIT_SLACK": LIMIT_SLACK,
             "SLICE": SLICE,
+            **{k: v for k, v in self._options.items() if isinstance(v, float)},
         }
 
     @property

@@ -17,7 +17,7 @@
 
 /* The first state and the parameters of the round, from its postures; what was found before stays. */
 static int begin_round(search *job) {
-  const int64_t number = job->round, later = number - TABLE_ROUNDS;
+  const int64_t number = job->round, later = number - ROUNDS;
   const double *inputs[5 + N_MORE];
   double *outputs[2], first[N_MOTORS];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
@@ -25,13 +25,13 @@ static int begin_round(search *job) {
   memcpy(job->last, job->state, sizeof job->last);
   /* The floor of some valleys falls so little that a refinement gives up: ten of them have reached
    * the end. By turns, since what has come to a valley's lowest place has to leave it. */
-  goes_on = later >= VALLEYS && (later - VALLEYS) % 2 == 0 && job->last[STATE_BEST_COST] < SURE;
+  goes_on = later >= VALLEY_ROUNDS && (later - VALLEY_ROUNDS) % 2 == 0 && job->last[STATE_BEST_COST] < FLAT_COST;
   if (later < 0 || !number) code = from_table(job, number);
-  else if (later < VALLEYS) code = along_valley(job, later);
-  else if (goes_on) code = along_valley(job, VALLEYS + (later - VALLEYS) / 2);
-  else from_anywhere(job, later - VALLEYS, first);
+  else if (later < VALLEY_ROUNDS) code = along_valley(job, later);
+  else if (goes_on) code = along_valley(job, VALLEY_ROUNDS + (later - VALLEY_ROUNDS) / 2);
+  else from_anywhere(job, later - VALLEY_ROUNDS, first);
 #if MENDS
-  if (later >= VALLEYS && !goes_on) code = from_spread(job, number);
+  if (later >= VALLEY_ROUNDS && !goes_on) code = from_spread(job, number);
 #endif
   if (code != DONE) return code;
   inputs[0] = job->points;
@@ -52,7 +52,7 @@ static int begin_round(search *job) {
   }
   job->state[STATE_PHASE] = CANDIDATE_PHASE;
   job->state[STATE_CANDIDATE] = 0.0;
-  if (later >= VALLEYS) {
+  if (later >= VALLEY_ROUNDS) {
     /* The first begins as a whole: what stands in the way may be arm and hand together. */
     if (goes_on) memcpy(first, job->last + STATE_BEST_Q, sizeof first);
     for (k = 0; k < N_MOTORS; ++k) {
@@ -73,12 +73,12 @@ static int begin_round(search *job) {
 static int may_help(const search *job) {
   const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
   const int held = job->state[STATE_HELD] > 0;
-  const double most = held ? RETURNS_OF_HELD : RETURNS, near = held ? NEAR_OF_HELD : NEAR_COST;
+  const double most = held ? SAME_MINIMUM_MANY : SAME_MINIMUM, near = held ? FAR_COST_MANY : FAR_COST;
   const int64_t rugged = job->round - FIRST_RUGGED;
   if (rugged >= 0) {
-    return returns < most && cost < near && cost < NEAR_SHRINKS / (double) (rugged + 1);
+    return returns < most && cost < near && cost < FAR_COST_SHRINKS / (double) (rugged + 1);
   }
-  return returns < most || cost < SURE || job->round < VARIED || job->round >= TABLE_ROUNDS;
+  return returns < most || cost < FLAT_COST || job->round < VARIED_ROUNDS || job->round >= ROUNDS;
 }
 
 /* The next round that may help; 0 if there is none. A preference orders answers: where none was
@@ -136,7 +136,7 @@ static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
     code = begin_round(job);
     return code == DONE ? GOES_ON : code;
   }
-  job->status = *status == RUNNING ? LIMIT_STATUS
+  job->status = *status == RUNNING ? ITERATION_LIMIT_STATUS
               : *status == REPEATED ? STALLED_STATUS
               : *status < 0 ? INVALID_STATUS : *status;
   if (job->again) job->terms[TERMS_NEAREST] = 1.0;

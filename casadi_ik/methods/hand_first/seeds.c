@@ -12,6 +12,12 @@
  * take a pointer to a job of the drivers; the constants come from driver.py.
  */
 
+#ifndef NUDGE
+#define NUDGE 1e-6             /* difference [rad or m] from which slopes are taken */
+#endif
+#define AT_END 1e-6            /* this near to a limit [rad or m] a motor stays there in a valley */
+#define HELD 1e6               /* what holds it, in a matrix of squared slopes of order one */
+
 static const int64_t ALONE[] = {0, 0, 0, 0, 0, 0, 0, 0};
 
 static int is_number(double x) { return x == x; }
@@ -185,7 +191,7 @@ static int from_table(search *job, int64_t number) {
   int64_t pool = number ? POOL * wanted : wanted;
   int code, i, k;
 #if MENDS
-  if (number >= VARIED) {
+  if (number >= VARIED_ROUNDS) {
     code = from_spread(job, number);
     if (code == DONE && job->terms[TERMS_NEAREST] > 0) order(job, 0);
     return code;
