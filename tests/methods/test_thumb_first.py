@@ -119,7 +119,7 @@ def test_the_nearest_of_what_is_seen(robot, rng):
     close = np.clip(q + rng.uniform(-0.02, 0.02, q.shape) * ranges, robot.lower, robot.upper)
     followed = solver.solve_batch(*targets, q0=close)
     assert followed.success.all()
-    assert followed.success.mean() > 0.995
+    assert np.median(np.abs((followed.q - close) / ranges).max(axis=1)) < 0.05
 
 
 def test_contacts_that_contradict_each_other_a_little_are_balanced(robot, rng):
