@@ -22,7 +22,7 @@ from samplers import contact_slopes, corners
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.batches.code import code_version
+from casadi_ik.batches.parts import code_version
 from casadi_ik.errors import InputError
 
 CLIMBERS = 512

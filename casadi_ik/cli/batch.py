@@ -23,13 +23,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from casadi_ik.api import Solver
 from casadi_ik.batches.backend import check_installed
-from casadi_ik.batches.code import code_version
-from casadi_ik.batches.columns import columns
-from casadi_ik.batches.folder import BatchFolder
-from casadi_ik.batches.part import Asked
-from casadi_ik.batches.run import solve_parts
-from casadi_ik.batches.sources import Source, source_of
-from casadi_ik.batches.target_file import TargetFile
+from casadi_ik.batches.parts import Asked, BatchFolder, code_version, columns, solve_parts
+from casadi_ik.batches.targets import Source, TargetFile, source_of
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import the_fixed, the_object_pose, the_robot, the_solver, the_start
 from casadi_ik.cli.outputs import check_outputs, folder_of, say, write_output, writing

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
-from casadi_ik.batches.target_file import TargetFile
-from casadi_ik.batches.target_table import polars_module
+from casadi_ik.batches.targets import TargetFile, polars_module
 from casadi_ik.datasets.conventions import Convention, convention_for, of_robot
 from casadi_ik.datasets.layouts import LAYOUTS, READERS, read_layout
 from casadi_ik.datasets.postures import (

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import TimeRemainingColumn as TimeRemaining
 from rich.text import Text
 
-from casadi_ik.batches.code import code_version
+from casadi_ik.batches.parts import code_version
 from runner.cluster import backend
 
 PART = ".part"

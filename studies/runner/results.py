@@ -10,7 +10,7 @@ from typing import Any
 
 import polars as pl
 
-from casadi_ik.batches.code import code_version
+from casadi_ik.batches.parts import code_version
 from casadi_ik.errors import InputError
 from runner.block import PART
 from runner.study import Block, Study, robot_of

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import casadi_ik as ik
 from casadi_ik import grasps
-from casadi_ik.batches.target_file import TargetFile
+from casadi_ik.batches.targets import TargetFile
 from casadi_ik.cli.outputs import OutputError, check_outputs
 
 CONTACT = "contacts: {thumb: {point: [0, 0, 0]}}\n"

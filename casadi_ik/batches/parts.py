@@ -1,0 +1,360 @@
+"""Batches in parts: each solved by a worker, stored whole, and gone on with after a kill."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import pickle
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from casadi_ik.answers.diagnosis import Diagnosis
+from casadi_ik.answers.solution import BatchSolution
+from casadi_ik.api import Solver
+from casadi_ik.arrays import Array
+from casadi_ik.batches.backend import backend
+from casadi_ik.batches.targets import Part, Source
+from casadi_ik.errors import CasadiIKError, InputError
+from casadi_ik.files.writing import tidy, written_whole
+from casadi_ik.grasps.pose import moved
+from casadi_ik.problem.status import Status
+
+MANIFEST = "batch.json"
+"""Name of the file that says what a folder's parts are answers to."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of all parts alike, as `Solver.solve_blocks` takes it.
+
+    Attributes:
+        q0: Start (n,); None: home.
+        seed: Of all random numbers.
+        diagnose: Whether to find out why what is not solved is not.
+        fixed: Actuators that are not to move.
+        prefer: Which of several solutions.
+        log: Whether every iteration is logged.
+    """
+
+    q0: list[float] | None = None
+    seed: int = 0
+    diagnose: bool = False
+    fixed: dict[str, float] | None = None
+    prefer: str | None = None
+    log: bool = False
+
+
+@dataclass(frozen=True)
+class SolvedPart:
+    """A part, solved; bytes, so that a worker needs no folder in common with who asked.
+
+    Attributes:
+        number: Of the part.
+        count: Targets of it.
+        answers: An npz of the arrays of `columns`, and `row`, each target's number among all.
+        log: An MCAP log, if one was asked for; solves are numbered as among all targets.
+        faults: What is wrong with a target, by its number among all.
+    """
+
+    number: int
+    count: int
+    answers: bytes
+    log: bytes | None
+    faults: dict[int, str]
+
+
+def solve_part(solver: bytes, asked: Asked, part: Part) -> SolvedPart:
+    """Solve a part.
+
+    Args:
+        solver: A pickled `Solver`; what it is made to is kept for the next part.
+        asked: How.
+        part: Its targets.
+    """
+    with tempfile.TemporaryDirectory(prefix="casadi_ik-part-") as place:
+        path = Path(place) / "part.mcap" if asked.log else None
+        (block,) = _solver(solver).solve_blocks(
+            [part.arrays],
+            asked.q0,
+            asked.seed,
+            log=path,
+            diagnose=asked.diagnose,
+            fixed=asked.fixed,
+            prefer=asked.prefer,
+            first_row=part.first_row,
+        )
+        log = None if path is None else path.read_bytes()
+    answers = io.BytesIO()
+    count = len(block.solution)
+    numbers = part.first_row + np.arange(count)
+    np.savez(answers, allow_pickle=False, row=numbers, **columns(block.solution))
+    return SolvedPart(part.number, count, answers.getvalue(), log, dict(block.faults))
+
+
+@lru_cache(maxsize=2)
+def _solver(pickled: bytes) -> Solver:
+    solver = pickle.loads(pickled)
+    assert isinstance(solver, Solver)
+    return solver
+
+
+class BatchFolder:
+    """Parts of one batch.
+
+    A part is there whole or not at all: whoever is killed loses what was being solved.
+
+    Attributes:
+        path: The folder.
+        logs: The folder of the logs, one per part; None: there are none.
+    """
+
+    def __init__(self, path: Path, logs: Path | None = None) -> None:
+        self.path, self.logs = path, logs
+
+    def part(self, number: int) -> Path:
+        """Where the answers of a part stand."""
+        return self.path / f"part-{number:06d}.npz"
+
+    def log(self, number: int) -> Path:
+        """Where its log stands."""
+        assert self.logs is not None
+        return self.logs / f"part-{number:06d}.mcap"
+
+    def claim(self, question: Mapping[str, Any], resume: bool) -> None:
+        """Take the folder for a batch, or go on with it.
+
+        Args:
+            question: Everything that decides the answers, as JSON holds it.
+            resume: Whether parts may be there already.
+
+        Raises:
+            InputError: It holds something else, or parts though `resume` is false.
+            OSError: It cannot be written.
+        """
+        mine = json.loads(json.dumps({"format": 1, **question}))
+        path = self.path / MANIFEST
+        if path.exists():
+            kept = self._read(path)
+            for key, value in mine.items():
+                if kept.get(key) != value:
+                    raise InputError(
+                        f"{path}: {key}: these parts were made with {_brief(kept.get(key))}, this "
+                        f"batch has {_brief(value)}; expected the same, or another --out"
+                    )
+            if not resume:
+                raise InputError(
+                    f"{self.path}: holds parts of this batch, expected --resume to go on with "
+                    "them, or another --out"
+                )
+        elif self.path.is_dir() and any(self.path.iterdir()):
+            raise InputError(f"{self.path}: holds files but no {MANIFEST}, expected a new folder")
+        for folder in filter(None, (self.path, self.logs)):
+            folder.mkdir(parents=True, exist_ok=True)
+            tidy(folder, ".part-*")
+        if not path.exists():
+            with written_whole(path) as part:
+                part.write_text(json.dumps(mine, indent=1) + "\n", encoding="utf-8")
+
+    def done(self) -> set[int]:
+        """Numbers of the parts that are there."""
+        return {
+            int(path.stem.removeprefix("part-"))
+            for path in self.path.glob("part-*.npz")
+            if path.stem.removeprefix("part-").isdigit()
+        }
+
+    def store(self, solved: SolvedPart) -> None:
+        """Put what came of a part into its place: the log first, so that what is there is whole.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        if solved.log is not None:
+            with written_whole(self.log(solved.number)) as part:
+                part.write_bytes(solved.log)
+        with written_whole(self.part(solved.number)) as part:
+            part.write_bytes(solved.answers)
+
+    def answers(self, number: int, first_row: int, count: int) -> dict[str, np.ndarray]:
+        """The arrays of a part.
+
+        Args:
+            number: Of the part.
+            first_row: Number of its first target among all.
+            count: Targets of it.
+
+        Raises:
+            InputError: Its file is damaged, or has the answers to other targets.
+        """
+        arrays = self._arrays(number)
+        rows = arrays.pop("row", np.zeros(0))
+        if not np.array_equal(rows, first_row + np.arange(count)):
+            found = f"{len(rows)} targets from {rows[0]} on" if len(rows) else "no row"
+            raise InputError(
+                f"{self.part(number)}: row: found {found}, expected {count} targets from "
+                f"{first_row} on; remove it and go on"
+            )
+        return arrays
+
+    def _arrays(self, number: int) -> dict[str, np.ndarray]:
+        path = self.part(number)
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(f"{path}: damaged ({error}); remove it and go on") from error
+
+    def remove(self) -> None:
+        """Remove the parts and the folder, if there is nothing else in it."""
+        for number in self.done():
+            self.part(number).unlink()
+        (self.path / MANIFEST).unlink()
+        if not any(self.path.iterdir()):
+            self.path.rmdir()
+
+    def _read(self, path: Path) -> dict[str, Any]:
+        try:
+            kept = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: cannot be read: {error}") from error
+        if not isinstance(kept, dict):
+            raise InputError(f"{path}: found {type(kept).__name__}, expected an object")
+        return kept
+
+
+def _brief(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:70]}..."
+
+
+def solve_parts(
+    solver: Solver,
+    source: Source,
+    asked: Asked,
+    folder: BatchFolder,
+    jobs: int = 1,
+    dask: str | None = None,
+    object_pose: Array | None = None,
+) -> Iterator[SolvedPart]:
+    """Solve what is missing and put it into its place; in the order in which parts are finished.
+
+    Args:
+        solver: The solver; it travels to the workers.
+        source: The targets.
+        asked: What is asked of all parts alike.
+        folder: Where parts are and go; claimed already.
+        jobs: Processes on this machine.
+        dask: Address of a Dask scheduler whose workers solve instead. A worker that dies costs
+            what it was solving, which others do again.
+        object_pose: (4, 4) where the object is in whose frame the targets are; None: they are in
+            the base frame.
+
+    Yields:
+        The parts, stored.
+
+    Raises:
+        InputError: A file of targets is damaged, or the cluster cannot be used or went away; what
+            is finished by then is in the folder.
+        OSError: A part cannot be stored.
+    """
+    done = folder.done()
+    if len(done.intersection(range(len(source.sizes)))) == len(source.sizes):
+        return
+    pickled = pickle.dumps(solver)
+    with backend(jobs, dask):
+        import joblib
+
+        # A batch of calls would come back, and be lost, as a whole; joblib's annotation of this
+        # argument knows the word "auto" only.
+        one: Any = 1
+        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=one)
+        parts = source.without(done)
+        if object_pose is not None:
+            parts = (replace(part, arrays=moved(part.arrays, object_pose)) for part in parts)
+        calls = (joblib.delayed(solve_part)(pickled, asked, part) for part in parts)
+        solved = iter(parallel(calls))
+        while True:
+            try:
+                ended = next(solved)
+            except StopIteration:
+                return
+            except CasadiIKError:
+                raise
+            except Exception as error:
+                if dask is None:
+                    raise
+                raise InputError(
+                    f"--dask {dask}: the cluster went away ({type(error).__name__}: {error}); "
+                    f"{folder.path} has {len(folder.done())} of {len(source.sizes)} parts, "
+                    "--resume goes on with them"
+                ) from error
+            assert isinstance(ended, SolvedPart)
+            folder.store(ended)
+            yield ended
+
+
+STATUS = np.dtype(f"<U{max(len(status.name) for status in Status)}")
+"""Names of statuses, as wide as the longest."""
+
+REASON = np.dtype("<U9")
+"""Names of reasons, "" where there is no diagnosis."""
+
+
+def columns(solved: BatchSolution) -> dict[str, np.ndarray]:
+    """The arrays of a block as they are written, a row per target."""
+    found: dict[str, np.ndarray] = {
+        "q": solved.q,
+        "success": solved.success,
+        "status": solved.status_names.astype(STATUS),
+        "position_error": solved.position_error,
+        "angle_error": solved.angle_error,
+        "iterations": solved.iterations,
+        "restarts": solved.restarts,
+        "time": solved.time,
+    }
+    if solved.clearance is not None:
+        found["clearance"] = solved.clearance
+    if solved.diagnoses:
+        found |= _diagnoses(solved.diagnoses, solved.q.shape[1])
+    return found
+
+
+def _diagnoses(diagnoses: tuple[Diagnosis | None, ...], n: int) -> dict[str, np.ndarray]:
+    count = len(diagnoses)
+    reason = np.zeros(count, dtype=REASON)
+    nearest, enough = np.full((count, n), np.nan), np.full((count, 2), np.nan)
+    for row, diagnosis in enumerate(diagnoses):
+        if diagnosis is not None:
+            reason[row] = diagnosis.reason.name
+            nearest[row] = diagnosis.q
+            enough[row] = diagnosis.enough.position, diagnosis.enough.angle
+    return {
+        "reason": reason,
+        "nearest_q": nearest,
+        "enough_position": enough[:, 0],
+        "enough_angle": enough[:, 1],
+    }
+
+
+@cache
+def code_version() -> str:
+    """Version of the package and a digest of the sources that decide a result."""
+    no_say = ("batches", "cli", "views", "logs")
+    digest = hashlib.sha256()
+    root = Path(str(files("casadi_ik")))
+    for path in sorted(path for pattern in ("*.py", "*.c") for path in root.rglob(pattern)):
+        name = path.relative_to(root)
+        if name.parts[0] not in no_say:
+            digest.update(name.as_posix().encode() + b"\0" + path.read_bytes())
+    return f"{version('casadi-ik')}+{digest.hexdigest()[:12]}"
