@@ -27,7 +27,7 @@ from runner import command, markdown_table, program, provenance, write_page
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.batches.code import code_version
+from casadi_ik.batches.parts import code_version
 
 Kept = dict[str, Any]
 """Arrays by name of the targets / what they are."""
