@@ -276,7 +276,7 @@ class ClosedForm(ArmFamily):
 def margin(joints: dict[int, Expr], lower: Expr, upper: Expr) -> Expr:
     """Smallest distance [rad] of some joints from their bounds, negative outside."""
     ends = [ca.fmin(angle - lower[i], upper[i] - angle) for i, angle in joints.items()]
-    return ca.mmin(ca.vertcat(*ends))
+    return ca.mmin(ca.vertcat(*ends)) if ends else ca.SX(np.inf)
 
 
 def better(one: tuple[Expr, ...], other: tuple[Expr, ...]) -> tuple[Expr, ...]:

@@ -1,0 +1,85 @@
+"""A family more, the lines of docs/add_an_arm_family.md, in a copy of the package."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import yaml
+from toy_robots import copy_shipped_robot, replace
+
+ROOT = Path(__file__).parents[2]
+
+SCRIPT = """
+import sys
+import numpy as np
+import casadi_ik as ik
+from casadi_ik.arms.recognise import family_in_words
+
+robot = ik.load_robot(sys.argv[1])
+assert family_in_words(robot.description) == "nearly gimbal", family_in_words(robot.description)
+solver = ik.Solver(robot, compiled=False)
+q = robot.random(np.random.default_rng(3), 5)
+batch = solver.solve_batch(*robot.contacts(q))
+assert batch.success.all(), batch.status
+assert batch.phases["arm-placement"].all()
+points, normals = robot.contacts(q[0])
+contacts = zip(robot.fingers, points, normals)
+grasp = ik.Grasp({name: ik.Contact(point, normal) for name, point, normal in contacts})
+found = solver.solve_all(grasp, limit=8, apart=0)
+assert {one.branch.wrist for one in found} <= {1, -1}
+assert found and all(one.branch.swivel is None for one in found)
+"""
+
+
+def gimbal_robot(folder: Path) -> Path:
+    """The shipped hand on the wrist of the shipped arm."""
+    path = copy_shipped_robot(folder)
+    arm = yaml.safe_load((folder / "arm.yaml").read_text())
+    arm["joints"] = arm["joints"][4:]
+    arm["joints"][0]["parent"] = arm["root"]
+    arm["home"] = {}
+    arm.pop("collision")
+    (folder / "arm.yaml").write_text(yaml.safe_dump(arm))
+    whole = yaml.safe_load(path.read_text())
+    for key in ("home", "collision"):
+        whole.pop(key, None)
+    path.write_text(yaml.safe_dump(whole))
+    return path
+
+
+def package_with_the_page(folder: Path) -> None:
+    """A copy of the package with the page's blocks in their places."""
+    shutil.copytree(
+        ROOT / "casadi_ik", folder / "casadi_ik", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    (folder / "models").symlink_to(ROOT / "models")
+    text = (ROOT / "docs" / "add_an_arm_family.md").read_text(encoding="utf-8")
+    family, row = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    arms = folder / "casadi_ik" / "arms"
+    (arms / "gimbal.py").write_text(family)
+    registry = arms / "recognise.py"
+    (old,) = re.findall(r"^FAMILIES: .*$", registry.read_text(), re.MULTILINE)
+    replace(registry, old, row.rstrip())
+    imported = "from casadi_ik.arms.locked_joints"
+    replace(registry, imported, f"from casadi_ik.arms.gimbal import Gimbal\n{imported}")
+
+
+def test_a_family_is_added_in_two_files(tmp_path):
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "package").mkdir()
+    path = gimbal_robot(tmp_path / "robot")
+    package_with_the_page(tmp_path / "package")
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(path)],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "package")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
