@@ -316,7 +316,7 @@ def reach(said: Said) -> Answer:
     draw, animation = None, outputs["--animation"]
     if animation is not None:
         with located("--animation", (MissingExtraError,)):
-            from casadi_ik.views.animation import draw_motion as draw
+            from casadi_ik.views import draw_motion as draw
     solver = the_solver(said, robot)
     with located(str(path)):
         found = solver.reach(

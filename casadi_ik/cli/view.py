@@ -33,10 +33,9 @@ from casadi_ik.importing.surfaces import Surface
 from casadi_ik.logs.solve import OneSolve, check_robot, one_solve
 
 if TYPE_CHECKING:
-    from casadi_ik.viewing import Viewer
-    from casadi_ik.viewing.asked import Asked, Settings
+    from casadi_ik.viewing import PageRequest, Settings, Viewer
 
-    Choices = dict[str, Callable[[], tuple[Asked, Array]]]
+    Choices = dict[str, Callable[[], tuple[PageRequest, Array]]]
 
 
 @command(
@@ -101,7 +100,7 @@ def opened(said: Said) -> Viewer:
     """
     with located("view", (MissingExtraError,)):
         from casadi_ik import viewing
-    from casadi_ik.viewing.asked import Settings
+    from casadi_ik.viewing import Settings
 
     served: dict[str, Any] = {"host": said.host, "port": said.port}
     if all(_is_log(Path(one)) for one in said.what):
@@ -176,11 +175,11 @@ def _meshes(robot: ArmHand, path: Path, said: Said) -> dict[str, Surface] | None
     """What the robot's files show, if that is asked for."""
     if not said.meshes:
         return None
-    from casadi_ik.viewing.meshes import robot_meshes
+    from casadi_ik.viewing import file_meshes
 
     if not path.is_file():
         raise InputError(f"--meshes: {robot.name} has no files of its own, expected a YAML file")
-    return robot_meshes(robot, path)
+    return file_meshes(robot, path)
 
 
 def _the_logs(said: Said) -> list[tuple[OneSolve, ArmHand]]:
@@ -214,15 +213,15 @@ def _candidates(
     Raises:
         InputError: The file is malformed, or no robot is said.
     """
-    from casadi_ik.viewing.asked import asked_of
+    from casadi_ik.viewing import request_of
 
     robot, pose = the_robot(said.robot, path), the_object_pose(said)
     choices: Choices = {}
     for number, grasp in enumerate(load_candidates(path, robot)):
         placed = grasp if pose is None else grasp.in_object_frame().at(pose)
 
-        def ask(placed: Any = placed) -> tuple[Asked, Array]:
-            return asked_of(robot, placed, None, scene, settings), robot.home
+        def ask(placed: Any = placed) -> tuple[PageRequest, Array]:
+            return request_of(robot, placed, None, scene, settings), robot.home
 
         choices[f"{number}: {grasp.name}" if grasp.name else str(number)] = ask
     return robot, choices
@@ -236,7 +235,7 @@ def _ranked(
     Raises:
         InputError: The file is none of that kind, or has no answers.
     """
-    from casadi_ik.viewing.asked import asked_of
+    from casadi_ik.viewing import request_of
 
     found = read_ranked(path)
     with located(f"{path}: ranked[0].solution.robot"):
@@ -246,8 +245,8 @@ def _ranked(
         with located(f"{path}: ranked[{place - 1}].solution.q"):
             q = robot.configuration(np.array([one.solution.q]))[0]
 
-        def ask(q: Array = q) -> tuple[Asked, Array]:
-            return asked_of(robot, None, q, scene, settings), q
+        def ask(q: Array = q) -> tuple[PageRequest, Array]:
+            return request_of(robot, None, q, scene, settings), q
 
         choices[f"{place}. {one.label}"] = ask
     return robot, choices

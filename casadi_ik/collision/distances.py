@@ -288,7 +288,7 @@ def _sharp_edges(points: Array, triangles: NDArray[np.int64]) -> tuple[Array, Ar
     """(e, 3) and (e, 3) the ends of edges at which a closed surface bends by more than 35 deg."""
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     order = np.lexsort(edges.T)
     faces = (order // 3).reshape(-1, 2)  # each edge is one of two triangles

@@ -60,12 +60,14 @@ class Solid:
         reach: Radius of a ball about the origin that holds it [m]; infinite for a half-space.
         planes: (m, 4) outward unit normals and offsets [m] of a convex body. Of a cloud, for each
             `GROUP` of points: centre and radius of a ball that holds them, then the points and 0.
+        surface: What it is drawn as, if that is known better than by its numbers.
     """
 
     kind: Kind
     size: Array
     reach: float
     planes: Array
+    surface: Mesh | None = None
 
     @property
     def points(self) -> Array:
@@ -78,7 +80,7 @@ class Solid:
 
     def mesh(self) -> Mesh:
         """Its surface: vertices (v, 3) [m] and triangles; of a half-space a plate at the origin."""
-        return (ROWS[self.kind].mesh or _seen_from_inside)(self)
+        return self.surface or (ROWS[self.kind].mesh or _seen_from_inside)(self)
 
 
 @dataclass(frozen=True)
@@ -197,10 +199,11 @@ def _solid(kind: Kind, size: tuple[float, ...], reach: float) -> Solid:
     return Solid(kind, np.array([*size, *[0.0] * (3 - len(size))]), reach, np.zeros((0, 4)))
 
 
-def convex(points: Array, normals: Array) -> Solid:
+def convex(points: Array, normals: Array, surface: Mesh | None = None) -> Solid:
     """The convex hull of points (k, 3) whose faces have these normals (m, 3)."""
     planes = _planes(normals, lambda ways: (ways @ points.T).max(axis=1))
-    return Solid(Kind.CONVEX, np.zeros(3), float(np.linalg.norm(points, axis=1).max()), planes)
+    reach = float(np.linalg.norm(points, axis=1).max())
+    return Solid(Kind.CONVEX, np.zeros(3), reach, planes, surface)
 
 
 def _planes(normals: Array, support: Callable[[Array], Array], spread_out: int = 512) -> Array:
@@ -301,9 +304,13 @@ def hull(points: Array, where: str) -> Solid:
         raise DescriptionError(f"{where}: encloses no volume, expected a body") from error
     if faces.volume < 1e-9 / 6:  # [m^3]
         raise DescriptionError(f"{where}: encloses no volume, expected a body")
+    ways = faces.equations[:, :3]
+    a, b, c = (points[faces.simplices[:, i]] for i in range(3))
+    inwards = (np.cross(b - a, c - a) * ways).sum(axis=1) < 0
+    triangles = np.where(inwards[:, None], faces.simplices[:, ::-1], faces.simplices)
     # Triangles of one face have one normal.
-    normals = np.unique(np.round(faces.equations[:, :3], 9), axis=0)
-    return convex(points, normals)
+    normals = np.unique(np.round(ways, 9), axis=0)
+    return convex(points, normals, (points, triangles.astype(np.int64)))
 
 
 def hulls(shape: MeshShape, where: str) -> list[tuple[Solid, Array]]:
@@ -359,7 +366,7 @@ def _elliptic(shape: EllipticCylinder) -> Solid:
         return np.hypot(ways[:, 0] * half[0], ways[:, 1] * half[1]) + np.abs(ways[:, 2]) * half[2]
 
     reach = math.hypot(max(half[0], half[1]), half[2])
-    return Solid(Kind.CONVEX, np.zeros(3), reach, _planes(faces, support))
+    return Solid(Kind.CONVEX, np.zeros(3), reach, _planes(faces, support), shape.mesh(48))
 
 
 def _bent(shape: BentCapsule, links: int = 5) -> list[tuple[Solid, Array]]:

@@ -1,16 +1,137 @@
 """Pages in the browser in which contacts are dragged and logs play; needs the extra `view`."""
 
-from casadi_ik.errors import MissingExtraError
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from os import PathLike
+from pathlib import Path
+
+from numpy.typing import ArrayLike
+
+from casadi_ik.arm_hand import ArmHand, load_robot
+from casadi_ik.arrays import Array
+from casadi_ik.collision.scene import Scene
+from casadi_ik.drawing.drawables import file_meshes
+from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
+from casadi_ik.files.reading import read_yaml
+from casadi_ik.grasps import Grasp
+from casadi_ik.importing.surfaces import Surface
+from casadi_ik.logs.solve import OneSolve
 
 try:
     import viser as _  # noqa: F401
 except ImportError as error:
     raise MissingExtraError(
         f"views in the browser need {error.name}, which is not installed: "
-        "pip install casadi-ik[view]"
+        "pip install 'casadi-ik[view]'"
     ) from error
 
-from casadi_ik.viewing.server import HOST, PORT, Viewer
-from casadi_ik.viewing.start import view_grasp, view_log, view_pads
+from casadi_ik.viewing.access import HOST, LOOPBACK, PORT, Viewer, serve
+from casadi_ik.viewing.grasp_page import GraspPage
+from casadi_ik.viewing.log_page import LogPage, track_of
+from casadi_ik.viewing.pad_page import PadPage
+from casadi_ik.viewing.request import PageRequest, Settings, request_of
 
-__all__ = ["HOST", "PORT", "Viewer", "view_grasp", "view_log", "view_pads"]
+__all__ = [
+    "HOST",
+    "PORT",
+    "PageRequest",
+    "Settings",
+    "Viewer",
+    "file_meshes",
+    "request_of",
+    "view_grasp",
+    "view_log",
+    "view_pads",
+]
+
+
+def view_grasp(
+    robot: ArmHand,
+    grasp: Grasp | None = None,
+    *,
+    q: ArrayLike | None = None,
+    scene: Scene | None = None,
+    settings: Settings | None = None,
+    meshes: Mapping[str, Surface] | None = None,
+    candidates: Mapping[str, Callable[[], tuple[PageRequest, Array]]] | None = None,
+    host: str = HOST,
+    port: int | None = None,
+) -> Viewer:
+    """A page on which contacts, the object and what stands about are dragged.
+
+    Args:
+        robot: The robot.
+        grasp: What is asked; None: the contacts that the robot has at q.
+        q: (n,) where the robot begins [rad or m]; None: at home. With a grasp it is solved from
+            there, unless q meets the contacts already.
+        scene: What stands about; None: nothing is checked.
+        settings: How it is solved.
+        meshes: What the robot's files show, by link.
+        candidates: Other requests to choose from, by name: each gives it, and a start.
+        host: Who may see it; "0.0.0.0": everybody in the network.
+        port: Where; None: the first free one from 8080 on.
+
+    Raises:
+        InputError: A finger that the robot has not, or a port that cannot be had.
+        CasadiIKError: The scene does not fit the robot.
+    """
+    start = robot.configuration(q)
+    asked = request_of(robot, grasp, start, scene, settings)
+    server = serve(host, port)
+    try:
+        page = GraspPage(server, robot, asked, start, meshes, candidates, solved=q is None)
+    except BaseException:
+        server.stop()
+        raise
+    return Viewer(server, page, page.stop)
+
+
+def view_log(
+    *solves: tuple[OneSolve, ArmHand],
+    scene: Scene | None = None,
+    host: str = HOST,
+    port: int | None = None,
+) -> Viewer:
+    """A page on which one solve plays, or two side by side.
+
+    Args:
+        solves: Each with the robot that it was solved for.
+        scene: What stood about the robot, which a log does not tell; None: nothing is drawn.
+        host: As for `view_grasp`.
+        port: As for `view_grasp`.
+
+    Raises:
+        LogError: The log has kept no iterations.
+        InputError: None or more than two, or a port that cannot be had.
+    """
+    if not 1 <= len(solves) <= 2:
+        raise InputError(f"found {len(solves)} solves, expected one or two")
+    tracks = [track_of(*one) for one in solves]
+    server = serve(host, port)
+    page = LogPage(server, tracks, scene)
+    return Viewer(server, page, page.stop)
+
+
+def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None = None) -> Viewer:
+    """A page on which the pads of an imported robot are corrected.
+
+    Args:
+        path: Its description, as `casadi-ik import` has written it.
+        host: As for `view_grasp`; what others may see they may not have written, and of what is
+            written from here the address has a token.
+        port: As for `view_grasp`.
+
+    Raises:
+        DescriptionError: The description is malformed, or does not state its pads.
+        InputError: A port that cannot be had.
+    """
+    file = Path(path)
+    robot = load_robot(file)
+    if not isinstance(read_yaml(file).get("fingers"), dict):
+        raise DescriptionError(f"{file}: fingers: expected the pads of the fingers, by name")
+    surfaces = file_meshes(robot, file)
+    writable = host in LOOPBACK
+    server = serve(host, port, secret=writable)
+    page = PadPage(server, robot, file, surfaces, writable)
+    return Viewer(server, page, page.stop)

@@ -1,20 +1,24 @@
-"""Who may open a page: Host, Origin and token of every request are looked at before viser is.
+"""Pages that are served, and who may open them.
 
-A browser sends any web page's requests to this machine, websockets too, and says in `Origin` whose
-they are; a page that had its own name lead here says so in `Host`. viser looks at neither.
+Host, Origin and token of every request are looked at before viser is: a browser sends any web
+page's requests to this machine, websockets too, and says in `Origin` whose they are; a page that
+had its own name lead here says so in `Host`. viser looks at neither.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import errno
 import hmac
+import io
 import ipaddress
 import logging
+import secrets
 import socket
 import threading
 import warnings
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
@@ -24,7 +28,10 @@ import msgspec.msgpack
 import viser
 from websockets.asyncio import server as websocket_server
 from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
+
+from casadi_ik.errors import InputError, UnsupportedError
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +39,13 @@ connections = logging.getLogger(f"{__name__}.connections")
 """Told of every connection and why it ended; goes nowhere unless somebody adds a handler."""
 connections.addHandler(logging.NullHandler())
 connections.propagate = False
+
+HOST = "127.0.0.1"
+"""Only this machine sees a page unless more is asked for."""
+
+PORT = 8080
+"""The first that is tried."""
+
 
 Handler = Callable[[ServerConnection], Awaitable[None]]
 
@@ -85,7 +99,7 @@ def _is_address(name: str) -> bool:
     return True
 
 
-@contextmanager
+@contextlib.contextmanager
 def asking(access: Access) -> Iterator[threading.Event]:
     """A viser server made here asks first, and says nothing of what is no message of its pages.
 
@@ -118,9 +132,21 @@ def _asking_first(access: Access, then: Any) -> Any:
         if refusal:
             return connection.respond(HTTPStatus.FORBIDDEN, f"{refusal}\n")
         path = request.path.removeprefix(f"/{access.token}") if access.token else request.path
-        return then(connection, Request(path or "/", request.headers))
+        if path.split("?")[0] not in ("", "/"):
+            return then(connection, Request(path, request.headers))
+        plain = ((k, v) for k, v in request.headers.raw_items() if k.lower() != "accept-encoding")
+        return _titled(then(connection, Request(path or "/", Headers(plain))))
 
     return process_request
+
+
+def _titled(page: Response | None) -> Response | None:
+    """The page itself, with its own name on the browser's tab."""
+    if page is not None:
+        page.body = page.body.replace(b"<title>Viser</title>", b"<title>casadi_ik</title>")
+        del page.headers["Content-Length"]
+        page.headers["Content-Length"] = str(len(page.body))
+    return page
 
 
 def _quiet(handler: Handler) -> Handler:
@@ -159,3 +185,100 @@ def refuse_other_updates(message: str | bytes) -> None:
     found = msgspec.msgpack.decode(message)
     if found.get("type") == "GuiUpdateMessage" and set(found["updates"]) != {"value"}:
         raise ValueError(f"found updates of {set(found['updates'])}, expected the value")
+
+
+# Servers.
+
+
+class Server(viser.ViserServer):
+    """viser's server without its public tunnel, which any browser could ask for.
+
+    Attributes:
+        token: First part of its address's path; "": it has none.
+    """
+
+    token = ""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Share nothing."""
+
+    def disconnect_share_url(self) -> None:
+        """Nothing is shared."""
+
+
+class Viewer:
+    """A running page; every browser that opens it sees and moves the same robot.
+
+    Attributes:
+        url: Where it is.
+        page: What is on it.
+    """
+
+    def __init__(self, server: Server, page: Any, stop: Callable[[], None]) -> None:
+        """Take what runs."""
+        self._server, self._stop, self.page = server, stop, page
+        self.url = f"http://{_shown(server.get_host())}:{server.get_port()}"
+        if server.token:
+            self.url += f"/{server.token}/"
+
+    def __repr__(self) -> str:
+        return f"<Viewer {self.url}>"
+
+    def _repr_html_(self) -> str:
+        """In a notebook: the page itself."""
+        return f'<iframe src="{self.url}" width="100%" height="600" frameborder="0"></iframe>'
+
+    def stop(self) -> None:
+        """End the page."""
+        self._stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def wait(self) -> None:
+        """Go on until somebody interrupts, then end the page."""
+        with contextlib.suppress(KeyboardInterrupt):
+            self._server.sleep_forever()
+        self.stop()
+
+
+def serve(host: str = HOST, port: int | None = None, secret: bool = False) -> Server:
+    """An empty page.
+
+    Args:
+        host: Who may see it: the address it is served at; "0.0.0.0" is everybody in the network.
+        port: Of the address; None: the first free one from 8080 on.
+        secret: Whether only who has the whole address, with its token, may open it.
+
+    Raises:
+        InputError: The port is taken, or nothing can be served there.
+        UnsupportedError: viser serves in a way in which nobody can be refused.
+    """
+    wanted = range(PORT, PORT + 100) if port is None else (port,)
+    free = next((one for one in wanted if _is_free(host, one)), None)
+    if free is None:
+        found = f"{port}" if port is not None else f"{PORT} to {PORT + 99}"
+        raise InputError(f"port: found {found}, which cannot be had at {host}; expected a free one")
+    access = Access(host, secrets.token_urlsafe(16) if secret else "")
+    with asking(access) as asked, contextlib.redirect_stdout(io.StringIO()):
+        server = Server(host=host, port=free, verbose=False)
+    if not asked.is_set():
+        server.stop()
+        raise UnsupportedError(f"viser {viser.__version__} cannot be told whom to refuse")
+    server.token = access.token
+    return server
+
+
+def _is_free(host: str, port: int) -> bool:
+    try:
+        with socket.create_server((host, port)):
+            return True
+    except OSError as error:
+        if error.errno in (errno.EADDRINUSE, errno.EACCES):
+            return False
+        raise InputError(f"host: found {host!r}, expected an address of this machine") from error
+
+
+def _shown(host: str) -> str:
+    if host in ("0.0.0.0", "::", ""):
+        return "127.0.0.1"
+    return f"[{host}]" if ":" in host else host

@@ -1,33 +1,51 @@
-"""The page on which guessed pads are corrected: fingertips and normals dragged on the hand."""
+"""The page on which guessed pads are corrected: fingertips and normals dragged on the hand.
+
+What is saved goes into the text of the description: all else in it stays as it was written.
+"""
 
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import viser
+import yaml
 
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.errors import CasadiIKError
+from casadi_ik.drawing.drawables import links_seen
+from casadi_ik.errors import CasadiIKError, DescriptionError
+from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
+from casadi_ik.files.writing import written_whole
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.importing.surfaces import Surface, together
-from casadi_ik.viewing.asked import Asked, asked_of
-from casadi_ik.viewing.drawn_contacts import Drags, DrawnContacts
-from casadi_ik.viewing.drawn_robot import DrawnRobot
+from casadi_ik.robots.load import load_description
+from casadi_ik.viewing.drawn import Drags, DrawnContacts, DrawnRobot, look_at_hand, set_stage
+from casadi_ik.viewing.grasp_page import on_press, on_set
 from casadi_ik.viewing.newest import Newest
-from casadi_ik.viewing.pad_text import LinkPad, save_pads
-from casadi_ik.viewing.robot_parts import robot_parts
-from casadi_ik.viewing.skin import on_skin
-from casadi_ik.viewing.stage import legend, look_at_hand, set_stage
-from casadi_ik.viewing.words import block
+from casadi_ik.viewing.request import PageRequest, request_of
+from casadi_ik.viewing.words import block, legend
 
-LEGEND = ((palette.TARGET, "pad and its outward normal: drag ball, arrow, rings"),)
+GUESS, CORRECTED = "GUESS:", "corrected by hand"
+"""What `casadi-ik import` marks a guess with, and what that becomes."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkPad:
+    """A pad in the frame of the link that moves it.
+
+    Attributes:
+        point: (3,) [m].
+        normal: (3,) outward, unit.
+    """
+
+    point: Array
+    normal: Array
 
 
 class PadPage:
@@ -60,11 +78,11 @@ class PadPage:
         """
         self.server, self.robot, self.path, self.said = server, robot, path, ""
         self._surfaces = dict(surfaces)
-        self.asked = self._first = asked_of(robot, None, None)
+        self.asked = self._first = request_of(robot, None, None)
         self._links, self._dragged = robot.links(robot.home), ""
-        parts = robot_parts(robot, surfaces)
+        parts = links_seen(robot, surfaces)
         lowest = min(
-            float(part.surface.moved(self._links[part.link]).points[:, 2].min()) for part in parts
+            float(part.surface.moved(self._links[part.frame]).points[:, 2].min()) for part in parts
         )
         set_stage(server, f"pads of {robot.name}", min(lowest, 0.0))
         look_at_hand(server, robot, robot.home)
@@ -77,7 +95,7 @@ class PadPage:
             self.asked,
             Drags(self.drag_control, self.drag_point, self.drag_normal, self.select),
             tips=False,
-            size=0.7,
+            size=1.0,
         )
         self._add_panel(writable)
         self.work = Newest(self._draw)
@@ -108,7 +126,7 @@ class PadPage:
     def onto_skin(self, finger: str) -> None:
         """Put a pad where its normal's line meets the skin, and face as the skin does there."""
 
-        def put(asked: Asked) -> Asked:
+        def put(asked: PageRequest) -> PageRequest:
             link = self.robot.description.finger(finger).link
             surface = self._skin(link)
             if surface is None or not len(surface.triangles):
@@ -159,7 +177,7 @@ class PadPage:
             if not np.allclose(held.control, self._first.held[name].control, atol=1e-7)
         ]
 
-    def pads(self, asked: Asked) -> dict[str, LinkPad]:
+    def pads(self, asked: PageRequest) -> dict[str, LinkPad]:
         """The pads in the frames of their links."""
         found: dict[str, LinkPad] = {}
         for finger, held in asked.held.items():
@@ -172,7 +190,9 @@ class PadPage:
         """End its thread."""
         self.work.stop()
 
-    def _change(self, key: str, change: Callable[[Asked], Asked], dragged: str = "") -> None:
+    def _change(
+        self, key: str, change: Callable[[PageRequest], PageRequest], dragged: str = ""
+    ) -> None:
         def work() -> None:
             self.said = ""
             self.asked, self._dragged = change(self.asked), dragged
@@ -185,7 +205,7 @@ class PadPage:
         for joint in self.robot.description.joints:
             if joint.type == "fixed" and joint.parent in rigid:
                 rigid.add(joint.child)
-        skins = {part.link: part.surface for part in robot_parts(self.robot)} | self._surfaces
+        skins = {part.frame: part.surface for part in links_seen(self.robot)} | self._surfaces
         return together([skins[one].moved(back @ self._links[one]) for one in skins.keys() & rigid])
 
     def _add_panel(self, writable: bool) -> None:
@@ -197,25 +217,12 @@ class PadPage:
         self._save = gui.add_button(
             f"Save to {self.path.name}", icon=None, color="green", disabled=not writable
         )
-        gui.add_html(legend(LEGEND))
+        gui.add_html(legend([(palette.TARGET, "pad and its normal: drag ball, arrow, rings")]))
         if writable:  # a disabled button can be pressed by who writes the messages by hand
-
-            @self._save.on_click
-            async def _(_: Any) -> None:
-                self.save()
-
-        @self._chosen.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                self.select(str(self._chosen.value))
-
-        @skin.on_click
-        async def _(_: Any) -> None:
-            self.onto_skin(str(self._chosen.value))
-
-        @back.on_click
-        async def _(_: Any) -> None:
-            self.reset()
+            on_press(self._save, lambda _: self.save())
+        on_set(self._chosen, lambda finger: self.select(str(finger)))
+        on_press(skin, lambda _: self.onto_skin(str(self._chosen.value)))
+        on_press(back, lambda _: self.reset())
 
     def _draw(self) -> None:
         with self.server.atomic():
@@ -247,3 +254,165 @@ class PadPage:
         table = f'<table style="width:100%;border-collapse:collapse">{"".join(rows)}</table>'
         said = f'<div class="ik-said"><b>{html.escape(self.said)}</b></div>' if self.said else ""
         return block(table + said, 0.72)
+
+
+# Files.
+
+
+def save_pads(path: Path, pads: Mapping[str, LinkPad]) -> None:
+    """Write corrected pads into a description; what was written is read back before it counts.
+
+    Args:
+        path: The description.
+        pads: By finger.
+
+    Raises:
+        DescriptionError: The description does not state its pads, or cannot be written.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DescriptionError(f"{path}: cannot be read: {error.strerror or error}") from error
+    frames = read_yaml(path).get("fingers")
+    if not isinstance(frames, dict):
+        raise DescriptionError(f"{path}: fingers: expected the pads of the fingers, by name")
+    before = load_description(path)
+    for finger, pad in pads.items():
+        entry = frames.get(finger)
+        if not isinstance(entry, dict):
+            raise DescriptionError(f"{path}: fingers.{finger}: missing, expected a pad")
+        place = before.finger(finger).placement
+        xyz, rpy = (tuple(entry.get(key, (0.0, 0.0, 0.0))) for key in ("xyz", "rpy"))
+        # The link that the file names may be fixed to the one that moves.
+        named = place @ inverse(frame_matrix(Frame(xyz, rpy)))
+        point = (inverse(named) @ np.append(pad.point, 1.0))[:3]
+        text = corrected(text, finger, point, place[:3, :3].T @ pad.normal)
+    try:
+        with written_whole(path) as part:
+            part.write_text(text, encoding="utf-8")
+            _check(part, pads)
+    except OSError as error:
+        raise DescriptionError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def corrected(text: str, finger: str, point: Array, normal: Array) -> str:
+    """A description with another pad.
+
+    Args:
+        text: The YAML.
+        finger: Whose pad.
+        point: (3,) in the link's frame [m].
+        normal: (3,) in the contact frame.
+
+    Raises:
+        DescriptionError: The text has no such pad.
+    """
+    key, entry = _finger(text, finger)
+    values = {"xyz": _vector(point), "normal": _vector(normal)}
+    edits: list[tuple[int, int, str]] = []
+    there = {name.value: value for name, value in entry.value}
+    for name, value in values.items():
+        if name in there:
+            node = there[name]
+            edits.append((node.start_mark.index, node.end_mark.index, value))
+        elif entry.flow_style:
+            edits.append((entry.end_mark.index - 1, entry.end_mark.index - 1, f", {name}: {value}"))
+        else:
+            first, _ = entry.value[0]
+            indent = " " * first.start_mark.column
+            at = first.start_mark.index
+            edits.append((at, at, f"{name}: {value}\n{indent}"))
+    for start, end, value in sorted(edits, reverse=True):
+        text = text[:start] + value + text[end:]
+    return _marked(text, key.start_mark.line)
+
+
+def _finger(text: str, finger: str) -> tuple[yaml.ScalarNode, yaml.MappingNode]:
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    for above in ("fingers", finger):
+        pairs = root.value if isinstance(root, yaml.MappingNode) else []
+        found = next(((key, value) for key, value in pairs if key.value == above), None)
+        if found is None:
+            raise DescriptionError(f"fingers.{finger}: not in the description")
+        key, root = found
+    if not isinstance(root, yaml.MappingNode):
+        raise DescriptionError(f"fingers.{finger}: expected a pad (link, xyz, normal)")
+    return key, root
+
+
+def _marked(text: str, line: int) -> str:
+    """The comment above a finger says that it is no guess any more, and what the guess was."""
+    lines = text.split("\n")
+    above = lines[line - 1] if line else ""
+    indent = re.match(r"\s*", lines[line])
+    if above.lstrip().startswith("#") and GUESS in above:
+        lines[line - 1] = above.replace(GUESS, f"{CORRECTED}; the guess was:")
+    elif CORRECTED not in above:
+        lines.insert(line, f"{indent[0] if indent else ''}# {CORRECTED}")
+    return "\n".join(lines)
+
+
+def _check(part: Path, pads: Mapping[str, LinkPad]) -> None:
+    """See to it that what was written is what was meant.
+
+    Raises:
+        DescriptionError: It is not.
+    """
+    description = load_description(part)
+    for finger, pad in pads.items():
+        found = description.finger(finger)
+        normal = found.placement[:3, :3] @ found.normal
+        point = found.placement[:3, 3]
+        if np.abs(np.concatenate([point - pad.point, normal - pad.normal])).max() > 1e-6:
+            raise DescriptionError(f"fingers.{finger}: could not be corrected in the text")
+
+
+def _vector(values: Array) -> str:
+    return "[" + ", ".join(_number(float(value)) for value in values) + "]"
+
+
+def _number(value: float) -> str:
+    text = f"{value:.7f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text
+
+
+# The skin.
+
+
+def on_skin(surface: Surface, point: Array, normal: Array) -> tuple[Array, Array] | None:
+    """The point where a pad's normal comes out of the skin, and the skin's normal there.
+
+    The skin is looked for from 6 cm along the normal; what is within 4 mm says which way it faces.
+
+    Args:
+        surface: Of what moves with the pad.
+        point: (3,) the pad as it is [m].
+        normal: (3,) its normal, unit.
+
+    Returns:
+        (3,) and (3,); None: the normal's line does not meet the skin.
+    """
+    found = surface.hit(point + 0.06 * normal, -normal)
+    if found is None:
+        return None
+    a, b, c = (surface.points[surface.triangles[:, i]] for i in range(3))
+    ways = np.cross(b - a, c - a)
+    near = np.linalg.norm((a + b + c) / 3 - found, axis=1) <= 0.004
+    # Of large triangles the middle is far from the pad: then it is the one under the pad.
+    chosen = near | _holds(a, b, c, ways, found)
+    ways = ways[chosen] / np.maximum(np.linalg.norm(ways[chosen], axis=1), 1e-30)[:, None] ** 0.5
+    cosines = ways @ normal
+    total = (ways * np.sign(cosines)[:, None])[np.abs(cosines) > 0].sum(axis=0)
+    length = float(np.linalg.norm(total))
+    return found, total / length if length > 0 else normal
+
+
+def _holds(a: Array, b: Array, c: Array, ways: Array, point: Array) -> Array:
+    """(t,) whether a point lies on triangles."""
+    areas = np.maximum((ways * ways).sum(axis=1), 1e-30)
+    flat = np.abs(((point - a) * ways).sum(axis=1)) <= 1e-7 * np.sqrt(areas)
+    parts = [
+        (np.cross(two - one, point - one) * ways).sum(axis=1) / areas
+        for one, two in ((a, b), (b, c), (c, a))
+    ]
+    return flat & (np.min(parts, axis=0) >= -1e-6)

@@ -16,8 +16,20 @@ except ImportError as error:
         f"pictures need {error.name}, which is not installed: pip install casadi-ik[plots]"
     ) from error
 
-from casadi_ik.views.convergence import draw_convergence
-from casadi_ik.views.pads import draw_pads
-from casadi_ik.views.scene import draw_alternatives, draw_solution, show
+from casadi_ik.views.charts import draw_convergence
+from casadi_ik.views.pictures import (
+    draw_alternatives,
+    draw_motion,
+    draw_pads,
+    draw_solution,
+    show,
+)
 
-__all__ = ["draw_alternatives", "draw_convergence", "draw_pads", "draw_solution", "show"]
+__all__ = [
+    "draw_alternatives",
+    "draw_convergence",
+    "draw_motion",
+    "draw_pads",
+    "draw_solution",
+    "show",
+]

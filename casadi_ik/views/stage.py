@@ -1,19 +1,23 @@
-"""A PyVista plotter with light, a floor with a soft shadow, and a parallel camera."""
+"""Pictures of drawables by PyVista: light, a floor with a soft shadow, a parallel camera."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
+from itertools import product
 from typing import cast
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
+from casadi_ik.drawing.drawables import Drawable
 from casadi_ik.errors import PictureError
-from casadi_ik.views.shapes import Solid
-from casadi_ik.views.viewpoint import View, axes_of
+
+View = tuple[float, float]
+"""Azimuth about z from x, and elevation above the horizon, of the viewer [rad]."""
 
 Image = NDArray[np.floating]
 """(h, w, channels) of values in 0..1."""
@@ -27,15 +31,9 @@ LIGHTS = (
 
 MATERIAL = {"ambient": 0.46, "diffuse": 1.0, "specular": 0.35, "specular_power": 40.0}
 
-GRID = 0.25
-"""Distance of the floor's lines [m]."""
-
-TEXELS = 1024
-"""Of the floor's texture along each side."""
-
 
 class Stage:
-    """Groups of solids on white.
+    """Groups of drawables on white.
 
     Args:
         off_screen: Whether no window will be opened.
@@ -68,41 +66,62 @@ class Stage:
         """Give back what was taken."""
         self.plotter.close()
 
-    def add(self, group: str, solids: Sequence[Solid], opacity: float = 1.0) -> None:
-        """Put solids on the stage."""
+    def add(
+        self, group: str, drawables: Sequence[Drawable], opacity: float = 1.0, orient: bool = False
+    ) -> None:
+        """Put drawables on the stage.
+
+        Args:
+            group: What they belong to.
+            drawables: In the base frame.
+            opacity: 0 to 1.
+            orient: Whether their triangles may wind either way.
+        """
         look = {"opacity": opacity, "culling": "back", "render": False, **MATERIAL}
-        actors = [self.plotter.add_mesh(mesh, color=color, **look) for mesh, color in solids]
+        actors = [
+            self.plotter.add_mesh(_smooth(one, orient), color=one.color, **look)
+            for one in drawables
+        ]
         for actor in actors:
             actor.prop.interpolation = "Phong"
         self._groups[group] = actors
 
-    def replace(self, group: str, solids: Sequence[Solid], opacity: float = 1.0) -> None:
-        """Put other solids in the place of a group."""
+    def replace(self, group: str, drawables: Sequence[Drawable], opacity: float = 1.0) -> None:
+        """Put other drawables in the place of a group."""
         for actor in self._groups.pop(group, []):
             self.plotter.renderer.remove_actor(actor, render=False)
-        self.add(group, solids, opacity)
+        self.add(group, drawables, opacity)
 
-    def add_floor(self, height: float, solids: Sequence[Solid]) -> None:
-        """A floor that fades out, with a grid and the soft shadow of solids."""
-        points = np.concatenate([mesh.points for mesh, _ in solids])
+    def add_floor(
+        self, height: float, drawables: Sequence[Drawable], grid: float = 0.25, texels: int = 1024
+    ) -> None:
+        """A floor that fades out, with a grid and the soft shadow of drawables.
+
+        Args:
+            height: Of the floor [m].
+            drawables: Of what the shadow is.
+            grid: Distance of its lines [m].
+            texels: Of its texture along each side.
+        """
+        points = points_of(drawables)
         low, high = points.min(axis=0), points.max(axis=0)
         middle = np.array([*(low + high)[:2] / 2, height])
         radius = 0.35 + float(np.linalg.norm(high[:2] - low[:2])) / 2
         with closing(Stage()) as sky:
             sky.plotter.disable_anti_aliasing()  # it gets blurred
-            sky.add("solids", solids)
+            sky.add("above", drawables)
             square = middle + radius * np.array([[-1, -1, 0], [1, 1, 0]])
-            sky.aim((-np.pi / 2, np.pi / 2), square, (TEXELS, TEXELS))
-            above = pv.ImageData(dimensions=(TEXELS, TEXELS, 1))
+            sky.aim((-np.pi / 2, np.pi / 2), square, (texels, texels))
+            above = pv.ImageData(dimensions=(texels, texels, 1))
             above["shadow"] = sky.shoot()[..., 3].ravel()
         soft = cast("pv.ImageData", above.gaussian_smooth(std_dev=9.0, radius_factor=2.5))
-        shadow = np.reshape(soft.point_data["shadow"], (TEXELS, TEXELS))
+        shadow = np.reshape(soft.point_data["shadow"], (texels, texels))
 
-        x, y = np.meshgrid(*[((np.arange(TEXELS) + 0.5) / TEXELS * 2 - 1) * radius] * 2)
+        x, y = np.meshgrid(*[((np.arange(texels) + 0.5) / texels * 2 - 1) * radius] * 2)
         fade = np.clip(1.6 * (1 - np.hypot(x, y) / radius), 0.0, 1.0)
-        off = [np.abs((v / GRID + 0.5) % 1 - 0.5) * GRID for v in (x + middle[0], y - middle[1])]
-        line = np.clip(1.5 - np.minimum(*off) / (1.2 * radius / TEXELS + 0.0012), 0.0, 1.0)
-        texture = np.zeros((TEXELS, TEXELS, 4), dtype=np.uint8)
+        off = [np.abs((v / grid + 0.5) % 1 - 0.5) * grid for v in (x + middle[0], y - middle[1])]
+        line = np.clip(1.5 - np.minimum(*off) / (1.2 * radius / texels + 0.0012), 0.0, 1.0)
+        texture = np.zeros((texels, texels, 4), dtype=np.uint8)
         light = (1 - 0.26 * shadow) * (1 - fade * (0.035 + 0.10 * line))
         texture[..., 3] = np.round(255 * (1 - light))
         plane = pv.Plane(center=middle, i_size=2 * radius, j_size=2 * radius)
@@ -153,7 +172,70 @@ class Stage:
         return np.asarray(image, dtype=np.float32) / np.float32(255)
 
 
+def _smooth(one: Drawable, orient: bool) -> pv.PolyData:
+    """Its surface, smooth but where its faces meet at a sharp angle."""
+    mesh = pv.PolyData.from_regular_faces(one.surface.points, one.surface.triangles)
+    if orient:
+        mesh.clean(inplace=True)
+    mesh.compute_normals(
+        split_vertices=True, feature_angle=35.0, auto_orient_normals=orient, inplace=True
+    )
+    return mesh
+
+
+def points_of(drawables: Sequence[Drawable]) -> Array:
+    """(k, 3) corners of all of them."""
+    return np.concatenate([one.surface.points for one in drawables])
+
+
 def over(below: Image | float, layer: Image, opacity: Image | float = 1.0) -> Image:
     """An image (h, w, 3) under one of `Stage.shoot`."""
     alpha = layer[..., 3:]
     return below + opacity * (layer[..., :3] - (1 - alpha) - alpha * below)
+
+
+def axes_of(view: View) -> Array:
+    """(3, 3) unit rows: to the right, up, and towards the viewer."""
+    (c, s), (ce, se) = ((np.cos(angle), np.sin(angle)) for angle in view)
+    return np.array([[-s, c, 0.0], [-se * c, -se * s, ce], [ce * c, ce * s, se]])
+
+
+def close_view(robot: ArmHand, q: ArrayLike) -> View:
+    """Where fingertips and palm are furthest apart in the image, and pads are seen from the side.
+
+    Args:
+        robot: The robot.
+        q: (n,) actuator positions [rad or m].
+    """
+    points, normals = robot.contacts(q)
+    links, palm = robot.links(q), robot.palm(q)[:3, 3]
+    joints = [joint for joint in robot.description.joints if joint.part != "hand"]
+    arm = np.mean([links[joint.parent][:3, 3] for joint in joints] or [palm], axis=0)
+    spots = np.concatenate([points, palm[None]])
+
+    def score(view: View) -> float:
+        axes = axes_of(view)
+        flat = spots @ axes[:2].T
+        gaps = np.linalg.norm(flat[:, None] - flat[None], axis=2)
+        gap = gaps[np.triu_indices(len(spots), 1)].min()
+        side = 1 - np.abs(normals @ axes[2]).max()
+        hidden = max(0.0, float((arm - palm) @ axes[2]))  # behind the arm
+        return float(gap + 0.03 * side - 0.05 * hidden - 0.01 * abs(view[1] - 0.35))
+
+    azimuths = np.deg2rad(np.arange(0, 360, 10)).tolist()
+    return max(product(azimuths, np.deg2rad([5, 15, 25, 35]).tolist()), key=score)
+
+
+def whole_view(target: Array, close: View) -> View:
+    """From the side of an arm that reaches for a target, on the side of the close-up.
+
+    Args:
+        target: (3,) what is to be grasped, in the base frame [m].
+        close: How the close-up is seen.
+    """
+    elevation = float(np.deg2rad(18.0))
+    if np.hypot(target[0], target[1]) < 0.05:
+        return close[0], elevation
+    along = float(np.arctan2(target[1], target[0]))
+    sides = (along + np.deg2rad(65.0), along - np.deg2rad(65.0))
+    return max(sides, key=lambda side: float(np.cos(side - close[0]))), elevation

@@ -11,7 +11,8 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
 from casadi_ik.arrays import Array
-from casadi_ik.views.picture import FAINT, INK, new_figure
+from casadi_ik.palette import FAINT, INK
+from casadi_ik.views.charts import new_figure
 
 RESULTS = Path(__file__).parents[1] / "results"
 PAPER, OURS = "#e08a2e", "#2f6db3"

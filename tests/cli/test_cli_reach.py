@@ -19,7 +19,7 @@ import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.grasps.load import grasp_data
 from casadi_ik.motion.motion import Motion
-from casadi_ik.views.animation import draw_motion
+from casadi_ik.views import draw_motion
 
 
 def test_the_motion_is_written(run: Command, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.viewing import Viewer, view_grasp
+from casadi_ik import viewing
 
 URDF = """<robot name="hand"><link name="palm"/>
 {links}</robot>"""
@@ -36,15 +36,15 @@ fingers:  # xyz [m]
 
 
 @pytest.fixture(scope="session")
-def cup_viewer(robot: ik.ArmHand) -> Iterator[Viewer]:
+def cup_viewer(robot: ik.ArmHand) -> Iterator[viewing.Viewer]:
     """The cup on the shipped robot, a table about it."""
-    viewer = view_grasp(robot, ik.load_grasp("cup"), scene=ik.load_scene("table"))
+    viewer = viewing.view_grasp(robot, ik.load_grasp("cup"), scene=ik.load_scene("table"))
     yield viewer
     viewer.stop()
 
 
 @pytest.fixture
-def cup(cup_viewer: Viewer) -> Iterator[Viewer]:
+def cup(cup_viewer: viewing.Viewer) -> Iterator[viewing.Viewer]:
     """The same, as it was at the beginning."""
     cup_viewer.page.reset()
     assert cup_viewer.page.work.settle()

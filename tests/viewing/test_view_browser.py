@@ -14,9 +14,9 @@ from bench_view import NO_PAINTING
 from browser import CHROMIUM, Browser, Page
 
 import casadi_ik as ik
-from casadi_ik.viewing import Viewer, files, view_log, view_pads
-from casadi_ik.viewing.drawn_contacts import SIZE
-from casadi_ik.viewing.frames import pose_of
+from casadi_ik import viewing
+
+SIZE, pose_of = viewing.drawn.CONTACT_CONTROL, viewing.drawn.pose_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (Debian: apt chromium)")
 
@@ -38,7 +38,7 @@ def browser() -> Iterator[Browser]:
         yield one
 
 
-def opened(browser: Browser, viewer: Viewer, painted: bool = False) -> tuple[Page, Any]:
+def opened(browser: Browser, viewer: viewing.Viewer, painted: bool = False) -> tuple[Page, Any]:
     """The page, and the camera of its browser as the server knows it, once it has drawn.
 
     Without a graphics card painting takes most of the time: it is left out unless it is asked for.
@@ -71,7 +71,13 @@ def pixel(page: Page, client: Any, point: np.ndarray) -> np.ndarray:
     return np.array(box[:2]) + np.array(box[2:]) / 2 + focal * seen[:2] / seen[2]
 
 
-def drag_along(page: Page, client: Any, pose: np.ndarray, far: float, size: float = SIZE) -> None:
+def drag_along(
+    page: Page,
+    client: Any,
+    pose: np.ndarray,
+    far: float,
+    size: float = SIZE,
+) -> None:
     """Drag that arrow of a control at a pose that is seen longest, so far [m]."""
     here = pixel(page, client, pose[:3, 3])
     tips = [pixel(page, client, pose[:3, 3] + size * pose[:3, i]) for i in range(3)]
@@ -111,7 +117,7 @@ def arrived(file: Path) -> None:
     assert file.is_file(), sorted(one.name for one in file.parent.iterdir())
 
 
-def test_a_contact_is_dragged_by_mouse_and_reached(cup: Viewer, browser: Browser) -> None:
+def test_a_contact_is_dragged_by_mouse_and_reached(cup: viewing.Viewer, browser: Browser) -> None:
     page, client = opened(browser, cup)
     time.sleep(1.5)  # the camera comes to rest
     assert said(page, ".ik-status") == "SOLVED"
@@ -136,9 +142,9 @@ def test_a_contact_is_dragged_by_mouse_and_reached(cup: Viewer, browser: Browser
 
 
 def test_two_browsers_see_one_drag_and_save_it(
-    cup: Viewer, browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cup: viewing.Viewer, browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(files, "SIZE", (320, 200))
+    monkeypatch.setattr("casadi_ik.viewing.grasp_page.PICTURE", (200, 320))
     other, _ = opened(browser, cup)
     page, _ = opened(browser, cup, painted=True)
     shown = cup.page
@@ -172,12 +178,12 @@ def test_two_browsers_see_one_drag_and_save_it(
 def test_guessed_pads_are_corrected_by_mouse_and_saved(description: Path, browser: Browser) -> None:
     guessed = ik.load_robot(description)
     points, normals = guessed.contacts(guessed.home)
-    viewer = view_pads(description)
+    viewer = viewing.view_pads(description)
     page, client = opened(browser, viewer)
     time.sleep(1.0)  # the camera comes to rest
     shown = viewer.page
     # One by its arrows, which it has from the beginning, the other's normal by its own arrow.
-    drag_along(page, client, shown.asked.held["first"].control, 0.004, 0.7 * SIZE)
+    drag_along(page, client, shown.asked.held["first"].control, 0.004, SIZE / 1.5)
     pose = shown.asked.held["second"].control
     tip = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0])
     aside = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0] + 0.012 * pose[:3, 2])
@@ -208,7 +214,7 @@ def test_two_logs_are_played_by_mouse_in_their_scene(
         path = tmp_path / f"{name}.mcap"
         ik.Solver(robot).solve(ik.load_grasp(name), log=path)
         solves.append((ik.logs.one_solve(ik.logs.open(path)), robot))
-    viewer = view_log(*solves, scene=ik.load_scene("table"))
+    viewer = viewing.view_log(*solves, scene=ik.load_scene("table"))
     page, _ = opened(browser, viewer)
     assert "iteration 0 of" in said(page, ".ik-iteration")
     press(page, "Play")

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
+from casadi_ik import viewing
 from casadi_ik.cli.main import main
 from casadi_ik.cli.report import as_json
 from casadi_ik.cli.table import parse
 from casadi_ik.cli.view import opened
-from casadi_ik.viewing import Viewer
 
 CANDIDATES = """robot: kuka_lwr_barrett
 candidates:
@@ -26,9 +26,9 @@ candidates:
 @pytest.fixture
 def view() -> Iterator[object]:
     """Opens what the command line says; ends it all."""
-    running: list[Viewer] = []
+    running: list[viewing.Viewer] = []
 
-    def open_page(*words: str) -> Viewer:
+    def open_page(*words: str) -> viewing.Viewer:
         running.append(opened(parse(["view", *words])[1]))
         return running[-1]
 
@@ -153,5 +153,5 @@ def test_without_viser_the_extra_is_named(
     for name in [name for name in sys.modules if name.startswith("casadi_ik.viewing")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ik.CasadiIKError, match=r"pip install casadi-ik\[view\]"):
+    with pytest.raises(ik.CasadiIKError, match=r"pip install 'casadi-ik\[view\]'"):
         robot.view()

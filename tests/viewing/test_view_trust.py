@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Origin, Subprotocol
 
-from casadi_ik.viewing import Viewer, view_pads
+from casadi_ik import viewing
 
 VERSION = f"viser-v{viser.__version__}"
 CAMERA = {
@@ -74,15 +74,15 @@ def asked(url: str, **headers: str) -> tuple[int, bytes]:
 
 
 @pytest.fixture
-def pads(description: Path) -> Iterator[Viewer]:
-    viewer = view_pads(description)
+def pads(description: Path) -> Iterator[viewing.Viewer]:
+    viewer = viewing.view_pads(description)
     yield viewer
     viewer.stop()
 
 
-def dragged(viewer: Viewer) -> dict[str, Any]:
+def dragged(viewer: viewing.Viewer) -> dict[str, Any]:
     """What a browser sends when the first contact is moved."""
-    control = viewer.page._contacts._targets[viewer.page.robot.fingers[0]].control
+    control = viewer.page._contacts._targets[viewer.page.robot.fingers[0]].control.handle
     moved = control.position + np.array([0.0, 0.002, 0.0])
     return {
         "type": "TransformControlsUpdateMessage",
@@ -107,7 +107,7 @@ def pressed(handle: Any) -> dict[str, Any]:
         ("127.0.0.1.evil.example:8080", None),
     ],
 )
-def test_a_foreign_page_is_refused(cup: Viewer, host: str, origin: str | None) -> None:
+def test_a_foreign_page_is_refused(cup: viewing.Viewer, host: str, origin: str | None) -> None:
     with pytest.raises(InvalidStatus) as caught:
         opened(cup.url, host, origin)
     assert caught.value.response.status_code == 403
@@ -116,7 +116,7 @@ def test_a_foreign_page_is_refused(cup: Viewer, host: str, origin: str | None) -
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
-def test_the_page_itself_is_answered(cup: Viewer, name: str) -> None:
+def test_the_page_itself_is_answered(cup: viewing.Viewer, name: str) -> None:
     """Also through a tunnel: the port may be another one."""
     there = urlsplit(cup.url)
     assert b"<html" in asked(cup.url, Host=f"{name}:9999")[1].lower()
@@ -125,7 +125,7 @@ def test_the_page_itself_is_answered(cup: Viewer, name: str) -> None:
             assert greeted(page)
 
 
-def test_where_can_be_written_the_address_has_a_token(pads: Viewer, description: Path) -> None:
+def test_where_can_be_written_the_address_has_a_token(pads, description: Path) -> None:
     there, before = urlsplit(pads.url), description.read_text()
     assert len(there.path) > 20
     assert asked(pads.url)[0] == 200
@@ -145,7 +145,7 @@ def test_where_can_be_written_the_address_has_a_token(pads: Viewer, description:
 
 
 def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
-    before, viewer = description.read_text(), view_pads(description, host="0.0.0.0")
+    before, viewer = description.read_text(), viewing.view_pads(description, host="0.0.0.0")
     with opened(viewer.url) as page:
         assert greeted(page)
         send(page, dragged(viewer))
@@ -161,7 +161,7 @@ def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
     viewer.stop()
 
 
-def test_nothing_is_shared(cup: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_shared(cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
 
     def tunnel(*words: Any) -> None:
@@ -179,11 +179,11 @@ def test_nothing_is_shared(cup: Viewer, monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path: Path) -> None:
     code = (
-        "from casadi_ik.viewing import view_grasp; import casadi_ik as ik, sys\n"
-        "viewer = view_grasp(ik.load_robot('kuka_lwr_barrett'), ik.load_grasp('cup'))\n"
+        "from casadi_ik import viewing; import casadi_ik as ik, sys\n"
+        "viewer = viewing.view_grasp(ik.load_robot('kuka_lwr_barrett'), ik.load_grasp('cup'))\n"
         "panel, targets = viewer.page._panel, viewer.page._contacts._targets\n"
-        "print(viewer.url, panel._drag._impl.uuid, targets['thumb'].control.name,\n"
-        "      panel._motors._sliders[0]._impl.uuid, flush=True)\n"
+        "print(viewer.url, panel._drag._impl.uuid, targets['thumb'].control.handle.name,\n"
+        "      panel._motors[0]._impl.uuid, flush=True)\n"
         "sys.stdin.read(); assert viewer.page.work.settle(); viewer.stop()\n"
         "print(viewer.page.asked.grasp.contacts['thumb'].point.tolist())\n"
     )

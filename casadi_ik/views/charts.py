@@ -1,34 +1,91 @@
-"""How a solve converges: errors, step sizes and singular values over the iterations."""
+"""Diagrams: how a solve converges, over its iterations; and figures, which are written whole."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass, field
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullFormatter
+from numpy.typing import NDArray
 
 from casadi_ik import palette
 from casadi_ik.arrays import Array
-from casadi_ik.errors import InputError
+from casadi_ik.errors import InputError, PictureError
+from casadi_ik.files.writing import written_whole
 from casadi_ik.logs import Table
+from casadi_ik.logs.detect import bits_of
+from casadi_ik.logs.events import EVENT_COLORS
 from casadi_ik.problem.problems import Tolerance
-from casadi_ik.views.picture import DPI, FAINT, INK, new_figure, save_picture
-from casadi_ik.views.strips import draw_strip, events_strip, limits_strip, mark_events, runs
 
-COLORS = palette.LINES
-"""Of the lines of a panel; where there are more of them, dashes tell the rounds apart."""
+DPI = 160
+"""Dots per inch of a picture unless said."""
+
+INK, FAINT = palette.INK, palette.FAINT
+"""Colours of text."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What a picture is drawn on.
+
+    Attributes:
+        paper: Its colour.
+        ink: Of text.
+        faint: Of text beside.
+    """
+
+    paper: str
+    ink: str
+    faint: str
+
+
+LIGHT = Ground("#ffffff", INK, FAINT)
+DARK = Ground(palette.DARK_PAPER, palette.DARK_INK, palette.DARK_FAINT)
+
+
+def new_figure(width: float, height: float, dpi: float = DPI, ground: Ground = LIGHT) -> Figure:
+    """An empty figure.
+
+    Args:
+        width: [inch].
+        height: [inch].
+        dpi: Dots per inch.
+        ground: What it is drawn on.
+    """
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor=ground.paper)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_picture(picture: Figure | bytes, path: str | PathLike[str]) -> None:
+    """Write a figure as PNG, or what is a picture already; there is a whole file or none.
+
+    Raises:
+        PictureError: It cannot be written; the message names path and reason.
+    """
+    target = Path(path)
+    if target.exists() and not target.is_file():
+        raise PictureError(f"{target}: cannot write the picture: not a regular file")
+    drawn = io.BytesIO()
+    if isinstance(picture, Figure):
+        picture.savefig(drawn, format="png", dpi=picture.dpi)
+    try:
+        with written_whole(target) as part:
+            part.write_bytes(picture if isinstance(picture, bytes) else drawn.getvalue())
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise PictureError(f"{target}: cannot write the picture: {reason}") from error
+
 
 DASHES = ("-", (0, (4, 1.2)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)))
-
-LONG = 400
-"""From so many iterations on, lines are thin: thick ones would fill the panel."""
-
-PHASE_COLORS = palette.PHASES
-"""By the code of the phase."""
+"""Of lines of a panel that have the same of its colours."""
 
 FIELDS = {
     "position_error": ("distance to the contact [mm]", 1e3, 1e-6),
@@ -102,8 +159,9 @@ def draw_convergence(
     for panel in panels:
         for values in panel.lines.values():
             values[:first] = values[last + 1 :] = np.nan  # the scale is that of what is seen
-    strips = [strip for strip in (events_strip(events), limits_strip(iterations)) if strip.rows]
-    heights = [1.0] * len(panels) + [0.12 + 0.11 * len(strip.rows) for strip in strips]
+    strips = {"events": event_rows(events), "at a limit": _limits(iterations)}
+    strips = {title: rows for title, rows in strips.items() if rows}
+    heights = [1.0] * len(panels) + [0.12 + 0.11 * len(rows) for rows in strips.values()]
     figure = new_figure(9.0, 1.25 + 1.7 * sum(heights), dpi)
     grid = figure.subplots(
         len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
@@ -112,9 +170,9 @@ def draw_convergence(
         _dress(axes, iterations)
     for axes, panel in zip(grid, panels, strict=False):
         _draw(axes, panel, last - first + 1)
-        mark_events(axes, events)
-    for axes, strip in zip(grid[len(panels) :], strips, strict=True):
-        draw_strip(axes, strip)
+        _mark_events(axes, events)
+    for axes, (title_of, rows) in zip(grid[len(panels) :], strips.items(), strict=True):
+        _draw_rows(axes, title_of, rows)
     grid[-1].set_xlabel("iteration", color=INK)
     grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     grid[-1].set_xlim(first - 0.5, last + 0.5)
@@ -177,13 +235,13 @@ def _lines(iterations: Table, name: str, factor: float, smallest: float) -> dict
 def _draw(axes: Axes, panel: Panel, shown: int) -> None:
     """Draw a panel of so many iterations."""
     marker = "." if shown <= 60 else ""
-    long = shown >= LONG
-    many = len(panel.lines) > len(COLORS)
+    long = shown >= 400  # thick lines would fill the panel
+    many = len(panel.lines) > len(palette.LINES)
     for i, (label, values) in enumerate(panel.lines.items()):
         axes.plot(
             values,
-            color=COLORS[i % len(COLORS)],
-            ls=DASHES[i // len(COLORS) % len(DASHES)],
+            color=palette.LINES[i % len(palette.LINES)],
+            ls=DASHES[i // len(palette.LINES) % len(DASHES)],
             # Equal lines must not hide one another.
             lw=0.7 if long else 1.2 if many else max(2.8 - 0.7 * i, 1.2),
             marker="" if many else marker,
@@ -191,7 +249,7 @@ def _draw(axes: Axes, panel: Panel, shown: int) -> None:
             label=label.replace("_", " "),
         )
         if label in panel.thresholds:
-            style = {"color": COLORS[i % len(COLORS)], "lw": 1.0, "ls": (0, (1, 1.5))}
+            style = {"color": palette.LINES[i % len(palette.LINES)], "lw": 1.0, "ls": (0, (1, 1.5))}
             axes.axhline(panel.thresholds[label], label=f"{label}: near singular", **style)
     if not panel.linear:
         axes.set_yscale("log")
@@ -226,8 +284,8 @@ def _dress(axes: Axes, iterations: Table) -> None:
     """Phases as shades, a faint grid, no box."""
     if "phase" in iterations.names:
         codes = iterations.rows["phase"].astype(np.int64)
-        for first, last in runs(codes):
-            color = PHASE_COLORS[codes[first] % len(PHASE_COLORS)]
+        for first, last in _runs(codes):
+            color = palette.PHASES[codes[first] % len(palette.PHASES)]
             axes.axvspan(first - 0.5, last + 0.5, color=color, lw=0, zorder=0)
     axes.grid(visible=True, color="white", lw=0.9)
     axes.set_axisbelow(True)
@@ -251,7 +309,7 @@ def _head(figure: Figure, iterations: Table, title: str) -> None:
     names = labels.get("phase", ())
     handles = [
         Patch(
-            color=PHASE_COLORS[code % len(PHASE_COLORS)],
+            color=palette.PHASES[code % len(palette.PHASES)],
             label=(names[code] if code < len(names) else f"phase {code}").replace("-", " "),
         )
         for code in np.unique(rows["phase"]).astype(int).tolist()
@@ -265,3 +323,64 @@ def _head(figure: Figure, iterations: Table, title: str) -> None:
         fontsize=10,
         labelcolor=INK,
     )
+
+
+Rows = dict[str, tuple[list[tuple[float, float]], str]]
+"""Bars (where one begins, how wide it is) and their colour, by the name of the row."""
+
+
+def _limits(iterations: Table) -> Rows:
+    """When each actuator was at a limit, of those that ever were."""
+    rows: Rows = {}
+    if "limit_mask" in iterations.names:
+        bits = bits_of(iterations.rows["limit_mask"].reshape(len(iterations), -1))
+        for name, hit in zip(iterations.labels.get("limit_mask", ()), bits.T, strict=False):
+            if hit.any():
+                held = [pair for pair in _runs(hit.astype(np.int64)) if hit[pair[0]]]
+                bars = [(first - 0.5, last - first + 1.0) for first, last in held]
+                rows[name.replace("_", " ")] = bars, palette.LINES[4]
+    return rows
+
+
+def event_rows(events: Table | None) -> Rows:
+    """When what happened that is marked, by kind and Jacobian."""
+    rows: Rows = {}
+    for kind, subject, iteration in _marked(events):
+        name = " ".join((kind.lower(), subject if "_" in kind else "")).replace("_", " ").strip()
+        rows.setdefault(name, ([], EVENT_COLORS[kind]))[0].append((iteration - 0.5, 1.0))
+    return rows
+
+
+def _mark_events(axes: Axes, events: Table | None) -> None:
+    """Draw a faint line through a diagram where something happened that is marked."""
+    for kind, _, iteration in _marked(events):
+        axes.axvline(iteration, color=EVENT_COLORS[kind], lw=0.7, alpha=0.5, zorder=1)
+
+
+def _draw_rows(axes: Axes, title: str, rows: Rows) -> None:
+    for row, (bars, color) in enumerate(rows.values()):
+        # The edge keeps an iteration among thousands visible.
+        axes.broken_barh(bars, (row - 0.32, 0.64), facecolor=color, edgecolor=color, lw=0.8)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.yaxis.set_ticks_position("right")
+    axes.set_yticks(range(len(rows)), list(rows), fontsize=9)
+    axes.tick_params(axis="y", length=0, colors=INK)
+    axes.grid(visible=False, axis="y")
+    axes.set_title(title, loc="left", size=10, color=INK, pad=4)
+
+
+def _runs(values: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """First and last index of every run of equal values."""
+    edges = np.flatnonzero(np.diff(values)) + 1
+    return list(zip([0, *edges.tolist()], [*(edges - 1).tolist(), len(values) - 1], strict=True))
+
+
+def _marked(events: Table | None) -> list[tuple[str, str, int]]:
+    """Kind, subject and iteration of every event that is marked."""
+    if events is None or len(events) == 0:
+        return []
+    return [
+        (record["kind"], record["subject"], record["iteration"])
+        for record in events.records()
+        if record["kind"] in EVENT_COLORS
+    ]

@@ -1,4 +1,4 @@
-"""Questions of a page: what a drag makes of them, what is saved."""
+"""Parts of pages: what a drag makes of a request, the worker, surfaces, texts that are saved."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
+from casadi_ik.drawing.drawables import item_of, links_seen
+from casadi_ik.drawing.surfaces import arrow, ball, facing, sharp
+from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.kernels.cancellation import stop_if_cancelled
-from casadi_ik.viewing.asked import asked_of
-from casadi_ik.viewing.bodies import arrow, body_of, sharp
-from casadi_ik.viewing.frames import facing, pose_of, quaternions
-from casadi_ik.viewing.grasp_text import grasp_text
+from casadi_ik.viewing import file_meshes, request_of
+from casadi_ik.viewing.drawn import pose_of, quaternions
+from casadi_ik.viewing.grasp_page import grasp_text
 from casadi_ik.viewing.newest import REST, Newest
+from casadi_ik.viewing.pad_page import LinkPad, corrected, save_pads
 
 
 def turned(x: float, y: float, z: float, *angles: float) -> np.ndarray:
@@ -45,7 +48,7 @@ def test_a_control_faces_along_the_normal(rng: np.random.Generator) -> None:
 
 def test_dragging_a_control_moves_all_that_the_contact_asks_for(robot: ik.ArmHand) -> None:
     contact = ik.Contact([0.5, 0.1, 0.6], [0, 0, 1], line=[1, 0, 0])
-    asked = asked_of(robot, ik.Grasp({"thumb": contact}), None)
+    asked = request_of(robot, ik.Grasp({"thumb": contact}), None)
     step = turned(0.1, 0.0, -0.1)
     moved = asked.with_control("thumb", step @ asked.held["thumb"].control)
     found, expected = moved.grasp.contacts["thumb"], contact.at(step)
@@ -56,7 +59,7 @@ def test_dragging_a_control_moves_all_that_the_contact_asks_for(robot: ik.ArmHan
 
 def test_contacts_move_with_the_object(robot: ik.ArmHand) -> None:
     grasp = ik.load_grasp("cup")
-    asked, pose = asked_of(robot, grasp, None), turned(-0.7, 0.2, 0.5)
+    asked, pose = request_of(robot, grasp, None), turned(-0.7, 0.2, 0.5)
     moved = asked
     for share in (0.25, 0.5, 1.0):  # in steps, as a drag comes
         here = pose.copy()
@@ -69,7 +72,7 @@ def test_contacts_move_with_the_object(robot: ik.ArmHand) -> None:
 
 
 def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
-    asked = asked_of(robot, ik.load_grasp("cup"), None)
+    asked = request_of(robot, ik.load_grasp("cup"), None)
     for finger in robot.fingers[:-1]:
         asked = asked.with_use(finger, used=False, normal=True)
     last = robot.fingers[-1]
@@ -173,22 +176,44 @@ def test_bodies_are_closed_and_wind_outwards() -> None:
             "box": {"kind": "box", "size": [0.1, 0.2, 0.3]},
             "drum": {"kind": "cylinder", "radius": 0.1, "length": 0.2},
             "ball": {"kind": "sphere", "radius": 0.1},
+            "tube": {"kind": "capsule", "radius": 0.1, "length": 0.2},
+            "floor": {"kind": "half-space"},
+            "seen": {"kind": "point-cloud", "radius": 0.01, "points": [[0.1, 0, 0], [0, 0.1, 0]]},
             "banana": {"kind": "object", "object": "banana"},
             "can": {"kind": "object", "object": "mustard_bottle"},
         }
     )
-    bodies = [body_of(s, np.zeros(3)) for item in scene.items.values() for s, _ in item.parts]
-    for body in [*bodies, arrow(0.05, 0.005)]:
-        a, b, c = (body.points[body.triangles[:, i]] for i in range(3))
-        volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
-        assert volume > 0
-        # What is closed has no area in sum.
-        assert np.allclose(np.cross(b - a, c - a).sum(axis=0), 0, atol=1e-9)
+    drawn = [one for item in scene.items.values() for one in item_of(item, np.zeros(3))]
+    bodies = [one.surface for one in drawn]
+    for body in [*bodies, arrow(np.zeros(3), np.array([1.0, 0, 0]), 0.05, 0.005)]:
+        for surface in (body, sharp(body)):
+            a, b, c = (surface.points[surface.triangles[:, i]] for i in range(3))
+            assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 > 0
+            # What is closed has no area in sum.
+            assert np.allclose(np.cross(b - a, c - a).sum(axis=0), 0, atol=1e-9)
 
 
 def test_edges_are_sharp_and_round_sides_are_not() -> None:
-    from casadi_ik.importing.surfaces import box_shape, round_shape
+    (box,) = ik.Scene({"box": {"kind": "box", "size": [1, 1, 1]}}).items.values()
+    (body,) = item_of(box, np.zeros(3))
+    assert len(sharp(body.surface).points) == 6 * 4 + 2  # lids have a middle
+    assert len(sharp(ball(1.0)).points) == len(ball(1.0).points)
 
-    assert len(sharp(box_shape(np.ones(3))).points) == 24
-    ball = round_shape(1.0, 0.0, "Sphere")
-    assert len(sharp(ball).points) <= len(ball.points)
+
+def test_nothing_is_written_where_pads_are_not_stated(description: Path) -> None:
+    text = description.read_text()
+    with pytest.raises(DescriptionError, match=r"fingers\.third"):
+        save_pads(description, {"third": LinkPad(np.zeros(3), np.array([1.0, 0.0, 0.0]))})
+    assert description.read_text() == text
+    with pytest.raises(DescriptionError, match=r"fingers\.third: not in the description"):
+        corrected(text, "third", np.zeros(3), np.ones(3))
+
+
+def test_meshes_are_those_of_the_files(description: Path) -> None:
+    robot = ik.load_robot(description)
+    meshes = file_meshes(robot, description)
+    assert set(meshes) == {"first_2", "second_2"}
+    drawn = {one.frame: one.surface for one in links_seen(robot, meshes)}
+    for link in meshes:
+        assert np.allclose(np.ptp(drawn[link].points, axis=0), [0.02, 0.016, 0.04])
+        assert np.allclose(drawn[link].points.mean(axis=0), [0, 0, 0.02])

@@ -1,9 +1,13 @@
-"""Questions of a page answered: solved, and told why not where they cannot be."""
+"""Requests of a page, and how they are answered: solved, and told why not where they cannot be.
+
+A request is contacts that hang on controls, an object, a scene and settings.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -12,20 +16,16 @@ from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
+from casadi_ik.drawing.surfaces import facing
 from casadi_ik.errors import CasadiIKError, UnsupportedError
-from casadi_ik.grasps import Grasp
+from casadi_ik.grasps import Contact, Grasp, Tolerance
+from casadi_ik.grasps.pose import inverse
 from casadi_ik.problem.clearance import Closest, closest_points
 from casadi_ik.problem.questions import CLEARANCE, Questions, tolerances_by_finger
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import ContactVerdict, judge
+from casadi_ik.registry import METHODS
 from casadi_ik.solving.alternatives.finder import Alternative
-from casadi_ik.viewing.asked import Asked, Settings
-
-MOST = 64
-"""Solutions that are looked for."""
-
-NEARER = 1.02
-"""What is found at rest is shown where it misses by so much less than what is shown."""
 
 NOT_MET = "NOT MET"
 """Said of a configuration that has not all it is asked for."""
@@ -35,8 +35,174 @@ MISSES = "the nearest that was found; why follows when the mouse rests"
 """Said until it is known why nothing answers."""
 
 
+@dataclass(frozen=True)
+class Settings:
+    """How it is solved.
+
+    Attributes:
+        method: One of `METHODS`.
+        tolerance: When a contact counts as reached.
+        limits: "enforce" or "ignore".
+        prefer: Which of several solutions; "q0": the one nearest to what is shown.
+    """
+
+    method: str = METHODS[0]
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    limits: str = "enforce"
+    prefer: str = "q0"
+
+
 @dataclass(frozen=True, eq=False)
-class Answered:
+class Held:
+    """A contact that moves with a control.
+
+    Attributes:
+        contact: In the control's frame.
+        control: (4, 4) where the control is, base frame.
+        used: Whether the contact is asked for.
+        normal: Whether its normal is.
+    """
+
+    contact: Contact
+    control: Array
+    used: bool = True
+    normal: bool = True
+
+    @cached_property
+    def placed(self) -> Contact:
+        """The contact in the base frame, with what is asked of it."""
+        found = self.contact.at(self.control)
+        if self.normal or not np.isfinite(found.point).all():
+            return found
+        return Contact(found.point, tolerance=found.tolerance, line=found.line, plane=found.plane)
+
+
+@dataclass(frozen=True, eq=False)
+class PageRequest:
+    """A question; moved things give another one.
+
+    Attributes:
+        held: Contact by finger, of all fingers of the robot that may have one.
+        name: What the grasp is called.
+        robot: Name or path of the robot.
+        object: Name of the object that is grasped; "" if there is none.
+        object_pose: (4, 4) where it is; None if there is none.
+        scene: What stands about the robot; None: nothing is checked.
+        settings: How it is solved.
+    """
+
+    held: Mapping[str, Held]
+    name: str = ""
+    robot: str = ""
+    object: str = ""
+    object_pose: Array | None = None
+    scene: Scene | None = None
+    settings: Settings = Settings()
+
+    @cached_property
+    def grasp(self) -> Grasp:
+        """The grasp; at least one finger is used."""
+        contacts = {name: one.placed for name, one in self.held.items() if one.used}
+        return Grasp(contacts, self.robot, self.name, self.object, self.object_pose)
+
+    def with_control(self, finger: str, pose: Array) -> PageRequest:
+        """A contact dragged: its control is at another (4, 4) pose."""
+        return self._held(finger, replace(self.held[finger], control=pose))
+
+    def with_point(self, finger: str, point: Array) -> PageRequest:
+        """A contact moved to a point (3,) [m], facing as before."""
+        pose = self.held[finger].control.copy()
+        pose[:3, 3] = point
+        return self.with_control(finger, pose)
+
+    def with_normal(self, finger: str, normal: Array) -> PageRequest:
+        """A contact turned so that its control's x axis, its normal, faces another way (3,)."""
+        pose = self.held[finger].control
+        return self.with_control(finger, facing(pose[:3, 3], normal, pose[:3, :3]))
+
+    def with_use(self, finger: str, used: bool, normal: bool) -> PageRequest:
+        """A finger taken in or left free; as it is if it is the last one that is used."""
+        changed = self._held(finger, replace(self.held[finger], used=used, normal=normal))
+        return changed if any(one.used for one in changed.held.values()) else self
+
+    def with_object(self, pose: Array) -> PageRequest:
+        """The object moved to a (4, 4) pose, and all contacts with it."""
+        assert self.object_pose is not None
+        step = pose @ inverse(self.object_pose)
+        held = {
+            name: replace(one, control=_rigid(step @ one.control))
+            for name, one in self.held.items()
+        }
+        return replace(self, held=held, object_pose=pose)
+
+    def with_item(self, name: str, pose: Array) -> PageRequest:
+        """Something in the scene moved to a (4, 4) pose.
+
+        Raises:
+            CasadiIKError: There is no such thing.
+        """
+        assert self.scene is not None
+        return replace(self, scene=self.scene.moved(name, pose))
+
+    def _held(self, finger: str, one: Held) -> PageRequest:
+        return replace(self, held={**self.held, finger: one})
+
+
+def request_of(
+    robot: ArmHand,
+    grasp: Grasp | None,
+    q: Array | None,
+    scene: Scene | None = None,
+    settings: Settings | None = None,
+) -> PageRequest:
+    """The first question of a page.
+
+    Args:
+        robot: The robot.
+        grasp: What is asked; None: the contacts that are reached at q.
+        q: (n,) where the robot is [rad or m]; None: at home.
+        scene: What stands about.
+        settings: How it is solved.
+
+    Raises:
+        InputError: The grasp has a finger that the robot has not.
+    """
+    frames = robot.contact_frames(robot.configuration(q))
+    given = {} if grasp is None else dict(grasp.contacts)
+    if grasp is not None:
+        grasp.arrays(robot.fingers)
+    held: dict[str, Held] = {}
+    for finger, frame in zip(robot.fingers, frames, strict=True):
+        contact = given.get(finger)
+        used = contact is not None or grasp is None
+        contact = contact or Contact(frame[:3, 3], frame[:3, 0])
+        place = contact.point if np.isfinite(contact.point).all() else frame[:3, 3]
+        normal = frame[:3, 0] if contact.normal is None else contact.normal
+        control = facing(place, normal, frame[:3, :3])
+        if contact.normal is None and contact.line is None and contact.plane is None:
+            # Its normal is at hand if it is wanted after all.
+            whole = Contact(place, normal, contact.tolerance)
+            held[finger] = Held(whole.at(inverse(control)), control, used, normal=False)
+        else:
+            held[finger] = Held(contact.at(inverse(control)), control, used)
+    found = PageRequest(held, robot=robot.name, scene=scene, settings=settings or Settings())
+    if grasp is None:
+        return found
+    return replace(found, name=grasp.name, object=grasp.object, object_pose=grasp.object_pose)
+
+
+def _rigid(pose: Array) -> Array:
+    """A pose without what rounding has added to its rotation over many steps."""
+    u, _, vt = np.linalg.svd(pose[:3, :3])
+    pose[:3, :3] = u @ vt
+    return pose
+
+
+# Answers.
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
     """What is shown.
 
     Attributes:
@@ -50,6 +216,7 @@ class Answered:
         seconds: The solve took.
         how: Method, iterations and such in a line.
         unexplained: Whether why not has to be found out yet.
+        checked: Whether collisions are checked: there is a scene.
     """
 
     q: Array
@@ -62,6 +229,7 @@ class Answered:
     seconds: float = 0.0
     how: str = ""
     unexplained: bool = False
+    checked: bool = True
 
 
 class Answerer:
@@ -75,7 +243,7 @@ class Answerer:
         self._alone = lru_cache(maxsize=16)(lambda name: Scene().holding(name, np.eye(4)))
         self._in_scene: tuple[Scene | None, Solver] | None = None
 
-    def solver(self, asked: Asked) -> Solver:
+    def solver(self, asked: PageRequest) -> Solver:
         """The solver for a question; one in the scene of the last is that one with things moved.
 
         Raises:
@@ -97,7 +265,7 @@ class Answerer:
         self._in_scene = scene, solver
         return solver
 
-    def solve(self, asked: Asked, q: Array, solver: Solver | None = None) -> Answered:
+    def solve(self, asked: PageRequest, q: Array, solver: Solver | None = None) -> Answer:
         """The answer nearest to q, or the preferred one, or the nearest to one that was found.
 
         Why there is none takes up to a second to find out: `explain` tells.
@@ -107,7 +275,7 @@ class Answerer:
         """
         return self._answered(asked, q, solver or self.solver(asked), diagnose=False)
 
-    def explain(self, asked: Asked, q: Array) -> Answered:
+    def explain(self, asked: PageRequest, q: Array) -> Answer:
         """The same with why a grasp is not solved and what would help.
 
         What is shown stays if nothing nearer is found: of several that are equally near, the arm
@@ -121,7 +289,7 @@ class Answerer:
         if found.success:
             return found
         shown = self.judged(asked, q, solver)
-        if _missed(shown) > NEARER * _missed(found):
+        if _missed(shown) > 1.02 * _missed(found):
             return found
         return replace(
             found,
@@ -131,7 +299,7 @@ class Answerer:
             closest=shown.closest,
         )
 
-    def _answered(self, asked: Asked, q: Array, solver: Solver, diagnose: bool) -> Answered:
+    def _answered(self, asked: PageRequest, q: Array, solver: Solver, diagnose: bool) -> Answer:
         solution = self._preferred(solver, asked.grasp, q, asked, diagnose)
         shown = solution.q
         if solution.diagnosis is not None and solution.status is not Status.COLLISION:
@@ -153,7 +321,7 @@ class Answerer:
             unexplained=not (diagnose or solution.success),
         )
 
-    def judged(self, asked: Asked, q: Array, solver: Solver | None = None) -> Answered:
+    def judged(self, asked: PageRequest, q: Array, solver: Solver | None = None) -> Answer:
         """How a configuration meets what is asked."""
         tolerances = tolerances_by_finger(asked.settings.tolerance, self.robot.fingers)
         enforced = asked.settings.limits == "enforce"
@@ -171,18 +339,19 @@ class Answerer:
         clearance, closest, free = self._clear(asked, q, solver)
         met = bool(verdict.solved(enforced)[0]) and free
         word = "MET" if met else NOT_MET
-        return Answered(q, met, word, contacts, clearance=clearance, closest=closest)
+        checked = asked.scene is not None
+        return Answer(q, met, word, contacts, clearance=clearance, closest=closest, checked=checked)
 
-    def every(self, asked: Asked, q: Array) -> tuple[Alternative, ...]:
+    def every(self, asked: PageRequest, q: Array) -> tuple[Alternative, ...]:
         """All solutions, by arm branch, swivel and hand posture; none from other methods."""
         settings = asked.settings
         try:
-            return self.solver(asked).solve_all(asked.grasp, MOST, settings.prefer, q)
+            return self.solver(asked).solve_all(asked.grasp, 64, settings.prefer, q)
         except UnsupportedError:
             return ()
 
     def _clear(
-        self, asked: Asked, q: Array, solver: Solver | None
+        self, asked: PageRequest, q: Array, solver: Solver | None
     ) -> tuple[float | None, tuple[tuple[str, str], Closest] | None, bool]:
         if asked.scene is None:
             return None, None, True
@@ -199,7 +368,7 @@ class Answerer:
         return distance, None if found is None else (pair, found), free
 
     def _preferred(
-        self, solver: Solver, grasp: Grasp, q: Array, asked: Asked, diagnose: bool
+        self, solver: Solver, grasp: Grasp, q: Array, asked: PageRequest, diagnose: bool
     ) -> Solution:
         prefer = asked.settings.prefer
         if prefer == CLEARANCE and asked.scene is None:
@@ -219,7 +388,7 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
-def _missed(answer: Answered) -> float:
+def _missed(answer: Answer) -> float:
     """By how much the worst contact is missed, in tolerances."""
     parts = [0.0]
     for one in answer.contacts.values():
@@ -254,6 +423,6 @@ def _alike(solver: Solver, settings: Settings, before: Scene | None, scene: Scen
     )
 
 
-def failed(error: CasadiIKError, q: Array) -> Answered:
+def failed(error: CasadiIKError, q: Array) -> Answer:
     """What is shown of a question that cannot be asked."""
-    return Answered(q, False, "NOT ASKED", {}, (str(error),))
+    return Answer(q, False, "NOT ASKED", {}, (str(error),))

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import pyvista as pv
 
+import casadi_ik as ik
+from casadi_ik import palette
+from casadi_ik.drawing.drawables import Drawable, body, contact_marks, target_place
+from casadi_ik.drawing.surfaces import arrow, ball, drum, ring, rod, stretched
 from casadi_ik.errors import InputError, PictureError
-from casadi_ik.views import show
-from casadi_ik.views.robot_body import robot_body
-from casadi_ik.views.shapes import arrow, capsule, drum, stretched
-from casadi_ik.views.stage import Stage, over
-from casadi_ik.views.viewpoint import axes_of, close_view, whole_view
+from casadi_ik.views import draw_solution, show
+from casadi_ik.views.stage import Stage, axes_of, close_view, over, whole_view
 
 pytestmark = pytest.mark.opengl
 
@@ -23,25 +24,27 @@ CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 SHAPES = {
     "capsule": (
-        capsule(ORIGIN, AXIS, 0.1),
+        rod(ORIGIN, AXIS, 0.1),
         np.pi * 1e-2 * np.linalg.norm(AXIS) + 4 / 3 * np.pi * 1e-3,
     ),
-    "ball": (capsule(ORIGIN, ORIGIN, 0.1), 4 / 3 * np.pi * 1e-3),
+    "ball": (ball(0.1), 4 / 3 * np.pi * 1e-3),
     "drum": (drum(CORNERS[1], AXIS, 0.1, 0.5), np.pi * 1e-2 * 0.5),
     "prism": (
         stretched(drum(ORIGIN, np.array([0, 0, 1.0]), 0.1, 1.0), CORNERS),
         0.5 + 0.1 * (2 + np.sqrt(2)) + np.pi * 0.01,
     ),
+    "ring": (ring(CORNERS[1], AXIS, 0.1, 0.02), 2 * np.pi**2 * 0.1 * 1e-4),
 }
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_shapes_are_closed_and_of_their_size(name: str) -> None:
-    mesh, expected = SHAPES[name]
-    whole = pv.PolyData(mesh.points, mesh.faces).clean()
+    surface, expected = SHAPES[name]
+    whole = pv.PolyData.from_regular_faces(surface.points, surface.triangles)
     assert whole.n_open_edges == 0
-    assert whole.volume == pytest.approx(expected, rel=0.05)
-    assert np.linalg.norm(mesh.point_data["Normals"], axis=1) == pytest.approx(1.0, abs=1e-4)
+    corners = surface.points[surface.triangles]  # outwards: the volume is positive
+    volume = np.linalg.det(corners - surface.points.mean(axis=0)).sum() / 6
+    assert volume == pytest.approx(expected, rel=0.05)
 
 
 def test_a_drum_lies_along_its_axis() -> None:
@@ -61,15 +64,68 @@ def test_an_arrow_ends_at_its_length() -> None:
 def test_fingertips_of_the_body_touch_their_contacts(robot) -> None:
     for q in robot.random(np.random.default_rng(1), 5):
         points, normals = robot.contacts(q)
-        _, hand = robot_body(robot, q)
-        for (mesh, _), point, normal in zip(hand[-len(points) :], points, normals, strict=True):
-            assert np.linalg.norm(mesh.points - point, axis=1).min() < 1.5e-3
-            assert ((mesh.points - point) @ normal).max() < 1e-3  # nothing beyond the pad
+        _, hand = body(robot, q)
+        for one, point, normal in zip(hand[-len(points) :], points, normals, strict=True):
+            corners = one.surface.points
+            assert np.linalg.norm(corners - point, axis=1).min() < 1.5e-3
+            assert ((corners - point) @ normal).max() < 1e-3  # nothing beyond the pad
 
 
 def test_the_body_stands_on_the_floor(robot) -> None:
-    arm, _ = robot_body(robot, robot.home)
-    assert min(mesh.points[:, 2].min() for mesh, _ in arm) == pytest.approx(0.0, abs=1e-6)
+    arm, _ = body(robot, robot.home)
+    assert min(one.surface.points[:, 2].min() for one in arm) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "legend", "solids"),
+    [
+        ({}, "contact, pad normal", 2),
+        ({"normal": None}, "contact", 1),
+        ({"tangent": 1}, "contact, pad normal, second axis (shorter)", 3),
+        ({"line": 2}, "line (rod), pad normal", 2),
+        ({"plane": 0}, "plane (ring), pad normal", 2),
+    ],
+)
+def test_every_kind_of_contact_has_its_marks(robot, solution, changed, legend, solids) -> None:
+    frames = robot.contact_frames(solution.q)
+    contacts = {}
+    for frame, finger in zip(frames, robot.fingers, strict=True):
+        vectors = {"normal": frame[:3, 0]}
+        for name, axis in changed.items():
+            vectors[name] = None if axis is None else frame[:3, axis]
+        contacts[finger] = ik.Contact(frame[:3, 3] + 0.01 * frame[:3, 1], **vectors)
+    asked = ik.Grasp(contacts)
+    marks = contact_marks(robot, solution.q, asked, dict.fromkeys(robot.fingers, palette.MET))
+    assert sum(one.color == palette.TARGET for one in marks) == solids * len(robot.fingers)
+    assert sum(one.color == palette.MET for one in marks) == len(robot.fingers)
+    (words, *_) = draw_solution(robot, solution, asked, dpi=40).legends[0].get_texts()
+    assert words.get_text() == f"asked for: {legend}"
+
+
+def test_a_direction_alone_is_drawn_where_the_fingertip_is(robot, solution) -> None:
+    points, normals = robot.contacts(solution.q)
+    asked = ik.Grasp(
+        {name: ik.Contact(direction=normals[i]) for i, name in enumerate(robot.fingers)}
+    )
+    colors = dict.fromkeys(robot.fingers, palette.MISSED)
+    marks = contact_marks(robot, solution.q, asked, colors)
+    arrows = [one.surface for one in marks if one.name == "normal"]
+    for mesh, point, normal in zip(arrows, points, normals, strict=True):
+        along = (mesh.points - point) @ normal
+        assert along.min() > -1e-6
+        assert along.max() == pytest.approx(0.03, abs=1e-4)
+
+
+def test_the_place_asked_for_is_the_nearest_that_a_contact_allows() -> None:
+    point, tip = np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.7, 0.9])
+    assert (target_place(ik.Contact(point), tip) == point).all()
+    np.testing.assert_allclose(
+        target_place(ik.Contact(point, line=[0, 0, 2]), tip), [0.1, 0.2, 0.9]
+    )
+    np.testing.assert_allclose(
+        target_place(ik.Contact(point, plane=[0, 0, 2]), tip), [0.5, 0.7, 0.3]
+    )
+    assert (target_place(ik.Contact(direction=[1, 0, 0]), tip) == tip).all()
 
 
 @pytest.fixture
@@ -95,7 +151,7 @@ def test_the_camera_shows_all_points_within_its_margins(stage) -> None:
 
 def test_what_is_drawn_is_where_it_is_projected_to(stage) -> None:
     points = np.array([[0.0, 0.2, 0.3], [0.1, -0.4, 0.2]])
-    stage.add("ball", [(pv.Sphere(radius=0.02, center=points[0]), "#ff0000")])
+    stage.add("ball", [Drawable("ball", ball(0.02, points[0]), "#ff0000")])
     stage.aim((0.3, 0.4), points, (121, 81), (0.2, 0.2))
     image = stage.shoot()
     rows, columns = np.nonzero(image[..., 3] > 0.5)
@@ -104,8 +160,8 @@ def test_what_is_drawn_is_where_it_is_projected_to(stage) -> None:
 
 
 def test_the_nearer_solid_hides_the_other_and_groups_can_be_left_out(stage) -> None:
-    stage.add("near", [(pv.Sphere(radius=0.2, center=(1, 0, 0)), "#ff0000")])
-    stage.add("far", [(pv.Sphere(radius=0.2, center=(-1, 0, 0)), "#0000ff")])
+    stage.add("near", [Drawable("ball", ball(0.2, (1, 0, 0)), "#ff0000")])
+    stage.add("far", [Drawable("ball", ball(0.2, (-1, 0, 0)), "#0000ff")])
     stage.aim((0.0, 0.0), [[0, 0.3, 0.3], [0, -0.3, -0.3]], (41, 41))
     red, _, blue, alpha = stage.shoot()[20, 20]
     assert red > 2 * blue
@@ -123,7 +179,7 @@ def test_layers_blend() -> None:
 
 
 def test_the_floor_has_the_shadow_below_the_body(stage) -> None:
-    thing = [(pv.Sphere(radius=0.1, center=(0.2, 0.3, 0.5)), "#ff0000")]
+    thing = [Drawable("ball", ball(0.1, (0.2, 0.3, 0.5)), "#ff0000")]
     stage.add_floor(0.0, thing)
     stage.aim((0.4, 0.8), [[-0.5, 0, 0], [0.5, 0, 0], [0, -0.5, 0], [0, 0.5, 0]], (80, 80))
     image = stage.shoot("floor")

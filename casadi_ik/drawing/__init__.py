@@ -1,0 +1,1 @@
+"""What there is to draw, for pictures and pages alike."""

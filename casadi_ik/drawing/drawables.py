@@ -1,0 +1,401 @@
+"""What there is to draw: a list of named surfaces, made alike for pictures and for pages.
+
+Every function gives drawables in a frame that it names. Pictures put them there at once; pages make
+a node of the frame and move that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from casadi_ik import palette
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.collision.model import own_solids
+from casadi_ik.collision.scene import Item, Scene
+from casadi_ik.collision.solids import Solid
+from casadi_ik.drawing.surfaces import (
+    arrow,
+    ball,
+    coarser,
+    drum,
+    joined,
+    ring,
+    rod,
+    stretched,
+)
+from casadi_ik.errors import UnknownNameError
+from casadi_ik.files.reading import read_yaml
+from casadi_ik.grasps import Contact, Grasp, load_object
+from casadi_ik.grasps.pose import inverse
+from casadi_ik.importing.imported import tree_of
+from casadi_ik.importing.surfaces import Surface, link_surfaces
+from casadi_ik.problem.clearance import Closest
+from casadi_ik.robots.description import Joint, RobotDescription
+from casadi_ik.robots.parts import PREFIX
+
+ARM_RADIUS, FINGER_RADIUS = 0.048, 0.009
+"""Of an arm's tubes, and of a finger whose pad does not say how far from its axis it is [m]."""
+
+BEYOND = 0.04
+"""How far a line is drawn past what it is given by and reached at; radius of a plane's ring [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawable:
+    """A surface that is drawn.
+
+    Attributes:
+        name: What it is.
+        surface: In its frame.
+        color: As in `casadi_ik.palette`.
+        frame: The frame that it moves with: a link, or "" for the base frame.
+    """
+
+    name: str
+    surface: Surface
+    color: str
+    frame: str = ""
+
+    def at(self, pose: Array) -> Drawable:
+        """The same in the base frame, in which its frame has a (4, 4) pose."""
+        return replace(self, surface=self.surface.moved(pose), frame="")
+
+
+# Robots.
+
+
+def side_of(description: RobotDescription) -> dict[str, str]:
+    """By link "arm" or "hand"."""
+    first = "arm" if description.arm_actuators else "hand"
+    return {description.root: first} | {
+        joint.child: "hand" if joint.part == "hand" else "arm" for joint in description.joints
+    }
+
+
+def links_seen(robot: ArmHand, meshes: Mapping[str, Surface] | None = None) -> list[Drawable]:
+    """A robot as what is known of it: one drawable a link, in the link's frame.
+
+    A link is drawn by the mesh of its file, or the shapes that collisions are checked with; an arm
+    or a hand of which nothing is described by its skeleton.
+
+    Args:
+        robot: The robot.
+        meshes: By link what its files show.
+    """
+    description = robot.description
+    sides, found = side_of(description), _shapes(description)
+    described = {sides[link] for link in found}
+    by_link: dict[str, list[Surface]] = {}
+    arm, hand = skeleton(robot, robot.home)
+    for one in arm + hand:
+        if sides[one.frame] not in described:
+            by_link.setdefault(one.frame, []).append(one.surface)
+    found |= {link: joined(parts) for link, parts in by_link.items()}
+    found |= {link: coarser(one) for link, one in (meshes or {}).items() if len(one.triangles)}
+
+    def color(link: str) -> str:
+        if sides[link] == "arm":
+            joint = description.links.index(link) % 2 == 0
+            return palette.ARM_JOINT if joint else palette.ARM
+        return palette.PALM if link == description.palm_link else palette.HAND
+
+    links = [link for link in description.links if link in found]
+    return [Drawable(link, found[link], color(link), link) for link in links]
+
+
+def _shapes(description: RobotDescription) -> dict[str, Surface]:
+    by_link: dict[str, list[Surface]] = {}
+    for one in description.shapes.capsules:
+        if one.covers < 0:
+            body = rod(one.center - one.half, one.center + one.half, one.radius)
+            by_link.setdefault(one.link, []).append(body)
+    for one, solid in zip(description.shapes.solids, own_solids(description), strict=True):
+        by_link.setdefault(one.link, []).append(Surface(*solid.mesh()).moved(one.pose))
+    return {link: joined(parts) for link, parts in by_link.items()}
+
+
+def skeleton(robot: ArmHand, q: ArrayLike) -> tuple[list[Drawable], list[Drawable]]:
+    """A robot by its kinematics alone: thick tubes for the arm, thin ones for the hand, a palm.
+
+    It is not the real shell, but any robot has one.
+
+    Args:
+        robot: The robot.
+        q: (n,) actuator positions [rad or m]: what slides is as long as it is there.
+
+    Returns:
+        The arm, and the hand with the fingertips last; in the frames of links.
+
+    Raises:
+        InputError: Bad q.
+    """
+    poses, description = robot.links(q), robot.description
+    arm, hand = _foot(description), _palm(description, poses)
+    for joint in description.joints:
+        end = (inverse(poses[joint.parent]) @ poses[joint.child])[:3, 3]
+        if joint.part == "hand":
+            hand += _finger_link(description, joint, end)
+        else:
+            arm += _arm_link(description, joint, end)
+    for finger in description.fingers:
+        # How far the pad is from the axis of the last link, along the normal.
+        place, normal = finger.placement[:3, 3], finger.placement[:3, :3] @ finger.normal
+        height = float(place @ normal)
+        radius = height if 0.004 < height < 0.02 else FINGER_RADIUS
+        tip = rod(np.zeros(3), place - radius * normal, radius)
+        hand.append(Drawable(f"tip {finger.name}", tip, palette.HAND, finger.link))
+    return arm, hand
+
+
+def body(robot: ArmHand, q: ArrayLike) -> tuple[list[Drawable], list[Drawable]]:
+    """The same in the base frame."""
+    poses = robot.links(q)
+    arm, hand = skeleton(robot, q)
+    return [one.at(poses[one.frame]) for one in arm], [one.at(poses[one.frame]) for one in hand]
+
+
+def _foot(description: RobotDescription) -> list[Drawable]:
+    """Of an arm; a hand alone stands on its palm."""
+    if not description.arm_actuators:
+        return []
+    z = np.array([0.0, 0.0, 1.0])
+    foot = drum(0.0125 * z, z, 1.9 * ARM_RADIUS, 0.025)
+    return [Drawable("foot", foot, palette.ARM_JOINT, description.root)]
+
+
+def _arm_link(description: RobotDescription, joint: Joint, end: Array) -> list[Drawable]:
+    found, length = [], float(np.linalg.norm(end))
+    if length > 2e-3:
+        # The round end of the lowest link must not come out below the foot.
+        lowest = joint.parent == description.root
+        begin = min(1.0, ARM_RADIUS / length) * end if lowest else np.zeros(3)
+        tube = rod(begin, end, ARM_RADIUS)
+        found.append(Drawable(f"tube {joint.name}", tube, palette.ARM, joint.parent))
+    if joint.type == "revolute":
+        # A roll joint is a band around the tube, a pitch joint a drum across it.
+        way = joint.placement[:3, :3].T @ end
+        along = length > 2e-3 and abs(joint.axis @ way) > 0.9 * length
+        radius, width = (1.09, 0.35) if along else (1.12, 2.5)
+        band = drum(np.zeros(3), joint.axis, radius * ARM_RADIUS, width * ARM_RADIUS)
+        found.append(Drawable(joint.name, band, palette.ARM_JOINT, joint.child))
+    return found
+
+
+def _finger_link(description: RobotDescription, joint: Joint, end: Array) -> list[Drawable]:
+    found = []
+    if joint.parent != description.palm_link and np.linalg.norm(end) > 2e-3:
+        tube = rod(np.zeros(3), end, 1.15 * FINGER_RADIUS)
+        found.append(Drawable(f"tube {joint.name}", tube, palette.HAND, joint.parent))
+    if joint.type == "revolute":
+        knuckle = drum(np.zeros(3), joint.axis, 1.3 * FINGER_RADIUS, 2.7 * FINGER_RADIUS)
+        found.append(Drawable(joint.name, knuckle, palette.HAND_JOINT, joint.child))
+    return found
+
+
+def _palm(description: RobotDescription, poses: Mapping[str, Array]) -> list[Drawable]:
+    """Drums upright in the palm frame, at the palm's origin and where the fingers begin, in one."""
+    link = description.palm_link
+    back = inverse(poses[link])
+    bases = [
+        (back @ poses[joint.child])[:3, 3]
+        for joint in description.joints
+        if joint.part == "hand" and joint.parent == link
+    ]
+    if not bases:
+        return []
+    corners, up = np.array([np.zeros(3), *bases]), description.palm_placement[:3, 2]
+    heights, radius = corners @ up, 2.2 * FINGER_RADIUS
+    middle = (heights.min() + heights.max()) / 2 * up
+    block = drum(middle, up, radius, max(float(np.ptp(heights)), 2 * radius))
+    body = stretched(block, corners - heights[:, None] * up)
+    return [Drawable("palm", body, palette.PALM, link)]
+
+
+def file_meshes(robot: ArmHand, path: Path) -> dict[str, Surface]:
+    """What the files that a description points to show of its links.
+
+    Args:
+        robot: The robot of the description.
+        path: The description.
+
+    Returns:
+        By link its surface in its frame; links of which no file has a shape are left out.
+
+    Raises:
+        CasadiIKError: The description cannot be read.
+    """
+    raw, links = read_yaml(path), set(robot.description.links)
+    found: dict[str, Surface] = {}
+    for key in ("arm", "hand", "robot"):
+        entry = raw.get(key)
+        if not isinstance(entry, dict) or "file" not in entry:
+            continue
+        prefix = PREFIX if key == "hand" else ""
+        # A name that arm and hand both have is prefixed in the hand.
+        named = {link.removeprefix(prefix) if prefix else link: link for link in links}
+        named |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}
+        surfaces, _ = link_surfaces(tree_of(path, entry), list(named))
+        for link, surface in surfaces.items():
+            found.setdefault(named[link], surface)
+    return found
+
+
+# Contacts.
+
+
+def target_place(contact: Contact, tip: Array) -> Array:
+    """(3,) of the places a contact allows the nearest to a fingertip (3,) [m]."""
+    if np.isnan(contact.point[0]):
+        return tip
+    gap = tip - contact.point
+    if contact.line is not None:
+        return contact.point + contact.line * (contact.line @ gap)
+    if contact.plane is not None:
+        return tip - contact.plane * (contact.plane @ gap)
+    return contact.point
+
+
+def asked_marks(contact: Contact, tip: Array, size: float = 1.0) -> list[Drawable]:
+    """What a contact asks for: thick and short marks, in the contact's frame.
+
+    A line is a rod, a plane a ring about the place in it that is nearest to the fingertip; second
+    axes have arrows shorter than the normals'. Where the fingertip may be anywhere, what it must
+    face is drawn where it is.
+
+    Args:
+        contact: The contact.
+        tip: (3,) where the fingertip is [m].
+        size: Of balls and arrows, as a part of the usual.
+    """
+    place, found = target_place(contact, tip), {}
+    if contact.line is not None:
+        along = float(contact.line @ (place - contact.point))
+        low, high = min(0.0, along) - BEYOND, max(0.0, along) + BEYOND
+        start, end = (contact.point + t * contact.line for t in (low, high))
+        found["line"] = rod(start, end, 0.0020)
+    elif contact.plane is not None:
+        found["plane"] = ring(place, contact.plane, BEYOND, 0.0016)
+    elif not np.isnan(contact.point[0]):
+        found["point"] = ball(0.0036 * size, place)
+    if contact.normal is not None:
+        found["normal"] = arrow(place, contact.normal, 0.030 * size, 0.0048 * size)
+    if contact.tangent is not None:
+        found["tangent"] = arrow(place, contact.tangent, 0.021 * size, 0.0048 * size)
+    return [Drawable(name, surface, palette.TARGET) for name, surface in found.items()]
+
+
+def reached_mark(color: str, tangent: bool = False) -> Drawable:
+    """What a finger reaches: thin and long arrows, in the frame of its contact (x its normal)."""
+    x, y, _ = np.eye(3)
+    parts = [ball(0.0042), arrow(np.zeros(3), x, 0.046, 0.0022)]
+    if tangent:
+        parts.append(arrow(np.zeros(3), y, 0.034, 0.0022))
+    return Drawable("reached", joined(parts), color)
+
+
+def contact_marks(
+    robot: ArmHand, q: ArrayLike, grasp: Grasp, colors: Mapping[str, str]
+) -> list[Drawable]:
+    """Contacts asked for and reached, and a line to those that are missed, in the base frame.
+
+    Args:
+        robot: The robot.
+        q: (n,) where it is [rad or m].
+        grasp: What is asked for.
+        colors: Of what is reached, by finger; `palette.MISSED` of what is missed.
+
+    Raises:
+        InputError: The grasp has a finger that the robot has not.
+    """
+    grasp.arrays(robot.fingers)
+    found: list[Drawable] = []
+    for finger, frame in zip(robot.fingers, robot.contact_frames(q), strict=True):
+        contact, tip = grasp.contacts.get(finger), frame[:3, 3]
+        if contact is not None:
+            found += asked_marks(contact, tip)
+            found.append(reached_mark(colors[finger], contact.tangent is not None).at(frame))
+            if colors[finger] == palette.MISSED:
+                gap = rod(tip, target_place(contact, tip), 0.0006)
+                found.append(Drawable("gap", gap, palette.MISSED))
+    return found
+
+
+# Things.
+
+
+def object_of(name: str) -> Drawable | None:
+    """The object that is grasped, in its frame; None: there is no description of it.
+
+    Raises:
+        DescriptionError: Its description is malformed.
+    """
+    if not name:
+        return None
+    try:
+        points, triangles = load_object(name).mesh(64)
+    except UnknownNameError:
+        return None
+    return Drawable("object", Surface(points, np.asarray(triangles, np.int64)), palette.OBJECT)
+
+
+def item_of(item: Item, about: Array) -> list[Drawable]:
+    """Something that stands in a scene, in its frame.
+
+    Args:
+        item: The thing.
+        about: (3,) what reaches without end is drawn near this, base frame [m].
+    """
+    near = (inverse(item.pose) @ np.append(about, 1.0))[:3]
+    return [
+        Drawable(f"{item.name} {i}", _placed(solid, place, near), palette.SCENE)
+        for i, (solid, place) in enumerate(item.parts)
+    ]
+
+
+def _placed(solid: Solid, pose: Array, near: Array) -> Surface:
+    """A solid at a (4, 4) pose; of one that reaches without end the part near a point (3,)."""
+    surface = Surface(*solid.mesh())
+    if not np.isfinite(solid.reach):
+        x, y, _ = pose[:3, :3].T @ (near - pose[:3, 3])
+        surface = Surface(surface.points + np.array([x, y, 0.0]), surface.triangles)
+    return surface.moved(pose)
+
+
+def scene_of(scene: Scene, about: Array, without: str = "") -> list[Drawable]:
+    """Everything of a scene but one item, in the base frame."""
+    items = [item for name, item in scene.items.items() if name != without]
+    return [one.at(item.pose) for item in items for one in item_of(item, about)]
+
+
+def with_object(scene: Scene, grasp: Grasp | None) -> Scene:
+    """The scene with what a grasp names as its object where it has it."""
+    if grasp is not None and grasp.object and grasp.object_pose is not None:
+        return scene.holding(grasp.object, grasp.object_pose)
+    return scene
+
+
+# The nearest pair.
+
+
+def closest_rod(closest: Closest) -> Drawable:
+    """A rod between the nearest points of two shapes, with a ball at each, in the base frame."""
+    start, end = closest.ends
+    parts = [rod(start, end, 0.002), ball(0.004, start), ball(0.004, end)]
+    return Drawable("nearest", joined(parts), palette.NEAREST)
+
+
+def closest_bodies(closest: Closest) -> list[Drawable]:
+    """The two shapes, a millimetre larger to be seen; not what reaches without end."""
+    found = []
+    for solid, pose in closest.shapes:
+        if np.isfinite(solid.reach):
+            surface = Surface(*solid.mesh())
+            larger = Surface(surface.points * (1 + 1e-3 / solid.reach), surface.triangles)
+            found.append(Drawable("touching", larger.moved(pose), palette.NEAREST))
+    return found

@@ -1,0 +1,158 @@
+"""Surfaces that things are drawn with: turned bodies, rods, arrows, rings; care of meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from casadi_ik.arrays import Array
+from casadi_ik.collision.solids import capsule_mesh
+from casadi_ik.grasps.shapes import circle, tube_mesh
+from casadi_ik.importing.surfaces import Surface, together
+
+AROUND = 32
+"""Points around an axis."""
+
+
+def facing(point: Array, normal: Array, like: Array | None = None) -> Array:
+    """(4, 4) pose at a point whose x axis is a direction, otherwise turned as little as may be.
+
+    Args:
+        point: (3,) [m].
+        normal: (3,) any length but zero.
+        like: (3, 3) what it is turned from; None: the base frame.
+    """
+    x = normal / np.linalg.norm(normal)
+    axes = (np.eye(3) if like is None else like).T
+    sides = [axis - x * (x @ axis) for axis in axes[[1, 2, 0]]]
+    y = next(side for side in sides if np.linalg.norm(side) >= 1e-3)
+    y /= np.linalg.norm(y)
+    pose = np.eye(4)
+    pose[:3] = np.column_stack([x, y, np.cross(x, y), point])
+    return pose
+
+
+def upright(point: Array, axis: Array) -> Array:
+    """(4, 4) pose at a point whose z axis is a direction (3,)."""
+    return facing(point, axis)[:, [1, 2, 0, 3]]
+
+
+def turned(profile: ArrayLike) -> Surface:
+    """A closed body about z.
+
+    Args:
+        profile: (m, 2) radius and height, from below to above [m]; the ends are closed flat.
+    """
+    radii, heights = np.asarray(profile, dtype=float).T
+    rings = circle(AROUND)[None] * radii[:, None, None]
+    rings[..., 2] = heights[:, None]
+    ends = np.array([[0.0, 0.0, heights[0]], [0.0, 0.0, heights[-1]]])
+    return Surface(*tube_mesh(rings, *ends))
+
+
+def ball(radius: float, center: ArrayLike = (0.0, 0.0, 0.0)) -> Surface:
+    """A ball."""
+    points, triangles = capsule_mesh(radius, 0.0, AROUND)
+    return Surface(points + np.asarray(center), triangles)
+
+
+def rod(start: Array, end: Array, radius: float) -> Surface:
+    """A tube with round ends between two points."""
+    length = float(np.linalg.norm(end - start))
+    if length < 1e-9:
+        return ball(radius, start)
+    body = Surface(*capsule_mesh(radius, length / 2, AROUND))
+    return body.moved(upright((start + end) / 2, end - start))
+
+
+def drum(center: Array, axis: Array, radius: float, length: float) -> Surface:
+    """A cylinder with rounded edges about a point."""
+    edge = 0.12 * min(radius, length)
+    bow = edge * np.sin(np.linspace(0, np.pi / 2, 5))
+    rise = np.column_stack([radius - edge + bow, -length / 2 + edge - bow[::-1]])
+    return turned(np.concatenate([rise, rise[::-1] * [1, -1]])).moved(upright(center, axis))
+
+
+def arrow(start: Array, direction: Array, length: float, width: float) -> Surface:
+    """An arrow whose shaft is `width` thick."""
+    tip = min(0.45 * length, 3.2 * width)
+    shaft, head = width / 2, 1.35 * width
+    profile = [(shaft, 0), (shaft, length - tip), (head, length - tip), (1e-3 * head, length)]
+    return turned(profile).moved(upright(start, direction))
+
+
+def ring(center: Array, axis: Array, radius: float, width: float) -> Surface:
+    """A thin ring about an axis through its centre."""
+    around = circle(2 * AROUND)
+    across = circle(12)
+    out = radius + width / 2 * across[:, 0]
+    points = around[:, None] * out[None, :, None]
+    points[..., 2] = width / 2 * across[:, 1]
+    i, j = np.meshgrid(np.arange(2 * AROUND), np.arange(12), indexing="ij")
+    a, b = 12 * i + j, 12 * ((i + 1) % (2 * AROUND)) + j
+    c, d = 12 * i + (j + 1) % 12, 12 * ((i + 1) % (2 * AROUND)) + (j + 1) % 12
+    triangles = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
+    return Surface(points.reshape(-1, 3), triangles).moved(upright(center, axis))
+
+
+def stretched(convex: Surface, offsets: Array) -> Surface:
+    """The convex hull of copies of a convex surface, moved by offsets (k, 3)."""
+    corners = convex.points[convex.triangles]
+    ways = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(convex.points)
+    np.add.at(normals, convex.triangles, ways[:, None])
+    return Surface(convex.points + offsets[(normals @ offsets.T).argmax(axis=1)], convex.triangles)
+
+
+def joined(surfaces: Sequence[Surface]) -> Surface:
+    """Several surfaces as one."""
+    whole = together(list(surfaces))
+    assert whole is not None
+    return whole
+
+
+def sharp(body: Surface, degrees: float = 35.0) -> Surface:
+    """The same with points doubled where faces meet at an edge, as smooth shading needs it.
+
+    Args:
+        body: The surface.
+        degrees: Faces that meet at a larger angle meet at an edge.
+    """
+    corners = body.points[body.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    kept = areas > 1e-12
+    corners = corners[kept].reshape(-1, 3)
+    normals = np.repeat(normals[kept] / areas[kept, None], 3, axis=0)
+    _, place, counts = np.unique(
+        np.round(corners, 7), axis=0, return_inverse=True, return_counts=True
+    )
+    place = place.reshape(-1)
+    # All pairs of corners at the same place: corners of one side have the same mean normal.
+    size, order = counts[place], np.argsort(place, kind="stable")
+    one = np.repeat(np.arange(len(place)), size)
+    rank = np.arange(len(one)) - np.repeat(np.cumsum(size) - size, size)
+    other = order[(np.cumsum(counts) - counts)[place[one]] + rank]
+    alike = (normals[one] * normals[other]).sum(axis=1) > np.cos(np.deg2rad(degrees))
+    mean = np.zeros_like(normals)
+    np.add.at(mean, one[alike], normals[other[alike]])
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    sides = np.column_stack([place, np.round(mean, 3) + 0.0])
+    _, first, of = np.unique(sides, axis=0, return_index=True, return_inverse=True)
+    return Surface(corners[first], of.reshape(-1, 3))
+
+
+def coarser(body: Surface, most: int = 3000) -> Surface:
+    """A surface with no more than about so many triangles: points of a cell become one."""
+    size = float(np.ptp(body.points, axis=0).max()) / 256 if len(body.points) else 0.0
+    while len(body.triangles) > most:
+        cells = np.round(body.points / size).astype(np.int64)
+        _, first, of = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        triangles = of.reshape(-1)[body.triangles]
+        a, b, c = triangles.T
+        triangles = triangles[(a != b) & (b != c) & (a != c)]
+        body = Surface(body.points[first], np.unique(triangles, axis=0))
+        size *= 1.4
+    return body

@@ -1,0 +1,574 @@
+"""Drawables on a page by viser: robots, contacts and things that are dragged, light and camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import ArrayLike
+from viser.transforms import SO3
+
+from casadi_ik import palette
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.collision.scene import Scene
+from casadi_ik.drawing.drawables import (
+    Drawable,
+    asked_marks,
+    item_of,
+    object_of,
+    reached_mark,
+)
+from casadi_ik.drawing.surfaces import sharp
+from casadi_ik.grasps.pose import rotations_of
+from casadi_ik.problem.clearance import Closest
+from casadi_ik.problem.verdict import ContactVerdict
+from casadi_ik.viewing.request import Held, PageRequest
+
+OBJECT = "object"
+"""What the object is called among the things that can be dragged."""
+
+CONTACT_CONTROL, THING_CONTROL = 0.06, 0.09
+"""Sizes of the controls of contacts and of things [m]."""
+
+
+def add_drawable(server: viser.ViserServer, name: str, one: Drawable, **look: Any) -> Any:
+    """A mesh of a page; `look` as `add_mesh_simple` of viser has it."""
+    surface = sharp(one.surface)
+    return server.scene.add_mesh_simple(
+        name,
+        surface.points.astype(np.float32),
+        surface.triangles.astype(np.uint32),
+        color=palette.rgb(one.color),
+        **look,
+    )
+
+
+def quaternions(rotations: Array) -> Array:
+    """(..., 4) unit quaternions, scalar first, of rotations (..., 3, 3)."""
+    return np.asarray(SO3.from_matrix(rotations).wxyz, dtype=np.float64)
+
+
+def pose_of(position: ArrayLike, wxyz: ArrayLike) -> Array:
+    """(4, 4) of a position (3,) and a quaternion (4,) that a browser has sent.
+
+    Raises:
+        ValueError: They are not of these sizes, or not finite.
+    """
+    pose = np.eye(4)
+    pose[:3, :3] = rotations_of(usable(wxyz, 4)[None])[0]
+    pose[:3, 3] = usable(position, 3)
+    if not np.isfinite(pose).all():
+        raise ValueError("found a quaternion of no length")
+    return pose
+
+
+def usable(numbers: ArrayLike, count: int) -> Array:
+    """Numbers (count,) that a browser has sent.
+
+    Raises:
+        ValueError: They are none, not so many, not finite, or too large to be drawn.
+    """
+    try:
+        found = np.asarray(numbers, dtype=float)
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    if found.shape != (count,) or not (np.abs(found) <= 1e6).all():
+        raise ValueError(f"found {found}, expected {count} numbers up to 1e6")
+    return found
+
+
+class DrawnRobot:
+    """The links of a robot: each hangs on the one before, so a joint's turn is all that is sent.
+
+    Attributes:
+        q: (n,) where it is [rad or m].
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        robot: ArmHand,
+        links: Sequence[Drawable],
+        name: str = "/robot",
+    ) -> None:
+        """Draw it at home.
+
+        Args:
+            server: The page.
+            robot: The robot.
+            links: One drawable a link.
+            name: Of its node.
+        """
+        self._server, self._robot = server, robot
+        server.scene.add_frame(name, show_axes=False)
+        self._before = _drawn_before(robot, links)
+        names: list[str] = []
+        for one, before in zip(links, self._before, strict=True):
+            names.append(f"{names[before] if before >= 0 else name}/{one.frame}")
+        look = {"side": "double", "receive_shadow": False}
+        self._meshes = [
+            add_drawable(server, node, one, **look) for node, one in zip(names, links, strict=True)
+        ]
+        self._links = [robot.description.links.index(one.frame) for one in links]
+        self._poses = np.full((len(links), 4, 4), np.nan)
+        self.place(robot.home)
+
+    def place(self, q: Array) -> None:
+        """Move it to q (n,) [rad or m]."""
+        self.q = np.array(q)
+        every = np.array(list(self._robot.links(q).values()))[self._links]
+        # The last stands for the base frame, which the first links hang on.
+        on = np.concatenate([every, np.eye(4)[None]])[self._before]
+        poses = np.linalg.inv(on) @ every
+        gone = ~(np.abs(poses - self._poses) < 1e-9)
+        shifted, turned = gone[:, :3, 3].any(axis=1), gone[:, :3, :3].any(axis=(1, 2))
+        wxyz = quaternions(poses[:, :3, :3])
+        with self._server.atomic():
+            for i in np.flatnonzero(shifted):
+                self._meshes[i].position = poses[i, :3, 3]
+            for i in np.flatnonzero(turned):
+                self._meshes[i].wxyz = wxyz[i]
+        self._poses[shifted, :3, 3] = poses[shifted, :3, 3]
+        self._poses[turned, :3, :3] = poses[turned, :3, :3]
+
+
+def _drawn_before(robot: ArmHand, links: Sequence[Drawable]) -> list[int]:
+    """By link the number of the one that it hangs on; -1: none of them."""
+    drawn = {one.frame: i for i, one in enumerate(links)}
+    parents = {joint.child: joint.parent for joint in robot.description.joints}
+    found = []
+    for one in links:
+        link = parents.get(one.frame)
+        while link is not None and link not in drawn:
+            link = parents.get(link)
+        found.append(-1 if link is None else drawn[link])
+    return found
+
+
+class Control:
+    """A frame with arrows and rings to be dragged by, shown while it is selected."""
+
+    def __init__(
+        self, server: viser.ViserServer, name: str, size: float, moved: Callable[[Array], None]
+    ) -> None:
+        """Make it.
+
+        Args:
+            server: The page.
+            name: Of its node.
+            size: [m].
+            moved: Told of its (4, 4) pose when somebody drags it.
+        """
+        self._pose: Array | None = None
+        self.handle = server.scene.add_transform_controls(
+            name, scale=size, line_width=3.0, depth_test=False
+        )
+        self.select(False)
+
+        # Asynchronous callbacks keep their order; they only put down what is to be done. What is
+        # no place is left out: viser would tell the terminal.
+        @self.handle.on_update
+        async def _(_: Any) -> None:
+            with suppress(ValueError):
+                moved(pose_of(self.handle.position, self.handle.wxyz))
+
+    def place(self, pose: Array, held: bool) -> None:
+        """Put it at a (4, 4) pose, unless a hand holds it: then it is where the hand has it."""
+        if pose is not self._pose:
+            self._pose = pose
+            if not held:
+                self.handle.position = pose[:3, 3]
+                self.handle.wxyz = quaternions(pose[:3, :3])
+
+    def select(self, on: bool) -> None:
+        """Show its arrows and rings, or hide them."""
+        handle = self.handle
+        handle.disable_axes = handle.disable_sliders = handle.disable_rotations = not on
+
+
+@dataclass(frozen=True)
+class Drags:
+    """Who is told of drags: of a finger or a thing, and where it is put.
+
+    Attributes:
+        pose: Told of a (4, 4) pose.
+        point: Of a finger's point (3,).
+        normal: Of a finger's normal (3,), of any length.
+        selected: Of what is clicked.
+    """
+
+    pose: Callable[[str, Array], None] = lambda *_: None
+    point: Callable[[str, Array], None] = lambda *_: None
+    normal: Callable[[str, Array], None] = lambda *_: None
+    selected: Callable[[str], None] = lambda *_: None
+
+
+class DrawnContacts:
+    """What is asked of all fingers, to be dragged, and what is reached."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        asked: PageRequest,
+        drags: Drags,
+        name: str = "",
+        tips: bool = True,
+        size: float = 1.5,
+    ) -> None:
+        """Draw them.
+
+        Args:
+            server: The page.
+            asked: What is asked first.
+            drags: Who is told.
+            name: Of the node that they hang on; "": the base frame.
+            tips: Whether what is reached is drawn too.
+            size: Of the marks, as a part of the usual.
+        """
+        self._targets = {
+            finger: _Target(server, finger, held, drags, f"{name}/contacts/{finger}", size)
+            for finger, held in asked.held.items()
+        }
+        self._tips = {finger: _Tip(server, finger, name) for finger in asked.held if tips}
+        self.place(asked)
+
+    def place(self, asked: PageRequest, dragged: str = "") -> None:
+        """Put the targets where they are; one that is being dragged is where the hand has it."""
+        for finger, held in asked.held.items():
+            self._targets[finger].place(held, finger == dragged)
+
+    def reach(
+        self,
+        asked: PageRequest,
+        frames: Mapping[str, Array],
+        verdicts: Mapping[str, ContactVerdict],
+    ) -> None:
+        """Put the fingertips where they are: frames (4, 4) with the normal as x axis."""
+        for finger, tip in self._tips.items():
+            held = asked.held[finger]
+            tip.place(frames[finger], held, verdicts.get(finger) if held.used else None)
+
+    def select(self, finger: str) -> None:
+        """Give one contact its arrows and rings to be dragged by; "" none."""
+        for name, target in self._targets.items():
+            target.control.select(name == finger)
+
+
+class _Target:
+    """What is asked of a finger."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        finger: str,
+        held: Held,
+        drags: Drags,
+        name: str,
+        size: float,
+    ) -> None:
+        self.control = Control(
+            server, name, size / 1.5 * CONTACT_CONTROL, lambda pose: drags.pose(finger, pose)
+        )
+        self._meshes = {
+            one.name: add_drawable(server, f"{name}/{one.name}", one, cast_shadow=False)
+            for one in asked_marks(held.contact, np.zeros(3), size)
+        }
+        for part, mesh in self._meshes.items():
+
+            @mesh.on_drag("left")
+            async def _(event: Any, part: str = part) -> None:
+                with suppress(ValueError):
+                    end = usable(event.end_position, 3)
+                    if part != "normal":
+                        drags.point(finger, end)
+                        return
+                    way = end - usable(self.control.handle.position, 3)
+                    if np.linalg.norm(way) > 1e-3:
+                        drags.normal(finger, way)
+
+            @mesh.on_click
+            async def _(_: Any) -> None:
+                drags.selected(finger)
+
+    def place(self, held: Held, dragged: bool) -> None:
+        self.control.place(held.control, dragged)
+        for part, mesh in self._meshes.items():
+            mesh.visible = held.used and (held.normal or part not in ("normal", "tangent"))
+
+
+class _Tip:
+    """What a finger reaches."""
+
+    def __init__(self, server: viser.ViserServer, finger: str, above: str) -> None:
+        scene, name = server.scene, f"{above}/tips/{finger}"
+        self._finger, self._frame = finger, scene.add_frame(name, show_axes=False)
+        mark = reached_mark(palette.MET)
+        self._mesh = add_drawable(server, f"{name}/reached", mark, cast_shadow=False)
+        self._label = scene.add_label(
+            f"{name}/errors", "", anchor="bottom-center", font_screen_scale=0.85, visible=False
+        )
+        self._gap = _segment(server, f"{above}/gaps/{finger}", palette.MISSED, 0.0016)
+
+    def place(self, frame: Array, held: Held, verdict: ContactVerdict | None) -> None:
+        self._frame.position, self._frame.wxyz = frame[:3, 3], quaternions(frame[:3, :3])
+        met = verdict is None or verdict.ok
+        color = palette.FAINT if verdict is None else palette.MET if met else palette.MISSED
+        if self._mesh.color != palette.rgb(color):
+            self._mesh.color = palette.rgb(color)
+        self._gap.visible = self._label.visible = not met
+        if verdict is not None and not met:
+            ends = np.stack([frame[:3, 3], held.control[:3, 3]])[None]
+            self._gap.points = ends.astype(np.float32)
+            self._label.text = f"{self._finger}  {'  '.join(errors_of(verdict)) or 'free'}"
+
+
+def errors_of(verdict: ContactVerdict) -> list[str]:
+    """Distance and angle in words; what is free is left out."""
+    parts = [(1e3 * verdict.position_error, " mm"), (np.rad2deg(verdict.angle_error), "°")]
+    return [f"{value:.2f}{unit}" for value, unit in parts if not np.isnan(value)]
+
+
+def _segment(server: viser.ViserServer, name: str, color: str, width: float) -> Any:
+    """A line between two points, not seen yet."""
+    points = np.zeros((1, 2, 3), dtype=np.float32)
+    return server.scene.add_line_segments(
+        name, points, palette.rgb(color), thickness=width, visible=False
+    )
+
+
+class DrawnThings:
+    """The object that is grasped and the items of the scene, to be dragged."""
+
+    def __init__(self, server: viser.ViserServer, asked: PageRequest, drags: Drags) -> None:
+        """Draw them.
+
+        Args:
+            server: The page.
+            asked: What is asked first.
+            drags: Who is told.
+        """
+        self._controls: dict[str, Control] = {}
+        body = object_of(asked.object)
+        if body is not None and asked.object_pose is not None:
+            self._add(server, OBJECT, [body], drags, opacity=0.4, cast_shadow=True)
+        for name, item in () if asked.scene is None else asked.scene.items.items():
+            if name != asked.object:
+                bodies = item_of(item, np.zeros(3))
+                self._add(server, name, bodies, drags, opacity=0.8, cast_shadow=False)
+        self.place(asked)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What can be dragged."""
+        return tuple(self._controls)
+
+    def place(self, asked: PageRequest, dragged: str = "") -> None:
+        """Put everything where it is; what is being dragged is where the hand has it."""
+        items = {} if asked.scene is None else asked.scene.items
+        for name, control in self._controls.items():
+            if name == OBJECT and asked.object_pose is not None:
+                control.place(asked.object_pose, name == dragged)
+            elif name in items:
+                control.place(items[name].pose, name == dragged)
+
+    def select(self, name: str) -> None:
+        """Give one thing its arrows and rings to be dragged by."""
+        for other, control in self._controls.items():
+            control.select(other == name)
+
+    def _add(
+        self,
+        server: viser.ViserServer,
+        name: str,
+        bodies: Sequence[Drawable],
+        drags: Drags,
+        **look: Any,
+    ) -> None:
+        node = f"/things/{name}"
+        self._controls[name] = Control(
+            server, node, THING_CONTROL, lambda pose: drags.pose(name, pose)
+        )
+        for i, one in enumerate(bodies):
+            mesh = add_drawable(server, f"{node}/{i}", one, receive_shadow=0.15, **look)
+
+            @mesh.on_click
+            async def _(_: Any) -> None:
+                drags.selected(name)
+
+
+def draw_scene(server: viser.ViserServer, scene: Scene, above: str) -> None:
+    """Draw what stands about a robot, to be looked at only.
+
+    Args:
+        server: The page.
+        scene: The scene.
+        above: The node that the robot's base is.
+    """
+    look = {"opacity": 0.8, "cast_shadow": False, "receive_shadow": 0.15}
+    for name, item in scene.items.items():
+        for i, one in enumerate(item_of(item, np.zeros(3))):
+            add_drawable(server, f"{above}/things/{name}/{i}", one.at(item.pose), **look)
+
+
+def lowest(scene: Scene | None) -> float:
+    """Height of the ground: that of the robot's base, or below all that stands there [m]."""
+    heights = [0.0]
+    for item in () if scene is None else scene.items.values():
+        points = np.concatenate([one.surface.points for one in item_of(item, np.zeros(3))])
+        heights.append(float((points @ item.pose[2, :3]).min() + item.pose[2, 3]) - 1e-3)
+    return min(heights)
+
+
+class DrawnClosest:
+    """The pair that is nearest to touching: a red line between them, with its length."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        """Draw nothing yet."""
+        self._rod = _segment(server, "/closest/rod", palette.NEAREST, 0.003)
+        self._label = server.scene.add_label(
+            "/closest/length", "", anchor="top-center", font_screen_scale=0.8, visible=False
+        )
+
+    def place(
+        self, closest: Closest | None, clearance: float | None = None, told: bool = True
+    ) -> None:
+        """Put it where two shapes are nearest, with their clearance [m]; None: nowhere.
+
+        Args:
+            closest: The two points; farther apart than 0.25 m nothing is drawn.
+            clearance: What is told of them; None: how far they are from each other.
+            told: Whether anything is: not where it would lie over what matters more.
+        """
+        shown = closest is not None and closest.distance < 0.25
+        self._rod.visible, self._label.visible = shown, shown and told
+        if closest is None or not shown:
+            return
+        self._rod.points = closest.ends[None].astype(np.float32)
+        self._label.position = closest.ends.mean(axis=0)
+        length = closest.distance if clearance is None else clearance
+        self._label.text = f"{1e3 * length:.1f} mm"
+
+
+# Light, ground, camera.
+
+
+def set_stage(server: viser.ViserServer, title: str, floor: float = 0.0) -> None:
+    """Daylight, a ground with a grid of 0.1 m and 0.5 m, and the look of the panel.
+
+    Args:
+        server: The page.
+        title: On the panel.
+        floor: Height of the ground [m].
+    """
+    scene, gui = server.scene, server.gui
+    scene.set_up_direction("+z")
+    scene.world_axes.visible = False
+    scene.configure_default_lights(enabled=False)
+    scene.configure_environment_map(hdri=None)
+    scene.add_light_hemisphere(
+        "/light/sky", sky_color=(255, 255, 255), ground_color=(214, 210, 204), intensity=2.1
+    )
+    scene.add_light_directional("/light/fill", intensity=0.6, position=(-2.0, 2.0, 1.0))
+    scene.add_grid(
+        "/ground",
+        width=4.0,
+        height=4.0,
+        cell_size=0.1,
+        section_size=0.5,
+        cell_color=(226, 228, 231),
+        section_color=(200, 204, 209),
+        shadow_opacity=0.22,
+        plane_opacity=0.0,
+        position=(0.0, 0.0, floor),
+    )
+    gui.configure_theme(
+        control_layout="collapsible",
+        control_width="medium",
+        show_logo=False,
+        show_share_button=False,
+        brand_color=palette.rgb("#2f6db3"),
+    )
+    gui.set_panel_label(title)
+
+
+def look_at(server: viser.ViserServer, target: Array, size: float, view: Array) -> None:
+    """Where a browser that opens the page looks from, and what lights what it sees.
+
+    Args:
+        server: The page.
+        target: (3,) middle of what is to be seen [m].
+        size: How large it is [m].
+        view: (3,) from there towards the camera.
+    """
+    way = view / np.linalg.norm(view)
+    server.initial_camera.fov = float(np.deg2rad(40.0))
+    server.initial_camera.look_at = target
+    server.initial_camera.position = target + 1.3 * size * way
+    lamp = np.array([0.55, -0.45, 1.9])
+    # For its shadows the scene is drawn once more, for those of a sun three times.
+    server.scene.add_light_spot(
+        "/light/lamp",
+        color=(255, 250, 242),
+        intensity=2.2,
+        decay=0.0,
+        angle=0.95,
+        penumbra=0.3,
+        position=tuple((target + size * lamp).tolist()),
+        direction=tuple((-lamp).tolist()),
+        cast_shadow=True,
+    )
+
+
+def look_at_robot(server: viser.ViserServer, robot: ArmHand, q: Array, wide: int = 1) -> None:
+    """The robot at q, its hand in the middle and seen from where its fingertips are apart.
+
+    Args:
+        server: The page.
+        robot: The robot.
+        q: (n,) [rad or m].
+        wide: How many robots stand side by side.
+    """
+    links = np.array([pose[:3, 3] for pose in robot.links(q).values()])
+    tips, normals = robot.contacts(q)
+    every = np.concatenate([links, tips])
+    low, high = every.min(axis=0), every.max(axis=0)
+    hand = tips.mean(axis=0)
+    size = wide * max(float(np.linalg.norm(high - low)), 0.3)
+    side = float(np.arctan2(hand[1], hand[0])) if np.hypot(*hand[:2]) > 0.05 else 0.0
+
+    def apart(view: Array) -> float:
+        flat = tips - np.outer(tips @ view, view)
+        gaps = np.linalg.norm(flat[:, None] - flat[None], axis=2)
+        gap = gaps[np.triu_indices(len(tips), 1)].min() if len(tips) > 1 else 0.0
+        return float(gap + 0.03 * (1 - np.abs(normals @ view).max()))
+
+    views = []
+    # Two stand beside each other as seen from where they reach to.
+    turns = [-75, -60, -45, -30, 30, 45, 60, 75] if wide == 1 else [-30, 30]
+    for turn in np.deg2rad(turns):
+        way = np.array([np.cos(side + turn), np.sin(side + turn), 0.36])
+        views.append(way / np.linalg.norm(way))
+    share = 0.62 if wide == 1 else 0.0
+    target = (1 - share) * (low + high) / 2 + share * hand
+    look_at(server, target, (0.72 if wide == 1 else 0.78) * size, max(views, key=apart))
+
+
+def look_at_hand(server: viser.ViserServer, robot: ArmHand, q: Array) -> None:
+    """The hand alone at q, from the side that its thumb's pad is seen from."""
+    links, palm = robot.links(q), robot.palm(q)
+    hand = {joint.child for joint in robot.description.joints if joint.part == "hand"}
+    tips, _ = robot.contacts(q)
+    points = [links[link][:3, 3] for link in links if link in hand]
+    every = np.concatenate([np.array([*points, palm[:3, 3]]), tips])
+    low, high = every.min(axis=0), every.max(axis=0)
+    size = max(float(np.linalg.norm(high - low)), 0.1)
+    # Across the way from palm to thumb, along which the pads are seen from the side.
+    aside = 0.35 * palm[:3, 2] + 0.25 * palm[:3, 1]
+    # Of its two sides the one that is seen from above the ground.
+    view = max(palm[:3, 0] + aside, aside - palm[:3, 0], key=lambda one: one[2])
+    look_at(server, (low + high) / 2, 1.25 * size, view + np.array([0.0, 0.0, 0.3]))

@@ -1,0 +1,552 @@
+"""Pictures of robots: at the contacts of a grasp, several answers, in motion; pads of hands."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from os import PathLike
+
+import numpy as np
+import pyvista as pv
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import ArrayLike
+from PIL import Image as Pillow
+
+from casadi_ik import palette
+from casadi_ik.answers.solution import Solution
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.collision.scene import Scene
+from casadi_ik.drawing.drawables import (
+    Drawable,
+    body,
+    closest_bodies,
+    closest_rod,
+    contact_marks,
+    object_of,
+    scene_of,
+    target_place,
+    with_object,
+)
+from casadi_ik.drawing.surfaces import arrow, ball
+from casadi_ik.errors import InputError
+from casadi_ik.grasps import Grasp
+from casadi_ik.grasps.pose import inverse
+from casadi_ik.importing.surfaces import Surface
+from casadi_ik.motion.motion import Motion
+from casadi_ik.problem.clearance import closest_points
+from casadi_ik.solving.alternatives.finder import Alternative
+from casadi_ik.views.charts import DARK, DPI, LIGHT, Ground, new_figure, save_picture
+from casadi_ik.views.stage import Image, Stage, View, close_view, over, points_of, whole_view
+
+SIZE = (12.0, 6.6)
+"""Of a picture with two panels [inch]."""
+
+Box = tuple[float, float, float, float]
+"""Left, bottom, width and height of a panel, as parts of its picture."""
+
+WHOLE: Box = (0.0, 0.06, 0.40, 0.82)
+CLOSE: Box = (0.40, 0.06, 0.60, 0.82)
+
+OPACITY = {"object": 0.5, "scene": 0.45, "touching": 0.35}
+"""Of groups that are seen through; marks that something hides are half seen."""
+
+_one_at_a_time = threading.Lock()
+
+
+def draw_solution(
+    robot: ArmHand,
+    solution: Solution,
+    grasp: Grasp,
+    path: str | PathLike[str] | None = None,
+    *,
+    scene: Scene | None = None,
+    view: View | None = None,
+    dpi: float = DPI,
+    dark: bool = False,
+) -> Figure:
+    """Draw the answer to a grasp.
+
+    Args:
+        robot: The robot that was solved for.
+        solution: The answer.
+        grasp: The question; if it names an object that has a description, that is drawn too.
+        path: PNG file to write, if any.
+        scene: What stood about the robot: that is drawn too, and of the pair that is nearest to
+            touching the way between them in red; their shapes as well if they do touch.
+        view: Azimuth and elevation [rad] from which the close-up is seen; None: chosen so that
+            the fingertips are well apart.
+        dpi: Dots per inch.
+        dark: For a dark page.
+
+    Returns:
+        The figure, which belongs to no pyplot window.
+
+    Raises:
+        PictureError: The file cannot be written, or there is no OpenGL to draw with.
+        DescriptionError: The description of the object is malformed.
+        InputError: The grasp has a finger that the robot has not.
+    """
+    ground = DARK if dark else LIGHT
+    figure = new_figure(*SIZE, dpi, ground)
+    paper = np.array(palette.rgb(ground.paper), np.float32) / 255
+    colors = {
+        finger: palette.MET if verdict.ok else palette.MISSED
+        for finger, verdict in solution.contacts.items()
+    }
+    q = solution.q
+    with _one_at_a_time, closing(Stage()) as stage:
+        groups = _fill(stage, robot, q, grasp, colors)
+        if scene is not None:
+            _surround(stage, robot, solution, grasp, scene)
+        view = view or close_view(robot, q)
+        pixels = _pixels(figure, WHOLE)
+        everything = points_of([one for group in groups.values() for one in group])
+        stage.aim(whole_view(_middle(robot, q, grasp), view), everything, pixels, (0.03, 0.10))
+        image = over(paper, stage.shoot("floor"), _inwards(pixels))
+        image = over(image, stage.shoot(*groups, "scene", "nearest", "touching"))
+        _panel(figure, WHOLE, over(image, stage.shoot("marks", "nearest"), 0.45))
+
+        # What reaches further than this from the palm need not be in the close-up.
+        palm = robot.palm(q)[:3, 3]
+        things = groups["object"] + groups["marks"]
+        near = [one for one in things if _distances(one, palm).max() < 0.35]
+        pixels = _pixels(figure, CLOSE)
+        stage.aim(view, points_of(groups["hand"] + near), pixels, (0.17, 0.02))
+        # The arm is pale: it may stand in the way.
+        image = over(paper, stage.shoot("wrist"), 0.3 * _inwards(pixels))
+        image = over(image, stage.shoot("hand", "object", "marks", "nearest", "touching"))
+        axes = _panel(figure, CLOSE, over(image, stage.shoot("marks", "nearest"), 0.45))
+        seen = stage.project(robot.contacts(q)[0])
+    _label_fingers(axes, dict(zip(robot.fingers, seen, strict=True)), solution, grasp, ground)
+    _add_title(figure, solution, grasp, ground)
+    _add_legend(figure, solution, grasp, bool(groups["object"]), scene is not None, ground)
+    if path is not None:
+        save_picture(figure, path)
+    return figure
+
+
+def draw_alternatives(
+    robot: ArmHand,
+    alternatives: Sequence[Alternative],
+    grasp: Grasp,
+    path: str | PathLike[str] | None = None,
+    *,
+    columns: int = 4,
+    view: View | None = None,
+    dpi: float = DPI,
+) -> Figure:
+    """Draw several solutions of a grasp side by side, all seen from the same place.
+
+    Args:
+        robot: The robot that was solved for.
+        alternatives: The solutions, at least one.
+        grasp: The question; if it names an object that has a description, that is drawn too.
+        path: PNG file to write, if any.
+        columns: Pictures in a row.
+        view: Azimuth and elevation [rad] of the camera; None: chosen for the first solution.
+        dpi: Dots per inch.
+
+    Returns:
+        The figure, which belongs to no pyplot window.
+
+    Raises:
+        PictureError: The file cannot be written, or there is no OpenGL to draw with.
+        DescriptionError: The description of the object is malformed.
+        InputError: No solution, or the grasp has a finger that the robot has not.
+    """
+    if not alternatives:
+        raise InputError("alternatives: found none, expected at least one")
+    rows = -(-len(alternatives) // columns)
+    figure = new_figure(3.2 * columns, 3.4 * rows, dpi)
+    first = alternatives[0].q
+    target = robot.contacts(first)[0].mean(axis=0)
+    view = view or whole_view(target, close_view(robot, first))
+    everything = points_of([one for a in alternatives for part in body(robot, a.q) for one in part])
+    for number, found in enumerate(alternatives):
+        row, column = divmod(number, columns)
+        box = (column / columns, 1 - (row + 1) / rows, 1 / columns, 0.86 / rows)
+        with _one_at_a_time, closing(Stage()) as stage:
+            _fill(stage, robot, found.q, grasp, dict.fromkeys(robot.fingers, palette.MET))
+            stage.aim(view, everything, _pixels(figure, box), (0.03, 0.03))
+            axes = _panel(figure, box, over(1.0, stage.shoot()))
+        axes.set_title(_bent(found), color=palette.INK, fontsize=9)
+    if path is not None:
+        save_picture(figure, path)
+    return figure
+
+
+def _bent(found: Alternative) -> str:
+    """How the arm is bent, and how far its elbow may swing."""
+    branch = found.branch
+    if branch is None:
+        return f"hand posture {found.posture + 1}"
+    pairs = (("shoulder", branch.shoulder), ("elbow", branch.elbow), ("wrist", branch.wrist))
+    signs = ", ".join(f"{name} {'+' if sign > 0 else '−'}" for name, sign in pairs)
+    if branch.swivel is None:
+        return signs
+    start, end = branch.swivel
+    return f"{signs}\nelbow swings {np.rad2deg(end - start):.0f}°"
+
+
+def show(
+    robot: ArmHand, q: ArrayLike, grasp: Grasp | None = None, *, window: bool = True
+) -> pv.Plotter:
+    """Open a window in which a robot can be looked at from all sides.
+
+    Args:
+        robot: The robot.
+        q: (n,) actuator positions [rad or m].
+        grasp: Contacts and object to be shown too.
+        window: Whether to open it, until it is closed; else only the plotter is made.
+
+    Returns:
+        The plotter, e.g. for its `export_gltf`.
+
+    Raises:
+        PictureError: There is no OpenGL to draw with.
+        InputError: Bad q, or the grasp has a finger that the robot has not.
+    """
+    with _one_at_a_time:
+        stage = Stage(off_screen=not window)
+        groups = _fill(stage, robot, q, grasp, dict.fromkeys(robot.fingers, palette.INK))
+        view = whole_view(robot.contacts(q)[0].mean(axis=0), close_view(robot, q))
+        everything = points_of([one for group in groups.values() for one in group])
+        stage.aim(view, everything, (1200, 900), (0.05, 0.05))
+    if window:
+        stage.plotter.show(auto_close=False)
+    return stage.plotter
+
+
+def draw_motion(
+    motion: Motion,
+    grasp: Grasp,
+    path: str | PathLike[str],
+    scene: Scene | None = None,
+) -> int:
+    """Draw a motion in real time as a GIF: the whole robot, and the hand from close by.
+
+    Args:
+        motion: The motion.
+        grasp: What it leads to; if it names an object that has a description, that is drawn too.
+        path: The file; it is there when it is complete.
+        scene: What stands about the robot.
+
+    Returns:
+        How many pictures there are: twelve a second, fewer in a motion of more than 7.5 s.
+
+    Raises:
+        PictureError: The file cannot be written, or there is no OpenGL to draw with.
+        DescriptionError: The description of the object is malformed.
+    """
+    seconds = float(motion.times[-1])
+    count = int(np.clip(np.ceil(12 * seconds), 2, 90))
+    times = np.linspace(0.0, seconds, count)
+    q = np.stack([np.interp(times, motion.times, column) for column in motion.q.T], axis=1)
+    step = max(round(1e3 * seconds / (count - 1)), 20)
+    pictures = _shots(motion.robot, q, grasp, scene)
+    save_picture(_gif(pictures, [*[step] * (count - 1), 1500]), path)  # the last one stays [ms]
+    return count
+
+
+def _shots(robot: ArmHand, q: Array, grasp: Grasp, scene: Scene | None) -> list[Image]:
+    """Images (h, w, 3) of postures (k, n)."""
+    end, sizes = q[-1], ((420, 420), (340, 420))
+    passed = [one for row in q[:: max(len(q) // 8, 1)] for part in body(robot, row) for one in part]
+    there = _object(grasp)
+    tips = robot.contacts(end)[0]
+    close_up = tips.mean(axis=0) + 0.11 * np.vstack([np.eye(3), -np.eye(3)])
+    marks = contact_marks(robot, end, grasp, dict.fromkeys(robot.fingers, palette.MET))
+    found = []
+    with _one_at_a_time, closing(Stage()) as stage:
+        foot = robot.links(q[0])[robot.description.root]
+        stage.add_floor(float(foot[2, 3]), passed[:1] + there)
+        stage.add("object", there, OPACITY["object"])
+        stage.add("marks", marks)
+        if scene is not None:
+            about = scene_of(with_object(scene, grasp), foot[:3, 3], grasp.object)
+            stage.add("scene", about, OPACITY["scene"])
+        view = close_view(robot, end)
+        seen = (
+            (whole_view(tips.mean(axis=0), view), points_of(passed + there), sizes[0]),
+            (view, np.vstack([close_up, points_of(there or marks)]), sizes[1]),
+        )
+        for row in q:
+            for name, part in zip(("arm", "hand"), body(robot, row), strict=True):
+                stage.replace(name, part)
+            panels = []
+            for where, points, pixels in seen:
+                stage.aim(where, points, pixels, (0.04, 0.04))
+                panels.append(np.clip(over(1.0, stage.shoot()), 0.0, 1.0))
+            found.append(np.concatenate(panels, axis=1))
+    return found
+
+
+def _gif(images: list[Image], milliseconds: list[int]) -> bytes:
+    """Images as a GIF whose pictures share the palette of first, middle and last."""
+    whole = [Pillow.fromarray(np.round(255 * image).astype(np.uint8)) for image in images]
+    width, height = whole[0].size
+    some = [whole[0], whole[len(whole) // 2], whole[-1]]
+    sheet = Pillow.new("RGB", (width, height * len(some)))
+    for i, one in enumerate(some):
+        sheet.paste(one, (0, i * height))
+    shared = sheet.quantize(96)
+    frames = [one.quantize(palette=shared, dither=Pillow.Dither.NONE) for one in whole]
+    written = io.BytesIO()
+    frames[0].save(
+        written,
+        format="GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=milliseconds,
+        loop=0,
+        optimize=False,
+        disposal=1,
+    )
+    return written.getvalue()
+
+
+def draw_pads(
+    robot: ArmHand,
+    surfaces: Mapping[str, Surface],
+    path: str | PathLike[str] | None = None,
+    *,
+    dpi: float = DPI,
+) -> Figure:
+    """Draw the hand of a robot at home from two sides, with a mark at every pad.
+
+    Args:
+        robot: The robot.
+        surfaces: Shapes of the hand's links in the links' frames, by link of the robot; without
+            any the hand is drawn from its joints.
+        path: PNG file to write, if any.
+        dpi: Dots per inch.
+
+    Returns:
+        The figure, which belongs to no pyplot window.
+
+    Raises:
+        PictureError: The file cannot be written, or there is no OpenGL to draw with.
+    """
+    # In the palm frame, whose z is up and whose y goes to the thumb.
+    back, links = inverse(robot.palm(robot.home)), robot.links(robot.home)
+    hand = [
+        Drawable(link, surface.moved(back @ links[link]), palette.HAND)
+        for link, surface in surfaces.items()
+        if link in links and len(surface.triangles)
+    ]
+    hand = hand or [one.at(back) for one in body(robot, robot.home)[1]]
+    size = float(np.ptp(points_of(hand), axis=0).max())
+    frames, marks = back @ robot.contact_frames(robot.home), []
+    for name, frame in zip(robot.fingers, frames, strict=True):
+        color = palette.TARGET if name == robot.description.named_thumb else palette.MET
+        point, normal = frame[:3, 3], frame[:3, 0]
+        marks.append(Drawable(name, ball(0.014 * size, point), color))
+        marks.append(Drawable(name, arrow(point, normal, 0.16 * size, 0.012 * size), color))
+    figure = new_figure(*SIZE, dpi)
+    for left, turn in ((0.0, 25.0), (0.5, 115.0)):
+        box = (left, 0.0, 0.5, 0.88)
+        pixels = _pixels(figure, box)
+        with _one_at_a_time, closing(Stage()) as stage:
+            stage.add("hand", hand, orient=bool(surfaces))
+            stage.add("marks", marks)
+            view = float(np.deg2rad(turn)), float(np.deg2rad(20.0))
+            stage.aim(view, points_of(hand + marks), pixels, (0.12, 0.04))
+            # Pads are seen through the hand.
+            image = over(over(1.0, stage.shoot("hand")), stage.shoot("marks"), 0.55)
+            image = over(image, stage.shoot("hand", "marks"), 0.45)
+            places = stage.project(frames[:, :3, 3])
+        axes = _panel(figure, box, image)
+        _label_pads(axes, dict(zip(robot.fingers, places, strict=True)), pixels)
+    figure.text(0.02, 0.955, robot.name, size=15, weight="bold", color=palette.INK, va="center")
+    note = "pads and their outward normals; the thumb is yellow; seen from two sides, palm's z up"
+    figure.text(0.02, 0.91, note, size=10, color=palette.FAINT, va="center")
+    if path is not None:
+        save_picture(figure, path)
+    return figure
+
+
+# What is on a picture.
+
+
+def _fill(
+    stage: Stage, robot: ArmHand, q: ArrayLike, grasp: Grasp | None, colors: Mapping[str, str]
+) -> dict[str, list[Drawable]]:
+    """Put all there is to see on the stage, and give it back by group."""
+    arm, hand = body(robot, q)
+    palm = robot.palm(q)[:3, 3]
+    groups: dict[str, list[Drawable]] = {"arm": [], "wrist": [], "hand": hand}
+    for one in arm:  # the close-up shows what is no further than this from the palm
+        groups["wrist" if _distances(one, palm).min() < 0.10 else "arm"].append(one)
+    groups["object"] = _object(grasp) if grasp else []
+    groups["marks"] = contact_marks(robot, q, grasp, colors) if grasp else []
+    for name, members in groups.items():
+        stage.add(name, members, OPACITY.get(name, 1.0))
+    stage.add_floor(float(robot.links(q)[robot.description.root][2, 3]), arm + hand)
+    return groups
+
+
+def _surround(stage: Stage, robot: ArmHand, solution: Solution, grasp: Grasp, scene: Scene) -> None:
+    """Put what stands about on the stage, and what is nearest to touching."""
+    whole = with_object(scene, grasp)
+    about = robot.links(solution.q)[robot.description.root][:3, 3]
+    stage.add("scene", scene_of(whole, about, grasp.object), OPACITY["scene"])
+    pair = solution.closest
+    if pair is not None and np.isfinite(solution.q).all():
+        found = closest_points(robot, solution.q, whole, pair)
+        if found is not None:
+            stage.add("nearest", [closest_rod(found)])
+            touching = [] if solution.success else closest_bodies(found)
+            stage.add("touching", touching, OPACITY["touching"])
+
+
+def _object(grasp: Grasp) -> list[Drawable]:
+    """The object, if there is a description of it and its place is given."""
+    pose, found = grasp.object_pose, object_of(grasp.object)
+    return [] if found is None or pose is None else [found.at(pose)]
+
+
+def _middle(robot: ArmHand, q: ArrayLike, grasp: Grasp) -> Array:
+    """(3,) amid the contacts asked for [m]."""
+    grasp.arrays(robot.fingers)
+    tips = dict(zip(robot.fingers, robot.contacts(q)[0], strict=True))
+    places = [target_place(contact, tips[name]) for name, contact in grasp.contacts.items()]
+    return np.mean(places or list(tips.values()), axis=0)
+
+
+def _distances(one: Drawable, place: Array) -> Array:
+    return np.linalg.norm(one.surface.points - place, axis=1)
+
+
+def _inwards(pixels: tuple[int, int]) -> Image:
+    """(h, w, 1) 0 at the edges of an image, 1 further in."""
+    x, y = (np.linspace(0, 1, size, dtype=np.float32) for size in pixels)
+    x, y = (np.clip(np.minimum(v, 1 - v) / 0.15, 0, 1) for v in (x, y))
+    return y[:, None, None] * x[:, None]
+
+
+def _pixels(figure: Figure, box: Box) -> tuple[int, int]:
+    width, height = figure.get_size_inches() * figure.dpi
+    return round(width * box[2]), round(height * box[3])
+
+
+def _panel(figure: Figure, box: Box, image: Image) -> Axes:
+    axes = figure.add_axes(box)
+    axes.set_axis_off()
+    axes.imshow(np.clip(image, 0.0, 1.0))
+    return axes
+
+
+# What is written on it.
+
+
+def _label_fingers(
+    axes: Axes, places: dict[str, Array], solution: Solution, grasp: Grasp, ground: Ground
+) -> None:
+    """Name and errors of every finger, at the edge of the picture with a line to its contact."""
+    height, width = axes.images[0].get_size()
+    asked = grasp.contacts or places  # of a palm that is given all fingers follow
+    seen = {finger: place for finger, place in places.items() if finger in asked}
+    middle = (min(x for x, _ in seen.values()) + max(x for x, _ in seen.values())) / 2
+    lowest = {"left": -np.inf, "right": -np.inf}
+    for finger, (x, y) in sorted(seen.items(), key=lambda item: item[1][1]):
+        verdict = solution.contacts[finger]
+        side = "right" if x > middle else "left"
+        level = lowest[side] = max(y, lowest[side] + 0.12 * height, 0.08 * height)
+        edge, shoulder = (0.985, 0.825) if side == "right" else (0.015, 0.175)
+        above = {"ha": side, "va": "bottom", "size": 11, "color": ground.ink, "weight": "bold"}
+        axes.text(edge * width, level - 0.006 * height, finger, **above)
+        color = palette.MET if verdict.ok else palette.MISSED
+        below = {"ha": side, "va": "top", "size": 9.5, "color": color}
+        errors = _errors(verdict.position_error, verdict.angle_error)
+        axes.text(edge * width, level + 0.006 * height, errors, **below)
+        line = [edge * width, shoulder * width, x], [level, level, y]
+        axes.plot(*line, color=ground.faint, lw=0.8, alpha=0.8)
+
+
+def _label_pads(axes: Axes, places: Mapping[str, Array], pixels: tuple[int, int]) -> None:
+    """The fingers' names at the edges, a line from each to its pad."""
+    width, height = pixels
+    middle = float(np.median([x for x, _ in places.values()]))
+    for side, edge, sign in (("left", 0.01, 1), ("right", 0.99, -1)):
+        chosen = [item for item in places.items() if (item[1][0] <= middle) == (side == "left")]
+        level = 0.0
+        for name, (x, y) in sorted(chosen, key=lambda item: float(item[1][1])):
+            level = max(float(y), level + 0.06 * height, 0.03 * height)
+            axes.text(edge * width, level, name, ha=side, va="center", size=10, color=palette.INK)
+            start = (edge + sign * 0.011 * len(name) + sign * 0.02) * width
+            axes.plot([start, x], [level, y], color=palette.FAINT, lw=0.8)
+    axes.set_xlim(0, width)
+    axes.set_ylim(height, 0)
+
+
+def _errors(position: float, angle: float) -> str:
+    parts = [] if np.isnan(position) else [f"{1e3 * position:.2f} mm"]
+    return "  ".join(parts if np.isnan(angle) else [*parts, f"{np.rad2deg(angle):.2f}°"])
+
+
+def _add_title(figure: Figure, solution: Solution, grasp: Grasp, ground: Ground) -> None:
+    """What was asked, how it ended, and the largest errors."""
+    worst = [
+        np.nanmax([getattr(verdict, name) for verdict in solution.contacts.values()] + [0.0])
+        for name in ("position_error", "angle_error")
+    ]
+    what = f"{grasp.name} · {solution.robot}" if grasp.name else solution.robot
+    large = {"size": 16, "weight": "bold", "va": "center"}
+    figure.text(0.02, 0.945, what, color=ground.ink, **large)
+    color = palette.MET if solution.success else palette.MISSED
+    figure.text(0.98, 0.945, solution.status.name, color=color, ha="right", **large)
+    limits = "" if solution.limits_ok else " · beyond a limit"
+    how = f"{solution.method} · {solution.iterations} iterations"
+    how += f" · largest errors {_errors(*worst)}{limits}"
+    figure.text(0.02, 0.90, how, size=11, color=ground.faint, va="center")
+
+
+def _add_legend(
+    figure: Figure,
+    solution: Solution,
+    grasp: Grasp,
+    has_object: bool,
+    has_scene: bool,
+    ground: Ground,
+) -> None:
+    """What the arrows mean."""
+    states = {verdict.ok for verdict in solution.contacts.values()}
+    handles: list[Line2D | Patch] = [_mark(palette.TARGET, _asked(grasp), 4.5)]
+    if True in states:
+        handles.append(_mark(palette.MET, "reached, within tolerance", 2.0))
+    if False in states:
+        handles.append(_mark(palette.MISSED, "reached, out of tolerance", 2.0))
+    if has_object:
+        handles.append(Patch(color=palette.OBJECT, label="object"))
+    if has_scene and solution.closest is not None and solution.clearance is not None:
+        pair = " and ".join(solution.closest)
+        label = f"nearest: {pair}, {1e3 * solution.clearance:.1f} mm"
+        handles.append(Line2D([], [], color=palette.NEAREST, lw=3.0, label=label))
+    style = {"frameon": False, "fontsize": 10, "labelcolor": ground.ink}
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), **style)
+
+
+def _asked(grasp: Grasp) -> str:
+    """What the marks of a target are."""
+    if grasp.palm is not None:
+        return "asked for: palm and posture"
+    contacts = grasp.contacts.values()
+    placed = [contact for contact in contacts if not np.isnan(contact.point[0])]
+    marks = {
+        "contact": any(c.line is None and c.plane is None for c in placed),
+        "line (rod)": any(c.line is not None for c in placed),
+        "plane (ring)": any(c.plane is not None for c in placed),
+        "pad normal": any(c.normal is not None for c in contacts),
+        "second axis (shorter)": any(c.tangent is not None for c in contacts),
+    }
+    return "asked for: " + ", ".join(name for name, there in marks.items() if there)
+
+
+def _mark(color: str, label: str, width: float) -> Line2D:
+    return Line2D([], [], color=color, lw=width, marker="o", markersize=6, label=label)
