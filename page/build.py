@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 import casadi_ik as ik
+from casadi_ik import palette
 from casadi_ik.collision.solids import EXPORTED, of_object, stated
 from casadi_ik.exporting.project import checked_prefix, write_folder
 from casadi_ik.exporting.wasm import wasm_project
@@ -38,6 +39,15 @@ ROBOTS = {
     "panda+shadow": "Panda · Shadow",
 }
 """What can be chosen, and what it is called there."""
+
+COLORS = {
+    "arm": palette.ARM,
+    "hand": palette.HAND,
+    "object": palette.OBJECT,
+    "scene": palette.SCENE,
+    "touching": palette.NEAREST,
+}
+"""Of what the page draws."""
 
 CAPACITY = 8
 """Solids of a scene: an object of several parts, and the obstacle."""
@@ -73,7 +83,10 @@ def of_grasps(robot: ik.ArmHand, name: str) -> list[dict[str, Any]]:
                 "object": grasp.object.replace("_", " "),
                 "points": [None if np.isnan(p).any() else p.tolist() for p in points],
                 "normals": [None if np.isnan(n).any() else n.tolist() for n in normals],
-                "solids": [stated(solid, grasp.object_pose @ place) for solid, place in parts],
+                "solids": [
+                    stated(solid, grasp.object_pose @ place) | {"shape": solid.kind.name}
+                    for solid, place in parts
+                ],
             }
         )
     if not found:
@@ -192,7 +205,9 @@ def main() -> None:
     (out / "robots").mkdir(parents=True, exist_ok=True)
     run("npm", "ci", "--no-audit", "--no-fund", "--silent")
     robots = [build_robot(name, out, arguments.keep) for name in arguments.robots]
-    bundle(HERE / "src" / "main.js", out / "page.js", f"--define:ROBOTS={json.dumps(robots)}")
+    defined = {"ROBOTS": robots, "PALETTE": COLORS}
+    words = [f"--define:{name}={json.dumps(value)}" for name, value in defined.items()]
+    bundle(HERE / "src" / "main.js", out / "page.js", *words)
     for name in ("index.html", "page.css"):
         shutil.copy(HERE / "src" / name, out / name)
     print(f"open {out / 'index.html'}", file=sys.stderr)

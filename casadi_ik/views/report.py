@@ -65,7 +65,7 @@ def study_page(log: Log, title: str, most: int) -> str:
         f"{len(about.paths)} file(s), {about.size / 1e6:.1f} MB; written "
         f"{_text(about.metadata['created'])} by casadi-ik "
         f"{_text(about.metadata['code_version'])}.</p>",
-        "<h2>What came of it</h2>",
+        "<h2>Results</h2>",
         _totals(groups),
     ]
     if any(map(len, groups)):

@@ -1,23 +1,26 @@
 // What is drawn: the robot's shapes, solids, contacts.
 import * as THREE from "three";
 
-const KIND = { CAPSULE: 1, BOX: 2, CYLINDER: 3 };
+/* global PALETTE */
+// By the solver's names of kinds: what a solid looks like, along z where it is along anything.
+const UPRIGHT = Math.PI / 2;
+const GEOMETRY = {
+  BOX: (size) => new THREE.BoxGeometry(...size),
+  CAPSULE: ([radius, length]) =>
+    length > 0
+      ? new THREE.CapsuleGeometry(radius, length, 12, 32).rotateX(UPRIGHT)
+      : new THREE.SphereGeometry(radius, 40, 28),
+  CYLINDER: ([radius, length]) =>
+    new THREE.CylinderGeometry(radius, radius, length, 48).rotateX(UPRIGHT),
+};
 const UP = new THREE.Vector3(0, 1, 0);
 
 export const COLORS = ["#f0a400", "#2f7fd6", "#16a39a", "#b04fc9", "#e0528a"];
-const ARM = 0xf2a45e, HAND = 0x7a8897, OBJECT = 0x8cc4e8, OBSTACLE = 0x8d99a6, TOUCHING = 0xe00000;
 
 const solid = (color) => new THREE.MeshStandardMaterial({ color, roughness: 0.7, metalness: 0 });
 
-// A mesh for a solid as the solver has it; along z, where it is along anything.
-function meshOf(kind, size, material) {
-  let geometry;
-  if (kind === KIND.BOX) geometry = new THREE.BoxGeometry(...size);
-  else if (kind === KIND.CYLINDER) geometry = new THREE.CylinderGeometry(size[0], size[0], size[1], 48);
-  else if (size[1] > 0) geometry = new THREE.CapsuleGeometry(size[0], size[1], 12, 32);
-  else geometry = new THREE.SphereGeometry(size[0], 40, 28);
-  if (kind !== KIND.BOX) geometry.rotateX(Math.PI / 2);
-  const mesh = new THREE.Mesh(geometry, material);
+function meshOf(shape, size, material) {
+  const mesh = new THREE.Mesh(GEOMETRY[shape](size), material);
   mesh.castShadow = true;
   mesh.receiveShadow = true;
   return mesh;
@@ -39,7 +42,9 @@ export class RobotBody extends THREE.Group {
     super();
     const arm = new Set(armLinks);
     this.parts = [];
-    const materials = { arm: solid(ARM), hand: solid(HAND), touching: solid(TOUCHING) };
+    const materials = {
+      arm: solid(PALETTE.arm), hand: solid(PALETTE.hand), touching: solid(PALETTE.touching),
+    };
     this.materials = materials;
     const put = (mesh, link, at, isSolid) => {
       const usual = arm.has(link) ? materials.arm : materials.hand;
@@ -50,12 +55,11 @@ export class RobotBody extends THREE.Group {
     shapes.capsules.forEach((capsule, i) => {
       if (!capsule.shown) return;
       const half = Math.hypot(...places.slice(6 * i + 3, 6 * i + 6));
-      put(meshOf(KIND.CAPSULE, [capsule.radius, 2 * half], null), capsule.link, 6 * i, false);
+      put(meshOf("CAPSULE", [capsule.radius, 2 * half], null), capsule.link, 6 * i, false);
     });
     const first = 6 * shapes.capsules.length;
     shapes.solids.forEach((one, i) => {
-      const kind = one.kind === "box" ? KIND.BOX : KIND.CYLINDER;
-      put(meshOf(kind, one.size, null), one.link, first + 12 * i, true);
+      put(meshOf(one.kind.toUpperCase(), one.size, null), one.link, first + 12 * i, true);
     });
     this.place(places);
   }
@@ -86,11 +90,11 @@ export class Things extends THREE.Group {
   // Solids in one: the object (seen through) or the obstacle.
   constructor(solids, isObject) {
     super();
-    this.material = solid(isObject ? OBJECT : OBSTACLE);
+    this.material = solid(isObject ? PALETTE.object : PALETTE.scene);
     if (isObject) Object.assign(this.material, { transparent: true, opacity: 0.55, depthWrite: false });
     this.solids = solids;
     for (const one of solids) {
-      const mesh = meshOf(one.kind, one.size, this.material);
+      const mesh = meshOf(one.shape, one.size, this.material);
       matrixOf(one.pose).decompose(mesh.position, mesh.quaternion, mesh.scale);
       this.add(mesh);
     }

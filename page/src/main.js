@@ -108,7 +108,7 @@ function put() {
   if (side.dot(stage.camera.position.clone().sub(goal)) < 0) side.negate();
   const at = middle.clone().lerp(goal, 0.35).addScaledVector(side, 0.26);
   const turn = new THREE.Matrix4().makeTranslation(at);
-  now.obstacle = new Things([{ kind, size: [0.08, 0.08, 0.32], pose: poseOf(turn) }], false);
+  now.obstacle = new Things([{ kind, shape: "BOX", size: [0.08, 0.08, 0.32], pose: poseOf(turn) }], false);
   world.add(now.obstacle);
   solve();
 }
