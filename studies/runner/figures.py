@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from casadi_ik.views.charts import new_figure
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 
 from casadi_ik.arrays import Array
 from casadi_ik.palette import FAINT, INK
+from casadi_ik.views.charts import new_figure
 
 PAPER, OURS, THIRD, FOURTH = COLORS = "#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6"
 """What the paper does, what we do, others."""
