@@ -28,7 +28,7 @@ from casadi_ik.kernels.folders import NO_ROOM
 # but the driver is hidden, so that a function named like one of libc cannot be taken for it.
 FLAGS = ("-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden")
 
-LEVEL, LONG = ("-O2",), 250_000
+LEVEL, LONG = ("-O2",), 100_000
 LEVEL_OF_LONG = ("-O1", "-fexpensive-optimizations", "-finline-small-functions")
 """Optimization, and that of a source with more characters: the passes between the two take time
 that grows with the square of a function's length, a loop's whole compilation 2.5 (14 motors) to 4

@@ -10,6 +10,7 @@ what `real`, `mask` and `real_sin` stand for is said by the C text before it (`d
   caller gives no place for that output. Sines with cosines of the same angle are computed together,
   and up to `Form.width` sines or arcs that do not wait for each other in one call.
 - An MX Function is a list of calls, with arrays on the stack between them.
+- A Map calls a Function for each of its columns.
 - A Switch calls one of several Functions. Of vectors it calls each that any lane takes, and every
   lane keeps the results of its own.
 
@@ -131,7 +132,7 @@ def emit(functions: Sequence[ca.Function], form: Form) -> tuple[str, list[Name]]
     """C text of functions and of all they call.
 
     Args:
-        functions: Any; those that are called more than once are written once.
+        functions: Any; what is called more than once is written once.
         form: What the code is for.
 
     Returns:
@@ -190,6 +191,8 @@ class _Emitter:
             return _sx_body(function, self.form)
         if kind == "Switch":
             return _switch_body(function, self)
+        if kind == "Map":
+            return _map_body(function, self)
         if kind == "MXFunction":
             try:
                 return _MXBody(function, self).text()
@@ -540,7 +543,9 @@ class _MXBody:
             order = [known.get(place) for place in zip(*after.get_triplet(), strict=True)]
             return self._chosen(name, given[0], order)
         if code == ca.OP_HORZREPMAT:
-            return self._chosen(name, given[0], [*range(given[0].size)] * (size // given[0].size))
+            made, value = self._array(name, size), given[0].at(f"k%{given[0].size}")
+            self._lines.append(f"for (int k = 0; k < {size}; ++k) {name}[k]={value};")
+            return made
         if code == ca.OP_SETNONZEROS:
             made = self._array(name, size)
             self._lines.append(self._copy(given[0], name))
@@ -622,7 +627,16 @@ def _whole(numbers: Any) -> list[int]:
     return [int(number) for number in ca.DM(numbers).nonzeros()]
 
 
-# Switch: one of several.
+# Map: the same for each column; Switch: one of several.
+
+
+def _map_body(function: ca.Function, emitter: _Emitter) -> str:
+    about = function.info()
+    one, count = about["f"], about["n"]
+    inputs = [f"i{i}+k*{one.nnz_in(i)}" for i in range(one.n_in())]
+    outputs = [f"o{i} ? o{i}+k*{one.nnz_out(i)} : NULL" for i in range(one.n_out())]
+    call = emitter.call(one, [*inputs, *outputs])
+    return f"  for (int k = 0; k < {count}; ++k) {call}\n"
 
 
 def _switch_body(function: ca.Function, emitter: _Emitter) -> str:

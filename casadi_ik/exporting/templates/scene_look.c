@@ -9,10 +9,9 @@ static double least_room(@PREFIX@_solver *solver, const double *q) {
 
 /* Makes a configuration the answer, if it is one; else the status is another. */
 static int answered(@PREFIX@_solver *solver, const double *q) {
-  memcpy(solver->state + STATE_Q, q, sizeof solver->q);
+  memmove(solver->q, q, sizeof solver->q);
   solver->status = STALLED_STATUS;
-  if (finish(solver) != DONE) return 0;
-  return solver->status == SOLVED_STATUS;
+  return judge(solver) == DONE && solver->status == SOLVED_STATUS;
 }
 
 /* Ends the search: with a free answer, or the one of largest clearance. A preference orders answers,
@@ -25,7 +24,9 @@ static void end_look(@PREFIX@_solver *solver, int found) {
     solver->terms[TERMS_NEAREST] = 0.0;
     memcpy(solver->here, HOME, sizeof solver->here);
     look->again = 1;
-    solver->round = solver->under_way = solver->again = 0;
+    solver->slot = -1;
+    solver->loop_status = UNBEGUN;
+    solver->iterations = 0;
     solver->status = RUNNING;
     return;
   }

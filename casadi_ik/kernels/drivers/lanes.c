@@ -6,9 +6,6 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#if defined(__x86_64__)
-#include <immintrin.h>
-#endif
 
 typedef double lanes __attribute__((vector_size(LANES * sizeof(double))));
 typedef int64_t lane_mask __attribute__((vector_size(LANES * sizeof(double))));
@@ -81,16 +78,35 @@ LANES_INLINE lanes lanes_fmin(lanes x, lanes y) {
     return value;                                              \
   }
 
+/* Single instructions by name: the header of all of them takes longer to read than a small kernel to
+ * compile. */
+#define LANES_INSTRUCTION(NAME, CODE, REGISTER)      \
+  LANES_INLINE lanes lanes_##NAME(lanes x) {         \
+    lanes value;                                     \
+    __asm__(CODE : "=" REGISTER(value) : REGISTER(x)); \
+    return value;                                    \
+  }
+
 #if defined(__x86_64__) && LANES == 8
-LANES_INLINE lanes lanes_sqrt(lanes x) { return _mm512_sqrt_pd(x); }
-LANES_INLINE lanes lanes_floor(lanes x) { return _mm512_floor_pd(x); }
-LANES_INLINE lanes lanes_ceil(lanes x) { return _mm512_ceil_pd(x); }
-LANES_INLINE int lanes_all(lane_mask mask) { return _mm512_movepi64_mask((__m512i) mask) == 255; }
+LANES_INSTRUCTION(sqrt, "vsqrtpd %1, %0", "v")
+LANES_INSTRUCTION(floor, "vrndscalepd $9, %1, %0", "v")
+LANES_INSTRUCTION(ceil, "vrndscalepd $10, %1, %0", "v")
+
+LANES_INLINE int lanes_all(lane_mask mask) {
+  int bits;
+  __asm__("vpmovq2m %1, %%k1\n\tkmovb %%k1, %0" : "=r"(bits) : "v"(mask) : "k1");
+  return bits == 255;
+}
 #elif defined(__x86_64__)
-LANES_INLINE lanes lanes_sqrt(lanes x) { return _mm256_sqrt_pd(x); }
-LANES_INLINE lanes lanes_floor(lanes x) { return _mm256_floor_pd(x); }
-LANES_INLINE lanes lanes_ceil(lanes x) { return _mm256_ceil_pd(x); }
-LANES_INLINE int lanes_all(lane_mask mask) { return _mm256_movemask_pd((__m256d) mask) == 15; }
+LANES_INSTRUCTION(sqrt, "vsqrtpd %1, %0", "x")
+LANES_INSTRUCTION(floor, "vroundpd $9, %1, %0", "x")
+LANES_INSTRUCTION(ceil, "vroundpd $10, %1, %0", "x")
+
+LANES_INLINE int lanes_all(lane_mask mask) {
+  int bits;
+  __asm__("vmovmskpd %1, %0" : "=r"(bits) : "x"(mask));
+  return bits == 15;
+}
 #else
 LANES_OF_ONE(sqrt, sqrt)
 LANES_OF_ONE(floor, floor)

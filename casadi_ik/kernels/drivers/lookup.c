@@ -80,65 +80,48 @@ typedef void look_up(const lookup_job *, const asked *, int32_t *, int32_t *, in
 #endif
 
 #if defined(__x86_64__) && !defined(FREESTANDING)
-#include <immintrin.h>
-
 #define PAIR_OF(numbers) \
   ((int32_t) ((uint32_t) (uint16_t) (numbers)[0] | (uint32_t) (uint16_t) (numbers)[1] << 16))
 
-__attribute__((target("avx2")))
-static void measure_avx2(const lookup_job *job, const asked *pairs, int32_t *distance) {
-  __m256i twice[PAIRS], kept[PAIRS];
-  const __m256i *row = (const __m256i *) job->tiles;
-  int64_t half, halves = (job->rows + TILE - 1) / TILE * 2;
-  int i;
-  for (i = 0; i < PAIRS; ++i) {
-    twice[i] = _mm256_set1_epi32(PAIR_OF(pairs[i].twice));
-    kept[i] = _mm256_set1_epi32(PAIR_OF(pairs[i].kept));
+/* With registers of so many bytes. The instruction is named: the header of all of them takes longer
+ * to read than this file to compile. */
+#define DEFINE_FORM(BYTES, TARGET, REGISTER)                                                    \
+  typedef int32_t wide_##BYTES __attribute__((vector_size(BYTES)));                             \
+  typedef int16_t halves_##BYTES __attribute__((vector_size(BYTES)));                           \
+                                                                                                \
+  __attribute__((target(TARGET)))                                                               \
+  FORM void measure_##BYTES(const lookup_job *job, const asked *pairs, int32_t *distance) {     \
+    wide_##BYTES twice[PAIRS], kept[PAIRS];                                                     \
+    const int64_t parts = TILE * 4 / BYTES;                                                     \
+    int64_t part, count = (job->rows + TILE - 1) / TILE * parts;                                \
+    int i;                                                                                      \
+    for (i = 0; i < PAIRS; ++i) {                                                               \
+      twice[i] = PAIR_OF(pairs[i].twice) + (wide_##BYTES) {0};                                  \
+      kept[i] = PAIR_OF(pairs[i].kept) + (wide_##BYTES) {0};                                    \
+    }                                                                                           \
+    for (part = 0; part < count; ++part) {                                                      \
+      const char *from = (const char *) job->tiles + (part / parts * PAIRS * parts + part % parts) * BYTES; \
+      wide_##BYTES sum = {0};                                                                   \
+      for (i = 0; i < PAIRS; ++i) {                                                             \
+        wide_##BYTES a, rest, both;                                                             \
+        memcpy(&a, from + i * parts * BYTES, BYTES);                                            \
+        rest = (wide_##BYTES) ((halves_##BYTES) a - (halves_##BYTES) twice[i]) & kept[i];       \
+        __asm__("vpmaddwd %2, %1, %0" : "=" REGISTER(both) : REGISTER(a), REGISTER(rest));      \
+        sum += both;                                                                            \
+      }                                                                                         \
+      memcpy(distance + part * (BYTES / 4), &sum, BYTES);                                       \
+    }                                                                                           \
+  }                                                                                             \
+                                                                                                \
+  __attribute__((target(TARGET))) FORM void with_##BYTES(                                       \
+      const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest,           \
+      int64_t *found) {                                                                         \
+    measure_##BYTES(job, pairs, distance);                                                      \
+    choose(job, distance, nearest, found);                                                      \
   }
-  for (half = 0; half < halves; ++half) {
-    const __m256i *from = row + half / 2 * PAIRS * 2 + half % 2;
-    __m256i sum = _mm256_setzero_si256();
-    for (i = 0; i < PAIRS; ++i) {
-      const __m256i a = _mm256_loadu_si256(from + 2 * i);
-      const __m256i rest = _mm256_and_si256(_mm256_sub_epi16(a, twice[i]), kept[i]);
-      sum = _mm256_add_epi32(sum, _mm256_madd_epi16(a, rest));
-    }
-    _mm256_storeu_si256((__m256i *) (distance + half * TILE / 2), sum);
-  }
-}
 
-__attribute__((target("avx2"))) FORM void with_avx2(
-    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
-  measure_avx2(job, pairs, distance);
-  choose(job, distance, nearest, found);
-}
-
-__attribute__((target("avx512f,avx512bw")))
-static void measure_avx512(const lookup_job *job, const asked *pairs, int32_t *distance) {
-  __m512i twice[PAIRS], kept[PAIRS];
-  const __m512i *row = (const __m512i *) job->tiles;
-  int64_t tile, tiles = (job->rows + TILE - 1) / TILE;
-  int i;
-  for (i = 0; i < PAIRS; ++i) {
-    twice[i] = _mm512_set1_epi32(PAIR_OF(pairs[i].twice));
-    kept[i] = _mm512_set1_epi32(PAIR_OF(pairs[i].kept));
-  }
-  for (tile = 0; tile < tiles; ++tile) {
-    __m512i sum = _mm512_setzero_si512();
-    for (i = 0; i < PAIRS; ++i) {
-      const __m512i a = _mm512_loadu_si512(row++);
-      const __m512i rest = _mm512_and_si512(_mm512_sub_epi16(a, twice[i]), kept[i]);
-      sum = _mm512_add_epi32(sum, _mm512_madd_epi16(a, rest));
-    }
-    _mm512_storeu_si512(distance + tile * TILE, sum);
-  }
-}
-
-__attribute__((target("avx512f,avx512bw"))) FORM void with_avx512(
-    const lookup_job *job, const asked *pairs, int32_t *distance, int32_t *nearest, int64_t *found) {
-  measure_avx512(job, pairs, distance);
-  choose(job, distance, nearest, found);
-}
+DEFINE_FORM(32, "avx2", "x")
+DEFINE_FORM(64, "avx512f,avx512bw", "v")
 #endif
 
 #if defined(FREESTANDING) && (defined(__SSE2__) || defined(__wasm_simd128__))
@@ -210,8 +193,8 @@ static look_up *best_form(void) {
     bits = register_bits();
     __atomic_store_n(&known, bits, __ATOMIC_RELAXED);
   }
-  if (bits == 512) return with_avx512;
-  if (bits == 256) return with_avx2;
+  if (bits == 512) return with_64;
+  if (bits == 256) return with_32;
 #endif
   return PLAIN;
 }
