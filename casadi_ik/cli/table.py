@@ -102,7 +102,7 @@ WIDTH = 78
 
 
 class Exit(IntEnum):
-    """Exit codes of the program."""
+    """Exit codes of the program, beside those of signals (130: Ctrl-C, 143: SIGTERM)."""
 
     DONE = 0
     """Done; for `solve` and `batch`: everything is solved."""
@@ -110,12 +110,8 @@ class Exit(IntEnum):
     """A valid problem that is not solved; the report says why."""
     BAD_INPUT = 2
     """One line on stderr says where, what was found and what was expected."""
-    INTERRUPTED = 130
-    """Ctrl-C (128 + SIGINT, as shells count)."""
     BROKEN_PIPE = 141
     """Whoever read the report went away (128 + SIGPIPE)."""
-    TERMINATED = 143
-    """SIGTERM (128 + 15): what is finished is kept as after Ctrl-C."""
 
 
 @dataclass(frozen=True)
