@@ -10,7 +10,6 @@ import pytest
 from command_line import FAST, Command
 
 import casadi_ik as ik
-from casadi_ik.cli import batch as batch_command
 
 TargetFile = Callable[..., Path]
 ROBOT = ("--robot", "kuka_lwr_barrett")
@@ -80,7 +79,10 @@ def test_not_all_solved_names_rows(
 def test_jobs_and_start_give_what_the_api_gives(
     run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
+    """Whole numbers are numbers, too."""
     path, out = target_file(count=6), tmp_path / "solved.npz"
+    up = target_file("up.npz", normals=np.tile(np.array([0, 0, 1], dtype=np.int16), (3, 3, 1)))
+    assert run("batch", up, *ROBOT, *FAST, "--out", out).exit in (0, 1)
     start = robot.home + 0.05
     done = run("batch", path, *ROBOT, *FAST, "--jobs", 2, "--q0", *start, "--out", out)
     assert done.exit == 0, done.err
@@ -90,15 +92,6 @@ def test_jobs_and_start_give_what_the_api_gives(
     with np.load(out) as data:
         np.testing.assert_array_equal(data["q"], batch.q)
         np.testing.assert_array_equal(data["iterations"], batch.iterations)
-
-
-def test_whole_numbers_are_numbers_too(
-    run: Command, target_file: TargetFile, tmp_path: Path
-) -> None:
-    normals = np.tile(np.array([0, 0, 1], dtype=np.int16), (3, 3, 1))
-    path = target_file(normals=normals)
-    done = run("batch", path, *ROBOT, *FAST, "--out", tmp_path / "solved.npz")
-    assert done.exit in (0, 1), done.err
 
 
 @pytest.fixture
@@ -128,7 +121,7 @@ def test_blocks_and_jobs_do_not_show(
     """Nor does it matter how the arrays lie in the file."""
     found = []
     for block, jobs in ((4096, 1), (5, 2), (1, 1)):
-        monkeypatch.setattr(batch_command, "BLOCK", block)
+        monkeypatch.setattr("casadi_ik.cli.batch.BLOCK", block)
         out = tmp_path / f"{block}.npz"
         words = ("--method", method, "--jobs", jobs, "--seed", 3, "--out", out)
         assert run("batch", hands(count), *ROBOT, *words).exit == 1
@@ -145,7 +138,7 @@ def test_log_of_blocks_numbers_the_rows_through(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(batch_command, "BLOCK", 16)
+    monkeypatch.setattr("casadi_ik.cli.batch.BLOCK", 16)
     out, log = tmp_path / "o.npz", tmp_path / "o.mcap"
     run("batch", hands(60), *ROBOT, "--out", out, "--log", log)
     solves = list(ik.logs.open(log).solves().records())
@@ -200,3 +193,18 @@ def test_targets_in_the_frame_of_an_object(
         assert (normals * (data["normals"] @ turn)).sum(axis=-1).min() > np.cos(
             ik.Tolerance().angle
         )
+
+
+def test_batches_have_clearances(run: Command, tmp_path: Path) -> None:
+    robot = ik.load_robot("kuka_lwr_barrett")
+    arrays = [ik.load_grasp(name).arrays(robot.fingers) for name in ("cup", "mug")]
+    points, normals = (np.stack(parts) for parts in zip(*arrays, strict=True))
+    targets, out = tmp_path / "targets.npz", tmp_path / "out.npz"
+    np.savez(targets, points=points, normals=normals)
+    assert run("batch", targets, *ROBOT, "--out", out, "--scene", "table").exit == 0
+    with np.load(out) as found:
+        assert found["clearance"].shape == (2,)
+        assert (found["clearance"] >= 0).all()
+    assert "not checked" in run("batch", targets, *ROBOT, "--out", out).out
+    with np.load(out) as found:
+        assert "clearance" not in found

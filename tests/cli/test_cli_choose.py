@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import yaml
 from command_line import Command
+from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
-from casadi_ik.files.reading import roll_pitch_yaw
 
 ROBOT = "kuka_lwr_barrett"
 PLACE = ("--object-pose", "-0.82", "0.127", "0.41", "0", "0", "0.3")
@@ -148,7 +148,7 @@ def test_palms_of_a_table(run: Command, tmp_path: Path) -> None:
     palms, motors = robot.palm(q), robot.actuators[7:]
     rows = ["x,y,z,roll,pitch,yaw," + ",".join(motors)]
     for palm, row in zip(palms, q, strict=True):
-        turned = roll_pitch_yaw(palm[:3, :3])
+        turned = Rotation.from_matrix(palm[:3, :3]).as_euler("xyz")
         rows.append(",".join(repr(float(v)) for v in (*palm[:3, 3], *turned, *row[7:])))
     path = tmp_path / "grasps.csv"
     path.write_text("\n".join(rows))

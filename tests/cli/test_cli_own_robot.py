@@ -1,8 +1,10 @@
-"""`casadi-ik import`: from somebody's files to a description that is solved."""
+"""`casadi-ik import` and `calibrate`: from somebody's files to a robot that is solved."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -278,3 +280,91 @@ def test_a_missing_package_is_said_once(run: Command, tmp_path: Path) -> None:
     said = " ".join(done.out.split())
     assert "(3 meshes, one is 'package://shapes_of_it/meshes/ff_1.stl')" in said
     assert "ROS_PACKAGE_PATH=FOLDER casadi-ik import" in said
+
+
+HEADER = "finger,index_proximal_slider,index_middle_slider,x,y,z,qw,qx,qy,qz\n"
+ROW = "index,0.0485,0.0512,-0.0466,0.0921,0.1607,0.0831,0.7023,-0.0829,0.7021\n"
+
+
+@pytest.fixture
+def refused(run: Command, tmp_path: Path) -> Callable[..., str]:
+    """Calls `calibrate` and gives the refusal; nothing may be written."""
+
+    def call(path: Path, *words: Any, out: str = "out.yaml", robot: str = "ar10") -> str:
+        before = sorted(tmp_path.rglob("*"))
+        error = run("calibrate", path, "--robot", robot, "--out", tmp_path / out, *words).error
+        assert sorted(tmp_path.rglob("*")) == before
+        return error
+
+    return call
+
+
+@pytest.fixture
+def poses(tmp_path: Path) -> Path:
+    """Forty measured points of a finger, a few of them far off."""
+    robot, rng = ik.load_robot("ar10"), np.random.default_rng(1)
+    q = robot.random(rng, 40)
+    points = robot.contacts(q)[0][:, robot.fingers.index("index")] + rng.normal(0, 2e-4, (40, 3))
+    points[::20] += 5e-3
+    motors = ("index_proximal_slider", "index_middle_slider")
+    values = np.hstack([q[:, [robot.actuators.index(name) for name in motors]], points])
+    lines = [f"index,{','.join(map(repr, row))}" for row in values.tolist()]
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join([f"finger,{','.join(motors)},x,y,z", *lines, ""]))
+    return path
+
+
+def test_calibrate_in_a_process(run_process: Command, poses: Path, tmp_path: Path) -> None:
+    out = tmp_path / "my_ar10.yaml"
+    done = run_process("calibrate", poses, "--robot", "ar10", "--out", out)
+    assert done.exit == 0, done.err
+    assert done.out.startswith("ESTIMATED  33 numbers from 40 poses")
+    assert "index_proximal.b" in done.out
+    robot = ik.load_robot(out)
+    assert robot.actuators == ik.load_robot("ar10").actuators
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_group_of_numbers(run: Command, poses: Path, tmp_path: Path) -> None:
+    out = tmp_path / "tips.yaml"
+    done = run("calibrate", poses, "--robot", "ar10", "--estimate", "tips", "--out", out)
+    assert done.exit == 0, done.err
+    assert "6 numbers" in done.out
+    assert "index_proximal.b" not in done.out
+
+
+@pytest.mark.parametrize(
+    ("text", "fragment"),
+    [
+        ("", "holds no measurements"),
+        (HEADER, "holds no measurements"),
+        (HEADER.replace(",x,", ",X,") + ROW, ":1: unknown column 'X'; known: finger, x"),
+        (HEADER.replace("finger,", "") + ROW, ":1: column 'finger' is missing"),
+        (HEADER.replace(",y,", ",x,") + ROW, ":1: column 'x' appears twice"),
+        (HEADER.replace(",qz", "") + ROW, ":1: found qw, qx, qy, expected all or none"),
+        ("finger,index_proximal_slider,x,y,z\nindex,0.05,0,0,0\n", ":1: column 'index_middle_s"),
+        (HEADER + ROW + ROW.replace("index", "toe", 1), ":3: finger: found 'toe', expected one of"),
+        (HEADER + ROW + ROW.replace("0.0485", "0.5"), ":3: index_proximal_slider: found 0.5, exp"),
+        (HEADER + ROW + "\n" + ROW.replace("0.0921", "a"), ":4: y: found 'a', expected a finite"),
+        (HEADER + ROW.replace("0.0921", "nan"), ":2: y: found 'nan', expected a finite number"),
+        (HEADER + ROW.replace("0.0921", ""), ":2: y: found '', expected a finite number"),
+        (HEADER + ROW.replace("0.0921,", ""), ":2: found 9 columns, the header has 10"),
+        (HEADER + ROW.replace("0.7021", "0.9"), ":2: qw..qz: found length 1.148, expected 1"),
+        (HEADER + ROW.replace("0.7021", ""), ":2: qz: found '', expected a finite number"),
+    ],
+)
+def test_bad_csv(text: str, fragment: str, refused: Callable[..., str], tmp_path: Path) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    error = refused(path)
+    assert error.startswith(f"{path}:")
+    assert fragment in error
+
+
+def test_bad_options(refused: Callable[..., str], poses: Path, tmp_path: Path) -> None:
+    assert "No such file" in refused(tmp_path / "x.csv")
+    assert "no shipped" in refused(poses, robot="hand")
+    assert "found 'median'" in refused(poses, "--loss", "median")
+    assert "found 'screws'" in refused(poses, "--estimate", "screws")
+    assert "cannot be written" in refused(poses, out="no/out.yaml")
+    assert "expected a name ending in .yaml" in refused(poses, out="out.json")

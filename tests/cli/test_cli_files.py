@@ -1,0 +1,236 @@
+"""Files: outputs that cannot be written are found first; inputs larger than any are refused."""
+
+from __future__ import annotations
+
+import os
+import resource
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from command_line import FAST, Command
+from torch_zip import write_torch
+
+import casadi_ik as ik
+
+GraspFile = Callable[..., Path]
+TargetFile = Callable[..., Path]
+
+
+@pytest.fixture
+def unsolved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing may be solved in this test."""
+    monkeypatch.setattr(ik.Solver, "solve_batch", None)
+
+
+@pytest.mark.usefixtures("unsolved")
+@pytest.mark.parametrize("option", ["--out", "--log", "--picture"])
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        ("nowhere/new.png", "No such file or directory"),
+        ("folder.png", "the path is a directory"),
+        ("pinch.yaml/new.png", "Not a directory"),
+        ("/proc/new.png", "No such file or directory"),
+        ("x" * 260 + ".png", "File name too long"),
+    ],
+)
+def test_unwritable(
+    place: str,
+    reason: str,
+    option: str,
+    run: Command,
+    grasp_file: GraspFile,
+    tmp_path: Path,
+) -> None:
+    grasp, path = grasp_file(), tmp_path / place
+    (tmp_path / "folder.png").mkdir()
+    error = run("solve", grasp, *FAST, option, path).error
+    assert error == f"{path}: {option}: cannot be written: {reason}"
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["folder.png", "pinch.yaml"]
+
+
+@pytest.mark.usefixtures("unsolved")
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+@pytest.mark.parametrize("option", ["--out", "--log", "--picture"])
+def test_read_only(option: str, run: Command, grasp_file: GraspFile, tmp_path: Path) -> None:
+    folder, file = tmp_path / "folder", tmp_path / "file.png"
+    folder.mkdir(mode=0o500)
+    file.touch(mode=0o400)
+    for path, reason in ((folder / "new.png", "Permission denied"), (file, "read-only")):
+        assert reason in run("solve", grasp_file(), *FAST, option, path).error
+
+
+@pytest.mark.usefixtures("unsolved")
+def test_special_files_are_left_alone(run: Command, grasp_file: GraspFile) -> None:
+    error = run("solve", grasp_file(), *FAST, "--out", "/dev/null").error
+    assert "not a regular file" in error
+    assert not Path("/dev/null").is_file()
+
+
+@pytest.mark.usefixtures("unsolved")
+def test_outputs_do_not_overwrite_each_other_or_the_input(
+    run: Command, grasp_file: GraspFile, tmp_path: Path
+) -> None:
+    grasp, same = grasp_file(), tmp_path / "same"
+    (tmp_path / "link").symlink_to("same")
+    error = run("solve", grasp, "--out", same, "--log", tmp_path / "link").error
+    assert error == f"{same}: --out: found the file of --log, expected another"
+    error = run("solve", grasp, "--out", tmp_path / "." / grasp.name).error
+    assert "found the file of the input" in error
+    assert grasp.read_text().startswith("contacts:")
+
+
+def _at_most(size: int) -> Callable[[], None]:
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+@pytest.mark.parametrize("size", [4_000, 16_000])
+def test_disk_full_on_the_log(
+    size: int, run: Command, run_process: Command, grasp_file: GraspFile, tmp_path: Path
+) -> None:
+    grasp = grasp_file()
+    assert run("solve", grasp, *FAST).exit == 0  # kernels are compiled, nothing else is written
+    words = ("solve", grasp, *FAST, "--log", "new.mcap", "--out", "new.json")
+    error = run_process(*words, preexec_fn=_at_most(size)).error
+    assert error == "new.mcap: cannot write the log: File too large"
+    assert [item.name for item in tmp_path.iterdir()] == [grasp.name]
+
+
+def test_disk_full_on_the_output(
+    run: Command, run_process: Command, target_file: TargetFile, tmp_path: Path
+) -> None:
+    targets = target_file(count=20)
+    out = tmp_path / "solved.npz"
+    words = ("batch", targets, "--robot", "kuka_lwr_barrett", *FAST, "--out", out)
+    assert run(*words).exit == 0
+    before = out.read_bytes()
+    error = run_process(*words, preexec_fn=_at_most(2_000)).error
+    assert error == f"{out}: --out: cannot be written: File too large"
+    assert out.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_links_are_followed(run: Command, grasp_file: GraspFile, tmp_path: Path) -> None:
+    target, link = tmp_path / "target", tmp_path / "link"
+    link.symlink_to(target)
+    assert run("solve", grasp_file(), *FAST, "--out", link).exit == 0
+    assert link.is_symlink()
+    assert target.read_text().startswith("{")
+
+
+def _columns(robot: ik.ArmHand, count: int) -> dict[str, np.ndarray]:
+    names = ("x", "y", "z", "roll", "pitch", "yaw", *robot.actuators[7:])
+    return {name: np.full(count, 0.1) for name in names}
+
+
+def _parquet(path: Path, robot: ik.ArmHand) -> None:
+    pl.DataFrame(_columns(robot, 2000)).write_parquet(path)
+
+
+def _table(path: Path, robot: ik.ArmHand) -> None:
+    arrays: dict[str, np.ndarray] = _columns(robot, 2000)
+    np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def _csv(path: Path, robot: ik.ArmHand) -> None:
+    pl.DataFrame(_columns(robot, 2000)).write_csv(path)
+
+
+def _targets(path: Path, robot: ik.ArmHand) -> None:
+    points, normals = robot.contacts(np.tile(robot.home, (2000, 1)))
+    np.savez_compressed(path, points=points, normals=normals)
+
+
+def _target_table(path: Path, robot: ik.ArmHand) -> None:
+    points, normals = robot.contacts(np.tile(robot.home, (30_000, 1)))
+    columns = {}
+    for i, finger in enumerate(robot.fingers):
+        for array, endings in ((points, ("x", "y", "z")), (normals, ("nx", "ny", "nz"))):
+            columns |= {f"{finger}_{end}": array[:, i, j] for j, end in enumerate(endings)}
+    pl.DataFrame(columns).write_parquet(path)
+
+
+def _data_set(path: Path, robot: ik.ArmHand) -> None:
+    content = {"grasp_qpos": np.zeros((1000, 23))}
+    np.save(path, np.array(content, dtype=object))
+
+
+def _torch(path: Path, robot: ik.ArmHand) -> None:
+    write_torch(path, {"metadata": [(np.zeros((100_000,)), "a")]})
+
+
+def _frames(path: Path, robot: ik.ArmHand) -> None:
+    points = np.tile(robot.contacts(robot.home)[0], (5000, 1, 1))
+    np.savez_compressed(path, points=points)
+
+
+def _long(path: Path, robot: ik.ArmHand) -> None:
+    points = np.tile(robot.contacts(robot.home)[0], (2, 1, 1))
+    np.savez(path, points=points, times=[0.0, 30.0])
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "write", "factor", "says"),
+    [
+        ("choose", "set.parquet", _parquet, 1e-3, "to 208000 bytes, expected at most 67108"),
+        ("choose", "set.npz", _table, 1e-3, "bytes, expected at most 67108"),
+        ("choose", "set.csv", _csv, 1e-3, "bytes, expected at most 67108"),
+        ("choose", "targets.npz", _targets, 1e-3, "found 2000 grasps, expected at most 200"),
+        ("choose", "set.npy", _data_set, 1e-4, "bytes, expected at most 53687"),
+        ("choose", "set.pt", _torch, 1e-4, "bytes, expected at most 53687"),
+        ("batch", "targets.parquet", _target_table, 1e-3, "times its size"),
+        ("follow", "frames.npz", _frames, 1e-3, "bytes, expected at most 268435"),
+        ("follow", "frames.npz", _long, 1e-3, "found 30 s, expected at most 20 s"),
+    ],
+)
+def test_what_is_too_large(
+    command: str,
+    name: str,
+    write: Callable[[Path, ik.ArmHand], None],
+    factor: float,
+    says: str,
+    run: Command,
+    robot: ik.ArmHand,
+    tmp_path: Path,
+) -> None:
+    """Limits a thousand times as small as usual stand for files a thousand times as large."""
+    path = tmp_path / name
+    write(path, robot)
+    out = tmp_path / ("out.npz" if command == "batch" else "out.csv")
+    words = (command, path, "--robot", robot.name, "--out", out)
+    error = run(*words, "--size-limits", factor).error
+    assert says in error
+    assert "(--size-limits 4, or CASADI_IK_LIMITS=4 in the environment, allows four" in error
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_flag_lets_in(
+    run: Command, robot: ik.ArmHand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CASADI_IK_LIMITS", "1e-3")
+    path, out = tmp_path / "frames.npz", tmp_path / "out.csv"
+    _long(path, robot)
+    words = ("follow", path, "--robot", robot.name, "--out", out, "--period", "0.1")
+    assert run(*words, "--size-limits", "1e-5").exit == 2
+    assert run(*words, "--size-limits", "1").exit in (0, 1)
+    assert "expected a number > 0" in run(*words, "--size-limits", "0").error
+
+
+def test_arrays_that_are_larger_than_their_files(
+    run: Command, robot: ik.ArmHand, tmp_path: Path
+) -> None:
+    """A head that says more numbers than there are, and members that are no arrays."""
+    path = tmp_path / "frames.npz"
+    np.save(tmp_path / "a.npy", np.zeros((3, 3, 3)))
+    data = (tmp_path / "a.npy").read_bytes()
+    lying = data.replace(b"(3, 3, 3), }         ", b"(300000000000, 3, 3),}")
+    assert lying != data
+    for content, says in ((lying, "damaged"), (b"no array", "found values of type bytes")):
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("points.npy" if content is lying else "points", content)
+        words = ("follow", path, "--robot", robot.name, "--out", tmp_path / "out.csv")
+        assert says in run(*words).error
