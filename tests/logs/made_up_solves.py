@@ -8,10 +8,14 @@ import numpy as np
 
 from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.answers.solution import BatchSolution
+from casadi_ik.cli.main import main
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
+
+__all__ = ["Field", "Layout", "RecordedJacobian", "SolveBlock", "TraceFormat", "changed", "main"]
+__all__ += ["make_block", "make_rows"]
 
 FINGERS = ("thumb", "finger_2", "finger_3")
 PHASES = ("thumb reaching", "hand alignment", "refinement")

@@ -8,9 +8,11 @@ import numpy as np
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs import Asked
-from casadi_ik.logs.events import Happening
+from casadi_ik.logs.events import Happening, told
 from casadi_ik.logs.solve import OneSolve
 from casadi_ik.problem.problems import Tolerance
+
+__all__ = ["Field", "Happening", "Layout", "OneSolve", "told"]
 
 FINGERS = ("thumb", "finger_2")
 JOINTS = ("joint_a", "joint_b", "joint_c")

@@ -1,21 +1,26 @@
-"""Events on traces built so that the answer is known."""
+"""Every kind of event is found where it happens, and nowhere else."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_up_solves import FORMAT, LABELS, main, make_block
 
-from casadi_ik.errors import InputError
+import casadi_ik as ik
+from casadi_ik import errors, logs
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs import EventKind, EventRules, detect_events
 from casadi_ik.logs.events import event_format
-from casadi_ik.logs.tables import MethodRows, Table
+from casadi_ik.methods.common import coupling_record
+from casadi_ik.problem.jacobian_measures import THRESHOLDS, JacobianMeasures
+from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 
 STORAGE = {"phase": "u1", "restart": "u4", "limit_mask": "u4", "active_mask": "u4"}
@@ -27,7 +32,7 @@ class Event:
     """What a test expects."""
 
     iteration: int
-    kind: EventKind
+    kind: logs.EventKind
     subject: str
     value: float
     threshold: float
@@ -53,18 +58,20 @@ def found_in(
     trace: np.ndarray,
     labels: Mapping[str, Names] | None = None,
     jacobians: Mapping[str, RecordedJacobian] | None = None,
-    rules: EventRules | None = None,
+    rules: logs.EventRules | None = None,
     counts: Sequence[int] | None = None,
 ) -> tuple[Event, ...]:
     """All events, as a person reads them."""
     form = TraceFormat(layout, labels or {}, jacobians or {})
     count = np.array([len(trace)] if counts is None else counts)
-    rows = detect_events(form, trace, count, rules)
-    part = MethodRows("m", rows, rows["solve_id"], rows["iteration"], event_format(form).labels, {})
+    rows = logs.detect_events(form, trace, count, rules)
+    part = logs.MethodRows(
+        "m", rows, rows["solve_id"], rows["iteration"], event_format(form).labels, {}
+    )
     return tuple(
         Event(
             record["iteration"],
-            EventKind[record["kind"]],
+            logs.EventKind[record["kind"]],
             record["subject"],
             record["value"],
             record["threshold"],
@@ -72,11 +79,11 @@ def found_in(
             record["jacobian"].removeprefix("none"),
             record["solve_id"],
         )
-        for record in Table("event", (part,)).records()
+        for record in logs.Table("event", (part,)).records()
     )
 
 
-def where(events: tuple[Event, ...], kind: EventKind) -> list[int]:
+def where(events: tuple[Event, ...], kind: logs.EventKind) -> list[int]:
     return [event.iteration for event in events if event.kind is kind]
 
 
@@ -84,10 +91,10 @@ def test_phase_changes_and_restarts() -> None:
     layout, trace = trace_of(phase=[0, 0, 1, 1, 0, 2], restart=[0, 0, 0, 0, 1, 1])
     events = found_in(layout, trace, {"phase": ("reach", "align", "refine")})
     assert events == (
-        Event(2, EventKind.PHASE_CHANGE, "reach -> align", 1.0, 0.0),
-        Event(4, EventKind.RESTART, "0 -> 1", 1.0, 0.0),
-        Event(4, EventKind.PHASE_CHANGE, "align -> reach", 0.0, 1.0),
-        Event(5, EventKind.PHASE_CHANGE, "reach -> refine", 2.0, 0.0),
+        Event(2, logs.EventKind.PHASE_CHANGE, "reach -> align", 1.0, 0.0),
+        Event(4, logs.EventKind.RESTART, "0 -> 1", 1.0, 0.0),
+        Event(4, logs.EventKind.PHASE_CHANGE, "align -> reach", 0.0, 1.0),
+        Event(5, logs.EventKind.PHASE_CHANGE, "reach -> refine", 2.0, 0.0),
     )
     assert found_in(layout, trace)[0].subject == "0 -> 1"
     assert found_in(layout, trace, {"phase": ("", "a")})[0].subject == "0 -> a"
@@ -98,9 +105,9 @@ def test_limits_hit_and_left() -> None:
     layout, trace = trace_of(q=q, limit_mask=[0b10, 0b00, 0b01, 0b01])
     events = found_in(layout, trace, {"q": ("elbow", "wrist")})
     assert events == (
-        Event(0, EventKind.LIMIT_HIT, "wrist", 2.0, 2.0, ("wrist",)),
-        Event(1, EventKind.LIMIT_LEFT, "wrist", 1.9, 2.0, ("wrist",)),
-        Event(2, EventKind.LIMIT_HIT, "elbow", 0.3, 0.3, ("elbow",)),
+        Event(0, logs.EventKind.LIMIT_HIT, "wrist", 2.0, 2.0, ("wrist",)),
+        Event(1, logs.EventKind.LIMIT_LEFT, "wrist", 1.9, 2.0, ("wrist",)),
+        Event(2, logs.EventKind.LIMIT_HIT, "elbow", 0.3, 0.3, ("elbow",)),
     )
 
 
@@ -110,18 +117,18 @@ def test_a_rounding_error_does_not_leave_a_limit() -> None:
     )
     events = found_in(layout, trace)
     assert [(e.iteration, e.kind) for e in events] == [
-        (0, EventKind.LIMIT_HIT),
-        (4, EventKind.LIMIT_LEFT),
-        (5, EventKind.LIMIT_HIT),
+        (0, logs.EventKind.LIMIT_HIT),
+        (4, logs.EventKind.LIMIT_LEFT),
+        (5, logs.EventKind.LIMIT_HIT),
     ]
 
 
 def test_limits_without_coordinates() -> None:
     layout, trace = trace_of(limit_mask=[1, 0, 2])
     assert [(e.iteration, e.kind) for e in found_in(layout, trace)] == [
-        (0, EventKind.LIMIT_HIT),
-        (1, EventKind.LIMIT_LEFT),
-        (2, EventKind.LIMIT_HIT),
+        (0, logs.EventKind.LIMIT_HIT),
+        (1, logs.EventKind.LIMIT_LEFT),
+        (2, logs.EventKind.LIMIT_HIT),
     ]
 
 
@@ -134,9 +141,9 @@ def test_the_highest_bits_and_wide_masks() -> None:
     trace["limit_mask"] = masks
     events = found_in(layout, trace)
     assert [(e.iteration, e.kind, e.subject) for e in events] == [
-        (1, EventKind.LIMIT_HIT, "coordinate 31"),
-        (2, EventKind.LIMIT_HIT, "coordinate 37"),
-        (2, EventKind.LIMIT_LEFT, "coordinate 31"),
+        (1, logs.EventKind.LIMIT_HIT, "coordinate 31"),
+        (2, logs.EventKind.LIMIT_HIT, "coordinate 37"),
+        (2, logs.EventKind.LIMIT_LEFT, "coordinate 31"),
     ]
 
 
@@ -144,8 +151,8 @@ def test_active_set() -> None:
     layout, trace = trace_of(active_mask=[0b001, 0b001, 0b110, 0b110])
     events = found_in(layout, trace, {"q": ("a", "b", "c")})
     assert events == (
-        Event(2, EventKind.ACTIVATED, "b, c", 2.0, 1.0, ("b", "c")),
-        Event(2, EventKind.RELEASED, "a", 2.0, 1.0, ("a",)),
+        Event(2, logs.EventKind.ACTIVATED, "b, c", 2.0, 1.0, ("b", "c")),
+        Event(2, logs.EventKind.RELEASED, "a", 2.0, 1.0, ("a",)),
     )
 
 
@@ -161,7 +168,7 @@ def test_near_singular_on_entry_only() -> None:
     assert {e.threshold for e in events} == {0.1}
     assert {e.joints for e in events} == {("b", "c")}
     events = found_in(
-        layout, trace, jacobians=chain, rules=EventRules(singular={"closed_chain": 0.02})
+        layout, trace, jacobians=chain, rules=logs.EventRules(singular={"closed_chain": 0.02})
     )
     assert [(e.iteration, e.threshold) for e in events] == [(2, 0.02)]
     assert found_in(layout, trace) == (), "no threshold, no event"
@@ -172,7 +179,7 @@ def test_ill_conditioned_by_its_own_threshold() -> None:
     layout, trace = trace_of(condition_arm=condition, sigma_arm=np.ones(7))
     arm = {"arm": RecordedJacobian(("a",), singular=0.1, condition=200.0)}
     events = found_in(layout, trace, {"q": ("a",)}, arm)
-    assert {e.kind for e in events} == {EventKind.ILL_CONDITIONED}
+    assert {e.kind for e in events} == {logs.EventKind.ILL_CONDITIONED}
     # 150 is no release: it would have to fall below 200 / 1.5.
     assert [(e.iteration, e.value) for e in events] == [(1, 400.0), (6, 201.0)]
     assert {(e.jacobian, e.joints, e.threshold) for e in events} == {("arm", ("a",), 200.0)}
@@ -208,8 +215,8 @@ def test_a_singular_row_of_a_known_jacobian() -> None:
     arm = {"arm": RecordedJacobian(("shoulder", "elbow"), singular=0.03, condition=100.0)}
     events = found_in(layout, trace, {"q": ("shoulder", "elbow")}, arm)
     assert [(e.iteration, e.kind) for e in events] == [
-        (5, EventKind.NEAR_SINGULAR),
-        (5, EventKind.ILL_CONDITIONED),
+        (5, logs.EventKind.NEAR_SINGULAR),
+        (5, logs.EventKind.ILL_CONDITIONED),
     ]
     assert {e.joints for e in events} == {("shoulder", "elbow")}
 
@@ -225,7 +232,7 @@ def test_stall_once_per_standstill() -> None:
     cost = np.concatenate([np.linspace(2, 1, 20), np.ones(30), np.linspace(0.9, 0.5, 5)])
     layout, trace = trace_of(cost=cost)
     events = found_in(layout, trace)
-    assert where(events, EventKind.STALL) == [29]
+    assert where(events, logs.EventKind.STALL) == [29]
     assert events[0].subject == "whole solve"
     assert events[0].value <= events[0].threshold == 1e-4
 
@@ -239,15 +246,15 @@ def test_stall_by_errors_when_one_finger_is_stuck() -> None:
     assert found_in(*trace_of(position_error=moving)) == ()
     stuck = errors.copy()
     stuck[:, 1] = 0.3
-    assert where(found_in(*trace_of(position_error=stuck)), EventKind.STALL) == [10]
+    assert where(found_in(*trace_of(position_error=stuck)), logs.EventKind.STALL) == [10]
     free = np.stack([np.full(40, 0.3), np.full(40, np.nan)], axis=1)
-    assert where(found_in(*trace_of(position_error=free)), EventKind.STALL) == [10]
+    assert where(found_in(*trace_of(position_error=free)), logs.EventKind.STALL) == [10]
 
 
 def test_no_stall_at_zero_error_or_across_phases() -> None:
     assert found_in(*trace_of(cost=np.zeros(40))) == ()
     layout, trace = trace_of(cost=np.ones(36), phase=np.arange(36) // 9)
-    assert where(found_in(layout, trace), EventKind.STALL) == []
+    assert where(found_in(layout, trace), logs.EventKind.STALL) == []
 
 
 def test_oscillation_names_the_joints() -> None:
@@ -257,7 +264,7 @@ def test_oscillation_names_the_joints() -> None:
     q[:, 2] = 0.01 * k
     layout, trace = trace_of(q=q, cost=1 + 0.01 * (k % 2))
     events = found_in(layout, trace, {"q": ("a", "b", "c")})
-    assert [e.kind for e in events] == [EventKind.OSCILLATION]
+    assert [e.kind for e in events] == [logs.EventKind.OSCILLATION]
     assert events[0].subject == "b"
     assert events[0].iteration == 10  # the step into row 5 is the first of six
     assert events[0].value == pytest.approx(0.2)
@@ -272,10 +279,10 @@ def test_a_standstill_names_the_singularity_and_the_limits_it_is_at() -> None:
     arm = {"arm": RecordedJacobian(singular=0.1)}
     labels = {"q": ("a", "b"), "sigma_arm": ("point", "normal")}
     events = found_in(layout, trace, labels, arm)
-    still = [e for e in events if e.kind in (EventKind.STALL, EventKind.OSCILLATION)]
+    still = [e for e in events if e.kind in (logs.EventKind.STALL, logs.EventKind.OSCILLATION)]
     assert [(e.kind, e.jacobian, e.joints) for e in still] == [
-        (EventKind.OSCILLATION, "arm[point]", ("a",)),
-        (EventKind.STALL, "arm[point]", ("b",)),
+        (logs.EventKind.OSCILLATION, "arm[point]", ("a",)),
+        (logs.EventKind.STALL, "arm[point]", ("b",)),
     ]
     far = found_in(layout, trace, labels, {"arm": RecordedJacobian(singular=0.01)})
     assert {e.jacobian for e in far} == {""}
@@ -290,9 +297,9 @@ def test_oscillation_with_progress_is_none() -> None:
 def test_five_swings_or_tiny_ones_are_no_oscillation() -> None:
     k = np.arange(30)
     q = np.where(k < 6, 0.1 * (-1.0) ** k, 0.0)[:, None]
-    assert where(found_in(*trace_of(q=q)), EventKind.OSCILLATION) == [6]
+    assert where(found_in(*trace_of(q=q)), logs.EventKind.OSCILLATION) == [6]
     q = np.where(k < 5, 0.1 * (-1.0) ** k, 0.0)[:, None]
-    assert where(found_in(*trace_of(q=q)), EventKind.OSCILLATION) == []
+    assert where(found_in(*trace_of(q=q)), logs.EventKind.OSCILLATION) == []
     tiny = 1e-6 * (-1.0) ** k[:, None]
     assert found_in(*trace_of(q=tiny)) == ()
 
@@ -311,8 +318,8 @@ def test_non_finite_numbers_are_no_event() -> None:
 
 
 def test_windows_are_checked() -> None:
-    with pytest.raises(InputError, match="windows"):
-        EventRules(oscillation_window=2)
+    with pytest.raises(errors.InputError, match="windows"):
+        logs.EventRules(oscillation_window=2)
 
 
 @settings(max_examples=60)
@@ -341,3 +348,270 @@ def test_solves_do_not_see_each_other(seed: int, counts: list[int]) -> None:
         for event in found_in(layout, trace[end - count : end], None, arm)
     ]
     assert list(map(repr, together)) == list(map(repr, alone))
+
+
+@pytest.fixture(scope="module")
+def robot() -> ik.ArmHand:
+    return ik.load_robot("kuka_lwr_barrett")
+
+
+def test_entries_and_leavings() -> None:
+    """Two solves: one begins touching and is free twice, the other is always free."""
+    form = TraceFormat(Layout.record(Field("clearance", (), "f4", "m")))
+    rows = np.zeros(9, form.layout.dtype)
+    rows["clearance"] = [-0.01, 0.001, 0.003, 0.001, 0.004, 0.002, 0.005, np.nan, 0.002]
+    found = logs.detect_events(form, rows, np.array([6, 3]), logs.EventRules(clearance=0.002))
+    told = [(e["solve_id"], e["iteration"], logs.EventKind(e["kind"]).name) for e in found]
+    assert told == [
+        (0, 0, "COLLISION_ENTERED"),
+        (0, 2, "COLLISION_LEFT"),
+        (0, 3, "COLLISION_ENTERED"),
+        (0, 4, "COLLISION_LEFT"),
+    ]
+    np.testing.assert_allclose(found["value"], [-0.01, 0.003, 0.001, 0.004], rtol=1e-6)
+    assert (found["threshold"] == 0.002).all()
+
+
+def test_a_log_with_a_scene(robot, tmp_path: Path) -> None:
+    grasps = [ik.load_grasp(name) for name in ("cup", "mug", "banana")]
+    arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
+    points, normals = (np.stack(parts) for parts in zip(*arrays, strict=True))
+    poses = np.stack([grasp.object_pose for grasp in grasps])
+    scene = ik.Scene(
+        {
+            "table": {"kind": "box", "size": [2, 2, 0.04], "xyz": [0, 0, -0.02]},
+            "cup": {"kind": "object", "object": "cup"},
+        },
+        margin=0.001,
+        grasped="cup",
+    )
+    solver = ik.Solver(robot, scene=scene)
+    path = tmp_path / "scene.mcap"
+    batch = solver.solve_batch(points, normals, log=path, object_pose=poses)
+    log = logs.open(path)
+    solves, rows = log.solves(), log.iterations()
+    np.testing.assert_allclose(solves.rows["clearance"], batch.clearance)
+    named = [(record["closest_first"], record["closest_second"]) for record in solves.records()]
+    assert named == list(batch.closest)
+    # Every iteration's is that of its q with its own object's pose.
+    around = solver._engine.around(
+        solver._questions.of_arrays(points, normals, None).holding("cup", poses)
+    )
+    expected = around.rows(rows.solve_id).check(np.ascontiguousarray(rows.rows["q"]))
+    np.testing.assert_allclose(
+        rows.rows["clearance"], expected.room + scene.margin, atol=1e-6, equal_nan=True
+    )
+    kinds = {record["kind"] for record in log.events().records()}
+    touching = np.flatnonzero(expected.room < -1e-6)
+    assert ("COLLISION_ENTERED" in kinds) == bool(len(touching))
+    first = logs.one_solve(log, 0)
+    assert first.clearance == pytest.approx(batch.clearance[0])
+    assert any(" and ".join(batch.closest[0]) in line for line in logs.explain(first).verdict)
+
+
+def test_why_names_what_blocks_and_that_nothing_was_checked(robot, tmp_path: Path) -> None:
+    cup = ik.load_grasp("cup")
+    wall = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3]}
+    path = tmp_path / "blocked.mcap"
+    solver = ik.Solver(robot, scene=ik.Scene({"balloon": wall}))
+    blocked = solver.solve(cup, log=path, diagnose=False)
+    assert blocked.status is ik.Status.COLLISION
+    story = logs.explain(logs.one_solve(logs.open(path)))
+    assert any("something touched from iteration" in line for line in story.met)
+    text = "\n".join(story.verdict)
+    assert "limits are kept, but something touches" in text
+    assert f"balloon overlap by {-1e3 * blocked.clearance:.2f} mm" in text
+    plain = tmp_path / "plain.mcap"
+    ik.Solver(robot).solve(cup, log=plain)
+    log = logs.open(plain)
+    assert "collision not checked" in logs.explain(logs.one_solve(log)).verdict
+    assert "clearance" not in log.iterations().names
+
+
+@pytest.fixture(scope="module")
+def ar10() -> ik.ArmHand:
+    return ik.load_robot("ar10")
+
+
+def margins(robot, q):
+    return np.min(list(robot.toggle_margins(q).values()), axis=0)
+
+
+def logged(robot, path, q):
+    """A log of a solve that ends at q, and its rows and events."""
+    points, normals = robot.contacts(q)
+    solver = ik.Solver(robot)
+    batch = solver.solve_batch(points[None], normals[None], log=path)
+    assert batch.success.all()
+    log = logs.open(path)
+    return log.iterations().rows, list(log.events(event="NEAR_SINGULAR").records())
+
+
+def test_the_least_margin_is_recorded(ar10, tmp_path):
+    q = ar10.random(np.random.default_rng(1), 1)[0]
+    rows, _ = logged(ar10, tmp_path / "a.mcap", q)
+    expected = [margins(ar10, row) for row in rows["q"].astype(float)]
+    np.testing.assert_allclose(rows["sigma_coupling"], expected, rtol=1e-5)
+
+
+def test_near_a_toggle_is_an_event_that_names_the_motors(ar10, tmp_path, monkeypatch):
+    """The shipped strokes keep clear of it, so the threshold is raised to where they go."""
+    q = ar10.random(np.random.default_rng(1), 1)[0]
+    _, events = logged(ar10, tmp_path / "clear.mcap", q)
+    assert events == []
+    monkeypatch.setattr(coupling_record, "NEAR_TOGGLE", 1.0)
+    rows, events = logged(ar10, tmp_path / "near.mcap", q)
+    assert (rows["sigma_coupling"] < 1.0).all()
+    assert events
+    assert {event["jacobian"] for event in events} == {"coupling"}
+    named = coupling_record.coupling_jacobian(ar10.description)["coupling"].joints
+    assert set(named) == set(ar10.actuators)
+
+
+def test_a_robot_without_mechanisms_records_none():
+    barrett = ik.load_robot("kuka_lwr_barrett").description
+    assert coupling_record.coupling_fields(barrett) == ()
+    assert coupling_record.coupling_jacobian(barrett) == {}
+
+
+LENGTH = 0.1
+OPTIONS = {"enhanced-dls": {"max_iterations": 200}, "enhanced-sdls": {"max_iterations": 200}}
+OPTIONS |= {"original-dls": {"max_iterations": 200}, "original-sdls": {"max_iterations": 200}}
+OPTIONS |= {"ipopt": {"restarts": 1}}
+STEP = 1e-6
+
+
+def spread(robot: ik.ArmHand, q: np.ndarray, of: str, columns: tuple[int, ...]) -> np.ndarray:
+    """Singular values of a Jacobian by central differences, descending."""
+    found = []
+    for column in columns:
+        ahead, behind = q.copy(), q.copy()
+        ahead[column] += STEP
+        behind[column] -= STEP
+        if of == "palm":
+            first, second = (robot.palm(x) for x in (behind, ahead))
+            turn = (second[:3, :3] - first[:3, :3]) @ robot.palm(q)[:3, :3].T / (2 * STEP)
+            angular = np.array([turn[2, 1], turn[0, 2], turn[1, 0]])
+            moved = (second[:3, 3] - first[:3, 3]) / (2 * STEP * LENGTH)
+            found.append(np.concatenate([moved, angular]))
+        else:
+            finger = robot.fingers.index(of)
+            first, second = (robot.contacts(x)[0][finger] for x in (behind, ahead))
+            found.append((second - first) / (2 * STEP * LENGTH))
+    return np.linalg.svd(np.array(found).T, compute_uv=False)
+
+
+@pytest.fixture(scope="module")
+def arms(robot: ik.ArmHand) -> np.ndarray:
+    """Configurations whose elbow is straight to 1e-3 rad, within limits: the arm is singular."""
+    rng = np.random.default_rng(40)
+    q = robot.random(rng, 6)
+    q[:, robot.actuators.index("lwr_joint_4")] = rng.normal(0, 1e-3, 6)
+    return q
+
+
+@pytest.fixture(scope="module", params=ik.METHODS)
+def log(request, robot, arms, tmp_path_factory) -> logs.Log:
+    """A log of solves that begin at the answer, next to the singularity."""
+    path = tmp_path_factory.mktemp("singular") / f"{request.param}.mcap"
+    solver = ik.Solver(
+        robot, request.param, options=OPTIONS.get(request.param, {}), finger_step="closed-form"
+    )
+    solver.solve_batch(*robot.contacts(arms), q0=arms, log=path)
+    return logs.open(path)
+
+
+def test_each_row_with_a_configuration_has_the_values_it_should(robot, log):
+    """Against singular values of central differences, which know nothing of the measure."""
+    rows = log.iterations().rows
+    some = rows[:: max(len(rows) // 12, 1)]
+    arm = robot.description.arm_actuators
+    fingers = {name: robot.description.finger_actuators(name) for name in robot.fingers}
+    unplaced = log.iterations().method == "hand-first"
+    for row in some:
+        q = row["q"].astype(float)
+        hands = [spread(robot, q, name, columns) for name, columns in fingers.items()]
+        assert row["sigma_hand"] == pytest.approx(min(s[-1] for s in hands), rel=1e-3, abs=1e-5)
+        assert row["condition_hand"] == pytest.approx(max(s[0] / s[-1] for s in hands), rel=1e-2)
+        if unplaced and row["phase"] in (Phase.CANDIDATE, Phase.HAND_FIT):
+            assert np.isnan(row["sigma_arm"])
+            assert np.isnan(row["condition_arm"])
+            continue
+        values = spread(robot, q, "palm", arm)
+        assert row["sigma_arm"] == pytest.approx(values[-1], rel=1e-3, abs=1e-5)
+        if values[-1] > 1e-3:
+            assert row["condition_arm"] == pytest.approx(values[0] / values[-1], rel=1e-2)
+
+
+def test_singular_arms_are_events_in_every_method(robot, log):
+    """Every solve that comes to a singular arm has the event, its joints and its threshold."""
+    solves = log.solves()
+    lowest = solves.rows["lowest_sigma"][:, solves.labels["lowest_sigma"].index("arm")]
+    events = [r for r in log.events(event="NEAR_SINGULAR").records() if r["jacobian"] == "arm"]
+    near = set(np.flatnonzero(lowest < THRESHOLDS["arm"][0]).tolist())
+    assert {event["solve_id"] for event in events} == near
+    assert near, "the answers are singular: someone has to come there"
+    for event in events:
+        assert event["value"] < event["threshold"] == THRESHOLDS["arm"][0]
+        assert set(event["joint_mask"]) == set(robot.actuators[:7])
+
+
+def test_why_tells_of_every_jacobian(log):
+    for solve in range(2):
+        met = " | ".join(logs.explain(logs.one_solve(log, solve)).met)
+        for name in ("arm", "hand"):
+            assert (
+                f"{name} near singular" in met
+                or f"{name} never near singular" in met
+                or (f"smallest singular value of the {name} down to" in met)
+            ), met
+        assert "not measured" not in met
+
+
+def test_thumb_first_measures_its_closed_chain(robot):
+    """Five rows of the thumb's contact over arm and thumb; by central differences again."""
+    measures = JacobianMeasures(robot.description, closed_chain=True)
+    q = robot.random(np.random.default_rng(3), 5)
+    rows = np.zeros(5, [("q", "f8", q.shape[1]), ("phase", "u1")])
+    rows["q"] = q
+    names = [field.name for field in measures.fields]
+    values = dict(zip(names, measures(rows).T, strict=True))
+    description = robot.description
+    columns = (*description.arm_actuators, *description.finger_actuators("thumb"))
+    for row, x in enumerate(q):
+        found, (_, normals) = [], robot.contacts(x)
+        normal = normals[0]
+        across = np.linalg.svd(normal[None])[2][1:]
+        for column in columns:
+            ahead, behind = x.copy(), x.copy()
+            ahead[column] += STEP
+            behind[column] -= STEP
+            (p1, n1), (p2, n2) = robot.contacts(behind), robot.contacts(ahead)
+            turned = across @ np.cross(normal, (n2[0] - n1[0]) / (2 * STEP))
+            found.append([*(p2[0] - p1[0]) / (2 * STEP * LENGTH), *turned])
+        s = np.linalg.svd(np.array(found).T, compute_uv=False)
+        assert values["sigma_closed_chain"][row] == pytest.approx(s[-1], rel=1e-3)
+        assert values["condition_closed_chain"][row] == pytest.approx(s[0] / s[-1], rel=1e-3)
+
+
+def test_the_virtual_machine_measures_the_same(robot):
+    q = robot.random(np.random.default_rng(5), 9)
+    rows = np.zeros(9, [("q", "f8", q.shape[1]), ("phase", "u1")])
+    rows["q"] = q
+    fast, slow = (JacobianMeasures(robot.description, compiled=c)(rows) for c in (True, False))
+    np.testing.assert_allclose(fast[:, ::2], slow[:, ::2], rtol=1e-4, atol=1e-6)
+
+
+def test_info_tells_what_was_not_measured(write, tmp_path: Path, capsys, robot):
+    """A log of rows without singular values says so, and does not say that nothing happened."""
+    plain = Layout(tuple(f for f in FORMAT.layout if not f.name.startswith("sigma_")))
+    form = dataclasses.replace(FORMAT, layout=plain, labels=LABELS, jacobians={})
+    path = write(make_block(5, 5, form=form), name="bare.mcap")
+    assert main(["log", "info", str(path)]) == 0
+    assert "not measured" in capsys.readouterr().out
+    solved = ik.Solver(robot).solve(ik.load_grasp("cup"), log=tmp_path / "cup.mcap")
+    assert solved.success
+    assert main(["log", "info", str(tmp_path / "cup.mcap")]) == 0
+    shown = capsys.readouterr().out
+    assert "not measured" not in shown
+    assert "arm 0." in shown

@@ -7,16 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_solves import LABELS, T0, make_block, make_rows
+from made_up_solves import LABELS, T0, Field, Layout, SolveBlock, TraceFormat, make_block, make_rows
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.errors import LogError
-from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs import LogClock, merge_logs
-from casadi_ik.logs import open as open_log
-from casadi_ik.problem.trace import TraceFormat
+from casadi_ik import errors, logs
 
 Write = Callable[..., Path]
 
@@ -32,17 +27,17 @@ def test_shards_are_joined(write: Write, tmp_path: Path) -> None:
         for numbers in ((1, 3, 5), (0, 4), (2,))
     ]
     target = tmp_path / "all.mcap"
-    merged = merge_logs(shards, target)
+    merged = logs.merge_logs(shards, target)
     assert merged.solves == {"enhanced-dls": 6}
     assert merged.size == target.stat().st_size
-    log = open_log(target)
+    log = logs.open(target)
     assert log.solves().solve_id.tolist() == list(range(6))
     iterations = log.iterations()
     for i in range(6):
         rows = iterations.rows[iterations.solve_id == i]
         assert rows.tobytes() == make_rows(i, 50).tobytes()
         assert log.iterations(solve=i).rows.tobytes() == rows.tobytes()
-    assert len(log.events()) == sum(len(open_log(shard).events()) for shard in shards)
+    assert len(log.events()) == sum(len(logs.open(shard).events()) for shard in shards)
     assert log.attachment("robot.urdf") == b"<robot/>"
 
 
@@ -51,7 +46,7 @@ def test_chunks_are_copied_as_they_are_and_others_can_read_the_result(
 ) -> None:
     shards = [write(one(i), name=f"{i}.mcap") for i in range(3)]
     target = tmp_path / "all.mcap"
-    merged = merge_logs(shards, target)
+    merged = logs.merge_logs(shards, target)
     data = target.read_bytes()
     messages = 0
     for shard in shards:
@@ -80,7 +75,7 @@ def test_where_the_shards_come_from_is_kept(write: Write, tmp_path: Path) -> Non
         write(one(i), name=f"{i}.mcap", compression=compression)
         for i, compression in enumerate(("none", "lz4", "zstd"))
     ]
-    log = open_log(merge_logs(shards, tmp_path / "all.mcap").path)
+    log = logs.open(logs.merge_logs(shards, tmp_path / "all.mcap").path)
     assert '"file": "2.mcap"' in log.metadata["shards"]
     assert '"compression": "lz4"' in log.metadata["shards"]
     assert len(log.iterations().rows) == 150
@@ -91,8 +86,8 @@ def test_one_solve_in_two_shards_is_refused(write: Write, tmp_path: Path) -> Non
     second = write(one(1), one(2), one(0), name="b.mcap")
     target = tmp_path / "all.mcap"
     for shards, number in (([first, second], 2), ([first, first], 2)):
-        with pytest.raises(LogError) as caught:
-            merge_logs(shards, target)
+        with pytest.raises(errors.LogError) as caught:
+            logs.merge_logs(shards, target)
         assert str(caught.value) == (
             f"{shards[1]}: solve 0 of enhanced-dls is in {first} too ({number} such solves)"
         )
@@ -103,7 +98,7 @@ def test_the_same_number_under_two_methods_is_no_doubling(write: Write, tmp_path
     both = (one(0), one(0, "hand-first"))
     first = write(*both, name="a.mcap")
     second = write(one(1), one(1, "hand-first"), name="b.mcap")
-    assert merge_logs([first, second], tmp_path / "all.mcap").solves == {
+    assert logs.merge_logs([first, second], tmp_path / "all.mcap").solves == {
         "enhanced-dls": 2,
         "hand-first": 2,
     }
@@ -113,7 +108,7 @@ def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> Non
     first = write(one(0), name="first.mcap", urdf="<robot/>")
     layout = Layout.record(Field("q", (3,)), Field("phase", dtype="u1"))
     other = TraceFormat(layout, LABELS)
-    clock = LogClock(T0 + 10**9)
+    clock = logs.LogClock(T0 + 10**9)
     cases = {
         f"t0_ns: found {T0 + 10**9}, expected {T0}": write(one(1), name="late.mcap", clock=clock),
         "robot: found ar10, expected made_up": write(one(1), name="robot.mcap", robot_name="ar10"),
@@ -127,8 +122,8 @@ def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> Non
     }
     before = sorted(tmp_path.iterdir())
     for reason, shard in cases.items():
-        with pytest.raises(LogError) as caught:
-            merge_logs([first, shard], tmp_path / "all.mcap")
+        with pytest.raises(errors.LogError) as caught:
+            logs.merge_logs([first, shard], tmp_path / "all.mcap")
         assert reason in str(caught.value)
         assert str(shard) in str(caught.value)
         assert str(first) in str(caught.value)
@@ -148,13 +143,13 @@ def test_shards_that_cannot_be_read(write: Write, tmp_path: Path) -> None:
         tmp_path / "text": "not an MCAP file",
     }
     for shard, reason in cases.items():
-        with pytest.raises(LogError, match=reason) as caught:
-            merge_logs([good, shard], tmp_path / "all.mcap")
+        with pytest.raises(errors.LogError, match=reason) as caught:
+            logs.merge_logs([good, shard], tmp_path / "all.mcap")
         assert str(caught.value).startswith(f"{shard}: ")
-    with pytest.raises(LogError, match="found no shards"):
-        merge_logs([], tmp_path / "all.mcap")
-    with pytest.raises(LogError, match="cannot write the merged log: No such file"):
-        merge_logs([good], tmp_path / "nowhere" / "all.mcap")
+    with pytest.raises(errors.LogError, match="found no shards"):
+        logs.merge_logs([], tmp_path / "all.mcap")
+    with pytest.raises(errors.LogError, match="cannot write the merged log: No such file"):
+        logs.merge_logs([good], tmp_path / "nowhere" / "all.mcap")
     assert not (tmp_path / "all.mcap").exists()
 
 
@@ -165,6 +160,8 @@ def test_a_bit_flip_in_a_chunk_of_a_shard_is_refused(write: Write, tmp_path: Pat
     data[int(rng.integers(len(data) // 2, len(data) // 2 + 1000))] ^= 1
     shard.write_bytes(data)
     target = tmp_path / "all.mcap"
-    with pytest.raises(LogError, match=rf"^{shard}: the chunk at byte \d+ fails its checksum"):
-        merge_logs([shard, write(one(1), name="b.mcap")], target)
+    with pytest.raises(
+        errors.LogError, match=rf"^{shard}: the chunk at byte \d+ fails its checksum"
+    ):
+        logs.merge_logs([shard, write(one(1), name="b.mcap")], target)
     assert not target.exists()

@@ -1,26 +1,35 @@
-"""What was written is what is read: by our reader and by three others."""
+"""What was written is what is read, by us and by three others; a solve is repeated from it."""
 
 from __future__ import annotations
 
+import string
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from made_up_solves import FINGERS, FORMAT, JOINTS, LABELS, LAYOUT, PHASES, T0, make_block
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_up_solves import FINGERS, FORMAT, JOINTS, LABELS, LAYOUT, PHASES, T0, changed, make_block
 from mcap.reader import make_reader
+from mcap_ros2._dynamic import generate_dynamic
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import casadi_ik as ik
+from casadi_ik import errors, logs
 from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.errors import UnknownNameError
-from casadi_ik.logs import EventKind, LogClock, Table
+from casadi_ik.kernels.layout import STORAGE, Field, Layout
+from casadi_ik.logs import format as schema
+from casadi_ik.logs.chunks import CDR_HEADER
 from casadi_ik.logs.events import event_format
 from casadi_ik.logs.format import KINDS, topic
 from casadi_ik.logs.rows import solve_format
 from casadi_ik.logs.writer import CHUNK_SIZE
+from casadi_ik.problem.problems import Problems
 
 Write = Callable[..., Path]
 
@@ -35,7 +44,7 @@ def assert_row(message: object, row: np.void) -> None:
         np.testing.assert_array_equal(found, row[name], err_msg=name)
 
 
-def assert_solves(table: Table, block: SolveBlock) -> None:
+def assert_solves(table: logs.Table, block: SolveBlock) -> None:
     """The solves of a block, and nothing else."""
     rows, batch = table.rows, block.batch
     np.testing.assert_array_equal(rows["solve_id"], block.first + np.arange(len(block)))
@@ -56,7 +65,7 @@ def assert_solves(table: Table, block: SolveBlock) -> None:
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
 def test_own_reader_gives_the_same_bits(write: Write, compression: str) -> None:
     blocks = [make_block(50, 1, 7), make_block(400, first=7)]
-    log = ik.logs.open(write(*blocks, compression=compression))
+    log = logs.open(write(*blocks, compression=compression))
     found = log.iterations()
     assert found.method == "enhanced-dls"
     assert found.rows.dtype == LAYOUT.dtype
@@ -80,32 +89,34 @@ def test_a_chunk_ends_where_a_solve_ends(write: Write) -> None:
     single = [make_block(3000, first=i) for i in range(12)]
     parts = write(*single, name="parts.mcap")
     for path in (whole, parts):
-        log = ik.logs.open(path)
+        log = logs.open(path)
         contents = log.shards[0].contents
         assert len(contents.chunks) >= 4
         firsts = [chunk.message_start_time for chunk in contents.chunks]
-        assert all((first - T0) % LogClock(T0).slot == 0 for first in firsts)
+        assert all((first - T0) % logs.LogClock(T0).slot == 0 for first in firsts)
         sizes = [chunk.uncompressed_size for chunk in contents.chunks[:-1]]
         assert all(CHUNK_SIZE <= size < CHUNK_SIZE + 3000 * 400 for size in sizes)
-    found = ik.logs.open(whole).iterations()
+    found = logs.open(whole).iterations()
     assert found.rows.tobytes() == make_block(*counts).rows.tobytes()
-    assert ik.logs.open(parts).iterations(solve=5).rows.tobytes() == single[5].rows.tobytes()
+    assert logs.open(parts).iterations(solve=5).rows.tobytes() == single[5].rows.tobytes()
 
 
 def test_solves_out_of_order_come_back_in_order(write: Write) -> None:
     blocks = [make_block(20, first=i) for i in (3, 0, 2)]
-    log = ik.logs.open(write(*blocks))
+    log = logs.open(write(*blocks))
     assert log.solves().solve_id.tolist() == [0, 2, 3]
     assert list(np.unique(log.iterations().solve_id)) == [0, 2, 3]
     assert log.iterations().rows[:20].tobytes() == blocks[1].rows.tobytes()
 
 
 def test_two_methods_share_a_log(write: Write) -> None:
-    log = ik.logs.open(write(make_block(30), make_block(7, method="hand-first")))
+    log = logs.open(write(make_block(30), make_block(7, method="hand-first")))
     assert log.methods == ("enhanced-dls", "hand-first")
-    with pytest.raises(UnknownNameError, match="of which method"):
+    with pytest.raises(errors.UnknownNameError, match="of which method"):
         _ = log.iterations().rows
-    with pytest.raises(UnknownNameError, match=r"no method 'ipopt'.*enhanced-dls, hand-first"):
+    with pytest.raises(
+        errors.UnknownNameError, match=r"no method 'ipopt'.*enhanced-dls, hand-first"
+    ):
         log.iterations(method="ipopt")
     assert len(log.iterations(method="hand-first").rows) == 7
     assert len(log.iterations()) == 37
@@ -116,7 +127,7 @@ def test_two_methods_share_a_log(write: Write) -> None:
 
 
 def test_a_solve_without_iterations(write: Write) -> None:
-    log = ik.logs.open(write(make_block(0)))
+    log = logs.open(write(make_block(0)))
     assert len(log.iterations().rows) == 0
     assert log.solves().rows["iterations"].tolist() == [0]
     assert np.isnan(log.solves().rows["lowest_sigma"]).all()
@@ -124,14 +135,14 @@ def test_a_solve_without_iterations(write: Write) -> None:
 
 
 def test_an_empty_log(write: Write) -> None:
-    log = ik.logs.open(write())
+    log = logs.open(write())
     assert log.methods == ()
     assert len(log.solves()) == len(log.iterations()) == len(log.events()) == 0
     assert log.info().counts == {}
 
 
 def test_events_come_back_and_are_counted(write: Write) -> None:
-    log = ik.logs.open(write(make_block(50, 50, first=4)))
+    log = logs.open(write(make_block(50, 50, first=4)))
     records = list(log.events(solve=4).records())
     assert {record["solve_id"] for record in records} == {4}
     phases = [record for record in records if record["kind"] == "PHASE_CHANGE"]
@@ -145,12 +156,12 @@ def test_events_come_back_and_are_counted(write: Write) -> None:
     totals = log.solves().rows["events"]
     for solve, total in zip((4, 5), totals, strict=True):
         kinds = log.events(solve=solve).rows["kind"]
-        np.testing.assert_array_equal(total, np.bincount(kinds, minlength=len(EventKind)))
+        np.testing.assert_array_equal(total, np.bincount(kinds, minlength=len(logs.EventKind)))
 
 
 def test_the_lowest_singular_values_are_kept(write: Write) -> None:
     block = make_block(50, 0, 20)
-    solves = ik.logs.open(write(block)).solves()
+    solves = logs.open(write(block)).solves()
     assert solves.labels["lowest_sigma"] == ("closed_chain",)
     sigma = block.rows["sigma_closed_chain"]
     expected = [sigma[:50].min(), np.nan, sigma[50:].min()]
@@ -166,18 +177,18 @@ def test_mcap_and_mcap_ros2(write: Write, compression: str) -> None:
         assert reader.get_header().profile == "ros2"
         found = list(reader.iter_decoded_messages(topics="/ik/enhanced-dls/iteration"))
     assert len(found) == 50
-    clock = LogClock(T0)
-    for i, (schema, channel, message, decoded) in enumerate(found):
-        assert schema is not None
-        assert schema.name == "casadi_ik/msg/IterationEnhancedDlsQ14F3J1"
-        assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
+    clock = logs.LogClock(T0)
+    for i, (form, channel, message, decoded) in enumerate(found):
+        assert form is not None
+        assert form.name == "casadi_ik/msg/IterationEnhancedDlsQ14F3J1"
+        assert (form.encoding, channel.message_encoding) == ("ros2msg", "cdr")
         assert channel.metadata["offered_qos_profiles"] == ""
         assert message.log_time == T0 + 2 * clock.slot + i * 1_000_000
         assert message.sequence == i
         assert_row(decoded, block.rows[i])
     first, last = found[0][2].publish_time, found[-1][2].publish_time
     assert block.started[0] < first < last == block.started[0] + 250_000_000
-    log = ik.logs.open(path)
+    log = logs.open(path)
     for kind, table in (("solve", log.solves()), ("event", log.events())):
         messages = [m.ros_msg for m in read_ros2_messages(path, [topic("enhanced-dls", kind)])]
         assert len(messages) == len(table) > 0
@@ -188,7 +199,7 @@ def test_mcap_and_mcap_ros2(write: Write, compression: str) -> None:
 def test_rosbags(write: Write) -> None:
     block = make_block(30, 20, first=2)
     path = write(block, make_block(3, method="hand-first"))
-    log = ik.logs.open(path)
+    log = logs.open(path)
     tables = (log.iterations, log.solves, log.events)
     rows = {
         kind: get(method="enhanced-dls").rows
@@ -216,3 +227,184 @@ def test_labels_of_solves_and_events() -> None:
     assert labels["phase_iterations"] == PHASES
     assert labels["q"] == JOINTS
     assert event_format(FORMAT).labels["jacobian"] == ("none", "closed_chain")
+
+
+NAME = "casadi_ik/msg/Random"
+names = st.from_regex(r"[a-z]([a-z0-9]|_[a-z0-9]){0,12}", fullmatch=True)
+docs = st.text(string.ascii_letters + string.digits + " .,:;#=[]()/'\"-π→", max_size=30)
+units = st.sampled_from(["", "m", "rad", "m/s", "rad or m"])
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> Layout:
+    fields = [
+        Field(
+            name,
+            draw(st.lists(st.integers(1, 5), max_size=3).map(tuple)),
+            draw(st.sampled_from(STORAGE)),
+            draw(units),
+            " ".join(draw(docs).split()),
+        )
+        for name in draw(st.lists(names, min_size=1, max_size=8, unique=True))
+    ]
+    return Layout.record(*fields)
+
+
+def flat(value: Any) -> np.ndarray:
+    if isinstance(value, bytes):
+        return np.frombuffer(value, np.uint8)
+    return np.asarray(value).ravel()
+
+
+@settings(max_examples=60)
+@given(layout=layouts(), data=st.data())
+def test_a_row_is_its_own_message(layout: Layout, data: st.DataObject) -> None:
+    row = np.frombuffer(
+        data.draw(st.binary(min_size=layout.dtype.itemsize, max_size=layout.dtype.itemsize)),
+        layout.dtype,
+    )[0]
+    text = schema.schema_text(layout, dict.fromkeys(layout.names, ("a", "b c")))
+    payload = CDR_HEADER + row.tobytes()
+    theirs = generate_dynamic(NAME, text)[NAME](payload)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, NAME))
+    third = store.deserialize_cdr(payload, NAME)
+    for item in layout:
+        expected = flat(row[item.name])
+        np.testing.assert_array_equal(flat(getattr(theirs, item.name)), expected)
+        third_name = item.name if hasattr(third, item.name) else item.name + "_"
+        np.testing.assert_array_equal(flat(getattr(third, third_name)), expected)
+
+
+@settings(max_examples=100)
+@given(layout=layouts())
+def test_the_layout_comes_back_from_the_schema(layout: Layout) -> None:
+    assert schema.parse_layout(schema.schema_text(layout)) == layout
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "float64 # []",
+        "geometry_msgs/Pose pose # []",
+        "float64[<=3] q # []",
+        "float64[] q # []",
+        "string name # []",
+        "float64 q",
+        "float64[6] q # (2, 2) []",
+        "float64[4] q # (999999999, 999999999, 999999999) []",
+        "float64[999999999] q # []",
+    ],
+)
+def test_lines_that_are_no_part_of_a_layout_are_refused(line: str) -> None:
+    with pytest.raises(errors.LogError, match="schema: "):
+        schema.parse_layout(f"{line}\n")
+
+
+def test_fields_that_would_need_padding_are_refused() -> None:
+    with pytest.raises(errors.LogError, match="not sorted by falling width"):
+        schema.parse_layout("uint8 a # []\nfloat64 b # []\n")
+
+
+def test_the_schema_is_for_people_too() -> None:
+    layout = Layout.record(
+        Field("phase", dtype="u1", doc="phase of\nthe method"),
+        Field("pose", (3, 4), "f8", "m"),
+        Field("limit_mask", dtype="u4"),
+    )
+    labels = {"phase": ("", "thumb reaching", "hand-alignment"), "limit_mask": ("a",)}
+    assert schema.schema_text(layout, labels) == (
+        "float64[12] pose # (3, 4) [m]\n"
+        "uint32 limit_mask # []\n"
+        "uint8 PHASE_THUMB_REACHING=1\n"
+        "uint8 PHASE_HAND_ALIGNMENT=2\n"
+        "uint8 phase # [] phase of the method\n"
+    )
+    assert schema.schema_name("iteration", "hand-first", layout, 3) == (
+        "casadi_ik/msg/IterationHandFirstQ0F3J0"
+    )
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        Layout(()),
+        Layout((Field("a", dtype="u1"), Field("b"))),
+        Layout((Field("J_arm"),)),
+        Layout((Field("a__b"),)),
+        Layout((Field("a", (0,)),)),
+    ],
+)
+def test_layouts_that_are_no_message(layout: Layout) -> None:
+    with pytest.raises(errors.LogError):
+        schema.schema_text(layout)
+
+
+GRASP = ik.load_grasp("cup")
+
+
+def repeated(solve: logs.OneSolve) -> ik.Solution:
+    """The same asked again, of a solver built from the log."""
+    contacts = {
+        finger: ik.Contact(point, None if np.isnan(normal).any() else normal, tolerance)
+        for finger, point, normal, tolerance in zip(
+            solve.fingers, solve.target_points, solve.target_normals, solve.tolerances, strict=True
+        )
+        if not np.isnan(point).any()
+    }
+    asked = solve.asked
+    solver = ik.Solver(ik.load_robot(solve.robot), solve.method, limits=asked.limits)
+    return solver.solve(
+        ik.Grasp(contacts),
+        q0=asked.start,
+        seed=asked.seed,
+        fixed=asked.fixed,
+        prefer=asked.prefer,
+    )
+
+
+@pytest.mark.parametrize("limits", ["enforce", "ignore"])
+def test_a_solve_is_repeated_from_its_log(tmp_path: Path, limits: str) -> None:
+    """Own tolerances, a free normal, a start, a seed and a held actuator included."""
+    robot = ik.load_robot("kuka_lwr_barrett")
+    contacts = dict(GRASP.contacts)
+    contacts["thumb"] = ik.Contact(contacts["thumb"].point, None, ik.Tolerance(1e-5, 0.2))
+    fixed = {"lwr_joint_3": 0.2, "bh_spread": float(robot.upper[7])}
+    q0 = robot.random(np.random.default_rng(5), 1)[0]
+    path = tmp_path / "asked.mcap"
+    solver = ik.Solver(robot, tolerance=ik.Tolerance(1e-3, 0.01), limits=limits)
+    first = solver.solve(ik.Grasp(contacts), q0=q0, seed=12345678901, fixed=fixed, log=path)
+    solve = logs.one_solve(logs.open(path))
+    asked = solve.asked
+    assert (asked.limits, asked.seed, asked.fixed) == (limits, 12345678901, fixed)
+    free = [name not in fixed for name in robot.actuators]
+    assert asked.start is not None
+    np.testing.assert_array_equal(asked.start[free], q0[free])
+    assert asked.tolerances == (ik.Tolerance(1e-5, 0.2), *(ik.Tolerance(1e-3, 0.01),) * 2)
+    again = repeated(solve)
+    assert (again.status, again.iterations, again.restarts) == (
+        *(first.status, first.iterations, first.restarts),
+    )
+    # A unit normal that is normalised again may change in its last bit.
+    np.testing.assert_allclose(again.q, first.q, rtol=0, atol=1e-9)
+    other = ik.Solver(robot, limits=limits).solve(GRASP)
+    assert not np.allclose(other.q, first.q, atol=1e-3)
+
+
+def test_held_actuators_beyond_one_word(write: Callable[..., Path]) -> None:
+    block = make_block(3)
+    held = np.full(40, np.nan)
+    held[[1, 33]] = 0.5, -0.25
+    points, normals = block.problems.points, block.problems.normals
+    wide = changed(
+        block,
+        q=np.zeros((1, 40)),
+        starts=np.ones((1, 40)),
+        problems=Problems(points, normals, ik.Tolerance(), enforce_limits=False, fixed=held),
+    )
+    assert solve_format(wide).layout.dtype["fixed_mask"].shape == (2,)
+    solve = logs.one_solve(logs.open(write(wide)))
+    assert list(solve.asked.fixed.values()) == [0.5, -0.25]
+    assert solve.asked.limits == "ignore"
+    assert solve.asked.start is not None
+    assert solve.asked.start[[0, 1, 33]].tolist() == [1.0, 0.5, -0.25]

@@ -1,36 +1,40 @@
-"""The viewer file as other libraries read it: it must tell what the solver did."""
+"""Viewer files and logs, read by what Foxglove and Lichtblick are made of."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
+import shutil
+import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio
 import pytest
+from made_up_solves import make_block
 from mcap.reader import make_reader
 from PIL import Image
 from viewer_reader import Decoded, decode, draw
 
 import casadi_ik as ik
-from casadi_ik.errors import LogError
-from casadi_ik.logs.solve import OneSolve, check_robot, one_solve
+from casadi_ik import errors, logs
 from casadi_ik.logs.viewers import layout_of, shipped_layout, write_layout, write_view
 
 
 @pytest.fixture(scope="module")
-def solve(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> OneSolve:
+def solve(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> logs.OneSolve:
     path = tmp_path_factory.mktemp("log") / "mug.mcap"
     solver = ik.Solver(robot, method="enhanced-dls", finger_step="closed-form")
     solver.solve(ik.load_grasp("mug"), log=path)
-    return one_solve(ik.logs.open(path))
+    return logs.one_solve(logs.open(path))
 
 
 @pytest.fixture(scope="module")
-def view(tmp_path_factory: pytest.TempPathFactory, solve: OneSolve, robot: ik.ArmHand) -> Path:
+def view(tmp_path_factory: pytest.TempPathFactory, solve: logs.OneSolve, robot: ik.ArmHand) -> Path:
     path = tmp_path_factory.mktemp("view") / "mug.mcap"
     write_view(path, solve, robot)
     return path
@@ -41,7 +45,7 @@ def decoded(view: Path) -> Decoded:
     return decode(view)
 
 
-def test_topics_and_times(decoded: Decoded, solve: OneSolve) -> None:
+def test_topics_and_times(decoded: Decoded, solve: logs.OneSolve) -> None:
     assert decoded.schemas == {
         "/robot_description": "std_msgs/msg/String",
         "/tf": "foxglove.FrameTransforms",
@@ -59,7 +63,7 @@ def test_topics_and_times(decoded: Decoded, solve: OneSolve) -> None:
 
 
 def test_frames_are_where_the_robot_was(
-    decoded: Decoded, solve: OneSolve, robot: ik.ArmHand
+    decoded: Decoded, solve: logs.OneSolve, robot: ik.ArmHand
 ) -> None:
     for row in (0, len(solve.rows) // 2, -1):
         frames = decoded.frames(row)
@@ -83,14 +87,14 @@ def test_urdf_and_joint_states_give_the_same_frames(decoded: Decoded) -> None:
         np.testing.assert_allclose(data.oMf[model.getFrameId(name)].homogeneous, pose, atol=1e-9)
 
 
-def test_iterations_are_those_of_the_log(decoded: Decoded, solve: OneSolve) -> None:
+def test_iterations_are_those_of_the_log(decoded: Decoded, solve: logs.OneSolve) -> None:
     messages = [message for _, message in decoded.topics["/ik/iteration"]]
     for name in ("q", "position_error", "sigma_thumb", "phase"):
         found = np.array([getattr(message, name) for message in messages])
         np.testing.assert_array_equal(found, solve.rows[name])
 
 
-def test_contacts_turn_green_when_they_are_reached(decoded: Decoded, solve: OneSolve) -> None:
+def test_contacts_turn_green_when_they_are_reached(decoded: Decoded, solve: logs.OneSolve) -> None:
     def green(message: Any) -> list[bool]:
         return [entity.arrows[0].color.g > 0.5 for entity in message.entities]
 
@@ -108,7 +112,7 @@ def test_contacts_turn_green_when_they_are_reached(decoded: Decoded, solve: OneS
         np.testing.assert_allclose([position.x, position.y, position.z], point)
 
 
-def test_messages_tell_the_story(decoded: Decoded, solve: OneSolve) -> None:
+def test_messages_tell_the_story(decoded: Decoded, solve: logs.OneSolve) -> None:
     lines = [message.message for _, message in decoded.topics["/ik/messages"]]
     assert lines[0] == "enhanced-dls on kuka_lwr_barrett, solve 0"
     assert "thumb-reaching" in lines
@@ -130,7 +134,9 @@ def test_a_picture_of_what_another_reader_decodes(decoded: Decoded, tmp_path: Pa
     assert green.sum() > 30
 
 
-def test_free_contacts_are_left_out(solve: OneSolve, robot: ik.ArmHand, tmp_path: Path) -> None:
+def test_free_contacts_are_left_out(
+    solve: logs.OneSolve, robot: ik.ArmHand, tmp_path: Path
+) -> None:
     points, normals = solve.target_points.copy(), solve.target_normals.copy()
     points[1] = normals[1] = normals[2] = np.nan
     freed = dataclasses.replace(solve, target_points=points, target_normals=normals)
@@ -147,29 +153,31 @@ def test_free_contacts_are_left_out(solve: OneSolve, robot: ik.ArmHand, tmp_path
 
 def test_another_robot_is_refused(robot: ik.ArmHand) -> None:
     urdf = robot.urdf()
-    check_robot(robot, urdf, "cup.mcap")
+    logs.solve.check_robot(robot, urdf, "cup.mcap")
     number = next(word for word in re.findall(r"\d+\.\d{6,}", urdf))
-    check_robot(robot, urdf.replace(number, f"{float(number) + 1e-13}"), "cup.mcap")
+    logs.solve.check_robot(robot, urdf.replace(number, f"{float(number) + 1e-13}"), "cup.mcap")
     for other in (urdf.replace(number, f"{float(number) + 1e-3}"), urdf.replace("bh_", "hand_")):
-        with pytest.raises(LogError, match=r"cup\.mcap: the robot 'kuka_lwr_barrett' is not the"):
-            check_robot(robot, other, "cup.mcap")
+        with pytest.raises(
+            errors.LogError, match=r"cup\.mcap: the robot 'kuka_lwr_barrett' is not the"
+        ):
+            logs.solve.check_robot(robot, other, "cup.mcap")
 
 
 def test_nothing_to_show_and_nowhere_to_write(
-    solve: OneSolve, robot: ik.ArmHand, tmp_path: Path
+    solve: logs.OneSolve, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
     empty = dataclasses.replace(solve, rows=solve.rows[:0])
-    with pytest.raises(LogError, match="kept no iterations"):
+    with pytest.raises(errors.LogError, match="kept no iterations"):
         write_view(tmp_path / "view.mcap", empty, robot)
-    with pytest.raises(LogError, match="cannot write the viewer file: No such file"):
+    with pytest.raises(errors.LogError, match="cannot write the viewer file: No such file"):
         write_view(tmp_path / "nowhere" / "view.mcap", solve, robot)
-    with pytest.raises(LogError, match="cannot write the layout: Is a directory"):
+    with pytest.raises(errors.LogError, match="cannot write the layout: Is a directory"):
         write_layout(tmp_path, {})
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_shipped_layout_is_the_one_of_the_shipped_robot(
-    solve: OneSolve, robot: ik.ArmHand, tmp_path: Path
+    solve: logs.OneSolve, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
     shipped = json.loads(shipped_layout().read_text())
     write_layout(tmp_path / "layout.json", layout_of(solve, robot))
@@ -197,3 +205,102 @@ def test_every_path_of_the_layout_is_in_the_file(view: Path, decoded: Decoded) -
         assert match is not None
         value = getattr(decoded.last(match[1]), match[2])
         assert match[3] is None or len(value) > int(match[3])
+
+
+PACKAGES = (
+    "@mcap/core@2.2.2",
+    "@foxglove/rosmsg@5.0.5",
+    "@foxglove/rosmsg2-serialization@3.1.0",
+    "fzstd@0.1.1",
+    "protobufjs@7.4.0",
+)
+
+
+@pytest.fixture(scope="module")
+def packages() -> Path:
+    """A folder with the packages, made once per machine; without node or registry, no test."""
+    npm = shutil.which("npm")
+    if npm is None or shutil.which("node") is None:
+        pytest.skip("needs node and npm")
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    folder = cache / "casadi_ik_tests" / "-".join(name.rpartition("@")[2] for name in PACKAGES)
+    if not (folder / "complete").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        command = [npm, "install", "--no-audit", "--no-fund", "--prefix", folder, *PACKAGES]
+        try:
+            subprocess.run(command, check=True, capture_output=True, timeout=120)
+        except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
+            pytest.skip(f"npm cannot install: {error}")
+        (folder / "complete").touch()
+    return folder
+
+
+def read(packages: Path, path: Path) -> list[dict[str, Any]]:
+    """Topic, time and values of every message, by time."""
+    script = Path(__file__).parent / "read_log.mjs"
+    done = subprocess.run(
+        ["node", script, packages, path], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def numbers(value: Any) -> np.ndarray:
+    """Numbers as the script prints them."""
+    names = {"NaN": np.nan, "Infinity": np.inf, "-Infinity": -np.inf}
+    items = value if isinstance(value, list) else [value]
+    return np.array([names[x] if isinstance(x, str) else x for x in items], dtype=float)
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_mcap_core_and_rosmsg2_serialization(
+    packages: Path, tmp_path: Path, write: Callable[..., Path], compression: str
+) -> None:
+    path = write(make_block(40, 7), urdf="<robot/>", compression=compression)
+    messages = read(packages, path)
+    log = logs.open(path)
+    for kind, table in (
+        ("iteration", log.iterations()),
+        ("solve", log.solves()),
+        ("event", log.events()),
+    ):
+        found = [m for m in messages if m["topic"] == f"/ik/enhanced-dls/{kind}"]
+        assert len(found) == len(table) > 0
+        for message, row in zip(found, table.rows, strict=True):
+            for name in table.names:
+                np.testing.assert_array_equal(numbers(message["values"][name]), row[name].ravel())
+    times = [int(message["time"]) for message in messages]
+    assert times == sorted(times)
+
+
+def test_the_viewer_file(packages: Path, tmp_path: Path, robot: ik.ArmHand) -> None:
+    """Every topic is deserialised, and tells what the solver did."""
+    log, view = tmp_path / "cup.mcap", tmp_path / "view.mcap"
+    grasp = ik.load_grasp("cup")
+    ik.Solver(robot).solve(grasp, log=log)
+    solve = logs.one_solve(logs.open(log))
+    write_view(view, solve, robot)
+    messages = read(packages, view)
+    topics: dict[str, list[dict[str, Any]]] = {}
+    for message in messages:
+        topics.setdefault(message["topic"], []).append(message["values"])
+    assert {topic: len(found) for topic, found in topics.items() if topic != "/ik/messages"} == {
+        **dict.fromkeys(("/robot_description", "/ik/targets"), 1),
+        **dict.fromkeys(("/tf", "/joint_states", "/ik/contacts", "/ik/iteration"), len(solve.rows)),
+    }
+    assert topics["/robot_description"][0]["data"] == robot.urdf()
+    targets = {entity["id"]: entity for entity in topics["/ik/targets"][0]["entities"]}
+    for finger, contact in grasp.contacts.items():
+        position = targets[f"{finger} target"]["spheres"][0]["pose"]["position"]
+        np.testing.assert_allclose([position[axis] for axis in "xyz"], contact.point)
+    for row in (0, -1):
+        joints = topics["/joint_states"][row]
+        found = dict(zip(joints["name"], joints["position"], strict=True))
+        assert found == pytest.approx(robot.joints(solve.rows["q"][row]))
+        children = {frame["child_frame_id"] for frame in topics["/tf"][row]["transforms"]}
+        assert children >= {f"{finger}_contact" for finger in robot.fingers}
+        np.testing.assert_array_equal(
+            numbers(topics["/ik/iteration"][row]["q"]), solve.rows["q"][row]
+        )
+    lines = [values["message"] for values in topics["/ik/messages"]]
+    assert any(line.startswith("SOLVED after") for line in lines)

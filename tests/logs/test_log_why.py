@@ -1,18 +1,17 @@
-"""The explanation of a solve says what is known to have happened, and nothing else."""
+"""Solves in words, made-up and real ones."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_traces import LAYOUT, event, make_one, make_rows
+from made_up_traces import LAYOUT, Layout, event, make_one, make_rows, told
 
-from casadi_ik.errors import InputError
-from casadi_ik.kernels.layout import Layout
-from casadi_ik.logs.compare import side_by_side, target_key
-from casadi_ik.logs.events import told
-from casadi_ik.logs.explanation import explain
+import casadi_ik as ik
+from casadi_ik import errors, logs
 
 DEGREE = float(np.deg2rad(1.0))
 
@@ -26,7 +25,7 @@ def test_a_finger_that_lags_at_a_limit() -> None:
     rows["position_error"][30, 1] = 0.008
     rows["limit_mask"][24:] = 0b010
     stall = event(36, "STALL", 1e-6, phase="hand-alignment", threshold=1e-4)
-    found = explain(make_one(rows, events=(stall,)))
+    found = logs.explain(make_one(rows, events=(stall,)))
     assert found.headline == "enhanced-dls, solve 7: not solved (STALLED) after 40 iterations"
     assert found.phases == (
         "thumb reaching (iterations 0 to 19, 20): thumb 100.0 mm 2.0 deg -> 1.0 mm 2.0 deg, "
@@ -57,14 +56,14 @@ def test_a_singularity_is_told_with_its_depth_and_time() -> None:
     singular = [
         event(i, "NEAR_SINGULAR", 0.008, jacobian="closed_chain", threshold=0.01) for i in (28, 36)
     ]
-    found = explain(make_one(rows, events=tuple(singular)))
+    found = logs.explain(make_one(rows, events=tuple(singular)))
     assert found.met == (
         "closed chain near singular from iteration 28 on, 8 iterations in all; smallest singular "
         "value 0.002 in iteration 29 (threshold 0.01), entered 2 times",
     )
     assert "at its end the closed chain is near singular" in found.verdict
     rows["sigma_closed_chain"][-1] = 0.4
-    found = explain(make_one(rows, events=tuple(singular)))
+    found = logs.explain(make_one(rows, events=tuple(singular)))
     assert not any("near singular" in line for line in found.verdict)
 
 
@@ -72,22 +71,24 @@ def test_a_dip_without_a_threshold_is_told_against_the_median() -> None:
     rows = make_rows()
     rows["sigma_closed_chain"][:20] = np.nan
     rows["sigma_closed_chain"][33] = 0.004
-    assert explain(make_one(rows)).met == (
+    assert logs.explain(make_one(rows)).met == (
         "smallest singular value of the closed chain down to 0.004 in iteration 33 (median 0.5)",
     )
     rows["sigma_closed_chain"][33] = 0.06
-    assert explain(make_one(rows)).met == (
+    assert logs.explain(make_one(rows)).met == (
         "closed chain never near singular: smallest singular value 0.06",
     )
     rows["sigma_closed_chain"] = np.nan
-    assert explain(make_one(rows)).met == ("singular values of the closed chain: not measured",)
+    assert logs.explain(make_one(rows)).met == (
+        "singular values of the closed chain: not measured",
+    )
 
 
 def test_a_finger_that_was_there_and_left() -> None:
     rows = make_rows()
     rows["position_error"], rows["angle_error"] = 0.001, 0.0
     rows["angle_error"][31:, 0] = 10 * DEGREE
-    found = explain(make_one(rows))
+    found = logs.explain(make_one(rows))
     assert found.fingers == (
         "thumb lagged: it ends 1.00 mm and 10.00 deg off; it was within tolerance in 31 "
         "iterations, the last of them 30",
@@ -103,7 +104,7 @@ def test_who_came_last_when_it_is_solved() -> None:
     rows["position_error"], rows["angle_error"] = 0.001, 0.0
     rows["position_error"][:22, 0] = 0.05
     rows["position_error"][:34, 1] = 0.05
-    found = explain(make_one(rows, restarts=2))
+    found = logs.explain(make_one(rows, restarts=2))
     assert found.headline == "enhanced-dls, solve 7: solved after 40 iterations and 2 restarts"
     assert found.fingers == (
         "finger_2 was the last to come within tolerance, in iteration 34; the others were there "
@@ -111,7 +112,7 @@ def test_who_came_last_when_it_is_solved() -> None:
     )
     assert found.verdict == ("every contact is within tolerance", "collision not checked")
     rows["position_error"][:34, 0] = 0.05
-    assert explain(make_one(rows)).fingers == (
+    assert logs.explain(make_one(rows)).fingers == (
         "the fingers came within tolerance together, in iteration 34",
     )
 
@@ -127,7 +128,7 @@ def test_a_budget_that_ran_out(end: float, expected: str) -> None:
     rows = make_rows()
     rows["angle_error"] = 0.0
     rows["position_error"][-4:] = np.linspace(0.1, end, 5)[1:, None]
-    found = explain(make_one(rows, status="ITERATION_LIMIT"))
+    found = logs.explain(make_one(rows, status="ITERATION_LIMIT"))
     assert found.verdict[-1] == f"its budget ran out {expected}".replace("out and", "out, and")
 
 
@@ -136,7 +137,9 @@ def test_restless_joints_and_oscillations() -> None:
     events += [event(3, "LIMIT_HIT", 1.0, joints=("joint_a",))]
     events += [event(i, "OSCILLATION", 0.1, joints=("joint_a", "joint_c")) for i in (11, 22)]
     events += [event(12, "OSCILLATION", 0.1, joints=("joint_c",))]
-    found = explain(make_one(make_rows(), events=tuple(sorted(events, key=lambda e: e.iteration))))
+    found = logs.explain(
+        make_one(make_rows(), events=tuple(sorted(events, key=lambda e: e.iteration)))
+    )
     assert found.met == (
         "closed chain never near singular: smallest singular value 0.5",
         "to its limit and off again: joint_c 5 times",
@@ -148,7 +151,7 @@ def test_phases_that_come_again_are_told_one_by_one_or_together() -> None:
     rows = make_rows()
     rows["phase"] = np.arange(40) // 10 % 2 + 1
     rows["position_error"][35:] = 0.02
-    names = [line.partition(" (")[0] for line in explain(make_one(rows)).phases]
+    names = [line.partition(" (")[0] for line in logs.explain(make_one(rows)).phases]
     assert names == [
         "thumb reaching 1",
         "hand alignment 1",
@@ -156,7 +159,7 @@ def test_phases_that_come_again_are_told_one_by_one_or_together() -> None:
         "hand alignment 2",
     ]
     rows["phase"] = np.arange(40) % 2 + 1
-    lines = explain(make_one(rows)).phases
+    lines = logs.explain(make_one(rows)).phases
     assert [line.partition(":")[0] for line in lines] == [
         "thumb reaching (iterations 0 to 38, 20 in 20 goes)",
         "hand alignment (iterations 1 to 39, 20 in 20 goes)",
@@ -172,7 +175,7 @@ def test_free_fingers_and_unmeasured_rows() -> None:
     rows["position_error"][-1] = rows["angle_error"][-1] = np.nan
     nan = np.array([0.001, np.nan]), np.array([0.0, np.nan])
     solve = make_one(rows, position_error=nan[0], angle_error=nan[1])
-    found = explain(solve)
+    found = logs.explain(solve)
     assert found.phases == (
         "thumb reaching (iterations 0 to 19, 20): errors not measured",
         "hand alignment (iterations 20 to 39, 20): thumb 100.0 mm 11.5 deg -> 1.0 mm 0.0 deg",
@@ -184,13 +187,13 @@ def test_a_free_finger_whose_errors_are_logged_as_zero_is_not_told() -> None:
     rows = make_rows()
     rows["position_error"][:, 1] = rows["angle_error"][:, 1] = 0.0
     free = np.array([0.1, np.nan])
-    found = explain(make_one(rows, position_error=free, angle_error=free))
+    found = logs.explain(make_one(rows, position_error=free, angle_error=free))
     assert "finger_2" not in " ".join((*found.phases, *found.fingers, *found.verdict))
 
 
 def test_without_a_trace_only_the_end_is_told() -> None:
     solve = make_one(make_rows())
-    found = explain(dataclasses.replace(solve, rows=solve.rows[:0]))
+    found = logs.explain(dataclasses.replace(solve, rows=solve.rows[:0]))
     assert found.verdict == (
         "the log kept no iterations of this solve",
         "thumb misses its point by 100.00 mm and its normal by 11.46 deg",
@@ -204,7 +207,7 @@ def test_without_limits_phases_or_singular_values() -> None:
     lean = Layout.record(*(f for f in LAYOUT if f.name in ("q", "position_error", "angle_error")))
     rows = np.zeros(3, lean.dtype)
     rows["position_error"] = 0.1
-    found = explain(make_one(rows, layout=lean))
+    found = logs.explain(make_one(rows, layout=lean))
     assert found.phases[0].startswith("the solve (iterations 0 to 2, 3): thumb 100.0 mm")
     assert found.met == ("singular values: not measured",)
 
@@ -249,7 +252,7 @@ def test_two_methods_side_by_side() -> None:
     rows["sigma_closed_chain"][7] = 0.03
     solved = make_one(rows)
     failed = make_one(make_rows()[20:], method="original-dls", time=0.5)
-    lines = {line.what: (line.first, line.second) for line in side_by_side(solved, failed)}
+    lines = {line.what: (line.first, line.second) for line in logs.side_by_side(solved, failed)}
     assert lines["status"] == ("SOLVED", "STALLED")
     assert lines["time"] == ("12 ms", "500 ms")
     assert lines["thumb off by"] == ("1.00 mm and 0.00 deg", "100.00 mm and 11.46 deg")
@@ -259,16 +262,105 @@ def test_two_methods_side_by_side() -> None:
     assert lines["smallest sigma, closed chain"] == ("0.03 in iteration 7", "0.5 in iteration 0")
     assert lines["limits at the end"] == ("none", "none")
     other = make_one(make_rows(), target_points=np.ones((2, 3)))
-    with pytest.raises(InputError, match="not the same target"):
-        side_by_side(solved, other)
+    with pytest.raises(errors.InputError, match="not the same target"):
+        logs.side_by_side(solved, other)
 
 
 def test_targets_are_the_same_but_for_rounding() -> None:
     rng = np.random.default_rng(0)
     points, normals = rng.normal(size=(2, 3, 3))
     normals[1] = np.nan
-    key = target_key(points, normals)
-    assert target_key(points * (1 + 1e-15), normals) == key
-    assert target_key(points + 1e-6, normals) != key
-    assert target_key(points, np.nan_to_num(normals)) != key
+    key = logs.compare.target_key(points, normals)
+    assert logs.compare.target_key(points * (1 + 1e-15), normals) == key
+    assert logs.compare.target_key(points + 1e-6, normals) != key
+    assert logs.compare.target_key(points, np.nan_to_num(normals)) != key
+    target_key = logs.compare.target_key
     assert target_key(np.zeros((3, 3)), normals) == target_key(-np.zeros((3, 3)), normals)
+
+
+COUNT = 5
+"""Arms per grasp."""
+
+
+@pytest.fixture(scope="module")
+def failed(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> list[logs.OneSolve]:
+    """What enhanced-dls does not solve of the shipped grasps with random arms."""
+    names = ik.shipped_grasps(robot.name)
+    q = robot.random(np.random.default_rng(0), len(names) * COUNT)
+    for i, name in enumerate(names):
+        for actuator, value in ik.load_grasp(name).posture.items():
+            q[i * COUNT : (i + 1) * COUNT, robot.actuators.index(actuator)] = value
+    path: Path = tmp_path_factory.mktemp("study") / "enhanced.mcap"
+    solver = ik.Solver(
+        robot, "enhanced-dls", finger_step="closed-form", options={"max_iterations": 400}
+    )
+    batch = solver.solve_batch(*robot.contacts(q), log=path)
+    log = logs.open(path)
+    found = [logs.one_solve(log, int(i)) for i in np.flatnonzero(~batch.success)]
+    assert len(found) > 4
+    assert any(e.kind == "NEAR_SINGULAR" for each in found for e in each.events)
+    return found
+
+
+def test_the_fingers_that_are_named_are_those_out_of_tolerance(failed: list[logs.OneSolve]) -> None:
+    for solve in failed:
+        story = logs.explain(solve)
+        out = [name for name, ok in zip(solve.fingers, solve.ok, strict=True) if not ok]
+        assert [line.split()[0] for line in story.fingers if "lagged" in line] == out
+        assert [line.split()[0] for line in story.verdict if "misses" in line] == out
+
+
+def test_phases_tell_the_errors_of_the_robot_in_that_posture(
+    failed: list[logs.OneSolve], robot: ik.ArmHand
+) -> None:
+    """First and last distance of the thumb in a phase, recomputed from q."""
+    thumb = robot.fingers.index(robot.thumb)
+    for solve in failed:
+        points, _ = robot.contacts(solve.rows["q"])
+        distance = 1e3 * np.linalg.norm(points[:, thumb] - solve.target_points[thumb], axis=1)
+        for line in logs.explain(solve).phases:
+            match = re.search(
+                r"\(iterations (\d+) to (\d+), \d+\): .*?thumb ([\d.]+) mm .*? -> ([\d.]+) mm", line
+            )
+            assert match is not None, line
+            first, last, begin, end = (float(text) for text in match.groups())
+            assert begin == pytest.approx(distance[int(first)], abs=0.06)
+            assert end == pytest.approx(distance[int(last)], abs=0.06)
+
+
+def test_singularities_are_where_the_singular_value_is_small(failed: list[logs.OneSolve]) -> None:
+    told = 0
+    for solve in failed:
+        for line in logs.explain(solve).met:
+            match = re.match(
+                r"closed chain near singular from iteration (\d+) on, (\d+) iterations in all; "
+                r"smallest singular value ([\d.e-]+) in iteration (\d+) \(threshold ([\d.]+)\)",
+                line,
+            )
+            if match is None:
+                continue
+            sigma = solve.rows["sigma_closed_chain"].astype(float)
+            threshold = float(match[5])
+            below = np.flatnonzero(sigma < threshold)
+            assert int(match[1]) == below[0]
+            assert int(match[2]) == len(below)
+            assert int(match[4]) == np.nanargmin(sigma)
+            assert float(match[3]) == pytest.approx(np.nanmin(sigma), rel=0.01)
+            told += 1
+    assert told
+
+
+def test_motors_at_a_limit_are_at_a_limit(failed: list[logs.OneSolve], robot: ik.ArmHand) -> None:
+    told = 0
+    for solve in failed:
+        q = solve.rows["q"]
+        at_limit = (q <= robot.lower) | (q >= robot.upper)
+        for line in logs.explain(solve).met:
+            match = re.match(r"(\w+) at its limit from iteration (\d+) to the end", line)
+            if match is None:
+                continue
+            column, since = at_limit[:, robot.actuators.index(match[1])], int(match[2])
+            assert column[since:].all()
+            assert since == 0 or not column[since - 1]
+            told += 1
+    assert told

@@ -1,4 +1,4 @@
-"""What goes wrong with files: one `LogError` with path and reason, what is there stays readable."""
+"""What a recorder refuses and what becomes of a log when writing fails."""
 
 from __future__ import annotations
 
@@ -12,15 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_up_solves import LABELS, T0, changed, make_block
+from made_up_solves import LABELS, T0, Field, Layout, TraceFormat, changed, make_block
 from mcap.writer import Writer
 
-import casadi_ik as ik
-from casadi_ik.answers.recorder import Recorder
-from casadi_ik.errors import InputError, LogError, UnknownNameError
-from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.logs import EventRules, Keep, LogClock, McapRecorder
-from casadi_ik.problem.trace import TraceFormat
+from casadi_ik import errors, logs
 
 Write = Callable[..., Path]
 
@@ -42,7 +37,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
 
 def record_many(path: Path, blocks: int) -> None:
     """Six solves of 1000 iterations each make a chunk and a bit."""
-    with McapRecorder(path, robot_name="made_up", compression="none") as recorder:
+    with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
         for i in range(blocks):
             recorder.record(make_block(*[1000] * 6, first=6 * i))
 
@@ -54,13 +49,15 @@ def test_disk_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, s
     """In the first chunk: nothing is left. Later: every chunk that fitted can be read."""
     path = tmp_path / "cup.mcap"
     full_disk(monkeypatch, room)
-    with pytest.raises(LogError, match=r"cup\.mcap: cannot write the log: No space left") as caught:
+    with pytest.raises(
+        errors.LogError, match=r"cup\.mcap: cannot write the log: No space left"
+    ) as caught:
         record_many(path, 4)
     assert isinstance(caught.value.__cause__, OSError)
     if not solves:
         assert list(tmp_path.iterdir()) == []
         return
-    log = ik.logs.open(path)
+    log = logs.open(path)
     assert log.info().unfinished == (path,)
     assert len(log.solves()) >= solves
     found = log.iterations(solve=0)
@@ -73,13 +70,13 @@ def test_disk_full_at_the_very_end(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     size = (tmp_path / "whole.mcap").stat().st_size
     full_disk(monkeypatch, size - 100)
     path = tmp_path / "cup.mcap"
-    with pytest.raises(LogError, match="No space left"):
+    with pytest.raises(errors.LogError, match="No space left"):
         record_many(path, 2)
-    log = ik.logs.open(path)
+    log = logs.open(path)
     assert len(log.solves()) == 12
     assert (
         log.iterations().rows.tobytes()
-        == ik.logs.open(tmp_path / "whole.mcap").iterations().rows.tobytes()
+        == logs.open(tmp_path / "whole.mcap").iterations().rows.tobytes()
     )
 
 
@@ -94,8 +91,8 @@ def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
         Path("/dev/null"): "not a regular file",
     }
     for path, reason in cases.items():
-        with pytest.raises(LogError, match=reason) as caught:
-            McapRecorder(path, robot_name="made_up")
+        with pytest.raises(errors.LogError, match=reason) as caught:
+            logs.McapRecorder(path, robot_name="made_up")
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
@@ -111,8 +108,8 @@ def test_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
         monkeypatch.setattr("casadi_ik.logs.writer.os.open", refuse)
-    with pytest.raises(LogError, match="Permission denied"):
-        McapRecorder(folder / "cup.mcap", robot_name="made_up")
+    with pytest.raises(errors.LogError, match="Permission denied"):
+        logs.McapRecorder(folder / "cup.mcap", robot_name="made_up")
     assert list(folder.iterdir()) == []
 
 
@@ -120,23 +117,24 @@ def test_two_writers_on_one_path(tmp_path: Path) -> None:
     """Refused in the same process and in another; the log of the first is not touched."""
     path = tmp_path / "cup.mcap"
     program = (
-        "import sys\nfrom casadi_ik.logs import McapRecorder\n"
-        "from casadi_ik.errors import LogError\n"
-        "try: McapRecorder(sys.argv[1], robot_name='r')\n"
-        "except LogError as error: print(error)\n"
+        "import sys\nfrom casadi_ik import errors, logs\n"
+        "try: logs.McapRecorder(sys.argv[1], robot_name='r')\n"
+        "except errors.LogError as error: print(error)\n"
     )
-    with McapRecorder(path, robot_name="made_up") as recorder:
-        with pytest.raises(LogError, match=r"cup\.mcap: cannot write the log: another writer"):
-            McapRecorder(path, robot_name="made_up")
+    with logs.McapRecorder(path, robot_name="made_up") as recorder:
+        with pytest.raises(
+            errors.LogError, match=r"cup\.mcap: cannot write the log: another writer"
+        ):
+            logs.McapRecorder(path, robot_name="made_up")
         other = subprocess.run(
             [sys.executable, "-c", program, path], capture_output=True, text=True, check=True
         )
         assert "another writer" in other.stdout
         recorder.record(make_block(10))
-    assert len(ik.logs.open(path).solves()) == 1
-    with McapRecorder(path, robot_name="made_up"):
+    assert len(logs.open(path).solves()) == 1
+    with logs.McapRecorder(path, robot_name="made_up"):
         pass
-    assert len(ik.logs.open(path).solves()) == 0
+    assert len(logs.open(path).solves()) == 0
 
 
 def test_what_was_there_stays_until_the_first_chunk(tmp_path: Path) -> None:
@@ -144,7 +142,7 @@ def test_what_was_there_stays_until_the_first_chunk(tmp_path: Path) -> None:
     path.write_bytes(b"an older log")
 
     def fail() -> None:
-        with McapRecorder(path, robot_name="made_up") as recorder:
+        with logs.McapRecorder(path, robot_name="made_up") as recorder:
             recorder.record(make_block(10))
             raise KeyboardInterrupt
 
@@ -161,14 +159,13 @@ def test_an_interrupted_log_keeps_its_chunks(tmp_path: Path) -> None:
     path = tmp_path / "cup.mcap"
 
     def fail() -> None:
-        recorder: Recorder
-        with McapRecorder(path, robot_name="made_up", compression="none") as recorder:
+        with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
             recorder.record(make_block(*[1000] * 10))
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         fail()
-    log = ik.logs.open(path)
+    log = logs.open(path)
     assert log.info().unfinished == ()
     assert 0 < len(log.solves()) < 10
 
@@ -194,7 +191,7 @@ def test_an_interrupt_while_a_chunk_is_written(
     if not written:
         assert list(tmp_path.iterdir()) == []
         return
-    log = ik.logs.open(path)
+    log = logs.open(path)
     assert log.info().unfinished == ()
     assert log.info().chunks == written
     solves = len(log.solves())
@@ -205,10 +202,10 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     link = tmp_path / "link.mcap"
     link.symlink_to(tmp_path / "real" / "cup.mcap")
-    with McapRecorder(link, robot_name="made_up") as recorder:
+    with logs.McapRecorder(link, robot_name="made_up") as recorder:
         recorder.record(make_block(5))
     assert link.is_symlink()
-    assert len(ik.logs.open(link).solves()) == 1
+    assert len(logs.open(link).solves()) == 1
 
 
 def test_blocks_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
@@ -227,30 +224,30 @@ def test_blocks_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
         "no time for a solve": make_block(1, first=2**32),
         "solve -1": changed(make_block(1), first=-1),
     }
-    with McapRecorder(path, robot_name="made_up", clock=LogClock(T0)) as recorder:
+    with logs.McapRecorder(path, robot_name="made_up", clock=logs.LogClock(T0)) as recorder:
         recorder.record(good)
         for reason, block in bad.items():
-            with pytest.raises(LogError, match=reason):
+            with pytest.raises(errors.LogError, match=reason):
                 recorder.record(block)
         recorder.record(make_block(5, first=6))
-    log = ik.logs.open(path)
+    log = logs.open(path)
     assert log.solves().solve_id.tolist() == [0, 1, 6]
     assert log.methods == ("enhanced-dls",)
-    with pytest.raises(LogError, match="closed"):
+    with pytest.raises(errors.LogError, match="closed"):
         recorder.record(make_block(5, first=7))
 
 
 def test_unknown_compression(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="'gzip': expected one of none, lz4, zstd"):
-        McapRecorder(tmp_path / "a", robot_name="r", compression="gzip")  # type: ignore[arg-type]
+    with pytest.raises(errors.LogError, match="'gzip': expected one of none, lz4, zstd"):
+        logs.McapRecorder(tmp_path / "a", robot_name="r", compression="gzip")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     "options", [{"sample": 1.5}, {"sample": float("nan")}, {"seed": -1}, {"seed": 0.5}]
 )
 def test_bad_policies_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=rf"keep\.{next(iter(options))}: found"):
-        Keep(**options)
+    with pytest.raises(errors.InputError, match=rf"keep\.{next(iter(options))}: found"):
+        logs.Keep(**options)
 
 
 def test_files_that_are_no_log(tmp_path: Path) -> None:
@@ -271,8 +268,8 @@ def test_files_that_are_no_log(tmp_path: Path) -> None:
         foreign: r"not a log of casadi_ik: no metadata 'casadi_ik' \(found: somebody\)",
     }
     for path, reason in cases.items():
-        with pytest.raises(LogError, match=reason) as caught:
-            ik.logs.open(path)
+        with pytest.raises(errors.LogError, match=reason) as caught:
+            logs.open(path)
         assert str(caught.value).startswith(f"{path}: ")
 
 
@@ -289,10 +286,10 @@ def test_metadata_is_complete(write: Write) -> None:
         urdf="<robot name='é'/>",
         parameters=parameters,
         seed=7,
-        keep=Keep(sample=0.5, seed=3),
-        rules=EventRules(singular={"arm": 0.02}),
+        keep=logs.Keep(sample=0.5, seed=3),
+        rules=logs.EventRules(singular={"arm": 0.02}),
     )
-    log = ik.logs.open(path)
+    log = logs.open(path)
     info = log.info()
     metadata = info.metadata
     assert metadata["robot"] == info.robot == "made_up"
@@ -311,7 +308,7 @@ def test_metadata_is_complete(write: Write) -> None:
     assert found["event_rules"]["singular"] == {"arm": 0.02}
     assert info.attachments == {"robot.urdf": len("<robot name='é'/>".encode())}
     assert log.attachment("robot.urdf").decode() == "<robot name='é'/>"
-    with pytest.raises(UnknownNameError, match=r"no attachment 'x'; attached: robot\.urdf"):
+    with pytest.raises(errors.UnknownNameError, match=r"no attachment 'x'; attached: robot\.urdf"):
         log.attachment("x")
     assert info.size == path.stat().st_size
     assert (info.compression, info.chunks) == ("zstd", 1)
@@ -319,18 +316,73 @@ def test_metadata_is_complete(write: Write) -> None:
 
 
 def test_log_times_are_arithmetic() -> None:
-    clock = LogClock(1000, slot=5_000_000)
+    clock = logs.LogClock(1000, slot=5_000_000)
     solve, iteration = np.array([3, 3, 4]), np.array([0, 4, 0])
     times = clock.times(solve, iteration)
     np.testing.assert_array_equal(times, [15_001_000, 19_001_000, 20_001_000])
     for found, expected in zip(clock.locate(times), (solve, iteration), strict=True):
         np.testing.assert_array_equal(found, expected)
     clock.check(3, np.array([5, 5]))
-    with pytest.raises(LogError, match="solve 4: 6 iterations, the log has room for 5"):
+    with pytest.raises(errors.LogError, match="solve 4: 6 iterations, the log has room for 5"):
         clock.check(3, np.array([5, 6]))
 
 
 def test_two_logs_share_one_time(tmp_path: Path, write: Write) -> None:
     """So that shards can be joined as they are."""
-    clocks = {McapRecorder(tmp_path / name, robot_name="r").clock for name in "ab"}
+    clocks = {logs.McapRecorder(tmp_path / name, robot_name="r").clock for name in "ab"}
     assert len(clocks) == 1
+
+
+LIMIT = 3 * 2**21
+
+
+@pytest.fixture
+def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readers and writers that take little."""
+    monkeypatch.setattr("casadi_ik.logs.chunks.RECORD_LIMIT", LIMIT)
+
+
+@pytest.mark.usefixtures("small_limit")
+def test_a_solve_that_is_too_large_leaves_the_log_usable(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    says = r"x\.mcap: method 'enhanced-dls', solve 3 holds \d{7} bytes, more than the 6291456"
+    with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
+        recorder.record(make_block(500, 4000))
+        with pytest.raises(errors.LogError, match=says):
+            recorder.record(make_block(10, 9000, first=2))
+        recorder.record(make_block(10, 4000, first=2))
+    log = logs.open(path)
+    assert log.solves().rows["solve_id"].tolist() == [0, 1, 2, 3]
+    assert len(log.iterations()) == 500 + 4000 + 10 + 4000
+
+
+@pytest.mark.usefixtures("small_limit")
+def test_the_largest_solve_that_is_written_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    most = 0
+    for iterations in range(4000, 9000, 250):
+        try:
+            with logs.McapRecorder(path, robot_name="made_up", compression="lz4") as recorder:
+                recorder.record(make_block(200, iterations))
+        except errors.LogError:
+            assert most
+            return
+        most = len(logs.open(path).iterations())
+        assert most == 200 + iterations
+    pytest.fail("nothing was too large")
+
+
+@pytest.mark.usefixtures("small_limit")
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"urdf": " " * LIMIT}, "attachment 'robot.urdf'"),
+        ({"parameters": {"note": "x" * LIMIT}}, "the metadata"),
+    ],
+)
+def test_what_goes_with_a_log_is_too_large(tmp_path: Path, given: dict, says: str) -> None:
+    with pytest.raises(
+        errors.LogError, match=rf"x\.mcap: {says} holds \d+ bytes, more than the 6291456"
+    ):
+        logs.McapRecorder(tmp_path / "x.mcap", robot_name="made_up", **given)
+    assert list(tmp_path.iterdir()) == []

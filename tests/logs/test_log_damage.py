@@ -1,0 +1,711 @@
+"""Damaged, cut and crafted files: the truth or one plain line, whoever reads them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import polars as pl
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from made_up_solves import main, make_block
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Chunk, Metadata
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from casadi_ik import errors, logs
+from casadi_ik.logs.chunks import RECORD, RECORD_LIMIT, unpack
+from casadi_ik.logs.container import (
+    MAGIC,
+    read_chunk,
+    read_contents,
+    records,
+)
+from casadi_ik.logs.provenance import METADATA_NAME, signed
+from casadi_ik.logs.writer import CHUNK_SIZE
+
+Write = Callable[..., Path]
+
+WRITER = """
+import sys
+sys.path.insert(0, sys.argv[2])
+from made_up_solves import make_block
+from casadi_ik import logs
+with logs.McapRecorder(sys.argv[1], robot_name="made_up") as recorder:
+    for first in range(0, 1_000_000, 20):
+        recorder.record(make_block(*[400] * 20, first=first))
+        print(first, flush=True)
+"""
+
+
+def answers(log: logs.Log) -> dict[str, Any]:
+    """Everything a log says, as bytes."""
+    tables = {"solves": log.solves(), "iterations": log.iterations(), "events": log.events()}
+    found: dict[str, Any] = {
+        name: [(part.method, part.labels, part.rows.tobytes()) for part in table.parts]
+        for name, table in tables.items()
+    }
+    found["times"] = [
+        (part.solve_id.tobytes(), part.iteration.tobytes())
+        for table in tables.values()
+        for part in table.parts
+    ]
+    return found | {"metadata": dict(log.metadata), "urdf": log.attachment("robot.urdf")}
+
+
+def said_of(path: Path) -> Any:
+    """Everything a log says, or the one error."""
+    try:
+        return answers(logs.open(path))
+    except (errors.LogError, errors.UnknownNameError) as error:
+        assert error.args[0].count("\n") == 0  # noqa: PT017
+        return error.args[0]
+
+
+@pytest.fixture
+def whole(write: Write, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A log of several chunks and two methods."""
+    monkeypatch.setattr("casadi_ik.logs.writer.CHUNK_SIZE", 2**15)
+    blocks = [make_block(*[60] * 3, first=3 * i) for i in range(3)]
+    return write(*blocks, make_block(20, 30, method="hand-first"), urdf="<robot/>" * 100)
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_a_cut_log(whole: Path, seed: int) -> None:
+    """Every complete chunk is read, and the log says that it is not whole."""
+    rng = np.random.default_rng(seed)
+    contents = read_contents(whole)
+    before = logs.open(whole)
+    truth = before.iterations(method="enhanced-dls").rows
+    urdf = before.attachment("robot.urdf")
+    length = int(rng.integers(whole.stat().st_size))
+    with whole.open("r+b") as stream:
+        stream.truncate(length)
+    complete = [
+        chunk
+        for chunk in contents.chunks
+        if chunk.chunk_start_offset + chunk.chunk_length <= length
+    ]
+    if length < contents.chunks[0].chunk_start_offset:
+        with pytest.raises(errors.LogError, match=rf"^{whole}: "):
+            logs.open(whole)
+        return
+    log = logs.open(whole)
+    assert log.info().unfinished == (whole,)
+    assert log.info().chunks == len(complete)
+    if not complete:
+        assert log.methods == ()
+        return
+    first = log.solves(method="enhanced-dls").solve_id
+    assert first.tolist() == list(range(len(first)))
+    found = log.iterations(method="enhanced-dls").rows
+    assert found.tobytes() == truth[: 60 * len(first)].tobytes()
+    assert log.attachment("robot.urdf") == urdf
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+@pytest.mark.parametrize("after", [0.0, 0.05, 0.2])
+def test_a_killed_writer(tmp_path: Path, after: float) -> None:
+    """All but the chunk being filled and the one being written is there."""
+    path = tmp_path / "killed.mcap"
+    command = [sys.executable, "-c", WRITER, str(path), str(Path(__file__).parent)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
+        assert writer.stdout is not None
+        for line in writer.stdout:
+            if int(line) >= 200:
+                break
+        time.sleep(after)
+        os.kill(writer.pid, signal.SIGKILL)
+        recorded = int((line, *writer.stdout.read().split())[-1]) + 20
+    log = logs.open(path)
+    assert log.info().unfinished == (path,)
+    solves = log.solves().solve_id
+    np.testing.assert_array_equal(solves, np.arange(len(solves)))
+    of_a_solve = sum(chunk.uncompressed_size for chunk in read_contents(path).chunks) / len(solves)
+    assert (recorded - len(solves)) * of_a_solve < 2 * (CHUNK_SIZE + of_a_solve)
+    assert len(solves) <= recorded + 20
+    assert len(log.iterations()) == 400 * len(solves)
+    assert log.iterations(solve=41).rows.tobytes() == make_block(400, first=41).rows.tobytes()
+    # The lock died with the writer.
+    with logs.McapRecorder(path, robot_name="made_up"):
+        pass
+
+
+def test_a_warning_names_the_unfinished_file(whole: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with whole.open("r+b") as stream:
+        stream.truncate(whole.stat().st_size - 4)
+    logs.open(whole)
+    (message,) = caplog.messages
+    assert message.startswith(f"{whole}: not finished; ")
+
+
+FIRST_RECORD = 9
+"""Bytes in front of the content of a record."""
+
+
+def read_messages(path: Path) -> list[tuple[str, int, bytes]]:
+    """What an independent reader finds, every checksum verified."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        found = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
+        assert summary.statistics.message_count == len(found)
+        assert summary.statistics.chunk_count == len(summary.chunk_indexes)
+        assert len(list(reader.iter_metadata())) == summary.statistics.metadata_count
+        assert len(list(reader.iter_attachments())) == summary.statistics.attachment_count
+    return found
+
+
+def many_chunks(path: Path, compression: CompressionType) -> list[int]:
+    """A file of 12 chunks with an attachment in between; gives where each chunk is whole."""
+    rng = np.random.default_rng(3)
+    whole: list[int] = []
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1, compression=compression)
+        writer.start("ros2", "a test")
+        writer.add_metadata("casadi_ik", {"robot": "made_up"})
+        schema = writer.register_schema("x", "ros2msg", b"float64 x\n")
+        channels = [writer.register_channel(f"/{i}", "cdr", schema) for i in range(3)]
+        for i in range(12):
+            if i == 5:
+                writer.add_attachment(1, 2, "robot.urdf", "application/xml", b"<robot/>" * 20)
+            for channel in channels:
+                data = rng.bytes(int(rng.integers(10, 300)))
+                writer.add_message(channel, 1000 * i + channel, data, 0)
+            whole.append(stream.tell())
+        writer.finish()
+    return whole
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_random_truncations_are_readable_afterwards(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    original = tmp_path / "whole.mcap"
+    many_chunks(original, compression)
+    data, messages = original.read_bytes(), read_messages(original)
+    first = len(MCAP0_MAGIC) + FIRST_RECORD + int.from_bytes(data[9:17], "little")
+    path = tmp_path / "torn.mcap"
+    rng = np.random.default_rng(7)
+    kept: list[int] = []
+    for length in sorted(rng.integers(first, len(data), 60).tolist()):
+        path.write_bytes(data[:length])
+        done = logs.finish_log(path)
+        found = read_messages(path)
+        assert found == messages[: len(found)]
+        assert (done.changed, done.messages) == (True, len(found))
+        kept.append(len(found))
+        again = path.read_bytes()
+        assert not logs.finish_log(path).changed
+        assert path.read_bytes() == again
+    assert kept == sorted(kept)
+    assert kept[0] == 0
+    assert kept[-1] == len(messages)
+    assert len(set(kept)) > 10
+
+
+def test_every_chunk_that_was_written_is_kept(tmp_path: Path) -> None:
+    """Cut anywhere behind a chunk but before the next one is whole: all up to it is there."""
+    original = tmp_path / "whole.mcap"
+    many_chunks(original, CompressionType.ZSTD)
+    data, messages = original.read_bytes(), read_messages(original)
+    with original.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunks = summary.chunk_indexes
+    path = tmp_path / "torn.mcap"
+    for chunk, following in pairwise(chunks):
+        behind = chunk.chunk_start_offset + chunk.chunk_length
+        expected = [m for m in messages if m[1] <= chunk.message_end_time]
+        last = following.chunk_start_offset + following.chunk_length - 1
+        for length in {behind, behind + 1, behind + chunk.message_index_length, last}:
+            path.write_bytes(data[:length])
+            logs.finish_log(path)
+            assert read_messages(path) == expected
+
+
+def test_a_finished_log_is_a_log(write: Write) -> None:
+    path = write(make_block(50, 50))
+    data, messages = path.read_bytes(), read_messages(path)
+    assert not logs.finish_log(path).changed
+    assert path.read_bytes() == data
+    path.write_bytes(data[:-40])
+    done = logs.finish_log(path)
+    assert done.changed
+    assert read_messages(path) == messages
+
+
+def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
+        for first in range(40):
+            recorder.record(make_block(1000, first=first))
+        while not path.stat().st_size:
+            time.sleep(0.01)
+        with pytest.raises(errors.LogError, match="its writer is still at it"):
+            logs.finish_log(path)
+    assert not logs.finish_log(path).changed
+    assert len(read_messages(path)) > 40_000
+
+
+def test_a_damaged_summary_is_written_anew(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    many_chunks(path, CompressionType.NONE)
+    messages = read_messages(path)
+    data = bytearray(path.read_bytes())
+    data[-100] ^= 1
+    path.write_bytes(data)
+    assert logs.finish_log(path).changed
+    assert read_messages(path) == messages
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_damage_in_the_middle_is_refused_and_nothing_changed(tmp_path: Path, closed: bool) -> None:
+    path = tmp_path / "log.mcap"
+    many_chunks(path, CompressionType.ZSTD)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[4]
+    data = bytearray(path.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length - 10] ^= 4
+    path.write_bytes(data if closed else data[:-50])
+    before = path.read_bytes()
+    with pytest.raises(
+        errors.LogError, match=rf"damaged in its middle: .* byte {chunk.chunk_start_offset}"
+    ):
+        logs.finish_log(path)
+    assert path.read_bytes() == before
+
+
+def test_random_bit_flips_never_pass_as_something_else(tmp_path: Path) -> None:
+    """After finish a flipped file is refused, or holds nothing that was not written."""
+    path = tmp_path / "log.mcap"
+    many_chunks(path, CompressionType.ZSTD)
+    data, written = path.read_bytes(), {m[2] for m in read_messages(path)}
+    rng = np.random.default_rng(11)
+    refused = 0
+    for position in rng.integers(0, len(data), 150).tolist():
+        flipped = bytearray(data)
+        flipped[position] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        try:
+            logs.finish_log(path)
+        except errors.LogError:
+            refused += 1
+        else:
+            assert {m[2] for m in read_messages(path)} <= written
+    assert refused > 50
+
+
+def test_what_is_no_log(tmp_path: Path, write: Write) -> None:
+    (tmp_path / "empty").write_bytes(b"")
+    (tmp_path / "text").write_text("robot: ar10\n")
+    (tmp_path / "magic").write_bytes(MCAP0_MAGIC)
+    (tmp_path / "zeros").write_bytes(MCAP0_MAGIC + bytes(5000))
+    (tmp_path / "folder").mkdir()
+    cases = {
+        "missing": "cannot finish the log: No such file",
+        "folder": "cannot finish the log: Is a directory",
+        "empty": "not an MCAP file: it is empty",
+        "text": "not an MCAP file: it begins with b'robot: a'",
+        "magic": "none of its 8 bytes is a whole record",
+        "zeros": "none of its 5008 bytes is a whole record",
+    }
+    for name, reason in cases.items():
+        with pytest.raises(errors.LogError, match=reason) as caught:
+            logs.finish_log(tmp_path / name)
+        assert str(caught.value).startswith(f"{tmp_path / name}: ")
+    assert (tmp_path / "text").read_text() == "robot: ar10\n"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_log(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    many_chunks(path, CompressionType.NONE)
+    path.chmod(0o400)
+    assert not logs.finish_log(path).changed
+    path.chmod(0o600)
+    path.write_bytes(path.read_bytes()[:-1])
+    path.chmod(0o400)
+    with pytest.raises(errors.LogError, match="Permission denied"):
+        logs.finish_log(path)
+
+
+BOUNDED = settings(
+    max_examples=60,
+    derandomize=True,
+    database=None,
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+)
+
+
+def said_by(path: Path) -> Any:
+    """All that a log says."""
+    log = logs.open(path)
+    tables = log.solves(), log.iterations(), log.events()
+    return (
+        [
+            (part.method, part.labels, part.solve_id.tolist(), part.rows.tobytes())
+            for table in tables
+            for part in table.parts
+        ],
+        log.metadata["parameters"],
+        log.metadata["seed"],
+        log.attachment("robot.urdf"),
+    )
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A log of two methods with an attachment."""
+    path = tmp_path_factory.mktemp("small") / "small.mcap"
+    with logs.McapRecorder(path, robot_name="made_up", urdf="<robot/>", seed=3) as recorder:
+        recorder.record(make_block(30, 20))
+        recorder.record(make_block(10, 5, method="hand-first"))
+    return path.read_bytes()
+
+
+def places(data: bytes, path: Path) -> list[int]:
+    """Bytes to flip: first and last of every kind of record, of its head, and some between."""
+    path.write_bytes(data)
+    rng, found = np.random.default_rng(4), {0, len(data) - 1}
+    kinds: dict[int, int] = {}
+    with path.open("rb") as stream:
+        for record in records(stream, len(MAGIC), len(data) - len(MAGIC)):
+            kinds[record.opcode] = kinds.get(record.opcode, 0) + 1
+            if kinds[record.opcode] <= 2:
+                start, end = record.offset, record.offset + record.length
+                found |= {start, start + 1, end - 1, *rng.integers(start, end, 4).tolist()}
+    assert len(kinds) >= 12, "every kind of record but a message outside of chunks"
+    return sorted(found)
+
+
+def test_a_flipped_bit_anywhere(small: bytes, tmp_path: Path) -> None:
+    """Reading, merging, finishing and a table: refused by name, or the same content."""
+    path, merged, table = (tmp_path / name for name in ("log.mcap", "all.mcap", "all.parquet"))
+    offsets = places(small, path)
+    truth, rng, refused = said_by(path), np.random.default_rng(5), 0
+
+    def export() -> Any:
+        logs.open(path).iterations().write_parquet(table)
+        return len(pl.read_parquet(table))
+
+    def finished() -> Any:
+        logs.finish_log(path)
+        return said_by(path)
+
+    asked: list[tuple[Callable[[], Any], Any]] = [
+        (lambda: said_by(path), truth),
+        (lambda: said_by(logs.merge_logs([path], merged).path), truth),
+        (export, 65),
+        (finished, truth),
+    ]
+    for offset in offsets:
+        data = bytearray(small)
+        data[offset] ^= 1 << int(rng.integers(8))
+        for ask, expected in asked:
+            path.write_bytes(data)
+            try:
+                found = ask()
+            except errors.LogError as error:
+                refused += 1
+                found = re.fullmatch(rf"{path}: [^\n]+", str(error)) and expected
+            assert found == expected, offset
+    assert refused > len(offsets)
+
+
+def crafted(
+    data: bytes,
+    path: Path,
+    metadata: Mapping[str, str] | None = None,
+    channel: Mapping[str, str] | None = None,
+    schema: Callable[[str], str] = str,
+) -> Path:
+    """The log with other contents, every checksum right."""
+    path.write_bytes(data)
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        (record,) = (each.metadata for each in reader.iter_metadata())
+        found = list(reader.iter_messages())
+    entries = {**record, **(metadata or {})}
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        writer.add_metadata(METADATA_NAME, signed(entries))
+        numbers: dict[int, int] = {}
+        for form, own, message in found:
+            assert form is not None
+            if own.id not in numbers:
+                text, about = schema(form.data.decode()), {**own.metadata, **(channel or {})}
+                number = writer.register_schema(form.name, form.encoding, text.encode())
+                numbers[own.id] = writer.register_channel(own.topic, "cdr", number, about)
+            times = message.log_time, message.data, message.publish_time
+            writer.add_message(numbers[own.id], *times, message.sequence)
+        writer.finish()
+    return path
+
+
+def ask_everything(path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """Every question of the command line; gives its refusals, each a plain line."""
+    refusals = []
+    for words in (
+        ("info", path),
+        ("solves", path),
+        ("events", path),
+        ("why", path, 0, "--method", "enhanced-dls"),
+        ("merge", path, "--out", path.with_name("all.mcap")),
+        ("export", path, "--what", "events", "--out", path.with_name("a.csv")),
+    ):
+        exit_code = main(["log", *map(str, words)])
+        said = capsys.readouterr()
+        assert exit_code in (0, 2)
+        for text in (said.out, said.err):
+            assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e]", text), words
+        if exit_code:
+            assert said.err.count("\n") == 1
+            assert len(said.err) < 1000
+            refusals.append(said.err)
+    return refusals
+
+
+DEEP = "[" * 5000 + "]" * 5000
+ESCAPE = "\x1b]0;owned\x07\x1b[31mred\u202e"
+
+
+@pytest.mark.parametrize(
+    ("entries", "reason"),
+    [
+        ({"format": "99"}, "format: found '99', expected '2'"),
+        ({"format": "2" * 10_000}, "format: found '2222"),
+        ({"t0_ns": "soon"}, "metadata: t0_ns: "),
+        ({"t0_ns": "9" * 5000}, "metadata: t0_ns: "),
+        ({"slot_ns": "0"}, "metadata: found t0_ns"),
+        ({"slot_ns": "-1"}, "metadata: slot_ns: "),
+        ({"iteration_ns": "5"}, "metadata: iteration_ns: found 5"),
+        ({"robot": ""}, "metadata: robot: "),
+        ({"robot": "r" * 10**6}, "metadata: robot: "),
+        ({"parameters": "7"}, "metadata: parameters: "),
+        ({"parameters": DEEP}, "metadata: parameters: lists and mappings are nested"),
+        ({"parameters": '{"a": ' * 40 + "1" + "}" * 40}, "metadata: parameters: lists and"),
+        ({"parameters": "{"}, "metadata: parameters: not JSON"),
+        ({"machine": "[]"}, "metadata: machine: "),
+        ({"packages": '{"numpy": 5}'}, "metadata: packages"),
+        ({"keep": "null"}, "metadata: keep: "),
+        ({"shards": '{"a": 1}'}, "metadata: shards: "),
+        ({"shards": '[{"file": "a", "first": -5}]'}, "metadata: shards: a number of a solve"),
+        ({"shards": '[{"file": "a", "differs": {"t0_ns": "x"}}]'}, "metadata: t0_ns: "),
+    ],
+)
+def test_crafted_metadata_are_refused(
+    small: bytes,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    entries: dict[str, str],
+    reason: str,
+) -> None:
+    path = crafted(small, tmp_path / "log.mcap", entries)
+    refusals = ask_everything(path, capsys)
+    assert len(refusals) == 6
+    for line in refusals:
+        assert line.startswith(f"casadi-ik: error: {path}: {reason}"), line
+
+
+@pytest.mark.parametrize(
+    ("labels", "reason"),
+    [
+        ("5", "labels: "),
+        ('{"status": 5}', "labels: "),
+        ('{"status": [5]}', "labels: "),
+        ('{"status": ["a"], "position_error": []}', "labels of position_error: 0 names for 3"),
+        ("{}", "labels of "),
+        (DEEP, "labels: lists and mappings are nested"),
+        (json.dumps({"q": ["j" * 1000]}), "labels of 'q': more than"),
+        (json.dumps({"q": ["j"] * 10_000}), "labels of 'q': more than"),
+    ],
+)
+def test_crafted_labels_are_refused(
+    small: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str], labels: str, reason: str
+) -> None:
+    path = crafted(small, tmp_path / "log.mcap", channel={"labels": labels})
+    refusals = ask_everything(path, capsys)
+    assert len(refusals) == 6
+    for line in refusals:
+        assert re.match(rf"casadi-ik: error: {path}: '/ik/.*': {reason}", line), line
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("float64", "float32"),
+        lambda text: text.replace("uint8 status", "uint8 state"),
+        lambda text: text.replace("float64[3] position_error", "float64[4] position_error"),
+        lambda text: text.replace("[14]", "[999999999]"),
+        lambda text: text + "string name # []\n",
+        lambda text: "",
+        lambda text: "\x1b[31m",
+    ],
+)
+def test_crafted_schemas_are_refused(
+    small: bytes,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[str], str],
+) -> None:
+    path = crafted(small, tmp_path / "log.mcap", schema=change)
+    for line in ask_everything(path, capsys):
+        assert line.startswith(f"casadi-ik: error: {path}: ")
+
+
+def test_terminal_escapes_in_names_are_shown_not_obeyed(
+    small: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with logs.McapRecorder(
+        tmp_path / f"{ESCAPE.replace('/', '')}.mcap", robot_name=ESCAPE, parameters={ESCAPE: ESCAPE}
+    ) as recorder:
+        recorder.record(make_block(5, method=f"m{ESCAPE}"))
+    ask_everything(recorder.path, capsys)
+    main(["log", "info", str(recorder.path)])
+    assert r"\x1b[31mred" in capsys.readouterr().out
+    assert errors.printable("a\x1b[0mb\nc\u202e ä→", 0) == "a\\x1b[0mb\nc\\u202e ä→"
+    assert errors.printable("x" * 50, 10) == "xxxxxxxxxx... (50 characters)"
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=30),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner),
+    max_leaves=12,
+)
+texts = st.text(max_size=200) | values.map(json.dumps)
+KEYS = ("robot", "seed", "keep", "t0_ns", "slot_ns", "machine", "packages", "parameters")
+KEYS = (*KEYS, "shards", "created", "compression", "code_version", "format", "iteration_ns")
+FIELDS = ("status", "events", "kind", "phase", "q", "position_error", "jacobian", "joint_mask")
+
+
+@BOUNDED
+@given(
+    entries=st.dictionaries(st.sampled_from(KEYS), texts, max_size=2),
+    labels=st.none() | texts | st.dictionaries(st.sampled_from(FIELDS), values).map(json.dumps),
+)
+def test_any_metadata_and_labels(
+    small: bytes,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    entries: dict[str, str],
+    labels: str | None,
+) -> None:
+    channel = None if labels is None else {"labels": labels}
+    ask_everything(crafted(small, tmp_path / "log.mcap", entries, channel), capsys)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("seed", range(24))
+def test_any_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int) -> None:
+    """Any bytes in the rows of a kind of messages, behind their numbers and times."""
+    rng, path = np.random.default_rng(seed), tmp_path / "any.mcap"
+    with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
+        recorder.record(make_block(30, 20))
+    data = bytearray(path.read_bytes())
+    (index,) = read_contents(path).chunks
+    with path.open("rb") as stream:
+        runs = read_chunk(stream, index).runs
+    begin = index.chunk_start_offset + index.chunk_length - index.uncompressed_size
+    run = runs[seed % len(runs)]
+    for start in range(run.start, run.stop, run.size):
+        for place in rng.integers(RECORD.size + 26, run.size, 12).tolist():
+            data[begin + start + place] = int(rng.choice([0, 127, 240, 255]))
+    crc = zlib.crc32(data[begin : begin + index.uncompressed_size])
+    struct.pack_into("<I", data, index.chunk_start_offset + RECORD.size + 24, crc)
+    path.write_bytes(data)
+    ask_everything(path, capsys)
+
+
+def test_a_question_in_python_is_refused_the_same(small: bytes, tmp_path: Path) -> None:
+    path = crafted(small, tmp_path / "log.mcap", {"parameters": '{"tolerance": 5}'})
+    assert len(logs.open(path).solves()) == 4
+    with pytest.raises(errors.CasadiIKError):
+        logs.one_solve(logs.open(path), 9)
+
+
+GIGABYTES = 3 * 10**9
+
+
+def metadata_bytes(**entries: str) -> bytes:
+    builder = RecordBuilder()
+    Metadata("a", entries).write(builder)
+    return builder.end()
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("said", [GIGABYTES, 1000])
+def test_a_chunk_that_unpacks_to_too_much_is_refused(compression: str, said: int) -> None:
+    """Whether it says so or not, and whether the compressed data say so or not."""
+    zeros = bytes(RECORD_LIMIT // 16)
+    packed = {
+        "zstd": lambda: zstandard.ZstdCompressor(write_content_size=said != 1000).compress(zeros),
+        "lz4": lambda: lz4.frame.compress(zeros),
+    }[compression]()
+    assert len(packed) < len(zeros) // 100
+    with pytest.raises(errors.LogError, match=r"the chunk at byte 0 (holds|cannot be unpacked)"):
+        unpack(Chunk(compression, packed, 0, 0, 0, said), "the chunk at byte 0")
+
+
+def test_what_does_not_belong_into_a_chunk_is_refused() -> None:
+    short = RECORD.pack(Opcode.MESSAGE, 4) + bytes(4)
+    for data, reason in (
+        (RECORD.pack(Opcode.ATTACHMENT, 1) + b"a", r"does not belong there \(9\)"),
+        (short, r"does not belong there \(5\)"),
+        (RECORD.pack(Opcode.MESSAGE, 100) + bytes(50), "reaches beyond it"),
+        (RECORD.pack(Opcode.MESSAGE, 22)[:5], "ends within a record"),
+        (RECORD.pack(Opcode.MESSAGE, 22) + struct.pack("<HIQQ", 1, 0, 9, 0), "of other times"),
+    ):
+        chunk = Chunk("", data, 2, 1, zlib.crc32(data), len(data))
+        with pytest.raises(errors.LogError, match=reason):
+            unpack(chunk, "the chunk")
+
+
+def huge(path: Path) -> Path:
+    """A log whose first chunk says that it unpacks to 3 GB, summary and all."""
+    contents = read_contents(path)
+    size = contents.chunks[0].uncompressed_size
+    data = path.read_bytes().replace(struct.pack("<Q", size), struct.pack("<Q", GIGABYTES))
+    magic, start = len(b"\x89MCAP0\r\n"), data.rindex(RECORD.pack(Opcode.FOOTER, 20))
+    (summary,) = struct.unpack_from("<Q", data, start + RECORD.size)
+    checksum = zlib.crc32(data[summary : -magic - 4])
+    path.write_bytes(data[: -magic - 4] + struct.pack("<I", checksum) + data[-magic:])
+    return path
+
+
+def test_reading_repair_and_merging_refuse_the_same(write: Write, tmp_path: Path) -> None:
+    path = huge(write(make_block(300), compression="zstd"))
+    merged = tmp_path / "all.mcap"
+    for ask in (
+        lambda: logs.open(path).solves(),
+        lambda: logs.open(path).iterations(solve=0),
+        lambda: logs.finish_log(path),
+        lambda: logs.merge_logs([path], merged),
+    ):
+        with pytest.raises(errors.LogError, match=rf"^{path}: .*holds {GIGABYTES} bytes") as caught:
+            ask()
+        assert "\n" not in str(caught.value)
+    assert not merged.exists()

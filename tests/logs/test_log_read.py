@@ -1,0 +1,472 @@
+"""Questions to a log: filters, several files as one, dataframes, where solves come from."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from made_up_solves import FORMAT, JOINTS, LAYOUT, changed, main, make_block
+from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC as MAGIC
+from mcap.writer import CompressionType, IndexType, Writer
+
+from casadi_ik import errors, logs
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every solve ends a chunk."""
+    monkeypatch.setattr("casadi_ik.logs.writer.CHUNK_SIZE", 1)
+
+
+def ids(log: logs.Log, **filters: object) -> list[int]:
+    return log.solves(**filters).solve_id.tolist()  # type: ignore[arg-type]
+
+
+def test_filters_of_solves(write: Write) -> None:
+    log = logs.open(write(make_block(40, 2, 1, 30)))
+    assert ids(log) == [0, 1, 2, 3]
+    assert ids(log, solve=2) == [2]
+    assert ids(log, solve=range(1, 3)) == ids(log, solve=[2, 1, 1]) == [1, 2]
+    assert ids(log, status="STALLED") == [1, 3]
+    assert ids(log, status=["STALLED", "SOLVED"], solve=[0, 3]) == [0, 3]
+    assert (
+        ids(log, event="PHASE_CHANGE") == ids(log, event=logs.EventKind.PHASE_CHANGE) == [0, 1, 3]
+    )
+    assert ids(log, event=["PHASE_CHANGE"], status="STALLED") == [1, 3]
+    assert ids(log, phase="refinement") == [0, 3], "one or two iterations do not get so far"
+    assert ids(log, solve=[]) == ids(log, solve=77) == []
+
+
+def test_filters_of_iterations_and_events(write: Write) -> None:
+    block = make_block(40, 2, 1, 30)
+    log = logs.open(write(block))
+    stalled = log.iterations(status="STALLED")
+    assert stalled.rows.tobytes() == np.concatenate([block.rows[40:42], block.rows[43:]]).tobytes()
+    refined = log.iterations(phase="refinement")
+    assert refined.rows.tobytes() == block.rows[block.rows["phase"] == 2].tobytes()
+    assert len(log.iterations(event="STALL")) == 0
+    two = log.iterations(fields=["phase", "cost"], solve=3)
+    assert two.rows.dtype.names == ("cost", "phase"), "in the order of the log"
+    np.testing.assert_array_equal(two.rows["cost"], block.rows["cost"][43:])
+    some = log.iterations(fields=["cost"], phase="refinement")
+    np.testing.assert_array_equal(some.rows["cost"], refined.rows["cost"])
+    events = log.events(event="PHASE_CHANGE", solve=[0, 1])
+    assert {record["kind"] for record in events.records()} == {"PHASE_CHANGE"}
+    assert set(events.solve_id) == {0, 1}
+    assert set(log.events(phase="hand alignment").rows["phase"]) == {1}
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_only_the_chunks_asked_for_are_read(write: Write) -> None:
+    """Whatever is wrong with the others goes unnoticed."""
+    path = write(make_block(*[10] * 20))
+    log, data = logs.open(path), bytearray(path.read_bytes())
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert log.info().chunks == len(summary.chunk_indexes) == 20
+    for i, chunk in enumerate(summary.chunk_indexes):
+        data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= i not in (3, 11)
+    path.write_bytes(data)
+    assert len(log.iterations(solve=[3, 11])) == 20
+    assert len(log.iterations(solve=30)) == 0
+    with pytest.raises(errors.LogError, match="chunk at byte"):
+        log.iterations(solve=4)
+
+
+@pytest.mark.parametrize(
+    ("question", "reason"),
+    [
+        ({"method": "ipopt"}, r"no method 'ipopt'; the log holds: enhanced-dls"),
+        ({"status": "solved"}, r"no status 'solved'; there are: .*SOLVED"),
+        ({"event": "CRASH"}, r"no event 'CRASH'; there are: NEAR_SINGULAR"),
+        ({"phase": ["refinement", "dinner"]}, r"no phase 'dinner'; there are: thumb reaching"),
+    ],
+)
+def test_names_that_are_not_there(write: Write, question: dict[str, str], reason: str) -> None:
+    log = logs.open(write(make_block(30)))
+    for ask in (log.solves, log.iterations, log.events):
+        with pytest.raises(errors.UnknownNameError, match=reason):
+            ask(**question)  # type: ignore[arg-type]
+
+
+def test_a_field_that_is_not_there(write: Write) -> None:
+    with pytest.raises(errors.UnknownNameError, match="no field 'costs'; there are: q, palm, cost"):
+        logs.open(write(make_block(3))).iterations(fields=["costs"])
+
+
+def test_several_files_are_one_log(write: Write, tmp_path: Path) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    blocks = [make_block(5, 6, first=10), make_block(7, first=3), make_block(4, first=20)]
+    paths = [
+        write(blocks[0], name="a/0.mcap"),
+        write(blocks[1], make_block(2, method="hand-first"), name="a/1.mcap"),
+        write(blocks[2], name="a/b/2.mcap", compression="none"),
+    ]
+    for log in (logs.open(paths), logs.open(tmp_path / "a"), logs.open(str(tmp_path))):
+        assert log.methods == ("enhanced-dls", "hand-first")
+        assert ids(log, method="enhanced-dls") == [3, 10, 11, 20]
+        found = log.iterations(method="enhanced-dls")
+        assert found.solve_id.tolist() == [3] * 7 + [10] * 5 + [11] * 6 + [20] * 4
+        expected = np.concatenate([blocks[1].rows, blocks[0].rows, blocks[2].rows])
+        assert found.rows.tobytes() == expected.tobytes()
+        info = log.info()
+        assert info.counts["enhanced-dls"]["iteration"] == 22
+        assert info.paths == tuple(paths)
+        assert info.size == sum(path.stat().st_size for path in paths)
+
+
+def test_files_that_do_not_belong_together(write: Write, tmp_path: Path) -> None:
+    first = write(make_block(5, 6), name="0.mcap")
+    copy = tmp_path / "1.mcap"
+    copy.write_bytes(first.read_bytes())
+    with pytest.raises(
+        errors.LogError, match=r"1\.mcap: solve 0 of enhanced-dls is in .*0\.mcap too"
+    ):
+        logs.open([first, copy]).solves()
+    other = write(make_block(6, first=2), name="2.mcap", robot_name="ar10")
+    with pytest.raises(
+        errors.LogError, match=r"2\.mcap: robot 'ar10', but .*0\.mcap has 'made_up'"
+    ):
+        logs.open([first, other])
+    form = dataclasses.replace(FORMAT, labels={**FORMAT.labels, "q": JOINTS[::-1]})
+    third = write(make_block(6, first=2, form=form), name="3.mcap")
+    with pytest.raises(
+        errors.LogError, match=r"3\.mcap: method 'enhanced-dls' has other fields or names"
+    ):
+        logs.open([first, third]).iterations()
+    with pytest.raises(errors.LogError, match="no log was named"):
+        logs.open([])
+
+
+def test_a_policy_keeps_what_it_says(write: Write) -> None:
+    """Totals of all; iterations and events of failed, of singular ones and of a seeded sample."""
+    block = make_block(*[20] * 400)
+    rows = block.rows.copy()
+    rows["sigma_closed_chain"] = 1.0
+    rows["sigma_closed_chain"][20 * 6 + 3] = 1e-4  # in solve 6, which is solved
+    block = changed(block, rows=rows)
+    whole = logs.open(write(block, name="whole.mcap"))
+    sample = logs.Keep(failed=False, singular=False, sample=0.25, seed=5)
+    log = logs.open(write(block, keep=sample, name="sample.mcap"))
+    kept = np.flatnonzero(log.solves().rows["kept"])
+    assert 60 < len(kept) < 140
+    assert set(log.iterations().solve_id) == set(log.events().solve_id) == set(kept)
+    assert log.iterations().rows.tobytes() == whole.iterations(solve=kept).rows.tobytes()
+    assert log.events().rows.tobytes() == whole.events(solve=kept).rows.tobytes()
+    for name in (name for name in log.solves().names if name != "kept"):
+        np.testing.assert_array_equal(log.solves().rows[name], whole.solves().rows[name])
+
+    parts = [
+        changed(make_block(*[20] * 100, first=i), rows=rows[20 * i : 20 * i + 2000])
+        for i in range(0, 400, 100)
+    ]
+    again = logs.open(write(*parts, keep=sample, name="parts.mcap"))
+    np.testing.assert_array_equal(np.flatnonzero(again.solves().rows["kept"]), kept)
+
+    log = logs.open(write(block, keep=logs.Keep(sample=0.0), name="failed.mcap"))
+    solved = block.batch.success
+    assert set(np.flatnonzero(log.solves().rows["kept"])) == {*np.flatnonzero(~solved), 6}
+    assert whole.solves().rows["kept"].all()
+
+
+def test_frames(write: Write, tmp_path: Path) -> None:
+    block = make_block(40, 2)
+    log = logs.open(write(block, make_block(3, first=5, method="hand-first")))
+    frame = log.iterations().frame()
+    assert frame.height == 45
+    assert frame.columns[:4] == ["method", "solve_id", "iteration", "q.joint_0"]
+    assert {"position_error.thumb", "palm.0.3", "cost", "limit_mask", "phase"} <= set(frame.columns)
+    ours = frame.filter(pl.col("method") == "enhanced-dls")
+    np.testing.assert_array_equal(ours["q.joint_3"], block.rows["q"][:, 3])
+    np.testing.assert_array_equal(ours["palm.1.2"], block.rows["palm"][:, 1, 2])
+    phases = [FORMAT.labels["phase"][code] for code in block.rows["phase"]]
+    assert ours["phase"].to_list() == phases
+    solves = log.solves().frame()
+    assert solves["status"].to_list() == ["SOLVED", "STALLED", "STALLED"]
+    np.testing.assert_array_equal(
+        solves["target_points.finger_2.y"][:2], block.problems.points[:, 1, 1]
+    )
+    assert solves["phase_iterations.hand alignment"].to_list() == [13, 1, 1]
+    events = log.events().frame()
+    assert {"kind", "subject", "jacobian", "joints", "value", "threshold"} <= set(events.columns)
+    path = tmp_path / "iterations.parquet"
+    log.iterations().write_parquet(path)
+    assert pl.read_parquet(path).equals(frame, null_equal=True)
+    with pytest.raises(errors.LogError, match="nowhere"):
+        log.iterations().write_parquet(tmp_path / "nowhere" / "a.parquet")
+
+
+def test_arrays(write: Write) -> None:
+    block = make_block(4, 2)
+    log = logs.open(write(block))
+    array = log.iterations().array()
+    assert array.dtype.names == ("solve_id", "iteration", *LAYOUT.names)
+    assert array["solve_id"].tolist() == [0, 0, 0, 0, 1, 1]
+    assert array["iteration"].tolist() == [0, 1, 2, 3, 0, 1]
+    np.testing.assert_array_equal(array["palm"], block.rows["palm"])
+    assert log.solves().array().dtype == log.solves().rows.dtype
+
+
+def test_without_polars(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "polars", None)
+    table = logs.open(write(make_block(4))).iterations()
+    assert len(table.array()) == 4
+    with pytest.raises(errors.MissingExtraError, match=r"casadi-ik\[dataframes\]"):
+        table.frame()
+
+
+def rewritten(path: Path, **options: object) -> Path:
+    """The same messages by mcap's own writer, in the order of their times."""
+    copy = path.with_name("copy.mcap")
+    with path.open("rb") as source, copy.open("wb") as target:
+        reader = make_reader(source, validate_crcs=True)
+        writer = Writer(target, chunk_size=20_000, **options)  # type: ignore[arg-type]
+        writer.start("ros2")
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            times = message.log_time, message.data, message.publish_time
+            writer.add_message(channels[channel.id], *times, message.sequence)
+        writer.finish()
+    return copy
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE, "index_types": IndexType.CHUNK | IndexType.METADATA},
+        {"enable_crcs": False},
+    ],
+)
+def test_a_log_that_other_tools_have_rearranged(write: Write, options: dict[str, object]) -> None:
+    """Messages of all topics mixed, in other chunks, perhaps without their index."""
+    path = write(make_block(30, 80, 3))
+    ours, theirs = logs.open(path), logs.open(rewritten(path, **options))
+    for one, other in (
+        (ours.iterations(), theirs.iterations()),
+        (ours.solves(), theirs.solves()),
+        (ours.events(), theirs.events()),
+        (ours.iterations(solve=1), theirs.iterations(solve=1)),
+    ):
+        assert one.rows.tobytes() == other.rows.tobytes()
+        np.testing.assert_array_equal(one.solve_id, other.solve_id)
+
+
+def test_messages_outside_chunks_are_refused(write: Write) -> None:
+    path = rewritten(write(make_block(5)), use_chunking=False)
+    with pytest.raises(errors.LogError, match=r"copy\.mcap: the messages are not in chunks"):
+        logs.open(path)
+
+
+COUNTS = ([40, 30], [20, 50, 10], [60])
+ALL_COUNTS = [count for counts in COUNTS for count in counts]
+NAMES = ("loose/cup/00000.mcap", "loose/cup/00001.mcap", "tight/cup/00000.mcap")
+
+
+@pytest.fixture
+def study(write: Write, tmp_path: Path) -> Path:
+    """Three shards in two settings, each counting from 0, with a sample of its own."""
+    folder = tmp_path / "study"
+    for i, (name, counts) in enumerate(zip(NAMES, COUNTS, strict=True)):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        block = make_block(*counts, first=100 * i)  # so that no two solves are the same
+        tolerance = {"thumb": {"position": 1e-3 if "tight" in name else 5e-3}}
+        numbered = make_block(*counts)
+        numbered.batch.q[:] = block.batch.q
+        write(
+            numbered,
+            name=f"study/{name}",
+            keep=logs.Keep(sample=1.0, seed=i),
+            parameters={"tolerance": tolerance},
+            urdf="<robot/>",
+        )
+    return folder
+
+
+def rows_by_solve(log: logs.Log) -> list[tuple[int, bytes]]:
+    table = log.iterations()
+    return [
+        (number, table.rows[table.solve_id == number].tobytes())
+        for number in np.unique(table.solve_id).tolist()
+    ]
+
+
+def test_numbers_go_on_from_shard_to_shard(study: Path) -> None:
+    log = logs.open(study)
+    assert log.solves().solve_id.tolist() == [0, 1, 2, 3, 4, 5]
+    assert log.solves().rows["solve_id"].tolist() == [0, 1, 2, 3, 4, 5]
+    assert log.solves().rows["iterations"].tolist() == ALL_COUNTS
+    assert [len(log.iterations(solve=i)) for i in range(6)] == ALL_COUNTS
+    own = [logs.open(study / name) for name in NAMES]
+    expected = [rows for each in own for _, rows in rows_by_solve(each)]
+    assert [rows for _, rows in rows_by_solve(log)] == expected
+    assert set(log.events(solve=4).rows["solve_id"]) <= {4}
+    frame = log.solves(solve=[1, 2, 5]).frame()
+    assert frame["shard"].to_list() == list(NAMES)
+    assert "shard" not in own[0].solves().frame().columns
+    assert [record["shard"] for record in log.solves(solve=5).records()] == [NAMES[2]]
+
+
+def test_where_a_solve_comes_from(study: Path, tmp_path: Path) -> None:
+    """In the folder as in what was merged from it, and in what was merged from that."""
+    merged = logs.merge_logs([study], tmp_path / "all.mcap").path
+    other = make_block(7, method="hand-first")
+    with logs.McapRecorder(tmp_path / "b.mcap", robot_name="made_up", urdf="<robot/>") as recorder:
+        recorder.record(other)
+    for log in (logs.open(study), logs.open(merged)):
+        for number, (name, own) in enumerate(
+            [
+                (NAMES[0], 0),
+                (NAMES[0], 1),
+                (NAMES[1], 0),
+                (NAMES[1], 1),
+                (NAMES[1], 2),
+                (NAMES[2], 0),
+            ]
+        ):
+            solve = logs.one_solve(log, number)
+            assert (solve.shard, solve.number, solve.solve_id) == (name, own, number)
+            position = 1e-3 if "tight" in name else 5e-3
+            assert solve.parameters["tolerance"]["thumb"]["position"] == position
+    keeps = logs.open(merged).info().differs["keep"]
+    assert [keep["seed"] for keep in keeps] == [0, 1, 2]
+
+
+def test_a_study_is_merged(study: Path, tmp_path: Path) -> None:
+    path = tmp_path / "all.mcap"
+    merged = logs.merge_logs(study, path)
+    assert (merged.shards, merged.solves) == (3, {"enhanced-dls": 6})
+    log, folder = logs.open(path), logs.open(study)
+    assert rows_by_solve(log) == rows_by_solve(folder)
+    for name in ("solves", "events"):
+        ours, theirs = getattr(log, name)(), getattr(folder, name)()
+        assert ours.rows.tobytes() == theirs.rows.tobytes()
+        assert ours.solve_id.tolist() == theirs.solve_id.tolist()
+    assert not logs.finish_log(path).changed, "every record of it is verified"
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        messages = [
+            (m.log_time, m.sequence) for _, c, m in reader.iter_messages(["/ik/enhanced-dls/solve"])
+        ]
+    assert [sequence for _, sequence in messages] == list(range(6))
+    assert messages == sorted(messages)
+
+
+def test_numbers_that_are_used_once_stay(write: Write, tmp_path: Path) -> None:
+    write(make_block(5, first=3), make_block(5, first=9), name="a.mcap")
+    write(make_block(6, first=5), name="b.mcap")
+    for log in (
+        logs.open(tmp_path),
+        logs.open(logs.merge_logs(tmp_path, tmp_path / "all").path),
+    ):
+        assert log.solves().solve_id.tolist() == [3, 5, 9]
+        assert [logs.one_solve(log, i).shard for i in (3, 5, 9)] == ["a.mcap", "b.mcap", "a.mcap"]
+        assert logs.one_solve(log, 5).number == 5
+
+
+def test_the_same_solve_is_never_counted_twice(study: Path) -> None:
+    """A merged log beside its shards, whatever numbers it has."""
+    logs.merge_logs(study, study / "all.mcap")
+    with pytest.raises(
+        errors.LogError, match=r"00000\.mcap: solve 0 of enhanced-dls is in .*all\.mcap too"
+    ):
+        logs.open(study).solves()
+
+
+def test_shards_with_channels_in_another_order_are_merged(write: Write, tmp_path: Path) -> None:
+    both = ("enhanced-dls", "hand-first")
+    first = write(*(make_block(9, method=m) for m in both), name="a.mcap")
+    second = write(*(make_block(8, first=1, method=m) for m in both[::-1]), name="b.mcap")
+    third = write(make_block(7, first=2, method=both[1]), name="c.mcap")
+    path = logs.merge_logs([first, second, third], tmp_path / "all.mcap").path
+    assert not logs.finish_log(path).changed
+    log = logs.open(path)
+    for method, expected in zip(both, ([9, 8], [9, 8, 7]), strict=True):
+        assert log.solves(method=method).rows["iterations"].tolist() == expected
+        shards = logs.open([first, second, third])
+        assert (
+            log.iterations(method=method).rows.tobytes()
+            == shards.iterations(method=method).rows.tobytes()
+        )
+
+
+@pytest.mark.parametrize("head", ["empty", "magic", "header", "metadata"])
+def test_a_shard_in_which_nothing_is_whole_is_named_and_left_out(
+    study: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, head: str
+) -> None:
+    whole = (study / NAMES[0]).read_bytes()
+    length = {"empty": 0, "magic": 5, "header": 20, "metadata": 100}[head]
+    torn = study / "loose" / "cup" / "00002.mcap"
+    torn.write_bytes(whole[:length])
+    log = logs.open(study)
+    assert len(log.solves()) == 6
+    assert log.info().left_out == (torn,)
+    (line,) = caplog.messages
+    assert line.startswith(f"{torn}: ")
+    assert line.endswith("; left out, nothing in it is whole")
+    assert logs.merge_logs(study, tmp_path / "all.mcap").left_out == (torn,)
+    with pytest.raises(errors.LogError, match=rf"^{torn}: "):
+        logs.open(torn)
+
+
+def test_a_shard_of_which_something_is_whole_is_read_or_finished_first(
+    study: Path, tmp_path: Path
+) -> None:
+    shard = study / NAMES[1]
+    shard.write_bytes(shard.read_bytes()[:-10])
+    assert len(logs.open(study).solves()) == 6
+    with pytest.raises(errors.LogError, match=rf"^{shard}: .*log finish"):
+        logs.merge_logs(study, tmp_path / "all.mcap")
+    assert main(["log", "finish", str(study)]) == 0
+    assert logs.merge_logs(study, tmp_path / "all.mcap").solves == {"enhanced-dls": 6}
+
+
+def test_what_the_shell_says(
+    study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (study / "empty.mcap").write_bytes(b"")
+    (study / ".all.1234.part.mcap").write_bytes(b"the work of a merge that was killed")
+
+    def said(*words: object) -> str:
+        assert main(["log", *map(str, words)]) == 0
+        return " ".join(capsys.readouterr().out.split())
+
+    info = said("info", study)
+    assert info.startswith(str(study))
+    assert f"shards 3: {', '.join(NAMES)}" in info
+    # A long path is folded in the middle of a word.
+    assert "empty.mcap:nothinginitiswhole" in info.replace(" ", "")
+    assert "thumb position 0.005 | thumb position 0.001 (by shard)" in info
+    solves = said("solves", study)
+    assert "6 solves" in solves
+    assert solves.index(f"from {NAMES[1]}") < solves.index(f"from {NAMES[2]}")
+    assert f"solve 1 of {NAMES[1]}" in said("why", study, 3)
+    merged = said("merge", study, "--out", tmp_path / "all.mcap")
+    assert "6 of enhanced-dls" in merged
+    assert "empty.mcap:nothinginitiswhole" in merged.replace(" ", "")
+    assert f"solve 1 of {NAMES[1]}" in said("why", tmp_path / "all.mcap", 3)
+
+
+def test_only_the_beginning_of_a_file(tmp_path: Path) -> None:
+    """A folder of nothing but such files holds no log."""
+    for i, data in enumerate((b"", MAGIC[:3], MAGIC)):
+        (tmp_path / f"{i}.mcap").write_bytes(data)
+    with pytest.raises(errors.LogError, match=r"0\.mcap: nothing in it is whole, nor in 2 others"):
+        logs.open(tmp_path)
