@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arms.recognise import arm_family
 from casadi_ik.arrays import Array, Counts
@@ -20,13 +23,13 @@ from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.driver import Searches, SearchPlan, SearchPool
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds
-from casadi_ik.methods.hand_first.state import STAGES
+from casadi_ik.methods.hand_first.state import CARRIED, STAGES
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts import Kinds, usual
 from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import PREFERENCES
-from casadi_ik.problem.status import Phase
+from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.proofs.premises import ArmSpan, arm_span, palms_in_span
 from casadi_ik.robots.description import RobotDescription
@@ -43,7 +46,7 @@ class HandFirstMethod(LoopedMethod):
 
     Rounds begin from other hand postures each; nearly all targets need one round only. What follows
     a round is said in C (hand_first.c), for a batch, one target and a solve by steps alike. Without
-    a compiler there is the first round only, in CasADi's virtual machine.
+    a compiler there are the rounds from tables only, in CasADi's virtual machine.
 
     Attributes:
         step: Its step for this robot.
@@ -118,9 +121,10 @@ class HandFirstMethod(LoopedMethod):
 
         `rounds` are so many of each search at most instead of all.
         """
+        del seed
         self._check(problems)
         if not self.kernel.compiled:
-            return super().run(problems, q0, seed, trace)
+            return self._run_from_tables(problems, q0, trace, rounds)
         most = np.full(len(problems), self._rounds_for(problems))
         if rounds is not None:
             most = np.minimum(most, rounds)
@@ -181,16 +185,53 @@ class HandFirstMethod(LoopedMethod):
                 found[row] = search.hands(number)
         return found
 
-    def begin(self, problems: Problems, q0: Array) -> Start:
-        """The first round; where what is near q0 is wanted, its own hand comes first."""
-        postures = self.seeds.table.nearest(
-            problems.points, problems.normals, self.options.candidates
-        )
-        if problems.prefer == NEAREST and self.robot.arm_actuators and postures.shape[1] > 1:
+    def begin(self, problems: Problems, q0: Array, number: int = 0) -> Start:
+        """A round from a table; where what is near q0 is wanted, its own hand comes first."""
+        postures = self.postures(problems, number)
+        nearest = problems.prefer == NEAREST and not number
+        if nearest and self.robot.arm_actuators and postures.shape[1] > 1:
             own = np.clip(q0, *problems.bounds(self.robot, UNBOUNDED))[:, None]
             own = own[:, :, list(self.robot.hand_actuators)]
             postures = np.concatenate([own, postures[:, :-1]], axis=1)
-        return self.rows(problems, q0, postures)
+        return self.rows(problems, q0, postures, begun=number > 0)
+
+    def _run_from_tables(
+        self, problems: Problems, q0: Array, trace: bool, rounds: int | None
+    ) -> Outcome:
+        """Solve a batch in the virtual machine: the next nearest hands for what is left over."""
+        layout, count = self.step.layouts.state, len(problems)
+        status, iterations = np.zeros((2, count), dtype=np.int64)
+        states, seconds = np.zeros((count, layout.size)), np.zeros(count)
+        traces: list[list[NDArray[Any]]] = [[] for _ in range(count)]
+        searches = [problems]
+        if problems.prefer == NEAREST:
+            searches.append(replace(problems, prefer="limits"))
+        most = min(self.rounds, self.options.rounds, rounds or self.rounds)
+        for asked, number in product(searches, range(most)):
+            left = np.flatnonzero(status != Status.SOLVED)
+            if not len(left):
+                break
+            first, parameters = self.begin(asked.rows(left), q0[left], number)
+            if number:
+                for name in CARRIED:
+                    first[:, layout.slice(name)] = states[left, layout.slice(name)]
+                first[:, layout.slice("earlier")] = number * self.options.candidates
+            result = self.kernel.run(first, parameters, self.max_iterations, trace)
+            states[left], status[left] = result.states, Status.from_loop(result.status)
+            iterations[left] += result.iterations
+            seconds[left] += result.time
+            for target, rows in zip(left.tolist(), result.trace, strict=trace):
+                traces[target].append(rows)
+        none, counts = np.empty(0, self.graph.record.dtype), self.phase_counts(states, iterations)
+        return Outcome(
+            q=states[:, layout.slice("q")].copy(),
+            status=status,
+            iterations=iterations,
+            restarts=self.restarts(states),
+            time=seconds,
+            phases={phase.label: spent for phase, spent in counts.items()},
+            rows=np.concatenate([none, *chain.from_iterable(traces)]) if trace else None,
+        )
 
     def _rounds_for(self, problems: Problems) -> int:
         """So many; of hands that are given none from anywhere but what every target gets."""
@@ -209,8 +250,12 @@ class HandFirstMethod(LoopedMethod):
 
     def restarts(self, states: Array) -> Counts:
         """Hand postures tried but the first."""
-        candidate = states[:, self.step.layouts.state.slice("candidate").start].astype(np.int64)
-        return np.clip(candidate, 0, self.options.candidates - 1)
+        layout = self.step.layouts.state
+        earlier, candidate = (
+            states[:, layout.slice(name).start].astype(np.int64)
+            for name in ("earlier", "candidate")
+        )
+        return earlier + np.clip(candidate, 0, self.options.candidates - 1)
 
     def rows(
         self, problems: Problems, q0: Array, postures: Array, begun: bool = False
