@@ -24,9 +24,9 @@ from casadi_ik.kernels.constants import define_arrays
 from casadi_ik.kernels.emitter import Form
 from casadi_ik.kernels.function_graph import FunctionGraph
 from casadi_ik.kernels.lookup import TILE
-from casadi_ik.methods.hand_first.beginning import terms
 from casadi_ik.methods.hand_first.driver import SearchPlan, source_text
 from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.methods.hand_first.state import terms
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.verdict import LIMIT_SLACK
 from casadi_ik.registry import build_method

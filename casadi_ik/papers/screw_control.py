@@ -21,7 +21,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.kernels import FunctionKernel, LoopKernel
 from casadi_ik.kernels.stepper import Stepper
 from casadi_ik.logs import McapRecorder
-from casadi_ik.methods.common.coupling_record import coupling_jacobian
+from casadi_ik.methods.common.limits import coupling_jacobian
 from casadi_ik.papers.screw_tasks import ScrewControlStep, ScrewTask
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Status

@@ -19,8 +19,12 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.kernels import Field, Layout, StepGraph
 from casadi_ik.methods.common.bounded_step import Bounded, damped_step
-from casadi_ik.methods.common.coupling_record import coupling_fields, coupling_values
-from casadi_ik.methods.common.limits import kept_within, limit_mask
+from casadi_ik.methods.common.limits import (
+    coupling_fields,
+    coupling_values,
+    kept_within,
+    limit_mask,
+)
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import LIMIT_MASK, STATUS, STEP_SIZE, Q
 from casadi_ik.robots.description import RobotDescription

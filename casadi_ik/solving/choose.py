@@ -37,7 +37,7 @@ from casadi_ik.solving.alternatives.finder import (
 )
 from casadi_ik.solving.alternatives.free import Deduplicator, free_answers
 from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.solved_part import judged
+from casadi_ik.solving.batch_parts import judged
 
 Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
 """One of `PREFERENCES`, or what gives configurations (m, n) of a robot their scores (m,)."""

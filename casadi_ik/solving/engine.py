@@ -38,11 +38,9 @@ from casadi_ik.solving.alternatives.way_out import with_way_out
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
-from casadi_ik.solving.parts import BatchParts
 from casadi_ik.solving.run import Run
-from casadi_ik.solving.solved_part import SolvedPart, judged
+from casadi_ik.solving.batch_parts import BatchParts, SolvedPart, judged, workers
 from casadi_ik.solving.trials import HandMethod
-from casadi_ik.solving.workers import workers
 
 MANIPULABILITY = "manipulability"
 """The preference that is seen to after the solve."""

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
-from casadi_ik.methods.common.elimination import elimination
+from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step, elimination
 
 M, N, FIRST = 9, 7, 3
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from casadi_ik.arms.recognise import srs_arm
+from casadi_ik.methods.common.contact_fit import whole_jacobian, whole_residual
 from casadi_ik.methods.common.numeric_arm import (
     STARTS,
     TABLE,
@@ -15,7 +16,6 @@ from casadi_ik.methods.common.numeric_arm import (
     pose_step,
 )
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
-from casadi_ik.methods.common.whole_contacts import whole_jacobian, whole_residual
 from casadi_ik.methods.hand_first.hand_fit import (
     PalmAndHand,
     fit_jacobian,

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.methods.common.contact_shape import contact_shape
-from casadi_ik.methods.common.posture_table import PostureTable, differing
+from casadi_ik.methods.common.posture_table import PostureTable, contact_shape, differing
 from casadi_ik.symbolic.even_spread import evenly
 
 HAND = tuple(range(7, 14))

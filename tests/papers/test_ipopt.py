@@ -8,7 +8,7 @@ import pytest
 from toy_robots import replace, write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.methods.common.whole_contacts import whole_residual
+from casadi_ik.methods.common.contact_fit import whole_residual
 from casadi_ik.papers.ipopt import EXACT, LENGTH, IpoptParameters, WholeNlp, limited_joints
 from casadi_ik.problem.contacts import ContactRows, usual
 from casadi_ik.problem.problems import Problems

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from casadi_ik.methods.common.contact_fit import whole_jacobian, whole_residual
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
-from casadi_ik.methods.common.whole_contacts import whole_jacobian, whole_residual
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_jacobian, fit_residual
 from casadi_ik.methods.thumb_first.closed_chain_step import contact_errors, linearised
 from casadi_ik.problem.contacts import (

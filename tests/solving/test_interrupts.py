@@ -15,7 +15,7 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.kernels.cancellation import CancelledError, stop_if_cancelled
-from casadi_ik.solving.workers import workers
+from casadi_ik.solving.batch_parts import workers
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 

@@ -13,12 +13,226 @@ those of dense matrices grow with the cube of the number of motors.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 
-from casadi_ik.methods.common.elimination import elimination
+from casadi_ik.symbolic.linear_algebra import PIVOT_FLOOR
 from casadi_ik.symbolic.smooth import Expr
+
+
+@dataclass(frozen=True)
+class Pivot:
+    """An unknown and those that its elimination concerns.
+
+    Attributes:
+        place: Number of the unknown.
+        others: Numbers of the unknowns it is coupled with by then, those eliminated before aside.
+    """
+
+    place: int
+    others: tuple[int, ...]
+
+    @property
+    def operations(self) -> int:
+        """About how many operations it takes."""
+        return (len(self.others) + 2) ** 2
+
+
+class System:
+    """Equations on the way of their elimination; the entries are scalar expressions.
+
+    Attributes:
+        entries: Of the matrix, by row and column, the smaller number first.
+        right: Right-hand side; of an unknown that is eliminated its value but for the others' part.
+        inverses: Of the pivots.
+    """
+
+    def __init__(
+        self, entries: dict[tuple[int, int], Expr], right: list[Expr], inverses: dict[int, Expr]
+    ) -> None:
+        """Copy what changes on the way."""
+        self.entries, self.right, self.inverses = dict(entries), list(right), dict(inverses)
+
+    @classmethod
+    def of(cls, matrix: Expr, slope: Expr) -> System:
+        """``matrix x = -slope``, symmetric."""
+        sparsity = matrix.sparsity()
+        places = zip(sparsity.row(), sparsity.get_col(), matrix.nonzeros(), strict=True)
+        entries = {(i, j): value for i, j, value in places if i <= j}
+        return cls(entries, [-slope[i] for i in range(slope.numel())], {})
+
+    def copy(self) -> System:
+        """The same, to go on with."""
+        return System(self.entries, self.right, self.inverses)
+
+    def eliminate(self, pivot: Pivot, free: Expr | None = None, value: Expr | None = None) -> None:
+        """Take an unknown out of the equations of the others.
+
+        Args:
+            pivot: The unknown.
+            free: 1 if it is not held, 0 if it is; None if it never is.
+            value: Where it is held, 0 if it is not.
+        """
+        i, entries = pivot.place, self.entries
+        inverse = 1 / ca.fmax(entries[i, i], PIVOT_FLOOR)
+        own = self.right[i]
+        if free is None:
+            own = inverse * own
+        else:
+            inverse = free * inverse
+            own = inverse * own + value
+        self.inverses[i], self.right[i] = inverse, own
+        for place, j in enumerate(pivot.others):
+            coupling = entries[_key(i, j)]
+            factor = coupling * inverse
+            self.right[j] = self.right[j] - coupling * own
+            for k in pivot.others[place:]:
+                taken = factor * entries[_key(i, k)]
+                # Where none was before an entry comes into being.
+                entries[j, k] = entries[j, k] - taken if (j, k) in entries else -taken
+
+    def value(self, pivot: Pivot, x: dict[int, Expr]) -> Expr:
+        """An eliminated unknown, from those that it was coupled with."""
+        i = pivot.place
+        behind = sum((self.entries[_key(i, j)] * x[j] for j in pivot.others), ca.SX(0))
+        return self.right[i] - self.inverses[i] * behind
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """In which order a system is solved.
+
+    Attributes:
+        free: Unknowns before this number are never held.
+        once: Pivots that come first, whatever is held: all that are never held, or none.
+        each: Those that follow, each time.
+        after: The pivots of all that are never held, if the others are known.
+    """
+
+    free: int
+    once: tuple[Pivot, ...]
+    each: tuple[Pivot, ...]
+    after: tuple[Pivot, ...]
+
+    def begun(self, matrix: Expr, slope: Expr) -> System:
+        """Eliminate what comes first.
+
+        Args:
+            matrix: (n, n) symmetric positive definite, with the sparsity the order was made for;
+                only its upper triangle is read.
+            slope: (n, 1).
+        """
+        system = System.of(matrix, slope)
+        for pivot in self.once:
+            system.eliminate(pivot)
+        return system
+
+    def solved(self, begun: System, held: Expr, values: Expr) -> dict[int, Expr]:
+        """The unknowns that do not come first, by number.
+
+        Args:
+            begun: The system.
+            held: (n - free, 1) whether an unknown is held.
+            values: (n - free, 1) where; zero for those that are not.
+        """
+        system = begun.copy()
+        for pivot in self.each:
+            place = pivot.place - self.free
+            if place < 0:
+                system.eliminate(pivot)
+            else:
+                system.eliminate(pivot, 1 - held[place], values[place])
+        x: dict[int, Expr] = {}
+        for pivot in reversed(self.each):
+            x[pivot.place] = system.value(pivot, x)
+        return x
+
+    def forces(self, begun: System, x: dict[int, Expr]) -> list[Expr]:
+        """By how much the equations of what may be held are not met, (n - free) numbers."""
+        found = []
+        for i in range(self.free, len(begun.right)):
+            parts = (begun.entries[_key(i, j)] * x[j] for j in x if _key(i, j) in begun.entries)
+            found.append(sum(parts, -begun.right[i]))
+        return found
+
+    def resting(self, begun: System) -> list[Expr]:
+        """The `forces` where all that may be held is 0, and what is never held follows."""
+        if self.once:
+            return self.forces(begun, {})
+        still = {i: ca.SX(0) for i in range(self.free, len(begun.right))}
+        whole = self.completed(begun, still)
+        return self.forces(begun, still | {i: whole[i] for i in range(self.free)})
+
+    def completed(self, begun: System, x: dict[int, Expr]) -> Expr:
+        """All unknowns (n, 1), where what may be held is given."""
+        system, known = begun, dict(x)
+        if not self.once:
+            system = begun.copy()
+            for i in range(self.free):
+                parts = (
+                    system.entries[i, j] * x[j]
+                    for j in range(self.free, len(begun.right))
+                    if (i, j) in system.entries
+                )
+                system.right[i] = system.right[i] - sum(parts, ca.SX(0))
+            for pivot in self.after:
+                system.eliminate(pivot)
+        for pivot in reversed(self.once or self.after):
+            known[pivot.place] = system.value(pivot, known)
+        return ca.vertcat(*(known[i] for i in range(len(begun.right))))
+
+
+def elimination(sparsity: ca.Sparsity, free: int, times: int) -> Elimination:
+    """The order that takes fewest operations.
+
+    Args:
+        sparsity: Of the matrix.
+        free: Unknowns before this number are never held.
+        times: How often it is solved with other unknowns held.
+    """
+    after = _pivots(_couplings(sparsity, free), range(free))
+    ways = []
+    for first in (range(free), range(0)):
+        couplings = _couplings(sparsity, sparsity.size1())
+        once = _pivots(couplings, first)
+        each = _pivots(couplings, [i for i in couplings if i not in first])
+        cost = _operations(once or after) + times * _operations(each)
+        ways.append((cost, Elimination(free, once, each, after)))
+    return min(ways, key=lambda way: way[0])[1]
+
+
+def _operations(pivots: Sequence[Pivot]) -> int:
+    return sum(pivot.operations for pivot in pivots)
+
+
+def _couplings(sparsity: ca.Sparsity, count: int) -> dict[int, set[int]]:
+    """With which others each of the first unknowns is coupled."""
+    found: dict[int, set[int]] = {i: set() for i in range(count)}
+    for i, j in zip(sparsity.row(), sparsity.get_col(), strict=True):
+        if i != j and max(i, j) < count:
+            found[i].add(j)
+            found[j].add(i)
+    return found
+
+
+def _pivots(couplings: dict[int, set[int]], places: Sequence[int]) -> tuple[Pivot, ...]:
+    """Some unknowns, always the least coupled one next (minimum degree); they are taken out."""
+    found, left = [], set(places)
+    while left:
+        place = min(left, key=lambda i: (len(couplings[i]), i))
+        left.remove(place)
+        others = couplings.pop(place)
+        for i in others:
+            couplings[i] |= others
+            couplings[i] -= {place, i}
+        found.append(Pivot(place, tuple(sorted(others))))
+    return tuple(found)
+
+
+def _key(i: int, j: int) -> tuple[int, int]:
+    return (i, j) if i <= j else (j, i)
 
 
 @dataclass(frozen=True, eq=False)

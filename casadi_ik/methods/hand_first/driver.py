@@ -31,10 +31,15 @@ from casadi_ik.kernels.loop import SLOTS, Followed
 from casadi_ik.kernels.loop_result import UNBEGUN
 from casadi_ik.made import made
 from casadi_ik.methods.common.contact_fit import fresh_fit
-from casadi_ik.methods.hand_first.beginning import terms
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds
-from casadi_ik.methods.hand_first.state import CARRIED, STAGE_LABELS, STAGES, HandFirstLayouts
+from casadi_ik.methods.hand_first.state import (
+    CARRIED,
+    STAGE_LABELS,
+    STAGES,
+    HandFirstLayouts,
+    terms,
+)
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.method import Outcome, Quick
 from casadi_ik.problem.problems import Problems

@@ -17,13 +17,12 @@ from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
 from casadi_ik.kernels.loop_result import UNBEGUN
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.kernels.stepper import Stepper
-from casadi_ik.methods.common.coupling_record import coupling_jacobian
+from casadi_ik.methods.common.limits import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
-from casadi_ik.methods.hand_first.beginning import beginning
 from casadi_ik.methods.hand_first.driver import Searches, SearchPlan, SearchPool
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds
-from casadi_ik.methods.hand_first.state import CARRIED, STAGES
+from casadi_ik.methods.hand_first.state import CARRIED, STAGES, beginning
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts import Kinds, usual
 from casadi_ik.problem.method import Outcome, Quick

@@ -23,23 +23,21 @@ from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import PARAMETERS
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
-from casadi_ik.methods.common.balance import differs, near_tolerance
+from casadi_ik.methods.common.balance import CLOSER, balanced, differs, near_tolerance
 from casadi_ik.methods.common.contact_fit import (
     Judged,
     Tried,
+    WholeStep,
     fresh_fit,
     judge_contacts,
 )
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
-from casadi_ik.methods.common.whole_contacts import WholeStep
-from casadi_ik.methods.hand_first.balance_stage import balance_stage
 from casadi_ik.methods.hand_first.choice_stage import choice_stage
 from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_step
 from casadi_ik.methods.hand_first.numeric_stage import numeric_stage
 from casadi_ik.methods.hand_first.placement_stage import placement_stage
-from casadi_ik.methods.hand_first.start_stage import at_start, start_stage
 from casadi_ik.methods.hand_first.state import STAGES, HandFirstLayouts, with_rows
-from casadi_ik.problem.contacts import Kinds, suffix
+from casadi_ik.problem.contacts import Kinds, chord, suffix, within_tolerance
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.smooth import Expr, shared
@@ -307,3 +305,89 @@ class HandFirstStep:
 
     def _with_hand(self, q: Expr, hand: Expr) -> Expr:
         return with_rows(q, self.robot.hand_actuators, hand)
+
+
+WHOLE = 0.5
+"""Cost up to which a start is refined as a whole (three contacts off by 4 cm each)."""
+
+
+def at_start(s: dict[str, Expr]) -> Expr:
+    """Whether a solve that wants what is near is at its beginning."""
+    return ca.logic_and(s["candidate"] < 0, s["spent"] < 1)
+
+
+def start_stage(layouts: HandFirstLayouts) -> ca.Function:
+    """A look at the contacts where the robot is; nothing moves.
+
+    It ends with a solution, with the refinement of the whole from there, or with hand postures. A
+    hand without an arm is refined in any case.
+    """
+    state = ca.MX.sym("state", layouts.state.size)
+    parameters = ca.MX.sym("parameters", layouts.parameters.size)
+    residual = layouts.whole.residual(layouts.state.unpack(state)["q"], parameters)
+    outputs = _looked(layouts)(state, parameters, residual)
+    return ca.Function("start", [state, parameters], list(outputs))
+
+
+def _looked(layouts: HandFirstLayouts) -> ca.Function:
+    """What follows from the residual of the contacts where the robot is."""
+    state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
+    s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
+    contacts = layouts.contacts
+    residual = ca.SX.sym("residual", contacts.size)
+    cost = ca.sumsqr(residual)
+    tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
+    met = within_tolerance(*contacts.errors(residual), *tolerances)
+    far = cost > WHOLE if layouts.robot.arm_actuators else ca.SX(0)
+    after = layouts.state.pack(
+        layouts.counted(s, Phase.REFINEMENT)
+        | {
+            "phase": ca.if_else(far, float(Phase.CANDIDATE), float(Phase.REFINEMENT)),
+            "candidate": s["candidate"] + far,
+            "spent": 1.0,
+            "best_cost": ca.fmin(cost, s["best_cost"]),
+        }
+    )
+    status = ca.if_else(met, float(Status.SOLVED), float(Status.RUNNING))
+    looked = Tried(s["q"], residual, residual, ca.SX(0), ca.SX(0))
+    record = layouts.row(s, p, s["q"], Phase.REFINEMENT, status, looked)
+    return ca.Function("looked", [state, parameters, residual], shared(after, record, status))
+
+
+def balance_stage(layouts: HandFirstLayouts) -> ca.Function:
+    """The stage: all motors at once, from where refinement ended.
+
+    It ends with a solution or with the next candidate.
+    """
+    state = ca.MX.sym("state", layouts.state.size)
+    parameters = ca.MX.sym("parameters", layouts.parameters.size)
+    s = layouts.state.unpack(state)
+    step = layouts.whole.balanced(s["q"], s["damping"], s["power"], parameters)
+    outputs = _judged(layouts, step)(state, parameters, *step.parts)
+    return ca.Function("balance", [state, parameters], list(outputs))
+
+
+def _judged(layouts: HandFirstLayouts, step: WholeStep) -> ca.Function:
+    """Go on from where a step leads if it gained."""
+    state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
+    s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
+    given, symbols = step.as_inputs()
+    found = balanced(s["q"], given.tried(s["q"]), layouts.contacts, s, p)
+    failed = ca.logic_and(found.over, ca.logic_not(found.within))
+    fit = {
+        name: ca.if_else(failed, fresh_fit().get(name, 0.0), found.fit[name]) for name in found.fit
+    }
+    after = layouts.state.pack(
+        layouts.counted(s, Phase.BALANCE)
+        | {
+            "q": found.q,
+            "phase": ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.BALANCE)),
+            "candidate": s["candidate"] + failed,
+            "returns": s["returns"] + ca.logic_and(failed, found.largest > CLOSER * s["least"]),
+            "least": ca.if_else(failed, ca.fmin(found.largest, s["least"]), s["least"]),
+        }
+        | fit
+    )
+    status = ca.if_else(found.within, float(Status.SOLVED), float(Status.RUNNING))
+    record = layouts.row(s, p, s["q"], Phase.BALANCE, status, found.tried, accepted=found.accepted)
+    return ca.Function("balanced", [state, parameters, *symbols], shared(after, record, status))

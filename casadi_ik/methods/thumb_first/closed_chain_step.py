@@ -14,15 +14,111 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import casadi as ca
+import numpy as np
+from proxsuite import proxqp as backend
 
-from casadi_ik.methods.thumb_first.proxqp import proxqp
 from casadi_ik.problem.contacts import LENGTH, PLACE, ContactRows, tip_vectors
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import ActuatedKinematics, actuated, motor_scales
 from casadi_ik.symbolic.linear_algebra import damped_pinv_times, project_to_null_space
-from casadi_ik.symbolic.smooth import Expr, shared
+from casadi_ik.symbolic.smooth import Expr, safe_norm, shared
+
+THUMB_MERIT = 4.0
+"""How much more the thumb's squared errors count when a step is judged: a step serves the thumb
+first, and one that does so at the others' cost is not to be refused for it. On 2400 targets (12
+shipped grasps, distal joints 25-45 deg, random arms) the failures of one start fell from 24 to 11;
+10 gained nothing more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Merit:
+    """Contacts at a configuration: (f, 1) distances [m], (f, 1) angles [rad], summed squares."""
+
+    positions: Expr
+    angles: Expr
+    cost: Expr
+
+
+def merit(robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[str, Expr]) -> Merit:
+    """Judge a configuration.
+
+    Args:
+        robot: The description.
+        rows: The contacts' kinds.
+        q: (n, 1) the configuration.
+        p: Parameters.
+    """
+    positions, angles = contact_errors(robot, rows, q, p)
+    return Merit(
+        ca.vertcat(*(LENGTH * safe_norm(x) for x in positions)),
+        ca.vertcat(*(safe_norm(x) for x in angles)),
+        sum(
+            (
+                (THUMB_MERIT if name == robot.thumb else 1.0)
+                * ca.sumsqr(ca.vertcat(position, angle))
+                for name, position, angle in zip(robot.finger_names, positions, angles, strict=True)
+            ),
+            ca.SX(0),
+        ),
+    )
+
+
+ITERATIONS = 30
+"""Of its outer loop: contradictions in a narrow box converge slowly, and the step is only tried."""
+
+ACCURACY = 1e-9
+"""Residuals at which a program counts as solved."""
+
+
+class ProxqpNode(ca.Callback):
+    """``(H, g, A, b, lower, upper) -> x``, the minimiser of x'Hx/2 + g'x with Ax = b in a box."""
+
+    def __init__(self, n: int, m: int) -> None:
+        """Make the node for n unknowns and m equations."""
+        ca.Callback.__init__(self)
+        self._shapes = [(n, n), (n, 1), (m, n), (m, 1), (n, 1), (n, 1)]
+        self.construct(f"proxqp_{n}_{m}", {})
+
+    def get_n_in(self) -> int:
+        """Number of inputs."""
+        return len(self._shapes)
+
+    def get_n_out(self) -> int:
+        """Number of outputs."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Shape of an input, dense."""
+        return ca.Sparsity.dense(*self._shapes[i])
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Shape of the output, dense."""
+        del i
+        return ca.Sparsity.dense(*self._shapes[1])
+
+    def eval(self, arg: Any) -> list[Any]:
+        """Solve one program; with contradicting equations the nearest that can be solved."""
+        H, g, A, b, lower, upper = (np.array(x) for x in arg)
+        program = backend.dense.QP(len(g), len(b), 0, True)
+        program.settings.eps_abs = ACCURACY
+        program.settings.primal_infeasibility_solving = True
+        program.settings.max_iter = ITERATIONS
+        nothing = None
+        vectors = (lower.ravel(), upper.ravel())
+        program.init(H, g.ravel(), A, b.ravel(), nothing, nothing, nothing, *vectors)
+        program.solve()
+        return [ca.DM(program.results.x.tolist())]
+
+
+@cache
+def proxqp(n: int, m: int) -> ProxqpNode:
+    """The node for n unknowns and m equations; kept, since a graph does not keep it alive."""
+    return ProxqpNode(n, m)
+
 
 THUMB_DAMPING = 0.01
 """Least damping [-] of the thumb's rows, 1 mm per rad: J_t^# stays finite where J_t is singular."""

@@ -9,7 +9,7 @@ import casadi as ca
 
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.limits import bits
-from casadi_ik.methods.thumb_first.merit import Merit
+from casadi_ik.methods.thumb_first.closed_chain_step import Merit
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.problem.contacts import ContactRows, Kinds
 from casadi_ik.problem.status import Phase

@@ -26,19 +26,25 @@ from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import ArmTrials, Farthest, Nearest
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
-from casadi_ik.methods.common.balance import NEAR, differs
-from casadi_ik.methods.common.contact_fit import DAMPING_START, fresh_fit, judge
+from casadi_ik.methods.common.balance import NEAR, balanced, differs
+from casadi_ik.methods.common.contact_fit import (
+    DAMPING_START,
+    WholeContacts,
+    WholeStep,
+    fresh_fit,
+    judge,
+)
 from casadi_ik.methods.common.limits import bits
 from casadi_ik.methods.common.numeric_arm import nearest_start, pose_step
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
-from casadi_ik.methods.thumb_first.balance_stage import balance_stage
 from casadi_ik.methods.thumb_first.closed_chain_step import (
     STEP_SOLVERS,
     Linear,
+    Merit,
     Room,
     linearised,
+    merit,
 )
-from casadi_ik.methods.thumb_first.merit import Merit, merit
 from casadi_ik.methods.thumb_first.state import STAGES, ThumbFirstLayouts
 from casadi_ik.problem.contacts import suffix, within_tolerance
 from casadi_ik.problem.status import Phase, Status
@@ -326,3 +332,45 @@ class ThumbFirstStep(ThumbFirstLayouts):
             return ca.SX(0)
         begins = ca.logic_and(s["spent"] < 1, s["start"] <= 0)
         return ca.logic_and(ca.logic_and(p["nearest"], begins), before.cost > AS_IT_IS)
+
+
+def balance_stage(layouts: ThumbFirstLayouts) -> ca.Function:
+    """One step of all motors; it ends with a solution or with the next start."""
+    state = ca.MX.sym("state", layouts.state.size)
+    parameters = ca.MX.sym("parameters", layouts.parameters.size)
+    s = layouts.state.unpack(state)
+    whole = WholeContacts(layouts.robot, layouts.contacts, layouts.parameters)
+    step = whole.balanced(s["q"], s["damping"], s["power"], parameters)
+    outputs = _judged(layouts, step)(state, parameters, *step.parts)
+    return ca.Function("balance", [state, parameters], list(outputs))
+
+
+def _judged(layouts: ThumbFirstLayouts, step: WholeStep) -> ca.Function:
+    """Go on from where a step leads if it gained."""
+    state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
+    s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
+    given, symbols = step.as_inputs()
+    found = balanced(s["q"], given.tried(s["q"]), layouts.contacts, s, p)
+    failed = ca.logic_and(found.over, ca.logic_not(found.within))
+    after = layouts.after(
+        s,
+        Phase.BALANCE,
+        found.fit,
+        q=found.q,
+        phase=ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.BALANCE)),
+        start=s["start"] + failed,
+    )
+    status = ca.if_else(found.within, float(Status.SOLVED), float(Status.RUNNING))
+    there = merit(layouts.robot, layouts.contacts, found.q, p)
+    record = layouts.row(
+        s,
+        p,
+        found.q,
+        Phase.BALANCE,
+        status,
+        there,
+        damping=s["damping"],
+        step_size=found.tried.size,
+        accepted=found.accepted,
+    )
+    return ca.Function("balanced", [state, parameters, *symbols], shared(after, record, status))

@@ -30,7 +30,7 @@ from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
-from casadi_ik.solving.solved_part import judged
+from casadi_ik.solving.batch_parts import judged
 from casadi_ik.solving.trials import Descent
 from casadi_ik.symbolic.even_spread import even_steps
 
