@@ -11,7 +11,7 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.methods.common.contact_fit import EXACT
+from casadi_ik.methods.common.contact_fit import FIT
 from casadi_ik.problem.problems import Tolerance
 
 TOKEN = re.compile(
@@ -41,7 +41,7 @@ ARM_ROUNDING = 16 * ROUNDING
 """What rounding makes of the joints of an arm that is found again from where its palm is [rad]:
 one that stands at a limit is beyond it by as much, and put back."""
 
-FOLLOWING = ((EXACT * EXACT, ARM_ROUNDING * ARM_ROUNDING),)
+FOLLOWING = ((FIT.exact * FIT.exact, ARM_ROUNDING * ARM_ROUNDING),)
 """Numbers in the graphs that say what is zero but for rounding, and what they are in single
 precision: the cost at which a fit, or an arm that is searched for, is exact. Single precision would
 never come to it, and an arm would be searched for from every start, in thirteen times as many

@@ -36,8 +36,8 @@ from casadi_ik.solving.alternatives.finder import (
     checked_distance,
 )
 from casadi_ik.solving.alternatives.free import Deduplicator, free_answers
-from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.batch_parts import judged
+from casadi_ik.solving.engine import Engine
 
 Judgement: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
 """One of `PREFERENCES`, or what gives configurations (m, n) of a robot their scores (m,)."""

@@ -35,11 +35,11 @@ from casadi_ik.solving.alternatives.free import (
     resolve_collisions,
 )
 from casadi_ik.solving.alternatives.way_out import with_way_out
+from casadi_ik.solving.batch_parts import BatchParts, SolvedPart, judged, workers
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.run import Run
-from casadi_ik.solving.batch_parts import BatchParts, SolvedPart, judged, workers
 from casadi_ik.solving.trials import HandMethod
 
 MANIPULABILITY = "manipulability"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.methods.common.balance import NEAR
+from casadi_ik.methods.common.contact_fit import BALANCE
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.problems import Problems, target_arrays
@@ -108,7 +108,7 @@ def test_the_largest_part_falls_until_all_are_met(robot):
             stage["position_error"] / TOLERANCE.position,
             np.sin(stage["angle_error"] / 2) / np.sin(TOLERANCE.angle / 2),
         ).max(axis=1)
-        assert 1 < parts[0] < NEAR
+        assert 1 < parts[0] < BALANCE.near
         assert parts.min() > 1
         assert trace["status"][-1] == Status.SOLVED
     assert seen > 5

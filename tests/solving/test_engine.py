@@ -14,8 +14,6 @@ from casadi_ik.problem.method import Outcome
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import TraceFormat
-from casadi_ik.solving.engine import Engine
-from casadi_ik.solving.run import Run
 from casadi_ik.solving.batch_parts import (
     CACHED_BYTES,
     ENOUGH,
@@ -23,6 +21,8 @@ from casadi_ik.solving.batch_parts import (
     PART_BYTES,
     BatchParts,
 )
+from casadi_ik.solving.engine import Engine
+from casadi_ik.solving.run import Run
 
 LAYOUT = Layout.record(Field("row", (), "f8"))
 

@@ -13,9 +13,9 @@ from typing import Any
 import casadi as ca
 
 from casadi_ik.kernels.layout import Layout
-from casadi_ik.methods.common.balance import DAMPING, reweighted
 from casadi_ik.methods.common.bounded_step import in_box
 from casadi_ik.problem.contacts import (
+    LENGTH,
     ContactRows,
     chord,
     resting,
@@ -27,38 +27,85 @@ from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.smooth import Expr, shared
 
-DAMPING_START = 1e-3
-DAMPING_FLOOR = 1e-12
-"""Damping [-] of the normal matrix; the rows are of order one per radian and 0.1 m."""
 
-DAMPING_CEILING = 1e4
-"""Damping at which a step that gains nothing shows that nothing is to be gained."""
+@dataclass(frozen=True)
+class FitParameters:
+    """When a fit is at its end, and how it is damped.
 
-DAMPING_DOWN = 1 / 8
-"""Smallest factor of the damping after a step that gained."""
+    Attributes:
+        damping: Of the normal matrix, whose rows are of order one per radian and 0.1 m.
+        damping_floor: Smallest damping.
+        damping_ceiling: Damping at which a step that gains nothing shows that nothing is to be
+            gained.
+        damping_down: Smallest factor of the damping after a step that gained.
+        growth: Factor of the damping after a step that gained nothing; doubles with every such
+            step.
+        slow: A step that leaves more than this part of the cost gained little.
+        quadratic: A step that leaves less than this part is converging fast: worth another one.
+        patience: Evaluations with little gain before a fit is given up.
+        budget: Evaluations in all.
+        promising: Cost below which a fit is close enough to be worth `persistence` times as much.
+        persistence: See above.
+        exact: Root of the cost at which contacts count as met exactly (0.1 nm per 100 mm, or rad).
+        fine: Part of the tolerance that is as good as exact.
+        passes: Corrections of the active set in a step.
+    """
 
-GROWTH_START = 4.0
-"""Factor of the damping after a step that gained nothing; it doubles with every such step."""
+    damping: float = 1e-3
+    damping_floor: float = 1e-12
+    damping_ceiling: float = 1e4
+    damping_down: float = 1 / 8
+    growth: float = 4.0
+    slow: float = 0.9
+    quadratic: float = 0.1
+    patience: int = 3
+    budget: int = 15
+    promising: float = 1e-3
+    persistence: int = 10
+    exact: float = 1e-8
+    fine: float = 1e-3
+    passes: int = 2
 
-SLOW = 0.9
-"""A step that leaves more than this part of the cost gained little."""
 
-QUADRATIC = 0.1
-"""A step that leaves less than this part is converging fast: worth another one."""
+@dataclass(frozen=True)
+class BalanceParameters:
+    """How the largest error by its tolerance is brought down, and when that is given up.
 
-PATIENCE, BUDGET = 3, 15
-"""Evaluations with little gain, and evaluations in all, before a fit is given up."""
+    Attributes:
+        powers: Powers in turn.
+        near: A fit that misses the tolerances by no more than this factor is worth balancing.
+        same: Relative difference of cost below which a fit counts as one that was balanced before.
+        steady: A step that leaves more than this part of the sum ends a power.
+        hopeless: Were all parts at most so large, the sum would be at most their number times this
+            to the power: one that is steady above that says that the contacts cannot be met near
+            here.
+        closer: A balance that leaves no less than this part of the least that others left is one
+            of them.
+        budget: Steps in all.
+        damping: The rows are errors by tolerances: their damping is that of a fit, times this.
+        damping_floor: Smallest damping of a fit.
+        damping_ceiling: Damping at which a power ends.
+        eased: Factor of the damping after a step that gained.
+        tightened: The same after one that did not.
+        farthest: A step to parts larger than so many times the largest before is refused.
+    """
 
-PROMISING = 1e-3
-"""Cost below which a fit is close enough to be worth `PERSISTENCE` times as much."""
+    powers: tuple[float, ...] = (4.0, 10.0, 24.0, 60.0, 150.0, 400.0)
+    near: float = 2.0
+    same: float = 1e-2
+    steady: float = 0.95
+    hopeless: float = 1.05
+    closer: float = 0.99
+    budget: int = 60
+    damping: float = 100.0
+    damping_floor: float = 1e-8
+    damping_ceiling: float = 10.0
+    eased: float = 1 / 8
+    tightened: float = 4.0
+    farthest: float = 2.0
 
-PERSISTENCE = 10
 
-EXACT = 1e-8
-"""Root of the cost at which contacts count as met exactly (0.1 nm per 100 mm, or rad)."""
-
-FINE = 1e-3
-"""Part of the tolerance that is as good as exact."""
+FIT, BALANCE = FitParameters(), BalanceParameters()
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +153,7 @@ def judge_contacts(
     residual = ca.if_else(gains(tried), tried.there, tried.before)
     positions, chords = rows.errors(residual)
     tolerances = part * p["position_tolerance"], part * chord(p["angle_tolerance"])
-    exact = within_tolerance(positions / FINE, chords / FINE, *tolerances)
+    exact = within_tolerance(positions / FIT.fine, chords / FIT.fine, *tolerances)
     return judge(s, tried, within_tolerance(positions, chords, *tolerances), exact)
 
 
@@ -129,20 +176,22 @@ def judge(s: dict[str, Expr], tried: Tried, within: Expr, exact: Expr) -> Judged
     accepted = gains(tried)
     cost = ca.if_else(accepted, cost_there, cost_before)
     left = cost / ca.fmax(cost_before, 1e-300)
-    waited = ca.if_else(left > SLOW, s["waited"] + 1, 0.0)
+    waited = ca.if_else(left > FIT.slow, s["waited"] + 1, 0.0)
     spent = s["spent"] + 1
-    worth = ca.if_else(cost < PROMISING, float(PERSISTENCE), 1.0)
-    over = ca.logic_or(waited >= PATIENCE * worth, spent >= BUDGET * worth)
-    stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > DAMPING_CEILING)
+    worth = ca.if_else(cost < FIT.promising, float(FIT.persistence), 1.0)
+    over = ca.logic_or(waited >= FIT.patience * worth, spent >= FIT.budget * worth)
+    stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > FIT.damping_ceiling)
     over = ca.logic_or(over, stuck)
-    slowing = ca.logic_and(within, left > QUADRATIC)
+    slowing = ca.logic_and(within, left > FIT.quadratic)
     kept = (cost_before - cost_there) / ca.fmax(tried.promised, 1e-300)
     bent = 2 * kept - 1
-    factor = ca.if_else(accepted, ca.fmax(DAMPING_DOWN, 1 - bent * bent * bent), s["growth"])
-    settled = ca.logic_or(ca.logic_or(exact, cost < EXACT * EXACT), ca.logic_or(over, slowing))
+    factor = ca.if_else(accepted, ca.fmax(FIT.damping_down, 1 - bent * bent * bent), s["growth"])
+    settled = ca.logic_or(
+        ca.logic_or(exact, cost < FIT.exact * FIT.exact), ca.logic_or(over, slowing)
+    )
     fit = fresh_fit() | {
-        "damping": ca.fmax(s["damping"] * factor, DAMPING_FLOOR),
-        "growth": ca.if_else(accepted, GROWTH_START, 2 * s["growth"]),
+        "damping": ca.fmax(s["damping"] * factor, FIT.damping_floor),
+        "growth": ca.if_else(accepted, FIT.growth, 2 * s["growth"]),
         "waited": waited,
         "spent": spent,
     }
@@ -152,11 +201,7 @@ def judge(s: dict[str, Expr], tried: Tried, within: Expr, exact: Expr) -> Judged
 
 def fresh_fit() -> dict[str, float]:
     """Counters and damping of a fit that begins."""
-    return {"damping": DAMPING_START, "growth": GROWTH_START, "waited": 0.0, "spent": 0.0}
-
-
-PASSES = 2
-"""Corrections of the active set in a step."""
+    return {"damping": FIT.damping, "growth": FIT.growth, "waited": 0.0, "spent": 0.0}
 
 
 def whole_residual(robot: RobotDescription, rows: ContactRows, q: Expr, p: dict[str, Expr]) -> Expr:
@@ -258,7 +303,7 @@ class WholeContacts:
         right, rows, stretched = self._reweighted(before, slopes, number, parameters)
         normal, gradient = self._squares(right, rows)
         normal = self._stretched(normal, stretched)
-        reached = self._box(normal, gradient, DAMPING * damping, q, parameters)
+        reached = self._box(normal, gradient, BALANCE.damping * damping, q, parameters)
         return WholeStep(reached, before, self.residual(reached, parameters), ca.MX(0))
 
     @cached_property
@@ -311,7 +356,7 @@ class WholeContacts:
         gradient, damping = ca.SX.sym("gradient", q.numel()), ca.SX.sym("damping")
         low, high = p["lower"] - q, p["upper"] - q
         damped = normal + damping * ca.DM.eye(q.numel())
-        step = in_box(damped, gradient, low, high, PASSES)
+        step = in_box(damped, gradient, low, high, FIT.passes)
         reached = ca.fmin(ca.fmax(q + step, p["lower"]), p["upper"])
         inputs = [normal, gradient, damping, q, parameters]
         return ca.Function("whole_box", inputs, shared(reached))
@@ -338,3 +383,153 @@ class WholeContacts:
 
 def _normal(jacobian: Expr, residual: Expr) -> tuple[Expr, Expr]:
     return ca.triu(ca.sparsify(jacobian.T @ jacobian)), ca.densify(jacobian.T @ residual)
+
+
+@dataclass(frozen=True, eq=False)
+class Balanced:
+    """A step that was tried and what comes of it.
+
+    Attributes:
+        tried: The step, with the residuals of the contacts.
+        q: (n, 1) where it leads, or where it began if it gained nothing.
+        accepted: Whether it gained.
+        within: Whether every contact is met at q.
+        over: Whether nothing more is to be hoped for.
+        largest: Largest part at q.
+        fit: Damping, power and steps spent, for the state.
+    """
+
+    tried: Tried
+    q: Expr
+    accepted: Expr
+    within: Expr
+    over: Expr
+    largest: Expr
+    fit: dict[str, Expr]
+
+
+def near_tolerance(residual: Expr, rows: ContactRows, p: dict[str, Expr]) -> Expr:
+    """Whether the contacts of a residual are met, or missed by little."""
+    positions, chords = rows.errors(residual)
+    tolerances = p["position_tolerance"], chord(p["angle_tolerance"])
+    return within_tolerance(positions / BALANCE.near, chords / BALANCE.near, *tolerances)
+
+
+def differs(cost: Expr, before: Expr) -> Expr:
+    """Whether the cost of a fit is another than that of the fit balanced before."""
+    return ca.fabs(cost - before) > BALANCE.same * before
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighed:
+    """The contacts' errors as they count for a power."""
+
+    scaled: Expr
+    parts: Expr
+    largest: Expr
+    power: Expr
+    weights: Expr
+
+
+def _weighed(before: Expr, contacts: ContactRows, number: Expr, p: dict[str, Expr]) -> _Weighed:
+    """Of a residual, for the power of a number."""
+    scaled = _scaled(before, contacts, p)
+    parts = _lengths(scaled, contacts)
+    largest = ca.fmax(ca.mmax(parts), 1e-100)
+    power = sum(
+        (ca.if_else(number == i, value, 0.0) for i, value in enumerate(BALANCE.powers)), ca.SX(0)
+    )
+    return _Weighed(scaled, parts, largest, power, (parts / largest) ** (power - 2))
+
+
+def reweighted(
+    before: Expr, jacobian: Expr, contacts: ContactRows, number: Expr, p: dict[str, Expr]
+) -> tuple[Expr, Expr, Expr]:
+    """The least squares that a step solves.
+
+    Args:
+        before: Residual (size, 1) of the contacts.
+        jacobian: (size, n) its Jacobian.
+        contacts: Their rows.
+        number: How many of `BALANCE.powers` are done.
+        p: Parameters.
+
+    Returns:
+        Residual (size, 1), Jacobian (size, n), and rows (2 f, n) that stretch it along the errors:
+        further ones, whose residual is zero.
+    """
+    weighed = _weighed(before, contacts, number, p)
+    weights, parts, scaled = weighed.weights, weighed.parts, weighed.scaled
+    rows = ca.sqrt(_each(weights, contacts))
+    slopes = _scaled(jacobian, contacts, p)
+    stretched = [
+        ca.sqrt(weights[i] * (weighed.power - 2))
+        / ca.fmax(parts[i], 1e-100)
+        * (scaled[own].T @ slopes[own, :])
+        for i, own in enumerate(contacts.slices)
+    ]
+    return rows * scaled, rows * slopes, ca.vertcat(*stretched)
+
+
+def balanced(
+    value: Expr, tried: Tried, contacts: ContactRows, s: dict[str, Expr], p: dict[str, Expr]
+) -> Balanced:
+    """What comes of a step.
+
+    Args:
+        value: (n, 1) where it begins.
+        tried: The step, with the residuals of the contacts.
+        contacts: Their rows.
+        s: State with damping, power (how many of `BALANCE.powers` are done) and spent.
+        p: Parameters.
+    """
+    weighed = _weighed(tried.before, contacts, s["power"], p)
+    weights, parts, largest = weighed.weights, weighed.parts, weighed.largest
+    power = weighed.power
+    parts_there = _lengths(_scaled(tried.there, contacts, p), contacts)
+    # Bounded, since a large number to a high power is none.
+    grown = ca.fmin(parts_there / largest, BALANCE.farthest)
+    total, total_there = ca.dot(weights, parts**2), ca.dot(grown ** (power - 2), parts_there**2)
+    accepted = total_there < total
+    left = ca.if_else(accepted, parts_there, parts)
+    damping = BALANCE.damping * s["damping"]
+    steady = ca.if_else(
+        accepted, total_there > BALANCE.steady * total, damping > BALANCE.damping_ceiling
+    )
+    done = s["power"] + steady
+    spent = s["spent"] + 1
+    over = ca.logic_or(done >= len(BALANCE.powers), spent >= BALANCE.budget)
+    powers = ca.if_else(accepted, total_there, total) * largest ** (power - 2)
+    hopeless = powers > len(contacts.slices) * BALANCE.hopeless**power
+    over = ca.logic_or(over, ca.logic_and(steady, hopeless))
+    eased = ca.if_else(accepted, BALANCE.eased, BALANCE.tightened)
+    fit = {
+        "damping": ca.fmax(s["damping"] * eased, BALANCE.damping_floor),
+        "power": done,
+        "spent": spent,
+    }
+    return Balanced(
+        tried=tried,
+        q=ca.if_else(accepted, tried.reached, value),
+        accepted=accepted,
+        within=ca.mmax(left) <= 1,
+        over=over,
+        largest=ca.mmax(left),
+        fit=fit,
+    )
+
+
+def _scaled(values: Expr, contacts: ContactRows, p: dict[str, Expr]) -> Expr:
+    """Rows (size, k) of the contacts as parts of the tolerances."""
+    allowed = ca.vertcat(p["position_tolerance"] / LENGTH, chord(p["angle_tolerance"]))
+    return values / _each(ca.fmax(allowed, 1e-100), contacts)
+
+
+def _each(values: Expr, contacts: ContactRows) -> Expr:
+    """A value for each place and facing (2 f, 1) as one for each of its rows (size, 1)."""
+    sizes = [own.stop - own.start for own in contacts.slices]
+    return ca.vertcat(*(ca.repmat(values[i], size, 1) for i, size in enumerate(sizes)))
+
+
+def _lengths(scaled: Expr, contacts: ContactRows) -> Expr:
+    return ca.vertcat(*(ca.norm_2(scaled[own]) for own in contacts.slices))

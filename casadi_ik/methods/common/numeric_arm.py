@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step
-from casadi_ik.methods.common.contact_fit import DAMPING_FLOOR, EXACT, Tried
+from casadi_ik.methods.common.contact_fit import FIT, Tried
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.even_spread import evenly
@@ -137,10 +137,10 @@ def newton_polish(robot: RobotDescription, model_error: float) -> ca.Function:
     start = ca.SX.sym("arm", len(columns))
     p = {"lower": ca.SX.sym("lower", n), "upper": ca.SX.sym("upper", n)}
     inside = ca.fmin(ca.fmax(start, p["lower"][columns]), p["upper"][columns])
-    tried = pose_step(robot, inside, Pose(rotation, origin), ca.SX(DAMPING_FLOOR), p)
+    tried = pose_step(robot, inside, Pose(rotation, origin), ca.SX(FIT.damping_floor), p)
     before, there = ca.sumsqr(tried.before), ca.sumsqr(tried.there)
     reached = ca.if_else(there < before, tried.reached, inside)
-    hits = ca.fmin(before, there) < EXACT * EXACT
+    hits = ca.fmin(before, there) < FIT.exact * FIT.exact
     given = [rotation, origin, p["lower"], p["upper"]]
     step = ca.Function("newton_step", [start, *given], shared(reached, hits))
     inputs: list[Expr] = [ca.MX.sym("x", x.shape) for x in step.mx_in()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from casadi_ik.methods.common.contact_fit import EXACT, judge
+from casadi_ik.methods.common.contact_fit import FIT, judge
 from casadi_ik.methods.common.numeric_arm import (
     NEAR,
     SIX,
@@ -65,7 +65,7 @@ def _pose_step(layouts: HandFirstLayouts) -> ca.Function:
     margin = -ca.sqrt(judged.cost)
     better = margin > s["margin"]
     best, best_margin = ca.if_else(better, now, s["arm"]), ca.fmax(margin, s["margin"])
-    exact = judged.cost < EXACT * EXACT
+    exact = judged.cost < FIT.exact * FIT.exact
     # What the first round missed may lie beyond the gap between two limits of a joint.
     *sent, turned = ca.vertsplit(other_side(layouts.robot, now, s["turned"], p))
     again = ca.logic_and(judged.settled, ca.logic_and(s["earlier"] > 0, turned > 0))

@@ -23,13 +23,16 @@ from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import PARAMETERS
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
-from casadi_ik.methods.common.balance import CLOSER, balanced, differs, near_tolerance
 from casadi_ik.methods.common.contact_fit import (
+    BALANCE,
     Judged,
     Tried,
     WholeStep,
+    balanced,
+    differs,
     fresh_fit,
     judge_contacts,
+    near_tolerance,
 )
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
 from casadi_ik.methods.hand_first.choice_stage import choice_stage
@@ -383,7 +386,8 @@ def _judged(layouts: HandFirstLayouts, step: WholeStep) -> ca.Function:
             "q": found.q,
             "phase": ca.if_else(failed, float(Phase.CANDIDATE), float(Phase.BALANCE)),
             "candidate": s["candidate"] + failed,
-            "returns": s["returns"] + ca.logic_and(failed, found.largest > CLOSER * s["least"]),
+            "returns": s["returns"]
+            + ca.logic_and(failed, found.largest > BALANCE.closer * s["least"]),
             "least": ca.if_else(failed, ca.fmin(found.largest, s["least"]), s["least"]),
         }
         | fit

@@ -26,11 +26,13 @@ from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import ArmTrials, Farthest, Nearest
 from casadi_ik.kernels.recipe import recipe
 from casadi_ik.kernels.step_graph import StepGraph
-from casadi_ik.methods.common.balance import NEAR, balanced, differs
 from casadi_ik.methods.common.contact_fit import (
-    DAMPING_START,
+    BALANCE,
+    FIT,
     WholeContacts,
     WholeStep,
+    balanced,
+    differs,
     fresh_fit,
     judge,
 )
@@ -199,7 +201,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             palm_origin=origin,
             passed=ca.if_else(as_it_is, s["passed"], passed),
             phase=float(Phase.ARM_PLACEMENT if numeric else Phase.HAND_ALIGNMENT),
-            damping=DAMPING_START if numeric else p["first_damping"],
+            damping=FIT.damping if numeric else p["first_damping"],
         )
         status = ca.if_else(exhausted, float(Status.STALLED), float(Status.RUNNING))
         record = self.row(s, p, q, Phase.CANDIDATE, status, merit(self.robot, self.contacts, q, p))
@@ -284,7 +286,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         stuck = ca.logic_and(ca.logic_not(accepted), s["damping"] > DAMPING_CEILING)
         over = ca.logic_or(waited >= PATIENCE, s["spent"] + 1 >= BUDGET)
         over = ca.logic_or(ca.logic_or(over, stuck), skipped)
-        near = ca.logic_and(self._met(left, p, NEAR), differs(cost, s["balanced"]))
+        near = ca.logic_and(self._met(left, p, BALANCE.near), differs(cost, s["balanced"]))
         near = ca.logic_and(ca.logic_and(near, over), ca.logic_not(solved))
         failed = ca.logic_and(over, ca.logic_not(ca.logic_or(solved, near)))
         following = ca.if_else(over, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT))
@@ -297,7 +299,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             q=q,
             phase=ca.if_else(near, float(Phase.BALANCE), following),
             start=s["start"] + failed,
-            damping=ca.if_else(near, DAMPING_START, eased),
+            damping=ca.if_else(near, FIT.damping, eased),
             waited=waited,
             spent=ca.if_else(near, 0.0, s["spent"] + 1),
             power=0.0,
