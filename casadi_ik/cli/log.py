@@ -209,7 +209,7 @@ def report(said: Said) -> Answer:
     meet singularities, and the hardest with their stories.
     """
     with located("log report", (MissingExtraError,)):
-        from casadi_ik.views.report import study_page
+        from casadi_ik.views import study_page
     path = Path(said.file)
     log = logs.open(path)
     check_outputs({"--out": said.out}, inputs=[path])

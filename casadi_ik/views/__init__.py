@@ -24,6 +24,7 @@ from casadi_ik.views.pictures import (
     draw_solution,
     show,
 )
+from casadi_ik.views.report import study_page
 
 __all__ = [
     "draw_alternatives",
@@ -32,4 +33,5 @@ __all__ = [
     "draw_pads",
     "draw_solution",
     "show",
+    "study_page",
 ]

@@ -9,7 +9,10 @@ import pytest
 from capsule_arm import SCENE, write_robot
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
+from casadi_ik import errors
+
+DescriptionError, InputError = errors.DescriptionError, errors.InputError
+UnknownNameError = errors.UnknownNameError
 
 BOX = {"kind": "box", "size": [1, 1, 1]}
 

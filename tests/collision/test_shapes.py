@@ -1,20 +1,83 @@
-"""Shapes in descriptions: read, checked, told apart; and those of the shipped robots."""
+"""Shapes of robots: described, of somebody's files, written as URDF; told apart, and refused."""
 
 from __future__ import annotations
 
 import copy
+from pathlib import Path
 
 import numpy as np
+import pinocchio
 import pytest
 import yaml
 from capsule_arm import ARM, write_robot
 
 import casadi_ik as ik
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.model import collision_model
+from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import DescriptionError, UnsupportedError
+from casadi_ik.files.reading import Frame, convert, frame_matrix
+from casadi_ik.files.units import in_si
+from casadi_ik.importing import capsules, imported
+from casadi_ik.importing.write import collision_lines
+from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.robots import load_description
-from casadi_ik.robots.collision import capsules_of
-from casadi_ik.robots.schema import BoxEntry, CylinderEntry
+from casadi_ik.robots.collision import Touching, capsules_of
+from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, CollisionEntry, CylinderEntry
+
+PLACE = '<origin xyz="0 0 0.02" rpy="0.3 0.2 0.1"/>'
+SIMPLE = {
+    "palm": '<box size="0.1 0.06 0.02"/>',
+    "left_1": '<cylinder radius="0.01" length="0.05"/>',
+    "right_1": '<sphere radius="0.012"/>',
+    "left_2": '<cylinder radius="0.008" length="0.04"/>',
+}
+
+
+def write_hand(folder: Path, right_2: str = '<sphere radius="0.01"/>') -> Path:
+    """Two fingers of two links each, opposed, with a shape on every link."""
+    shapes = SIMPLE | {"right_2": right_2}
+    text = "".join(
+        f'<link name="{name}"><collision>{PLACE}<geometry>{shape}</geometry></collision></link>\n'
+        for name, shape in shapes.items()
+    )
+    for side, y, axis in (("left", 0.04, "1 0 0"), ("right", -0.04, "-1 0 0")):
+        for number, parent, xyz in ((1, "palm", f"0 {y} 0.05"), (2, f"{side}_1", "0 0 0.05")):
+            text += (
+                f'<joint name="{side}_j{number}" type="revolute"><origin xyz="{xyz}"/>'
+                f'<parent link="{parent}"/><child link="{side}_{number}"/><axis xyz="{axis}"/>'
+                '<limit lower="-0.2" upper="1.2" velocity="1" effort="1"/></joint>\n'
+            )
+    path = folder / "hand.urdf"
+    path.write_text(f'<robot name="hand">{text}</robot>')
+    return path
+
+
+def write_mesh(folder: Path, rng: np.random.Generator) -> np.ndarray:
+    """A bent slab as an STL; its corners."""
+    x, y = (one.ravel() for one in np.meshgrid(np.linspace(-0.01, 0.01, 5), np.linspace(0, 1, 9)))
+    top = np.column_stack([x, 0.02 * y * y, 0.05 * y]) + rng.normal(0, 1e-4, (45, 3))
+    points = np.concatenate([top, top + np.array([0, 0.006, 0])])
+    lines = ["solid slab"]
+    for layer in (0, 45):
+        for row in range(8):
+            for column in range(4):
+                i = layer + 5 * row + column
+                for corners in ((i, i + 1, i + 5), (i + 1, i + 6, i + 5)):
+                    three = points[list(corners)]
+                    inner = "".join(f"vertex {a:.9g} {b:.9g} {c:.9g}\n" for a, b, c in three)
+                    lines.append(f"facet normal 0 0 1\nouter loop\n{inner}endloop\nendfacet")
+    (folder / "slab.stl").write_text("\n".join([*lines, "endsolid slab\n"]))
+    return points
+
+
+DESCRIPTION = """
+name: mine
+hand: {file: hand.urdf, palm: palm}
+fingers:
+  left: {link: left_2, xyz: [0, -0.01, 0.03], normal: [0, -1, 0]}
+  right: {link: right_2, xyz: [0, 0.01, 0.03], normal: [0, 1, 0]}
+"""
 
 
 def test_shapes_come_with_the_parts(tmp_path):
@@ -50,8 +113,6 @@ def test_capsules_hold_boxes_and_cylinders(shape, rng):
     else:
         inside = unit[np.hypot(unit[:, 0], unit[:, 1]) <= 1]
         inside = inside * [shape.radius, shape.radius, shape.length / 2]
-    from casadi_ik.files.reading import Frame, frame_matrix
-
     pose = frame_matrix(Frame(shape.xyz, shape.rpy))
     points = inside @ pose[:3, :3].T + pose[:3, 3]
     apart = []
@@ -129,8 +190,6 @@ def test_a_robot_without_shapes_works_but_takes_no_scene(tmp_path):
 )
 def test_shipped_robots_stand_free_at_home(name):
     """At home no two links touch that are checked: the shapes are not too large to be of use."""
-    from casadi_ik.problem.clearance import SceneCheck
-
     robot = ik.load_robot(name)
     check = SceneCheck(robot, ik.Scene(), compiled=False)
     points, normals = robot.contacts(robot.home)
@@ -163,3 +222,117 @@ def test_shapes_hold_what_is_seen_of_an_arm(arm, link, corner):
             along = np.clip((point - one.center) @ one.half / square, -1, 1) if square else 0.0
             apart.append(np.linalg.norm(point - one.center - along * one.half) - one.radius)
     assert min(apart) < 1e-4
+
+
+def test_a_description_reads_simple_shapes_of_its_file(tmp_path: Path) -> None:
+    write_hand(tmp_path)
+    path = tmp_path / "mine.yaml"
+    path.write_text(DESCRIPTION)
+    shapes = load_description(path).shapes
+    assert [(one.link, one.kind, one.size.tolist()) for one in shapes.solids] == [
+        ("palm", "box", [0.1, 0.06, 0.02]),
+        ("left_1", "cylinder", [0.01, 0.05, 0.0]),
+        ("left_2", "cylinder", [0.008, 0.04, 0.0]),
+    ]
+    spheres = [one for one in shapes.capsules if one.covers < 0]
+    assert [(one.link, one.radius) for one in spheres] == [("right_1", 0.012), ("right_2", 0.01)]
+    np.testing.assert_allclose(spheres[0].center, [0, 0, 0.02])
+    # What the description says of a link goes before its file.
+    own = "collision: {links: {palm: [{kind: sphere, radius: 5 cm}]}}\n"
+    path.write_text(DESCRIPTION + own)
+    palm = [one for one in load_description(path).shapes.capsules if one.link == "palm"]
+    assert [one.radius for one in palm] == [0.05]
+
+
+def test_meshes_that_nobody_fitted_are_no_shapes(tmp_path: Path, rng) -> None:
+    write_mesh(tmp_path, rng)
+    write_hand(tmp_path, '<mesh filename="slab.stl"/>')
+    path = tmp_path / "mine.yaml"
+    path.write_text(DESCRIPTION)
+    with pytest.raises(UnsupportedError, match="its hand has no shapes, which a scene needs"):
+        collision_model(load_description(path))
+
+
+def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
+    points = write_mesh(tmp_path, rng)
+    hand = write_hand(tmp_path, '<mesh filename="slab.stl"/>')
+    (tmp_path / "hand.srdf").write_text(
+        "<robot name='x'>"
+        "<disable_collisions link1='left_2' link2='right_2' reason='Never'/></robot>"
+    )
+    out = tmp_path / "mine.yaml"
+    found = imported.import_robot(None, hand, out, command="casadi-ik import")
+    out.write_text(found.written.text())
+    found = found.at_home(out).with_shapes(out, tmp_path / "hand.srdf")
+    out.write_text(found.written.text())
+    entry = yaml.safe_load(out.read_text())["collision"]
+    assert entry["links"]["left_1"][0]["kind"] == "cylinder"
+    assert entry["links"]["left_1"][0]["radius"] == "10 mm"
+    fitted = entry["links"]["right_2"]
+    assert {one["kind"] for one in fitted} <= {"capsule", "sphere"}
+    excess = float(fitted[0]["excess"].removesuffix(" mm"))
+    assert 0 < excess < 20
+    description = load_description(out)
+    # In the link's frame the mesh is turned as the file has it.
+    pose = frame_matrix(Frame((0, 0, 0.02), (0.3, 0.2, 0.1)))
+    mesh = points @ pose[:3, :3].T + pose[:3, 3]
+    apart = np.full(len(mesh), np.inf)
+    for one in description.shapes.capsules:
+        if one.link == "right_2":
+            t = np.clip((mesh - one.center) @ one.half / max(one.half @ one.half, 1e-30), -1, 1)
+            gap = np.linalg.norm(mesh - one.center - t[:, None] * one.half, axis=1) - one.radius
+            apart = np.minimum(apart, gap)
+    assert apart.max() <= 0
+    assert sum(one.link == "right_2" for one in description.shapes.capsules) == len(fitted)
+    excluded = {frozenset(one.links): one.reason for one in collision_model(description).excluded}
+    assert excluded[frozenset(("left_2", "right_2"))] == "hand.srdf: Never"
+    assert SceneCheck(ArmHand(description), Scene(), compiled=False).model.pairs.size
+
+
+def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
+    """Shapes come back from the YAML as they were."""
+    shapes = {
+        "a link": [BoxEntry(size=(0.1, 0.2, 0.3), xyz=(0.01, 0, 0), rpy=(0.1, 0, 0), excess=0.004)],
+        "b": [CapsuleEntry(ends=((0, 0, 0), (0, 0, 0.1)), radius=0.02)],
+    }
+    lines = collision_lines(shapes, [Touching(("a link", "b"), "they do", 0.003)], "shapes")
+    entry = convert(in_si(yaml.safe_load("\n".join(lines))["collision"]), CollisionEntry, tmp_path)
+    assert entry.links["a link"] == shapes["a link"]
+    assert entry.links["b"] == shapes["b"]
+    assert entry.touching[0].depth == 0.003
+    assert len(capsules_of(entry.links["b"][0])) == 1
+
+
+def test_how_far_capsules_stand_out_is_found_by_looking_at_few_points():
+    """The same as every sample against every point, and every corner held."""
+    rng = np.random.default_rng(0)
+    turned, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    low, high = np.array([-0.05, -0.02, -0.1]), np.array([0.05, 0.03, 0.1])
+    corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)]) @ turned
+    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6)]
+    triangles = corners[np.array([*faces, (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)])]
+    found, beyond = capsules.fit(triangles, 3)
+    points = capsules.cut(triangles).reshape(-1, 3)
+    held = np.min([one.beyond(points) for one in found], axis=0)
+    assert held.max() <= 1e-12
+    skin = np.concatenate([one.skin() for one in found])
+    skin = skin[np.min([one.beyond(skin) for one in found], axis=0) >= -1e-6]
+    every = np.concatenate([points, capsules.cut(triangles).mean(axis=1)])
+    nearest = np.linalg.norm(skin[:, None] - every, axis=2).min(axis=1)
+    assert beyond == pytest.approx(nearest.max(), abs=1e-9)
+    assert len(found) > 1
+
+
+def test_shapes_come_back_from_the_urdf(tmp_path):
+    robot = ik.load_robot(write_robot(tmp_path))
+    text = robot.urdf()
+    model = pinocchio.buildModelFromXML(text)
+    found = pinocchio.buildGeomFromUrdfString(model, text, pinocchio.GeometryType.COLLISION)
+    kinds = sorted(type(one.geometry).__name__ for one in found.geometryObjects)
+    # Four capsules of a cylinder and two spheres each, a sphere, two boxes and a cylinder.
+    assert kinds == ["Box"] * 2 + ["Cylinder"] * 5 + ["Sphere"] * 9
+    box = next(one for one in found.geometryObjects if model.frames[one.parentFrame].name == "l2")
+    place = (model.frames[box.parentFrame].placement.inverse() * box.placement).homogeneous
+    solid = next(one for one in robot.description.shapes.solids if one.link == "l2")
+    np.testing.assert_allclose(place, solid.pose, atol=1e-12)
+    np.testing.assert_allclose(2 * np.asarray(box.geometry.halfSide), solid.size, atol=1e-12)

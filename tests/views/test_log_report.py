@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.cli.main import main
+from casadi_ik import logs, views
 
 
 class Page(HTMLParser):
@@ -47,12 +49,9 @@ def study(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_page(study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "report.html"
-    title = "<script>alert(1)</script>"
-    assert main(["log", "report", str(study), "--out", str(out), "--title", title]) == 0
-    assert "24 solves" in capsys.readouterr().out
-    text = out.read_text(encoding="utf-8")
+def test_page(study: Path) -> None:
+    text = views.study_page(logs.open(study), "<script>alert(1)</script>", 24)
+    assert "24 solves" in text
     page = Page(text)
     assert "script" not in page.tags
     assert "i" not in page.tags
@@ -68,10 +67,8 @@ def test_page(study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert "STALLED" in text[first : first + 200]
 
 
-def test_most(study: Path, tmp_path: Path) -> None:
-    out = tmp_path / "report.html"
-    assert main(["log", "report", str(study), "--out", str(out), "--most", "5"]) == 0
-    assert Page(out.read_text(encoding="utf-8")).tags.count("details") == 5
+def test_most(study: Path) -> None:
+    assert Page(views.study_page(logs.open(study), "a study", 5)).tags.count("details") == 5
 
 
 @pytest.mark.parametrize(
@@ -81,9 +78,10 @@ def test_most(study: Path, tmp_path: Path) -> None:
         (["STUDY", "--out", "a.txt"], "expected a name ending in .html"),
     ],
 )
-def test_refusals(words: list[str], says: str, study: Path, capsys, monkeypatch, tmp_path) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_refusals(words: list[str], says: str, study: Path, tmp_path: Path) -> None:
     named = [str(study) if word == "STUDY" else word for word in words]
-    assert main(["log", "report", *named]) == 2
-    assert says in capsys.readouterr().err
+    command = [sys.executable, "-m", "casadi_ik", "log", "report", *named]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert says in done.stderr
     assert not list(tmp_path.iterdir())
