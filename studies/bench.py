@@ -26,9 +26,9 @@ from pathlib import Path
 
 from bench_parts import ABROAD, CASES, Case
 from rich.console import Console
-from runner import command, markdown_table, program, provenance, write_page
+from runner.parts import code_version
+from runner.report import command, markdown_table, program, provenance, write_page
 
-from casadi_ik.batches.parts import code_version
 from casadi_ik.errors import InputError
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+shadow", "xarm6+leap")

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from calibrated_hands.figures import draw_bars, draw_spectrum
-from calibrated_hands.trials import FINGER, NOISE, POSES, Trials, trials
-from runner import command, markdown_table, program
+from numpy.typing import NDArray
+from runner.figures import OURS, PAPER, THIRD, figure, title
+from runner.report import command, markdown_table, program
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
@@ -24,12 +25,154 @@ from casadi_ik.calibration import (
     LOSSES,
     Calibration,
     HandModel,
+    Measurements,
+    calibrate,
     hand_parameters,
+    simulate,
+    true_values,
 )
 from casadi_ik.errors import InputError
 
 OUTLIERS = 0.1, 0.25
 """Parts of the poses that are outliers, beside none, if not asked otherwise."""
+
+
+FINGER = "index"
+NOISE = (2e-4, math.radians(0.5))
+"""Of a measured coordinate [m] and angle [rad]: an assumption, of the size of marker tracking."""
+
+POSES = 60
+EXACT = (1e-9, 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """Estimates for many hands: h hands, k parameters.
+
+    Attributes:
+        deviations: (h, k) estimate minus truth, over the estimated standard deviation.
+        misses: (h,) root mean square distance of the estimated tip from the true one [mm].
+        described: (h,) the same of the description.
+        noise: (h,) estimated noise of a coordinate over the true one.
+        converged: (h,) whether the estimate converged.
+        last: One of the estimates.
+    """
+
+    deviations: Array
+    misses: Array
+    described: Array
+    noise: Array
+    converged: NDArray[np.bool_]
+    last: Calibration
+
+    def coverage(self, level: float = 1.959964) -> float:
+        """Part of the true numbers within so many standard deviations [%]."""
+        return 100 * float(np.mean(np.abs(self.deviations) <= level))
+
+
+def trials(
+    model: HandModel,
+    hands: int,
+    seed: int,
+    loss: str,
+    outliers: float,
+    poses: int = POSES,
+    noise: tuple[float, float] = NOISE,
+) -> Trials:
+    """Calibrate hands drawn from the priors, each with its own data and random numbers."""
+    rows = []
+    for hand in range(hands):
+        rng = np.random.default_rng([seed, hand])
+        truth = true_values(model, rng)
+        data = simulate(model, truth, FINGER, poses, rng, noise=noise, outliers=outliers)
+        found = calibrate(model, data, loss=loss)
+        fresh = simulate(model, truth, FINGER, 100, rng, noise=EXACT)
+        miss, described = (
+            tip_miss(model, values, fresh) for values in (found.values, model.nominal)
+        )
+        scaled = (found.values - truth) / found.deviation
+        rows.append((scaled, miss, described, found.noise[0] / noise[0], found.converged, found))
+    scaled, misses, described, ratios, converged, found = zip(*rows, strict=True)
+    return Trials(
+        np.array(scaled),
+        np.array(misses),
+        np.array(described),
+        np.array(ratios),
+        np.array(converged),
+        found[-1],
+    )
+
+
+def tip_miss(model: HandModel, values: Array, exact: Measurements) -> float:
+    """Root mean square distance of a model's tip from exact measurements [mm]."""
+    error, _ = model.misfit(FINGER, exact.q, values, exact.poses)
+    return 1e3 * float(np.sqrt((error[:, :3] ** 2).sum(axis=1).mean()))
+
+
+LEVELS = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99])
+NORMAL = np.array([0.6745, 0.8416, 1.0364, 1.2816, 1.6449, 1.96, 2.5758])
+"""Half widths in standard deviations that hold so much of a normal variable."""
+
+
+def draw_bars(results: dict[tuple[str, float], Trials], share: float, path: Path) -> None:
+    """Coverage against its level, and errors over deviations, without and with `share` outliers."""
+    drawn, grid = figure(1, 2, 5, 4)
+    levels, errors = grid[0]
+    colors = dict(zip(LOSSES, (OURS, THIRD, PAPER), strict=True))
+    for (loss, outliers), result in results.items():
+        if outliers not in (0.0, share):
+            continue
+        off = [result.coverage(width) for width in NORMAL] - 100 * LEVELS
+        style, fill = ("-", colors[loss]) if outliers else ("--", "white")
+        label = f"{loss}, {100 * outliers:.0f} % outliers"
+        levels.plot(100 * LEVELS, off, style, color=colors[loss], marker="o", ms=5, mfc=fill,
+                    label=label)  # fmt: skip
+    levels.axhline(0, color="black", lw=0.8)
+    name = "Intervals that hold too often (above 0) or too rarely"
+    title(levels, name, "level of the interval [%]", "true values within, minus level [%]")
+    low, high = levels.get_ylim()
+    levels.set_ylim(low, high + 0.55 * (high - low))  # room for the legend
+    levels.legend(frameon=False, fontsize=8, ncols=2, loc="upper left")
+    bins = np.linspace(-4, 4, 81)
+    pooled = results["cauchy", share].deviations.ravel()
+    errors.hist(pooled, bins=bins, density=True, color="#9fc3e6", label="all hands and numbers")
+    normal = np.exp(-0.5 * bins**2) / math.sqrt(2 * math.pi)
+    errors.plot(bins, normal, color="black", lw=1, label="what the intervals assume: normal")
+    name = f"Errors, Cauchy loss, {100 * share:g} % outliers"
+    title(errors, name, "error / its estimated standard deviation", "density")
+    errors.set_ylim(0, 0.55)
+    errors.legend(frameon=False, fontsize=8, loc="upper left")
+    drawn.tight_layout()
+    drawn.savefig(path)
+
+
+NONE = 1e-6
+"""Singular values below this are zero to rounding."""
+
+
+def draw_spectrum(found: Calibration, path: Path) -> None:
+    """Singular values, with the level of the priors."""
+    drawn, ((axes,),) = figure(1, 1, 7, 3.4)
+    values, order = found.singular_values, np.arange(1, len(found.singular_values) + 1)
+    for chosen, color, label in (
+        (values >= 1, OURS, "known from the measurements"),
+        ((values < 1) & (values > NONE), "#9fc3e6", "known from the priors for the most part"),
+    ):
+        axes.semilogy(order[chosen], values[chosen], "o", color=color, ms=5, label=label)
+    zero = order[values <= NONE]
+    axes.semilogy(zero, np.full(len(zero), NONE), "v", color=PAPER, ms=6,
+                  label="zero: no measurement of the tip tells")  # fmt: skip
+    axes.axhline(1, color="black", lw=0.8, ls="--")
+    axes.annotate(
+        "1: measurements say as much as priors", (0.99, 1.25), fontsize=8, ha="right",
+        xycoords=("axes fraction", "data"),
+    )  # fmt: skip
+    across = "direction in the space of dimensions, best known first"
+    title(axes, "What the measurements tell", across, "singular value, priors = 1")
+    axes.set_ylim(3e-7, None)
+    axes.legend(frameon=False, fontsize=8, loc="lower left")
+    drawn.tight_layout()
+    drawn.savefig(path)
 
 
 def main(arguments: list[str] | None = None) -> None:

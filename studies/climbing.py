@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from runner.parts import keep
+from runner.parts import code_version, keep
 from samplers import contact_slopes, corners
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.batches.parts import code_version
 from casadi_ik.errors import InputError
 
 CLIMBERS = 512

@@ -10,10 +10,10 @@ chooses there::
 from __future__ import annotations
 
 import numpy as np
-from closed_chain.chain import LENGTH, constraints, cylinder
-from closed_chain.report import OURS, PAPER, field, figure, options, title, write
+from closed_chain import LENGTH, constraints, cylinder
 from numpy.typing import NDArray
-from runner import command, program
+from runner.figures import OURS, PAPER, field, figure, options, title, write
+from runner.report import command, program
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

@@ -10,10 +10,10 @@ these palms the arm can follow within its limits::
 from __future__ import annotations
 
 import numpy as np
-from closed_chain.chain import HeldThumb, cylinder
-from closed_chain.report import FAINT, OURS, PAPER, field, figure, options, title, write
+from closed_chain import HeldThumb, cylinder
 from numpy.typing import NDArray
-from runner import command, program
+from runner.figures import OURS, PAPER, field, figure, options, title, write
+from runner.report import command, program
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
         grid[1, 0].scatter(*seen[:, part], s=2, color=color, label=label, rasterized=True)
     grid[1, 0].plot(0, 0, "o", color=PAPER, ms=8, label="thumb's contact")
     grid[1, 0].set_aspect("equal")
-    grid[1, 0].legend(frameon=False, fontsize=8, markerscale=2, labelcolor=FAINT)
+    grid[1, 0].legend(frameon=False, fontsize=8, markerscale=2)
     title(
         grid[1, 0],
         f"{given.grasp}: where the palm can be",

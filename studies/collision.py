@@ -31,7 +31,8 @@ from collision_study.search import (
     solve_piece,
     surroundings,
 )
-from runner import (
+from runner.parts import read_parts, run_parts
+from runner.report import (
     Metric,
     command,
     interval_text,
@@ -43,7 +44,6 @@ from runner import (
     write_metrics,
     write_page,
 )
-from runner.parts import read_parts, run_parts
 from samplers import grasps_of
 
 import casadi_ik as ik

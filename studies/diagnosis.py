@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 from impossible_targets import classes_of, impossible, moved
-from runner import command, markdown_table, program, provenance, write_page
+from runner.parts import code_version
+from runner.report import command, markdown_table, program, provenance, write_page
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.batches.parts import code_version
 
 Kept = dict[str, Any]
 """Arrays by name of the targets / what they are."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from runner import command, markdown_table, program, write_page
+from runner.report import command, markdown_table, program, write_page
 from samplers import random_arm_targets, random_hands
 
 import casadi_ik as ik

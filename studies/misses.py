@@ -23,7 +23,7 @@ import time
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,9 +31,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 from climbing import climb, read_search
-from made_robots import MADE, made_robot
 from minimax import MinimaxProgram
-from runner import (
+from runner.figures import figure, title
+from runner.parts import read_parts, run_parts
+from runner.report import (
     Metric,
     command,
     interval_text,
@@ -44,15 +45,19 @@ from runner import (
     write_metrics,
     write_page,
 )
-from runner.figures import figure, title
-from runner.parts import read_parts, run_parts
 from samplers import SAMPLERS, finger_sets, noisy, random_hands, suits
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 
-ROBOTS = ("kuka_lwr_barrett", "kuka_lwr_barrett_coupled", "ar10", "baxter_ar10", *MADE)
+MADE = {path.stem: path for path in (Path(__file__).parent / "robots").glob("*.yaml")}
+"""Robots that no parameter of a method was chosen for, and their arms."""
+
+ROBOTS = (
+    *("kuka_lwr_barrett", "kuka_lwr_barrett_coupled", "ar10", "baxter_ar10"),
+    *("seven_axes_four_fingers", "six_axes_coupled_barrett"),
+)
 USUAL = ("random", "one-arm", "corners", "limits", "singular")
 OTHERS = {"palms": "palms of random hands", "noise": "noisy contacts of random hands"}
 """What is asked for is a palm with a hand's posture, or contacts that a camera saw."""
@@ -110,7 +115,7 @@ class Part:
         number: Of the part.
         size: Targets in it.
         seed: Of the targets.
-        folder: Where the files of made robots are put.
+        arm_hand: The robot itself: a worker of a cluster need not have its file.
         noise: Standard deviation of contacts [mm] and [deg], of noisy ones.
         looked: How many missed ones of noisy contacts are given to Ipopt.
         ratio: Whether times are set beside those of the reference.
@@ -123,7 +128,7 @@ class Part:
     number: int
     size: int
     seed: int
-    folder: Path
+    arm_hand: ik.ArmHand = field(repr=False, compare=False)
     noise: tuple[float, float] = (0.0, 0.0)
     looked: int = 0
     ratio: bool = False
@@ -165,19 +170,26 @@ def tolerance_name(text: str) -> str:
     return f"{1e3 * one.position:g} mm, {np.rad2deg(one.angle):.4g} deg"
 
 
-def load(name: str, folder: Path) -> ik.ArmHand:
-    """A shipped robot, or a made one whose files are put into a folder."""
-    return ik.load_robot(made_robot(name, folder) if name in MADE else name)
+@cache
+def load(name: str) -> ik.ArmHand:
+    """A shipped robot, or one of `MADE`."""
+    return ik.load_robot(MADE.get(name, name))
+
+
+SOLVERS: dict[tuple[str, str], ik.Solver] = {}
+"""Of this process, by robot and tolerance."""
+
+
+def _solver(robot: ik.ArmHand, tolerance: str) -> ik.Solver:
+    key = robot.name, tolerance
+    if key not in SOLVERS:
+        SOLVERS[key] = ik.Solver(robot, tolerance=tolerance_of(tolerance))
+    return SOLVERS[key]
 
 
 @cache
-def _solver(robot: str, tolerance: str, folder: Path) -> ik.Solver:
-    return ik.Solver(load(robot, folder), tolerance=tolerance_of(tolerance))
-
-
-@cache
-def _reference(tolerance: str, folder: Path) -> tuple[ik.Solver, tuple[Array, Array]]:
-    solver = _solver(REFERENCE, tolerance, folder)
+def _reference(tolerance: str) -> tuple[ik.Solver, tuple[Array, Array]]:
+    solver = _solver(load(REFERENCE), tolerance)
     targets = solver.robot.contacts(solver.robot.random(np.random.default_rng(0), SCALE))
     solver.solve_batch(*targets)
     return solver, targets
@@ -185,7 +197,7 @@ def _reference(tolerance: str, folder: Path) -> tuple[ik.Solver, tuple[Array, Ar
 
 def _scale(part: Part) -> float:
     """Processor time of a target of the reference [s]."""
-    solver, targets = _reference(part.tolerance, part.folder)
+    solver, targets = _reference(part.tolerance)
     begun = time.thread_time()
     solver.solve_batch(*targets)
     return (time.thread_time() - begun) / SCALE
@@ -193,7 +205,7 @@ def _scale(part: Part) -> float:
 
 def solve(part: Part) -> dict[str, Any]:
     """Solve a part and count."""
-    solver = _solver(part.robot, part.tolerance, part.folder)
+    solver = _solver(part.arm_hand, part.tolerance)
     robot = solver.robot
     title_ = OTHERS.get(part.sampler) or SAMPLERS[part.sampler][0]
     rng = np.random.default_rng([part.seed, zlib.crc32(title_.encode()), part.number])
@@ -265,9 +277,8 @@ def robots_of(words: Sequence[str]) -> list[str]:
 
 def parts_of(options: argparse.Namespace) -> Iterator[Part]:
     """All parts, a little of everything first."""
-    folder = options.out / "robots"
     block = min(options.block, options.count)
-    robots = {name: load(name, folder) for name in robots_of(options.robots)}
+    robots = {name: load(name) for name in robots_of(options.robots)}
     for number in range(-(-options.count // block)):
         for name, robot in robots.items():
             for sampler in options.sampler:
@@ -282,7 +293,7 @@ def parts_of(options: argparse.Namespace) -> Iterator[Part]:
                         yield Part(
                             *(name, sampler, fingers, tolerance, number, block),
                             seed=options.seed,
-                            folder=folder,
+                            arm_hand=robot,
                             noise=tuple(options.noise) if noisy_ else (0.0, 0.0),
                             looked=options.looked if noisy_ else 0,
                             ratio=options.ratio,
@@ -316,8 +327,8 @@ class Climb:
 
 def search(asked: Climb) -> dict[str, Any]:
     """Climb for as long as is asked."""
-    folder = asked.options.out / "robots"
-    solvers = {name: _solver(asked.robot, name, folder) for name in asked.options.tolerance}
+    robot = load(asked.robot)
+    solvers = {name: _solver(robot, name) for name in asked.options.tolerance}
     found = climb(solvers, asked.state, asked.size, asked.options.seed)
     return {"seconds": found["seconds"]}
 
@@ -455,7 +466,7 @@ def climbed_table(rows: list[Row], metrics: list[Metric]) -> str:
     return markdown_table([*heads, "most iterations", "most restarts"], lines)
 
 
-def why(rows: list[Row], folder: Path) -> list[str]:
+def why(rows: list[Row]) -> list[str]:
     """Parts of the report on misses: causes, and the list."""
     lost = [row for row in rows if row["missed"]]
     listed = [
@@ -472,7 +483,7 @@ def why(rows: list[Row], folder: Path) -> list[str]:
         of_contacts = [row for row in mine if row["kind"] != OTHERS["palms"]]
         q = np.array([miss["q"] for row in of_contacts for miss in row["missed"]])
         if len(q):
-            found = causes(load(robot, folder), tolerance_of(tolerance), q)
+            found = causes(load(robot), tolerance_of(tolerance), q)
             cells.append([robot, tolerance_name(tolerance), *found])
     heads = ["robot", "tolerance", "missed", "solved now", "of the rest, given the hand"]
     heads += ["from nearby", "arm motors at limits", "hand motors at limits", "off, median"]
@@ -523,7 +534,7 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
         body += [table_of(noise, metrics)]
     if climbed:
         body += ["## Climbing", CLIMBING, climbed_table(climbed, metrics)]
-    body += why([*rows, *climbed], options.out / "robots")
+    body += why([*rows, *climbed])
     if lost > SHOWN:
         every = [
             {"robot": row["robot"], "kind": row["kind"], "tolerance": row["tolerance"]}

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from runner import (
+from runner.parts import read_parts, run_parts
+from runner.report import (
     Metric,
     command,
     markdown_table,
@@ -29,7 +30,6 @@ from runner import (
     write_metrics,
     write_page,
 )
-from runner.parts import read_parts, run_parts
 from samplers import grasps_of, palm_slopes, smooth_path
 
 import casadi_ik as ik

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from runner import markdown_table, write_page
+from runner.report import markdown_table, write_page
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

@@ -26,7 +26,8 @@ import numpy as np
 from impossible_targets import CLASSES, classes_of, impossible, moved
 from misses import ROBOTS as SHIPPED_AND_MADE
 from misses import load
-from runner import (
+from runner.parts import read_parts, run_parts
+from runner.report import (
     Metric,
     command,
     markdown_table,
@@ -37,7 +38,6 @@ from runner import (
     write_metrics,
     write_page,
 )
-from runner.parts import read_parts, run_parts
 from samplers import corners, near_limits, random_hands, singular_arms
 
 import casadi_ik as ik
@@ -114,7 +114,6 @@ class Part:
     number: int
     size: int
     seed: int
-    folder: Path
     beyond: tuple[float, float] = BEYOND
 
     @property
@@ -138,7 +137,7 @@ def case_name(case: tuple[str, float, float, bool]) -> str:
 def reachable(part: Part, case: tuple[str, float, float, bool]) -> dict[str, Any]:
     """Look for false proofs."""
     kind, tolerance, share, limits = case
-    robot, rng = load(part.robot, part.folder), part.rng
+    robot, rng = load(part.robot), part.rng
     q = KINDS[kind](robot, rng, part.size)
     if not limits:
         turning = [a.unit == "rad" for a in robot.description.actuators]
@@ -154,7 +153,7 @@ def reachable(part: Part, case: tuple[str, float, float, bool]) -> dict[str, Any
 
 def clearly_impossible(part: Part) -> dict[str, Any]:
     """Look for proofs of what is impossible."""
-    robot = load(part.robot, part.folder)
+    robot = load(part.robot)
     points, normals = impossible(robot, part.name, part.rng, part.size)
     usual = ik.Tolerance()
     further, turned = 1e-3 * part.beyond[0], float(np.deg2rad(part.beyond[1]))
@@ -191,15 +190,15 @@ def solve(part: Part) -> dict[str, Any]:
 
 def parts(options: argparse.Namespace) -> Iterator[Part]:
     """All parts, a little of everything first."""
-    robots, where = options.robot or ROBOTS, (options.seed, options.out / "robots")
+    robots = options.robot or ROBOTS
     for robot in robots if options.impossible else ():
-        for name in classes_of(load(robot, options.out / "robots")):
-            yield Part(robot, name, 0, options.impossible, *where, options.beyond)
+        for name in classes_of(load(robot)):
+            yield Part(robot, name, 0, options.impossible, options.seed, options.beyond)
     for number in range(-(-options.count // BLOCK)):
         for robot in robots:
             for case in CASES:
                 if case[0] != "blind hands" or robot == ROBOTS[0]:
-                    yield Part(robot, case_name(case), number, BLOCK, *where)
+                    yield Part(robot, case_name(case), number, BLOCK, options.seed)
 
 
 def write_report(options: argparse.Namespace, run_by: str) -> None:

@@ -17,10 +17,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from runner import command, markdown_table, program, provenance, write_page
+from runner.parts import code_version
+from runner.report import command, markdown_table, program, provenance, write_page
 
 import casadi_ik as ik
-from casadi_ik.batches.parts import code_version
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right")
 TOLERANCES = ((5e-3, 3.0), (1e-3, 0.5), (1e-4, 0.05))

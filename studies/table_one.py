@@ -21,19 +21,36 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from qiu_table.report import write_report
-from qiu_table.settings import (
+import yaml
+from qiu_report import write_report
+from qiu_settings import (
     METHODS,
     ablation_study,
     check_changes,
     readings_study,
     table_study,
 )
-from runner import Changes, Study, add_run_arguments, command, program, run_from
+from runner.report import command, program
+from runner.study import Study, run
+
+from casadi_ik.errors import InputError
+from casadi_ik.logs import Keep
 
 FULL = 10_000
 ABLATION_BLOCK = 10
+
+
+def changes_of(words: Sequence[str]) -> dict[str, Any]:
+    """``NAME=VALUE`` words as a mapping; values as YAML reads them."""
+    found: dict[str, Any] = {}
+    for word in words:
+        name, sign, text = word.partition("=")
+        if not (name and sign and text):
+            raise InputError(f"--set: found {word!r}, expected NAME=VALUE")
+        found[name] = yaml.safe_load(text)
+    return found
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -51,8 +68,7 @@ def main(arguments: list[str] | None = None) -> None:
         "--set",
         dest="changes",
         nargs="+",
-        default={},
-        action=Changes,
+        default=[],
         metavar="NAME=VALUE",
         help="parameters of the methods that have them (a damping, a gain, a step cap, ...)",
     )
@@ -61,8 +77,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--report", type=Path, default=Path("out/table_one/report"), help="folder of the report"
     )
-    add_run_arguments(parser, "out/table_one")
+    parser.add_argument("--jobs", type=int, default=1, help="processes on this machine")
+    parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster instead")
+    parser.add_argument("--out", type=Path, default=Path("out/table_one"), help="results")
+    parser.add_argument(
+        "--log",
+        type=float,
+        metavar="SHARE",
+        help="write an MCAP log per block: every iteration of all solves that failed or came near "
+        "a singularity and of this share of all; totals of the others",
+    )
     options = parser.parse_args(arguments)
+    options.changes = changes_of(options.changes)
     check_changes(options.methods, options.changes)
 
     def studies(methods: Sequence[str], count: int, ablation_count: int) -> tuple[Study, ...]:
@@ -77,7 +103,10 @@ def main(arguments: list[str] | None = None) -> None:
             readings_study(ablation_count, seed, min(options.block, ABLATION_BLOCK)),
         )
 
-    run_from(options, *studies(options.methods, options.count, options.ablation_count))
+    log = None if options.log is None else Keep(sample=options.log)
+    for study in studies(options.methods, options.count, options.ablation_count):
+        if study.count > 0 and study.settings:
+            run(study, options.out / study.name, options.jobs, options.dask, log)
     again = command(__file__, arguments)
     write_report(studies(METHODS, options.count, 0), options.out, options.report, again)
 

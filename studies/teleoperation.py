@@ -2,7 +2,10 @@
 
 A robot moves as random smooth postures do; a follower is given nothing but where the fingertips are
 in every frame, arm and hand together, and in a second run the palm's pose too, softly. Beside it,
-if it is installed, dex-retargeting leads a hand alone, and so does the follower::
+if it is installed, dex-retargeting (Qin et al. 2023, AnyTeleop) leads a hand alone by NLopt, and so
+does the follower, both with the kinematics of our URDF. Its own configuration sets it up: `vector`
+from the palm to every tip, `position` of the tips, `DexPilot` with the vectors between the tips too
+(those of a thumb nearer than 30 mm to a finger are closed by it on purpose)::
 
     pip install dex-retargeting torch six trimesh  # the last three it imports and does not name
     python studies/teleoperation.py --report out/teleoperation
@@ -12,13 +15,18 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
-from peer_retargeting import beside
 from rich.console import Console
-from runner import markdown_table, write_page
+from runner.report import markdown_table, write_page
 from samplers import smooth_path
 
 import casadi_ik as ik
@@ -79,6 +87,173 @@ def run(robot: ik.ArmHand, seed: int, count: int, wrist: bool) -> Run:
 
     away = float(np.median(np.linalg.norm(off, axis=1)))
     return Run(error.ravel(), rough(q), rough(path), seconds[10:], away)
+
+
+NEEDED = ("dex_retargeting", "torch", "nlopt")
+"""What the peer imports; torch is not among what it names."""
+
+KINDS = ("vector", "position", "dexpilot")
+
+SMOOTHED = 0.2
+"""Share of a new frame in dex-retargeting's own configurations for teleoperation."""
+
+NOISE = 1e-3
+"""Standard deviation of what is added to keypoints, as a camera does [m]."""
+
+HAND = "name: allegro_right\ndescription: The hand alone.\nhand: allegro_right\nthumb: thumb\n"
+HAND += "fingers: [thumb, index, middle, ring]\n"
+
+Lead = Callable[[Array], Array]
+"""Fingertips (f, 3) to motors (n,)."""
+
+HEADS = ["keypoints", "who", "error, median [mm]", "99th percentile", "roughness"]
+HEADS += ["beyond velocity %", "time [us]", "p99 [us]", "CPU [us]"]
+
+EXPLAINED = """
+The same motion of an Allegro hand's fingertips in the palm's frame, {count} frames of {frame:g} ms,
+seeds 0 to {last}; once as it is, once with noise of {noise:g} mm on every keypoint. *Error:* of
+fingertips against those without noise, in frames after the first second. *Roughness:* largest
+change of a motor's velocity from frame to frame, as a part of what its acceleration limit permits.
+*Beyond velocity:* frames in which a motor is faster than its limit. *Time:* of a call from Python,
+all in one thread of one run, by turns; other work ran on the machine, so the processor's time
+stands beside. dex-retargeting {version}; *smoothed:* with the low-pass filter of its own
+configurations ({smoothed:g} of every new frame).
+"""
+
+KNOWN = """
+Figures published for it with the Allegro hand, on another machine and another motion: 770 to 980 us
+a frame, 95th percentile 5 ms.
+"""
+
+MISSING = """
+Not run: {missing} not installed (`pip install dex-retargeting torch six trimesh`, the last three of
+which it imports and does not name).
+"""
+
+
+def lead_by(robot: ik.ArmHand, kind: str, share: float, start: Array, folder: Path) -> Lead:
+    """dex-retargeting for a hand.
+
+    Args:
+        robot: The hand.
+        kind: One of `KINDS`.
+        share: Of a new frame in what comes out; 1: nothing is smoothed.
+        start: (n,) where the hand is.
+        folder: Where its URDF goes.
+    """
+    path, tips = folder / "hand.urdf", [f"{name}_contact" for name in robot.fingers]
+    path.write_text(robot.urdf())
+    palm, count = robot.description.palm_link, len(tips)
+    config: dict[str, Any] = {"type": kind, "urdf_path": str(path), "low_pass_alpha": share}
+    if kind == "vector":
+        numbers = [[0] * count, list(range(1, count + 1))]
+        config |= {"target_origin_link_names": [palm] * count, "target_task_link_names": tips}
+        config |= {"target_link_human_indices": numbers}
+    elif kind == "position":
+        config |= {"target_link_names": tips, "target_link_human_indices": list(range(count))}
+    else:
+        config |= {"wrist_link_name": palm, "finger_tip_link_names": tips}
+    import_module("torch").set_num_threads(1)
+    module: Any = import_module("dex_retargeting.retargeting_config")
+    peer = module.RetargetingConfig.from_dict(config).build()
+    names = peer.optimizer.robot.dof_joint_names
+    ours = [names.index(name) for name in robot.actuators]
+    theirs = [robot.actuators.index(name) for name in names]
+    peer.set_qpos(start[theirs])
+    indices = peer.optimizer.target_link_human_indices
+    wrist = robot.links(start)[palm][:3, 3]
+
+    def lead(points: Array) -> Array:
+        if kind == "position":
+            return peer.retarget(points)[ours]
+        keys = np.vstack([wrist, points])
+        # DexPilot's numbers are those of 21 keypoints, four to a finger.
+        origin, task = np.array(indices) // (1 if kind == "vector" else 4)
+        return peer.retarget(keys[task] - keys[origin])[ours]
+
+    return lead
+
+
+@dataclass(frozen=True)
+class Led:
+    """What a motion came to: errors [m], roughness, share of frames beyond velocity, seconds."""
+
+    error: Array
+    rough: float
+    beyond: float
+    seconds: Array
+    cpu: float
+
+
+def measure(
+    robot: ik.ArmHand, lead: Lead, asked: Array, wanted: Array, period: float, velocity: Array
+) -> Led:
+    """Lead a hand through fingertips (k, f, 3) that are asked for."""
+    q, seconds = np.empty((len(asked), len(robot.actuators))), np.empty(len(asked))
+    before = time.process_time()
+    for i, points in enumerate(asked):
+        begin = time.perf_counter()
+        q[i] = lead(points)
+        seconds[i] = time.perf_counter() - begin
+    cpu = (time.process_time() - before) / len(asked)
+    settled = slice(round(1.0 / period), None)
+    error = np.linalg.norm(robot.contacts(q)[0] - wanted, axis=2)[settled]
+    rates = np.diff(q, axis=0) / period
+    most = period * velocity / 0.25
+    rough = float((np.abs(np.diff(rates, axis=0)) / most)[settled].max())
+    beyond = float((np.abs(rates) > 1.001 * velocity)[settled].any(axis=1).mean())
+    return Led(error.ravel(), rough, beyond, seconds[10:], cpu)
+
+
+def leaders(
+    robot: ik.ArmHand, start: Array, period: float, folder: Path
+) -> Iterator[tuple[str, Lead]]:
+    """Name and leader of everybody; each begins anew."""
+    follower = ik.Solver(robot).follow(start, period)
+    yield "casadi_ik, hand alone", lambda points: follower(points)
+    for kind in KINDS:
+        yield f"dex-retargeting {kind}", lead_by(robot, kind, 1.0, start, folder)
+    smoothed = lead_by(robot, "vector", SMOOTHED, start, folder)
+    yield "dex-retargeting vector, smoothed", smoothed
+
+
+def beside(paths: int, count: int, period: float, share: float) -> list[str]:
+    """The part of the report: the table, or why there is none."""
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        return [MISSING.format(missing=" and ".join(missing)), KNOWN]
+    found: dict[tuple[str, str], list[Led]] = {}
+    with TemporaryDirectory() as named:
+        folder = Path(named)
+        (folder / "hand.yaml").write_text(HAND)
+        robot = ik.load_robot(folder / "hand.yaml")
+        velocity = ik.Solver(robot).follow(robot.home, period).velocity
+        for seed in range(paths):
+            path = smooth_path(robot, seed, count, period, share)
+            tips = robot.contacts(path)[0]
+            noise = np.random.default_rng(seed).normal(0.0, NOISE, tips.shape)
+            for keypoints, asked in (("exact", tips), ("noisy", tips + noise)):
+                for who, lead in leaders(robot, path[0], period, folder):
+                    led = measure(robot, lead, asked, tips, period, velocity)
+                    found.setdefault((keypoints, who), []).append(led)
+    rows = []
+    for (keypoints, who), runs in found.items():
+        error = 1e3 * np.concatenate([one.error for one in runs])
+        seconds = 1e6 * np.concatenate([one.seconds for one in runs])
+        row = [keypoints, who, f"{np.median(error):.2f}", f"{np.quantile(error, 0.99):.1f}"]
+        row += [f"{max(one.rough for one in runs):.2f}"]
+        row += [f"{100 * np.mean([one.beyond for one in runs]):.1f}"]
+        row += [f"{np.median(seconds):.0f}", f"{np.quantile(seconds, 0.99):.0f}"]
+        rows.append([*row, f"{1e6 * np.mean([one.cpu for one in runs]):.0f}"])
+    said = EXPLAINED.format(
+        count=count,
+        frame=1e3 * period,
+        last=paths - 1,
+        noise=1e3 * NOISE,
+        version=version("dex_retargeting"),
+        smoothed=SMOOTHED,
+    )
+    return [said, markdown_table(HEADS, rows), KNOWN]
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -14,8 +14,8 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from closed_chain.report import OURS, PAPER, figure, options, title, write
-from runner import command, program
+from runner.figures import OURS, PAPER, figure, options, title, write
+from runner.report import command, program
 from samplers import random_arm_targets
 
 import casadi_ik as ik

@@ -10,10 +10,10 @@ that some arm configuration follows, and those in one piece with the start::
 from __future__ import annotations
 
 import numpy as np
-from closed_chain.chain import HeldThumb, cylinder
-from closed_chain.report import OURS, field, figure, options, title, write
+from closed_chain import HeldThumb, cylinder
 from numpy.typing import NDArray
-from runner import command, program
+from runner.figures import OURS, field, figure, options, title, write
+from runner.report import command, program
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array

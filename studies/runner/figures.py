@@ -1,7 +1,9 @@
-"""Figures in one style."""
+"""Figures in one style, and pages of one figure."""
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,8 @@ from matplotlib.collections import QuadMesh
 from casadi_ik.arrays import Array
 from casadi_ik.palette import FAINT, INK
 from casadi_ik.views.charts import new_figure
+
+RESULTS = Path(__file__).parents[1] / "results"
 
 PAPER, OURS, THIRD, FOURTH = COLORS = "#e08a2e", "#2f6db3", "#1f9d55", "#8e4ec6"
 """What the paper does, what we do, others."""
@@ -51,3 +55,29 @@ def field(
             medians[c] = np.median(part)
     grid = medians.reshape(bins, bins).T
     return axes.pcolormesh(*edges, grid, cmap=cmap, vmin=low, vmax=high, rasterized=True)
+
+
+def options(
+    description: str,
+    count: int,
+    arguments: list[str] | None,
+    **parameters: tuple[int | float | str, str],
+) -> argparse.Namespace:
+    """Size, seed and place of a study, and its own parameters: default and meaning by name."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--count", type=int, default=count, help="configurations")
+    parser.add_argument("--seed", type=int, default=0)
+    for name, (default, meaning) in parameters.items():
+        parser.add_argument(f"--{name}", type=type(default), default=default, help=meaning)
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the results")
+    return parser.parse_args(arguments)
+
+
+def write(folder: Path, name: str, drawn: Any, text: str) -> None:
+    """Write ``name/README.md`` and its picture, and say where."""
+    place = folder / name
+    place.mkdir(parents=True, exist_ok=True)
+    drawn.tight_layout()
+    drawn.savefig(place / f"{name}.png")
+    (place / "README.md").write_text(text.strip() + f"\n\n![{name}]({name}.png)\n")
+    print(f"{place / 'README.md'}\n\n{text.strip()}")

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import sys
+import tempfile
 import time
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -15,11 +19,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import TimeRemainingColumn as TimeRemaining
 from rich.text import Text
 
+from casadi_ik.batches import backend as places
 from casadi_ik.batches.parts import code_version
-from runner.cluster import backend
 
 PART = ".part"
 """Ending of a file that is not complete."""
+
+STUDIES = Path(__file__).parents[1]
+PACKAGES = (*places.PACKAGES, "polars")
 
 
 class Part(Protocol):
@@ -120,3 +127,36 @@ class _Rate(ProgressColumn):
 def _progress() -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate())
     return Progress(*columns, TimeRemaining(), console=Console(stderr=True))
+
+
+@contextmanager
+def backend(jobs: int, dask: str | None) -> Iterator[None]:
+    """Where joblib's calls go meanwhile, see `casadi_ik.batches.backend`.
+
+    A cluster needs the installed package with its extra `studies` and nothing else: the study's own
+    modules are sent to it, and what its workers solve comes back as bytes.
+
+    Args:
+        jobs: Processes on this machine.
+        dask: Address of a Dask scheduler whose workers solve instead.
+
+    Raises:
+        InputError: No scheduler answers, it has no worker, or a worker has not what is needed.
+    """
+    with places.backend(jobs, dask, PACKAGES) as client, tempfile.TemporaryDirectory() as place:
+        if client is not None:
+            modules = Path(place) / "casadi_ik_study.zip"
+            _pack(modules)
+            client.upload_file(str(modules))
+        yield
+
+
+def _pack(path: Path) -> None:
+    """A zip of the studies' modules in use here; the script itself travels with its calls."""
+    files = [getattr(module, "__file__", None) for module in list(sys.modules.values())]
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in sorted({Path(name).resolve() for name in files if name}):
+            if file.is_relative_to(STUDIES) and str(file) != getattr(
+                sys.modules["__main__"], "__file__", ""
+            ):
+                archive.write(file, file.relative_to(STUDIES))

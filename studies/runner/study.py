@@ -1,18 +1,27 @@
-"""What a study is: sets of targets, and the ways in which each target is solved."""
+"""A study: sets of targets times settings, solved block by block, resumable, in its own folder."""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import io
+import json
+import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
+from casadi_ik.logs import Keep
+from runner.parts import PART, code_version, keep, solved
 
 FIRST_USE = 8
 """Targets that a solver's first use is tried on: so many are also solved side by side."""
@@ -156,3 +165,188 @@ def _used(robot: str, setting: Setting) -> ik.Solver:
     home = solver.robot.home
     solver.solve_batch(*solver.robot.contacts(np.tile(home, (FIRST_USE, 1))))
     return solver
+
+
+def solve_block(study: Study, block: Block, log: Keep | None = None) -> dict[str, bytes]:
+    """Solve a block: what a worker does; bytes, so that it needs no folder in common.
+
+    Args:
+        study: The study.
+        block: The block.
+        log: What to log; None: no log.
+
+    Returns:
+        Files by ending, the last of which is there when all are: an MCAP log if one was asked for,
+        and a row per target as Parquet.
+    """
+    solver = study.ready_solver(block.setting)
+    q = study.configurations(block.targets, block.number)[: block.size]
+    points, normals = robot_of(study.robot).contacts(q)
+    asked: dict[str, Any] = {"seed": study.seed}
+    if block.setting.start:
+        # Said, it is also where the solution is to be near; else the same home is a start only.
+        asked["q0"] = study.start(block.setting)
+    files: dict[str, bytes] = {}
+    if log is None:
+        batch = solver.solve_batch(points, normals, **asked)
+    else:
+        # Solves are numbered from 0 in every log; with one seed all would keep the same numbers.
+        own = dataclasses.replace(log, seed=zlib.crc32(str(block.path).encode()))
+        with tempfile.TemporaryDirectory(prefix="casadi_ik-study-") as place:
+            path = Path(place) / "block.mcap"
+            batch = solver.solve_batch(points, normals, **asked, log=path, keep=own)
+            files[".mcap"] = path.read_bytes()
+    table = io.BytesIO()
+    _frame(study, block, batch, solver.robot.fingers).write_parquet(table)
+    return files | {".parquet": table.getvalue()}
+
+
+def _frame(
+    study: Study, block: Block, batch: ik.BatchSolution, fingers: tuple[str, ...]
+) -> pl.DataFrame:
+    """A row per target."""
+    count = len(batch)
+    columns: dict[str, Any] = {
+        "study": np.full(count, study.name),
+        "setting": np.full(count, block.setting.key),
+        "targets": np.full(count, block.targets.key),
+        "target": block.number * study.block + np.arange(count),
+        "method": np.full(count, block.setting.method),
+        "limits": np.full(count, block.setting.limits),
+        "success": batch.success,
+        "status": batch.status_names,
+        "iterations": batch.iterations,
+        "restarts": batch.restarts,
+        "time": batch.time,
+    }
+    for i, finger in enumerate(fingers):
+        columns[f"position_error_{finger}"] = batch.position_error[:, i]
+        columns[f"angle_error_{finger}"] = batch.angle_error[:, i]
+    return pl.DataFrame(columns)
+
+
+def run(
+    study: Study, folder: Path, jobs: int = 1, dask: str | None = None, log: Keep | None = None
+) -> None:
+    """Solve what is missing.
+
+    Args:
+        study: The study.
+        folder: Where its results are and go: one file per block. A run that is killed loses the
+            blocks being solved and nothing else; the next one goes on.
+        jobs: Processes on this machine.
+        dask: Address of a Dask scheduler whose workers solve instead; they need the installed
+            package with its extra `studies`, and neither this folder nor this script.
+        log: What to log, in one file per block; None: no logs.
+
+    Raises:
+        InputError: The folder holds results that were made otherwise, or the cluster cannot be
+            used.
+    """
+    claim(study, folder)
+    todo = missing(study, folder)
+    for block, files in solved(partial(solve_block, study, log=log), todo, jobs, dask, study.name):
+        for ending, content in files.items():
+            keep((folder / block.path).with_suffix(ending), content)
+
+
+STUDY_FILE = "study.json"
+
+
+def fingerprint(study: Study) -> dict[str, Any]:
+    """Everything that decides a result, but how many there are."""
+    return {
+        "code": code_version(),
+        "robot": _digest(robot_of(study.robot).urdf()),
+        "seed": study.seed,
+        "block": study.block,
+        "targets": {targets.key: _name(targets.configurations) for targets in study.sets},
+        "settings": {
+            setting.key: {
+                **study.solver(setting).parameters,
+                "start": study.start(setting).tolist(),
+                "robot": _digest(study.solver(setting).robot.urdf()),
+            }
+            for setting in study.settings
+        },
+    }
+
+
+def claim(study: Study, folder: Path) -> None:
+    """Take a folder for a study, or take it up again.
+
+    Parts that a killed run left behind are removed; new sets and settings are added.
+
+    Raises:
+        InputError: The folder holds results that were made otherwise.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path, mine = folder / STUDY_FILE, json.loads(json.dumps(fingerprint(study), default=str))
+    if path.exists():
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        for key, value in mine.items():
+            if isinstance(value, dict):
+                for name, entry in value.items():
+                    _same(path, f"{key}.{name}", kept[key].setdefault(name, entry), entry)
+            else:
+                _same(path, key, kept[key], value)
+        mine = kept
+    elif any(folder.iterdir()):
+        raise InputError(f"{folder}: holds files but no {STUDY_FILE}, expected an empty folder")
+    keep(path, json.dumps(mine, indent=1) + "\n")
+    for left in folder.rglob(f"*{PART}"):
+        left.unlink(missing_ok=True)
+
+
+def missing(study: Study, folder: Path) -> list[Block]:
+    """The blocks that are not there yet, or with fewer targets than are wanted now."""
+    return [block for block in study.blocks() if _rows(folder / block.path) < block.size]
+
+
+def _rows(path: Path) -> int:
+    if not path.exists():
+        return 0
+    return int(pl.scan_parquet(path).select(pl.len()).collect().item())
+
+
+def read_results(study: Study, folder: Path) -> pl.DataFrame:
+    """Everything a study has come to so far, whatever its count; no rows if nothing."""
+    paths = [
+        path
+        for setting in study.settings
+        for group in study.sets
+        for path in sorted((folder / setting.key / group.key).glob("*.parquet"))
+    ]
+    return pl.read_parquet(paths) if paths else pl.DataFrame()
+
+
+def code_of(folder: Path) -> str | None:
+    """Version of the code a folder's results were made with, if there are any."""
+    path = folder / STUDY_FILE
+    if not path.exists():
+        return None
+    return json.loads(path.read_text(encoding="utf-8"))["code"]
+
+
+def _same(path: Path, key: str, found: Any, expected: Any) -> None:
+    if found != expected:
+        raise InputError(
+            f"{path}: {key}: results made with {_brief(found)} are here, this study has "
+            f"{_brief(expected)}; use another folder"
+        )
+
+
+def _brief(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"settings {_digest(text)}"
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _name(function: Any) -> str:
+    if isinstance(function, partial):
+        given = [*map(str, function.args), *(f"{k}={v}" for k, v in function.keywords.items())]
+        return f"{_name(function.func)}({', '.join(given)})"
+    return function.__qualname__

@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from runner import Setting, Study, TargetSet, program, run
+from runner.report import program
+from runner.study import Setting, Study, TargetSet, run
 from samplers import near_limits, random_hands
 
 from casadi_ik.logs import Keep
@@ -24,7 +25,7 @@ STUDY = Study(
 def main() -> None:
     """Run it: FOLDER [ADDRESS of a Dask scheduler]."""
     address = sys.argv[2] if len(sys.argv) > 2 else None
-    run(STUDY, Path(sys.argv[1]), jobs=2, dask=address, keep=Keep())
+    run(STUDY, Path(sys.argv[1]), jobs=2, dask=address, log=Keep())
 
 
 if __name__ == "__main__":

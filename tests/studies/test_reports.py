@@ -9,12 +9,18 @@ import math
 import numpy as np
 import polars as pl
 import pytest
+import qiu_report
 import table_one
-from qiu_table import figures
-from qiu_table.paper import METHODS, TABLE_I, printed_mean
-from qiu_table.settings import ablation_study, readings_study, table_study
-from qiu_table.tables import readings
-from runner import read_results, run
+from qiu_report import readings
+from qiu_settings import (
+    PRINTED,
+    TABLE_I,
+    ablation_study,
+    printed_mean,
+    readings_study,
+    table_study,
+)
+from runner.study import read_results, run
 
 import casadi_ik as ik
 
@@ -28,13 +34,13 @@ def test_printed_table():
     assert round(printed_mean("enhanced-dls").success) == 96
     assert 11 < printed_mean("original-dls").success < 12
     assert set(TABLE_I) < set(ik.shipped_grasps("kuka_lwr_barrett"))
-    assert all(set(cells) == set(METHODS) for cells in TABLE_I.values())
+    assert all(set(cells) == set(PRINTED) for cells in TABLE_I.values())
     assert printed_mean("enhanced-sdls").iterations == pytest.approx(236.6, abs=0.1)
 
 
 def test_table_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(figures, "CURVES", 1)
-    monkeypatch.setattr(figures, "LONGEST", 20)
+    monkeypatch.setattr(qiu_report, "CURVES", 1)
+    monkeypatch.setattr(qiu_report, "LONGEST", 20)
     out, report = tmp_path / "results", tmp_path / "report"
     common = ["--out", str(out), "--report", str(report), "--block", "2"]
     table_one.main(["--count", "2", "--methods", "hand-first", "enhanced-dls", *common])

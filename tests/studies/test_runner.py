@@ -18,17 +18,9 @@ import polars as pl
 import pytest
 import small_study
 from dask_processes import scheduler_process, worker_process
-from runner import (
-    interval_text,
-    mean_metric,
-    median_metric,
-    rate_metric,
-    read_results,
-    run,
-    study,
-)
-from runner.block import solve_block
-from runner.results import STUDY_FILE, claim, missing
+from runner import study
+from runner.report import interval_text, mean_metric, median_metric, rate_metric
+from runner.study import STUDY_FILE, claim, missing, read_results, run, solve_block
 
 import casadi_ik as ik
 from casadi_ik.batches import backend
@@ -199,7 +191,7 @@ def test_no_time_holds_a_first_use(monkeypatch):
 
 
 def test_a_changed_seed_is_one_line(done):
-    script = f"import runner, small_study as s, dataclasses, pathlib; runner.program(lambda: runner.run(dataclasses.replace(s.STUDY, seed=1), pathlib.Path({str(done)!r})))"  # noqa: E501
+    script = f"from runner import report, study; import small_study as s, dataclasses, pathlib; report.program(lambda: study.run(dataclasses.replace(s.STUDY, seed=1), pathlib.Path({str(done)!r})))"  # noqa: E501
     ended = subprocess.run(
         [sys.executable, "-c", script],
         env=os.environ | {"PYTHONPATH": FOLDERS},
@@ -214,7 +206,7 @@ def test_a_changed_seed_is_one_line(done):
 def test_the_logs_of_a_study_are_one_log(tmp_path):
     """Of two settings, each block counting from 0 and with a sample of its own."""
     study = dataclasses.replace(STUDY, sets=STUDY.sets[:1], count=8)
-    run(study, tmp_path / "study", keep=Keep())
+    run(study, tmp_path / "study", log=Keep())
     merged = ik.logs.merge_logs(tmp_path / "study", tmp_path / "all.mcap")
     assert merged.shards == 4
     for log in map(ik.logs.open, (tmp_path / "study", merged.path)):
@@ -227,7 +219,7 @@ def test_the_logs_of_a_study_are_one_log(tmp_path):
 
 def test_a_log_per_block_keeps_what_is_asked_for(done, tmp_path):
     study = dataclasses.replace(STUDY, settings=STUDY.settings[:1])
-    run(study, tmp_path, keep=Keep(failed=True, singular=False, sample=0.25))
+    run(study, tmp_path, log=Keep(failed=True, singular=False, sample=0.25))
     assert contents(tmp_path, study).equals(contents(done, study))
     logs = sorted(tmp_path.rglob("*.mcap"))
     assert len(logs) == len(list(tmp_path.rglob("*.parquet"))) == len(list(study.blocks()))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import ar10_gains
 import calibration
 import closed_chain_singularities
 import closed_chain_workspace
@@ -11,8 +12,6 @@ import numpy as np
 import proofs
 import pytest
 import virtual_joint_range
-from ar10 import tip_poses
-from ar10.hand import within
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError
@@ -49,11 +48,11 @@ def test_what_counts_as_near_singular(tmp_path: Path) -> None:
 
 def test_gains_and_resolution_of_the_sliders(tmp_path: Path) -> None:
     robot, rng = ik.load_robot("ar10"), np.random.default_rng(0)
-    text = tip_poses.index_pose(robot, tmp_path, 1, rng, (0.3, 1.0), 3e-4)
+    text = ar10_gains.index_pose(robot, tmp_path, 1, rng, (0.3, 1.0), 3e-4)
     assert "model, sliders in 0.3 mm: left over 1 goals" in text
     assert "| 0.3 |  |  |" in text  # the paper has no such gain
     assert "| 1 | -0.60, -0.71 | 0.93 |" in text
-    assert within(robot, 0.5) == pytest.approx((robot.lower + robot.upper) / 2)
+    assert ar10_gains.within(robot, 0.5) == pytest.approx((robot.lower + robot.upper) / 2)
 
 
 def test_parts_of_outliers(tmp_path: Path) -> None:

@@ -1,1 +1,0 @@
-"""Hands that are calibrated although their dimensions are known: trials and their pictures."""

@@ -1,1 +1,0 @@
-"""What the studies of the arm-thumb closed chain share."""

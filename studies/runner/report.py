@@ -1,0 +1,195 @@
+"""Reports: figures with their confidence, tables, pages, and where they come from."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from markdown_it import MarkdownIt
+from numpy.typing import ArrayLike
+
+from casadi_ik.errors import CasadiIKError
+from casadi_ik.kernels.compiler import find_compiler
+from casadi_ik.logs.provenance import machine, package_versions
+
+Z95 = 1.959963984540054
+"""Quantile of the normal distribution for 95 % confidence."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure.
+
+    Attributes:
+        name: What it is of, from the general to the particular, separated by slashes.
+        value: The figure; NaN if there is nothing to take it from.
+        unit: Its unit.
+        better: "higher" or "lower".
+        low: Lower end of its 95 % confidence interval.
+        high: Upper end.
+        n: Number of samples behind it.
+    """
+
+    name: str
+    value: float
+    unit: str
+    better: str
+    low: float
+    high: float
+    n: int
+
+
+def rate_metric(name: str, successes: int, n: int) -> Metric:
+    """A success rate in percent with the interval of Wilson (1927)."""
+    if n == 0:
+        return Metric(name, math.nan, "%", "higher", 0.0, 100.0, 0)
+    share, z2 = successes / n, Z95**2
+    middle = (share + z2 / (2 * n)) / (1 + z2 / n)
+    half = Z95 * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
+    low, high = max(0.0, middle - half), min(1.0, middle + half)
+    # At the ends rounding would leave the interval a hair off the rate.
+    low, high = (0.0 if successes == 0 else low), (1.0 if successes == n else high)
+    return Metric(name, 100 * share, "%", "higher", 100 * low, 100 * high, n)
+
+
+def mean_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") -> Metric:
+    """A mean with the normal interval of its standard error."""
+    samples = np.asarray(values, dtype=float)
+    if len(samples) == 0:
+        return Metric(name, math.nan, unit, better, math.nan, math.nan, 0)
+    value = float(samples.mean())
+    spread = float(samples.std(ddof=1)) if len(samples) > 1 else math.nan
+    half = Z95 * spread / math.sqrt(len(samples))
+    # Of what cannot be negative the mean is not either, however few samples there are.
+    low = max(value - half, 0.0) if samples.min() >= 0 else value - half
+    return Metric(name, value, unit, better, low, value + half, len(samples))
+
+
+def median_metric(name: str, values: ArrayLike, unit: str, better: str = "lower") -> Metric:
+    """A median with the interval between order statistics (normal approximation)."""
+    samples = np.sort(np.asarray(values, dtype=float))
+    n = len(samples)
+    if n == 0:
+        return Metric(name, math.nan, unit, better, math.nan, math.nan, 0)
+    half = Z95 * math.sqrt(n) / 2
+    low = samples[max(0, math.floor(n / 2 - half))]
+    high = samples[min(n - 1, math.ceil(n / 2 + half))]
+    return Metric(name, float(np.median(samples)), unit, better, float(low), float(high), n)
+
+
+def interval_text(metric: Metric, digits: int = 1) -> str:
+    """The figure and its interval as "97.4 (97.1-97.7)"; a dash if there is none."""
+    if math.isnan(metric.value):
+        return "-"
+    if math.isnan(metric.low):
+        return f"{metric.value:.{digits}f}"
+    return f"{metric.value:.{digits}f} ({metric.low:.{digits}f}\u2013{metric.high:.{digits}f})"
+
+
+def write_metrics(metrics: Iterable[Metric], path: Path) -> None:
+    """Write figures as JSON, one per line; NaN as null."""
+    rows = []
+    for metric in metrics:
+        entry = dataclasses.asdict(metric)
+        rows.append(
+            {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in entry.items()}
+        )
+    lines = ",\n ".join(json.dumps(row) for row in rows)
+    path.write_text(f"[\n {lines}\n]\n", encoding="utf-8")
+
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem }
+table { border-collapse: collapse; font-size: 0.9rem }
+th, td { padding: 0.15rem 0.6rem; border-bottom: 1px solid #ddd }
+img { max-width: 100% }
+code { font-size: 0.9em }
+"""
+
+
+def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table; the first column to the left, the others to the right."""
+    lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def write_page(title: str, parts: Sequence[str], folder: Path) -> None:
+    """Write `report.md` and `report.html`.
+
+    Args:
+        title: Title of the page.
+        parts: Markdown, one block after the other; figures by names in the folder.
+        folder: Where it goes; made if it is not there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    text = "\n\n".join((f"# {title}", *(part.strip() for part in parts))) + "\n"
+    (folder / "report.md").write_text(text, encoding="utf-8")
+    body = MarkdownIt("commonmark").enable("table").render(text)
+    head = f'<meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+    page = f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{body}</body></html>\n'
+    (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+PACKAGES = ("casadi-ik", "casadi", "numpy", "polars", "joblib", "dask")
+
+
+def provenance(code: Mapping[str, str | None]) -> str:
+    """A paragraph of Markdown.
+
+    Args:
+        code: Version of the code the results of every study were made with (`code_of`).
+    """
+    on = machine()
+    compiler = find_compiler()
+    versions = ", ".join(f"{name} {text}" for name, text in package_versions(PACKAGES).items())
+    made = {name: text for name, text in code.items() if text is not None}
+    sources = ", ".join(f"{name} `{text}`" for name, text in made.items())
+    return (
+        f"Machine: {on['processor']}, {on['cores']} cores, {on['system']}; "
+        f"{compiler.version if compiler else 'no C compiler'}. Packages: {versions}. Sources "
+        f"(version and digest): {sources}; report written at commit `{_commit()}`."
+    )
+
+
+def _commit() -> str:
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True)
+    except OSError:
+        return "unknown"
+    return done.stdout.strip() or "unknown"
+
+
+def program(main: Callable[[], None]) -> None:
+    """Run a study's `main`; bad input ends it with one line and exit code 2."""
+    try:
+        main()
+    except CasadiIKError as error:
+        sys.exit(_refused(str(error)))
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on", file=sys.stderr)
+        sys.exit(130)
+
+
+def _refused(text: str) -> int:
+    print(f"{Path(sys.argv[0]).name}: error: {text}", file=sys.stderr)
+    return 2
+
+
+def command(script: str, arguments: Sequence[str] | None) -> str:
+    """The command that was run, as a shell takes it.
+
+    Args:
+        script: `__file__` of the study.
+        arguments: What its `main` was given; None: the words of the process.
+    """
+    words = sys.argv[1:] if arguments is None else arguments
+    return shlex.join(["python", f"studies/{Path(script).name}", *map(str, words)])
