@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
+from casadi_ik.collision.solids import box_mesh, capsule_mesh
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.mesh_file import read_mesh
+from casadi_ik.grasps.shapes import circle, prism_mesh
 from casadi_ik.robots.robot_files.foreign import package_folders
 from casadi_ik.robots.robot_files.tree import Element, RobotTree, pose_of, simple_shape, values_of
 
@@ -175,11 +177,8 @@ def _of_element(shape: Element, missing: Missing) -> Surface | None:
     surface = None
     if mesh is not None:
         surface = _of_mesh(mesh, missing)
-    elif simple is not None and simple[0] == "box":
-        surface = box_shape(np.array(simple[1]) / 2)
     elif simple is not None:
-        kind, (radius, length) = simple[0], (*simple[1], 0.0)[:2]
-        surface = round_shape(radius, length / 2, kind.capitalize())
+        surface = simple_surface(simple[0], np.array(simple[1]))
     return None if surface is None or pose is None else surface.moved(pose)
 
 
@@ -218,32 +217,13 @@ def mesh_file(name: str, path: Path) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def box_shape(half: Array) -> Surface:
-    """A box about the origin by half its edges (3,)."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    return Surface(corners.astype(float), np.array(triangles, dtype=np.int64))
-
-
-def round_shape(radius: float, half: float, kind: str) -> Surface:
-    """A sphere, or a capsule or cylinder along z."""
-    if kind == "Cylinder":
-        profile = np.array([[0.0, -half], [radius, -half], [radius, half], [0.0, half]])
-    else:
-        angles = np.linspace(-np.pi / 2, np.pi / 2, AROUND // 2 + 1)
-        profile = radius * np.column_stack([np.cos(angles), np.sin(angles)])
-        profile[:, 1] += np.where(angles < 0, -half, half)
-    turns = np.linspace(0, 2 * np.pi, AROUND, endpoint=False)
-    rings = [
-        np.column_stack([r * np.cos(turns), r * np.sin(turns), np.full(AROUND, z)])
-        for r, z in profile
-    ]
-    i, j = np.meshgrid(np.arange(len(rings) - 1), np.arange(AROUND), indexing="ij")
-    a, b = i * AROUND + j, i * AROUND + (j + 1) % AROUND
-    c, d = a + AROUND, b + AROUND
-    triangles = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
-    return Surface(np.concatenate(rings), triangles)
+def simple_surface(kind: str, size: Array) -> Surface:
+    """A box by its edges, a sphere, or a capsule or cylinder along z by radius and length [m]."""
+    if kind == "box":
+        return Surface(*box_mesh(size / 2))
+    if kind == "cylinder":
+        return Surface(*prism_mesh(size[0] * circle(AROUND), size[1]))
+    return Surface(*capsule_mesh(size[0], size[1] / 2 if kind == "capsule" else 0.0, AROUND))
 
 
 def _of_mjcf(mujoco: Any, model: Any) -> dict[str, Surface]:
@@ -270,17 +250,17 @@ def _of_mjcf(mujoco: Any, model: Any) -> dict[str, Surface]:
 def _of_geom(mujoco: Any, model: Any, geom: int) -> Surface | None:
     kind, size = int(model.geom_type[geom]), np.array(model.geom_size[geom])
     types = mujoco.mjtGeom
-    if kind == types.mjGEOM_BOX:
-        return box_shape(size)
-    if kind == types.mjGEOM_SPHERE:
-        return round_shape(size[0], 0.0, "Sphere")
-    if kind == types.mjGEOM_CAPSULE:
-        return round_shape(size[0], size[1], "Capsule")
-    if kind == types.mjGEOM_CYLINDER:
-        return round_shape(size[0], size[1], "Cylinder")
     if kind == types.mjGEOM_ELLIPSOID:
-        ball = round_shape(1.0, 0.0, "Sphere")
+        ball = simple_surface("sphere", np.ones(1))
         return Surface(ball.points * size, ball.triangles)
+    simple = {
+        types.mjGEOM_BOX: ("box", 2 * size),
+        types.mjGEOM_SPHERE: ("sphere", size),
+        types.mjGEOM_CAPSULE: ("capsule", size * [1, 2, 0]),
+        types.mjGEOM_CYLINDER: ("cylinder", size * [1, 2, 0]),
+    }
+    if kind in simple:
+        return simple_surface(*simple[kind])
     if kind != types.mjGEOM_MESH:
         return None
     mesh = int(model.geom_dataid[geom])
