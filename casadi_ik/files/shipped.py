@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
 
 from casadi_ik.errors import DescriptionError, UnknownNameError
@@ -59,10 +60,11 @@ def resolve(name_or_path: str | Path, kind: str, beside: Path | None = None) -> 
         return path
     path = models_folder() / kind / f"{text}.yaml"
     if text not in shipped_names(kind):
-        noun = kind.replace("_", "-").removesuffix("s")
+        noun, known = kind.replace("_", "-").removesuffix("s"), shipped_names(kind)
+        near = difflib.get_close_matches(text, known, 1)
+        rest = f"did you mean {near[0]!r}?" if near else f"shipped: {', '.join(known)}"
         raise UnknownNameError(
-            f"no shipped {noun} is called {text!r}; shipped: {', '.join(shipped_names(kind))} "
-            "(or give the path of a YAML file)"
+            f"no shipped {noun} is called {text!r}; {rest} (or give the path of a YAML file)"
         )
     return path
 

@@ -130,6 +130,7 @@ def test_method_that_cannot_take_the_robot(
     ("name", "fragment"),
     [
         ("nothing", "no shipped grasp is called 'nothing'; shipped: "),
+        ("cupp", "no shipped grasp is called 'cupp'; did you mean 'cup'? (or give the path of"),
         ("nothing.yaml", "nothing.yaml: no such file"),
         ("/", "/: "),
         ("", "no shipped grasp is called ''"),

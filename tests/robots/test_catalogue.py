@@ -132,11 +132,11 @@ def test_hands_stand_where_published_files_have_them(hand):
 
 def test_unknown_arms_and_hands_are_named():
     with pytest.raises(
-        ik.errors.UnknownNameError, match=r"no shipped arm is called 'pander'; shipped: "
+        ik.errors.UnknownNameError, match=r"no shipped arm is called 'pander'; did you mean 'panda'"
     ):
         ik.load_robot("pander+allegro_right")
     with pytest.raises(
-        ik.errors.UnknownNameError, match=r"no shipped hand is called 'allegra'; shipped: "
+        ik.errors.UnknownNameError, match=r"no shipped hand is called 'allegra'; did you mean 'allegro_"
     ):
         ik.load_robot("panda+allegra")
     with pytest.raises(ik.errors.DescriptionError, match="no such file"):
