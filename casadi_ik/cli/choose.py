@@ -29,12 +29,9 @@ from casadi_ik.cli.report import (
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.datasets import LAYOUTS, Candidates, load_candidates
 from casadi_ik.errors import DescriptionError, InputError
-from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.load import GraspFile, grasp_data, grasp_of
-
-MOST_BYTES = 2**26
-"""Of a file of ranked answers: ten thousand answers take a third of it."""
 
 
 @command(
@@ -287,7 +284,7 @@ def read_ranked(path: Path) -> list[RankedEntry]:
             message names file and key.
     """
     try:
-        size, most = path.stat().st_size, limit(MOST_BYTES)
+        size, most = path.stat().st_size, limit(LIMITS.ranked_bytes)
         if size > most:
             raise InputError(f"{path}: found {size} bytes, expected at most {most} {RAISED}")
         found = msgspec.json.decode(path.read_bytes(), type=_RankedFile).ranked

@@ -20,7 +20,7 @@ from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.report import fields, files, headline
 from casadi_ik.cli.table import Answer, Exit, Said, command
 from casadi_ik.errors import InputError, MissingExtraError
-from casadi_ik.files.limits import RAISED, limit
+from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.npz import read_npz
 from casadi_ik.grasps import Grasp
 from casadi_ik.motion.follower import Follower
@@ -30,18 +30,6 @@ from casadi_ik.motion.reaching import PARTS, Reach
 from casadi_ik.motion.retarget import KEYPOINTS, Retargeter, load_retarget, usual_retarget
 
 MOTION = opt.out("MOTION.mcap", "write the motion", opt.file_name(".mcap", ".npz", ".csv"))
-
-CYCLES_AT_ONCE = 1024
-"""Cycles whose targets are in memory at once."""
-
-MOST_CYCLES = 4_000_000
-"""Of a motion: an hour at a kilohertz."""
-
-MOST_BYTES = 2**28
-"""Of all arrays of a stream: hours of keypoints."""
-
-FAR = 5.0
-"""Contacts farther from the base than this [m], or keypoints from each other, are in mm."""
 
 
 @command(
@@ -98,10 +86,10 @@ def follow(said: Said) -> Answer:
     solver = the_solver(said, robot)
     start = np.asarray(the_start(said, robot) or _start(solver, frames))
     seconds = float(frames.times[-1])
-    if seconds > limit(MOST_CYCLES) * said.period:
+    if seconds > limit(LIMITS.stream_cycles) * said.period:
         raise InputError(
             f"{path}: times: found {seconds:g} s, expected at most "
-            f"{limit(MOST_CYCLES) * said.period:g} s at this period {RAISED}"
+            f"{limit(LIMITS.stream_cycles) * said.period:g} s at this period {RAISED}"
         )
     follower = solver.follow(start, said.period)
     times = np.arange(1, int(np.ceil(seconds / said.period)) + 2) * said.period
@@ -173,7 +161,7 @@ def _read_frames(path: Path, fingers: int) -> _Frames:
         DescriptionError: Missing, damaged or too large; the message names the file.
         InputError: Other arrays than expected; the message names file and key.
     """
-    arrays = read_npz(path, MOST_BYTES)
+    arrays = read_npz(path, LIMITS.stream_bytes)
     known = ["keypoints", "normals", "points", "times"]
     if ("keypoints" in arrays) == ("points" in arrays):
         raise InputError(
@@ -194,11 +182,11 @@ def _read_frames(path: Path, fingers: int) -> _Frames:
     with np.errstate(invalid="ignore"):
         away = np.linalg.norm(frames - middle, axis=2)
     away = away[np.isfinite(away)]
-    if len(away) and np.median(away) > FAR:
+    if len(away) and np.median(away) > LIMITS.stream_reach:
         of = "middle of the hand" if key == "keypoints" else "base"
         raise InputError(
             f"{path}: {key}: found {np.median(away):.4g} m from the {of}, expected at most "
-            f"{FAR:g} m (numbers in mm?)"
+            f"{LIMITS.stream_reach:g} m (numbers in mm?)"
         )
     normals = arrays.get("normals")
     if normals is not None and (key == "keypoints" or normals.shape != frames.shape):
@@ -232,8 +220,9 @@ def _followed(
 ) -> Iterator[Array]:
     """Where the motors are at the end of each cycle."""
     weight = retargeter.config.wrist_weight, retargeter.config.wrist_weight
-    for first in range(0, len(times), CYCLES_AT_ONCE):
-        now = times[first : first + CYCLES_AT_ONCE]
+    at_once = 1024  # whose targets are in memory
+    for first in range(0, len(times), at_once):
+        now = times[first : first + at_once]
         if frames.keypoints is None:
             both = frames.at(now, frames.points), frames.at(now, frames.normals)
             yield from (follower(*target) for target in zip(*both, strict=True))

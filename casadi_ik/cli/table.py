@@ -65,8 +65,8 @@ COMMANDS = {
 
 GROUPS = {
     "": """\
-Where must every motor of an arm and its hand stand, so that each fingertip
-touches a given point and faces a given way?
+Inverse kinematics for robot arms with multi-fingered hands: fingertip contacts in,
+motor positions out, or the reason why not.
 
 Examples:
   casadi-ik grasps                      list the shipped grasps

@@ -46,6 +46,11 @@ class FileLimits:
         dataset_bytes: Bytes of a file of a data set, unpacked.
         table_bytes: Bytes of a table of grasps, unpacked.
         candidates: Grasps of a file.
+        ranked_bytes: Bytes of a file of ranked answers, of which ten thousand take a third.
+        stream_bytes: Bytes of a stream of frames to be followed, unpacked: hours of keypoints.
+        stream_cycles: Cycles in which a stream is followed: an hour at a kilohertz.
+        stream_reach: Farthest contact from the base, or keypoint from the middle of the hand, in a
+            stream [m]; beyond it the numbers are in other units.
     """
 
     yaml_text: int = 10_000
@@ -71,6 +76,10 @@ class FileLimits:
     dataset_bytes: int = 2**29
     table_bytes: int = 2**26
     candidates: int = 200_000
+    ranked_bytes: int = 2**26
+    stream_bytes: int = 2**28
+    stream_cycles: int = 4_000_000
+    stream_reach: float = 5.0
 
 
 LIMITS = FileLimits()
