@@ -18,7 +18,7 @@ from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import checked_pose, one_pose
-from casadi_ik.kernels.stepper import Stepper
+from casadi_ik.kernels.loop import Stepper
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.writer import recorder_of
 from casadi_ik.motion.moving import MovingSolver

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.exporting.template import filled
-from casadi_ik.kernels.codegen import define, row_major, standing_alone
-from casadi_ik.kernels.constants import define_arrays, number
+from casadi_ik.exporting.single import filled
+from casadi_ik.kernels.codegen import define, define_arrays, number, row_major, standing_alone
 from casadi_ik.kernels.emitter import Form
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.motion.asked import contact_weights

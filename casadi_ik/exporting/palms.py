@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.exporting.template import filled
-from casadi_ik.kernels.constants import define_arrays, number
+from casadi_ik.exporting.single import filled
+from casadi_ik.kernels.codegen import define_arrays, number
 from casadi_ik.problem.questions import BEYOND, touched
 
 MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from casadi_ik.exporting.single import SinglePrecision
-from casadi_ik.kernels.constants import number
+from casadi_ik.kernels.codegen import number
 
 IN_DOUBLE = {
     "REAL": "double",

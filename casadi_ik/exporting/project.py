@@ -12,9 +12,9 @@ from pathlib import Path
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.exporting.follow import FollowSources
+from casadi_ik.exporting.solver import FollowSources
 from casadi_ik.exporting.scene import SceneSources
-from casadi_ik.exporting.scene_targets import IN_TEST_C, IN_TEST_SINGLE, SceneTargets
+from casadi_ik.exporting.targets import IN_TEST_C, IN_TEST_SINGLE, SceneTargets
 from casadi_ik.exporting.single import SinglePrecision, in_single_precision
 from casadi_ik.exporting.solver import SolverSources, hand_first
 from casadi_ik.exporting.targets import (
@@ -25,7 +25,7 @@ from casadi_ik.exporting.targets import (
     targets_header,
     written,
 )
-from casadi_ik.exporting.template import filled
+from casadi_ik.exporting.single import filled
 
 MARK = ".casadi_ik_export"
 """A file by which a folder is known as an export."""

@@ -18,11 +18,10 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import C_NAMES, EXPORTED
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.exporting.single import ARM_ROUNDING, SinglePrecision
-from casadi_ik.exporting.template import filled
-from casadi_ik.kernels.codegen import define, driver_text
-from casadi_ik.kernels.constants import define_arrays, number
-from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.exporting.single import filled
+from casadi_ik.kernels.codegen import define, define_arrays, driver_text, number
 from casadi_ik.kernels.function_kernel import FunctionKernel
+from casadi_ik.kernels.graphs import FunctionGraph
 from casadi_ik.kernels.robot_kernels import RobotKernels
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.problem.clearance import ROUNDING, SceneCheck

@@ -13,7 +13,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import stated
 from casadi_ik.errors import DescriptionError
-from casadi_ik.kernels.constants import number, numbers
+from casadi_ik.kernels.codegen import number, numbers
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.status import Status

@@ -12,17 +12,16 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.exporting.follow import NO_FOLLOWER
-from casadi_ik.exporting.palms import palm_marks
-from casadi_ik.exporting.precision import IN_DOUBLE, in_single
+from casadi_ik.exporting.solver import NO_FOLLOWER
+from casadi_ik.exporting.solver import palm_marks
+from casadi_ik.exporting.single import IN_DOUBLE, in_single
 from casadi_ik.exporting.scene import SceneSources, without_scene
 from casadi_ik.exporting.single import FOLLOWING, SinglePrecision, in_single_precision
-from casadi_ik.exporting.template import filled
+from casadi_ik.exporting.single import filled
 from casadi_ik.kernels import FunctionKernel, LoopKernel
-from casadi_ik.kernels.codegen import define, driver_text, row_major, standing_alone
-from casadi_ik.kernels.constants import define_arrays
+from casadi_ik.kernels.codegen import define, define_arrays, driver_text, row_major, standing_alone
 from casadi_ik.kernels.emitter import Form
-from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.graphs import FunctionGraph
 from casadi_ik.kernels.lookup import TILE
 from casadi_ik.methods.hand_first.driver import SearchPlan, source_text
 from casadi_ik.methods.hand_first.method import HandFirstMethod

@@ -10,10 +10,10 @@ import numpy as np
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.exporting.scene_targets import SceneTargets
+from casadi_ik.exporting.targets import SceneTargets
 from casadi_ik.exporting.single import in_single_precision
 from casadi_ik.grasps.load import load_grasp, shipped_grasps
-from casadi_ik.kernels.constants import number, numbers
+from casadi_ik.kernels.codegen import number, numbers
 
 COUNT = 1000
 """How many are stored."""

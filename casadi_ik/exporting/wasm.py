@@ -12,9 +12,9 @@ from pathlib import Path
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import KernelError, MissingExtraError
 from casadi_ik.exporting.project import Exported, exported, tested
-from casadi_ik.exporting.scene_targets import IN_TEST_MJS
+from casadi_ik.exporting.targets import IN_TEST_MJS
 from casadi_ik.exporting.targets import stored
-from casadi_ik.exporting.template import filled
+from casadi_ik.exporting.single import filled
 
 # No contraction: with fused multiply-adds the answers would be others in the last places.
 COMMAND = (

@@ -1,11 +1,22 @@
-"""How work is told to stop: Ctrl-C and SIGTERM reach the main thread, which tells the others."""
+"""How work is told to stop, and what a fork must not take along.
+
+Ctrl-C and SIGTERM reach the main thread, which tells the others; compiled code returns to Python a
+few times a second to be told.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
+from enum import IntEnum
+from functools import cached_property
+from types import TracebackType
+from typing import Any
 
 
 class CancelledError(BaseException):
@@ -70,3 +81,76 @@ def interrupt_afterwards() -> Iterator[None]:
                 signal.signal(number, handler)
     for number in came[:1]:
         signal.raise_signal(number)
+
+
+SLICE = 0.2
+"""Seconds after which a driver returns to Python, so that Ctrl-C works; then it is called again."""
+
+
+class DriverCode(IntEnum):
+    """Return values of the drivers (drivers/common.c)."""
+
+    DONE = 0
+    SLICE_OVER = 1
+    ROWS_FULL = 2
+    GOES_ON = 3
+    FEW_LEFT = 4
+    NO_MEMORY = -1
+
+
+def check(name: str, code: int) -> None:
+    """Raise unless the driver can be called again.
+
+    Raises:
+        MemoryError: No work memory.
+        CancelledError: This thread has been told to stop.
+    """
+    stop_if_cancelled()
+    if code == DriverCode.NO_MEMORY:
+        raise MemoryError(f"{name}: no work memory")
+
+
+class ForkSafeLock:
+    """A lock that is free in a forked child."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        _locks.add(self)
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._lock.release()
+
+    def renew(self) -> None:
+        """Be free, whoever holds it."""
+        self._lock = threading.Lock()
+
+
+_locks: weakref.WeakSet[ForkSafeLock] = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    for lock in list(_locks):
+        lock.renew()
+    if sys.version_info >= (3, 12):
+        return
+    # Up to Python 3.11 every cached property has a lock, held while its value is made.
+    for name, module in list(sys.modules.items()):
+        if not name.startswith("casadi_ik"):
+            continue
+        for kind in list(vars(module).values()):
+            for member in list(vars(kind).values()) if isinstance(kind, type) else []:
+                if isinstance(member, cached_property):
+                    unlocked: Any = member
+                    unlocked.lock = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

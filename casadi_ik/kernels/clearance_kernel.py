@@ -16,14 +16,11 @@ from casadi_ik.collision.distances import Table, nearest
 from casadi_ik.collision.model import placed, size_of
 from casadi_ik.collision.solids import C_NAMES
 from casadi_ik.errors import InputError
-from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.cancellation import SLICE, DriverCode, check
 from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
-from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
-from casadi_ik.kernels.function_graph import FunctionGraph
-from casadi_ik.kernels.function_kernel import FunctionKernel
-from casadi_ik.kernels.machine_lanes import machine_lanes
-from casadi_ik.kernels.recipe import recipe
+from casadi_ik.kernels.function_kernel import FunctionKernel, doubles, machine_lanes, memory
+from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.robots import RobotDescription
 
 SYMBOL = "casadi_ik_clearance"

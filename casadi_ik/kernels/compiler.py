@@ -19,9 +19,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from casadi_ik.errors import KernelError
-from casadi_ik.kernels.cancellation import stop_if_cancelled
-from casadi_ik.kernels.driver_code import SLICE
-from casadi_ik.kernels.folders import NO_ROOM
+from casadi_ik.kernels.cancellation import SLICE, stop_if_cancelled
 
 # No contraction: with fused multiply-adds the iterates would differ from the VM's. Errno of sqrt
 # and friends is never read, and without it they are single instructions of the same value. All
@@ -43,6 +41,8 @@ ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=all")
 
 SHOWN_ERROR_LINES, SHOWN_CHARACTERS = 3, 200
 """How much of a compiler's complaint is shown."""
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT) if hasattr(errno, "EDQUOT") else (errno.ENOSPC,)
 
 SMALL = 2**20
 """A disk with less room [bytes] counts as full if a compiler failed on it."""
@@ -279,3 +279,23 @@ def warn_no_compiler(problem: str = "") -> None:
         NoCompilerWarning,
         stacklevel=2,
     )
+
+
+RATE = 50_000
+"""Characters of C that a compiler takes in a second, about: 25,000 to 115,000 were measured."""
+
+LONG = 2.0
+"""Seconds from which a compilation is worth a word."""
+
+
+def announce(name: str, size: int) -> None:
+    """Say on stderr, if it is a terminal, what is compiled and about how long that takes.
+
+    Args:
+        name: Of the kernel.
+        size: Characters of its text.
+    """
+    stream, seconds = sys.stderr, size / RATE
+    if stream is not None and seconds >= LONG and stream.isatty():
+        stream.write(f"compiling {name} (about {seconds:.0f} s, once per machine)\n")
+        stream.flush()

@@ -1,8 +1,12 @@
-"""A CasADi Function as a fast callable on numpy arrays, with or without a batch dimension."""
+"""A CasADi Function as a fast callable on numpy arrays: one sample, a batch, step by step.
+
+Compiled if the machine can, otherwise in CasADi's virtual machine.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import logging
 from collections.abc import Sequence
 from functools import cached_property, partial
 from typing import Any
@@ -12,12 +16,92 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, KernelError
-from casadi_ik.kernels.buffered import BufferedFunction, doubles, memory
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
-from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
-from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.graphs import FunctionGraph
+
+logger = logging.getLogger(__name__)
+
+_BYTE: Any = ctypes.c_char
+
+
+class BufferedFunction:
+    """One function with its own input and output arrays; not to be shared by threads.
+
+    Attributes:
+        inputs: Flat arrays of the inputs' memory; write into them.
+        outputs: Flat arrays of the outputs' memory; a call overwrites them.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        """Make the arrays.
+
+        Args:
+            function: Dense and row-major (`codegen.row_major`).
+        """
+        self.inputs = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+        self.outputs = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
+        # The stubs of CasADi describe the C++ signatures of a buffer, not Python's.
+        buffer: Any
+        buffer, self._evaluate = function.buffer()
+        for i, array in enumerate(self.inputs):
+            buffer.set_arg(i, array.data)
+        for i, array in enumerate(self.outputs):
+            buffer.set_res(i, array.data)
+        self._buffer = buffer
+        self._name = function.name()
+
+    def __call__(self) -> bool:
+        """Evaluate; False if the function itself reports a failure, as generated code would."""
+        try:
+            self._evaluate()
+        except SystemError as error:
+            # A buffer reports Ctrl-C inside an evaluation as this.
+            if isinstance(error.__cause__, KeyboardInterrupt):
+                raise KeyboardInterrupt from error
+            raise
+        except RuntimeError as error:
+            # ... or, if it came while Ipopt was at work, as that.
+            if str(error) == "KeyboardInterrupt":
+                raise KeyboardInterrupt from error
+            logger.warning("function %r failed: %s", self._name, error)
+            return False
+        return self._buffer.ret() == 0
+
+
+def memory(array: NDArray[Any]) -> int:
+    """The address of an array's first element."""
+    if array.flags.writeable and array.flags.c_contiguous and array.size:
+        # A third of the time of the way below, which knows every array.
+        return ctypes.addressof(_BYTE.from_buffer(array))
+    return array.ctypes.data
+
+
+def doubles(values: Any) -> NDArray[np.float64]:
+    """The values as an aligned C-contiguous array of doubles, copied only if they are not."""
+    array = np.asarray(values, dtype=np.float64, order="C")
+    return array if array.flags.aligned else array.copy()
+
+
+SYMBOL_MACHINE = "casadi_ik_machine_lanes"
+
+
+def machine_lanes() -> int:
+    """Eight where registers hold eight doubles, else four; 0: one solve at a time.
+
+    The compiled answer is asked on every machine anew, since several may share a cache.
+    """
+    x = ca.SX.sym("x")
+    library = load_library(
+        "machine_lanes",
+        lambda: ca.Function("machine_lanes", [x], [x]),
+        driver_text("registers") + driver_text("machine_lanes"),
+        SYMBOL_MACHINE,
+        "machine_lanes",
+    )
+    return 0 if library is None else int(library[SYMBOL_MACHINE]())
+
 
 SYMBOL = "casadi_ik_map"
 
@@ -278,3 +362,189 @@ def _shape(size: tuple[int, int]) -> tuple[int, ...]:
     if columns != 1:
         return (rows, columns)
     return () if rows == 1 else (rows,)
+
+
+SYMBOL_LANES = "casadi_ik_map_lanes"
+
+
+class MeasureKernel:
+    """Evaluates a function of one vector for a batch of them; threads may call it at once."""
+
+    def __init__(self, graph: FunctionGraph, compiled: bool = True) -> None:
+        """Keep the function; it is compiled when first needed.
+
+        Args:
+            graph: One column in, one column out.
+            compiled: False keeps to the virtual machine.
+        """
+        self._graph = graph
+        self._compiled = compiled
+        ((self._n_in, _),) = graph.inputs.values()
+        ((self._n_out, _),) = graph.outputs
+
+    def prepare(self) -> None:
+        """Compile it."""
+        if self._map is None:
+            _ = self._one_by_one
+
+    @property
+    def entry(self) -> Any:
+        """The compiled map, with vectors or without; None if there is none."""
+        return self._one_by_one.entry if self._map is None else self._map
+
+    @cached_property
+    def _one_by_one(self) -> FunctionKernel:
+        """For machines without such vectors."""
+        return FunctionKernel(self._graph, self._compiled)
+
+    @cached_property
+    def _map(self) -> Any:
+        lanes = machine_lanes() if self._compiled else 0
+        if not lanes:
+            return None
+        constants = {"N_IN": 1, "N_OUT": 1, "TOTAL": self._n_in + self._n_out}
+        sizes = f"#define SIZES_IN {{{self._n_in}}}\n#define SIZES_OUT {{{self._n_out}}}\n"
+        driver = define(constants) + sizes + driver_text("map_job") + driver_text("map_lanes")
+        try:
+            library = load_library(
+                f"{self._graph.name}_lanes{lanes}",
+                lambda: row_major(self._graph.function),
+                driver,
+                SYMBOL_LANES,
+                f"{self._graph.recipe} lanes {lanes}" if self._graph.recipe else "",
+                partial(library_source, lanes=lanes),
+            )
+        except KernelError as error:
+            logger.warning("%s: one sample at a time: %s", self._graph.name, error)
+            return None
+        return None if library is None else library[SYMBOL_LANES]
+
+    def __call__(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values (k, m) for samples (k, n).
+
+        Raises:
+            KernelError: The function itself reports a failure.
+        """
+        given = doubles(samples)
+        if self._map is None or not len(given):
+            (values,) = self._one_by_one(given)
+            return values.reshape(len(given), self._n_out)
+        values = np.empty((len(given), self._n_out))
+        steps = [(ctypes.c_int64 * 1)(size) for size in (self._n_in, self._n_out)]
+        places = [(ctypes.c_void_p * 1)(memory(array)) for array in (given, values)]
+        job = MapJob(
+            *(ctypes.addressof(item) for pair in zip(places, steps, strict=True) for item in pair),
+            len(given),
+            0,
+            SLICE,
+        )
+        while (code := self._map(ctypes.byref(job))) != DriverCode.DONE:
+            check(self._graph.name, code)
+        return values
+
+
+Array = NDArray[np.float64]
+
+
+class Recurrence:
+    """Steps a function; not to be shared by threads.
+
+    Attributes:
+        parameters: Of the next step; write into it.
+        record: Of the last step; the next overwrites it.
+    """
+
+    def __init__(self, kernel: FunctionKernel) -> None:
+        """Lay the memory out.
+
+        Args:
+            kernel: Of two inputs and two outputs, the first of each of one size.
+        """
+        (size,), (count,) = kernel.input_shapes
+        _, (told,) = kernel.output_shapes
+        self._kernel = kernel
+        self.parameters, self.record = np.zeros(count), np.zeros(told)
+        # Code of CasADi reads inputs while it writes outputs: state and next state stand apart.
+        self._states = np.zeros(size), np.zeros(size)
+        self._now = 0
+        self._calls: tuple[SingleCall, ...] = ()
+        self._slow: BufferedFunction | None = None
+        if kernel.compiled:
+            self._calls = tuple(
+                SingleCall(kernel.name, kernel.entry, [here, self.parameters], [there, self.record])
+                for here, there in (self._states, self._states[::-1])
+            )
+        else:
+            self._slow = BufferedFunction(kernel.function)
+
+    @property
+    def state(self) -> Array:
+        """The state now; write into it to go on from elsewhere."""
+        return self._states[self._now]
+
+    @property
+    def before(self) -> Array:
+        """The state before the last step."""
+        return self._states[1 - self._now]
+
+    def step(self) -> Array:
+        """Make one step; the new state.
+
+        Raises:
+            KernelError: The function itself reports a failure.
+        """
+        now = self._now
+        if self._calls:
+            self._calls[now]()
+        else:
+            self._evaluate(self._states[now], self.parameters, self._states[1 - now], self.record)
+        self._now = 1 - now
+        return self._states[1 - now]
+
+    def back(self) -> None:
+        """Undo the last step, of which one can be undone."""
+        self._now = 1 - self._now
+
+    def run(self, state: Array, parameters: Array) -> tuple[Array, Array]:
+        """Make a row of steps; the own state stays as it is.
+
+        Args:
+            state: Where they begin.
+            parameters: (k, p) of each step.
+
+        Returns:
+            The states after the steps (k, s), and what they tell (k, r).
+
+        Raises:
+            KernelError: The function itself reports a failure.
+        """
+        asked = doubles(parameters)
+        count = len(asked)
+        states = np.empty((count + 1, len(state)))
+        records = np.empty((count, len(self.record)))
+        states[0] = state
+        if not self._calls:
+            for i in range(count):
+                stop_if_cancelled()
+                self._evaluate(states[i], asked[i], states[i + 1], records[i])
+            return states[1:], records
+        if not count:
+            return states[1:], records
+        # Every sample reads its state where the one before has written it.
+        inputs = (ctypes.c_void_p * 2)(memory(states), memory(asked))
+        outputs = (ctypes.c_void_p * 2)(memory(states[1:]), memory(records))
+        sizes = states.shape[1], asked.shape[1], records.shape[1]
+        into, out = (ctypes.c_int64 * 2)(*sizes[:2]), (ctypes.c_int64 * 2)(sizes[0], sizes[2])
+        pointers = map(ctypes.addressof, (inputs, into, outputs, out))
+        job = MapJob(*pointers, count=count, next=0, slice=SLICE)
+        while (code := self._kernel.entry(ctypes.byref(job))) != DriverCode.DONE:
+            check(self._kernel.name, code)
+        return states[1:], records
+
+    def _evaluate(self, state: Array, parameters: Array, after: Array, record: Array) -> None:
+        slow = self._slow
+        assert slow is not None
+        slow.inputs[0][:], slow.inputs[1][:] = state, parameters
+        if not slow():
+            raise KernelError(f"{self._kernel.name}: the function reports a failure")
+        after[:], record[:] = slow.outputs

@@ -10,13 +10,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, row_major
-from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
-from casadi_ik.kernels.function_graph import FunctionGraph
-from casadi_ik.kernels.function_kernel import FunctionKernel
+from casadi_ik.kernels.function_kernel import FunctionKernel, memory
+from casadi_ik.kernels.graphs import FunctionGraph
 
 SYMBOL = "casadi_ik_lookup"
 

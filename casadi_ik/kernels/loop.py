@@ -1,11 +1,16 @@
-"""A step run to its end: the one loop, in compiled code, with every iteration recorded."""
+"""A step run to its end: the one loop, in compiled code or in CasADi's virtual machine.
+
+Every iteration may be recorded; a solve may be looked at one iteration at a time.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from time import perf_counter
 from typing import Any
 
 import casadi as ca
@@ -13,24 +18,140 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, KernelError
-from casadi_ik.kernels.buffered import doubles, memory
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.cancellation import stop_if_cancelled
+from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, stop_if_cancelled
 from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
-from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
-from casadi_ik.kernels.loop_result import (
-    CODE_LIMIT,
-    FIRST_MARK,
-    FIRST_ROWS,
-    NON_FINITE,
-    REPEATED,
-    UNBEGUN,
-    LoopResult,
-)
-from casadi_ik.kernels.loop_vm import run_vm
-from casadi_ik.kernels.machine_lanes import machine_lanes
-from casadi_ik.kernels.rows import opaque, row_driver
-from casadi_ik.kernels.step_graph import RUNNING, StepGraph
+from casadi_ik.kernels.function_kernel import BufferedFunction, doubles, machine_lanes, memory
+from casadi_ik.kernels.graphs import RUNNING, StepGraph
+from casadi_ik.kernels.layout import opaque, row_driver, split_rows, store_rows
+
+NON_FINITE = -1
+"""Status of a solve whose state or status became NaN or infinite; its last finite state stays."""
+
+FAILED = -2
+"""Status of a solve whose step reported a failure; the state before that step stays."""
+
+REPEATED = -3
+"""Status of a solve that came back to an earlier state bit for bit, and so would for ever."""
+
+UNBEGUN = -4
+"""Status of a solve that a method has not begun yet."""
+
+FIRST_ROWS = 256
+"""Rows a trace starts with at least; it doubles when they are full."""
+
+FIRST_MARK = 16
+"""Iteration, a power of two, of the first state that later ones are compared with."""
+
+CODE_LIMIT = 2**31 - 1
+"""A status has to be smaller than this (it is kept as int32)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopResult:
+    """What a batch of k solves came to.
+
+    Attributes:
+        states: Last states, shape (k, ns).
+        iterations: Steps made, shape (k,); the one that became non-finite counts.
+        status: Shape (k,): the step's status, `RUNNING` if the iterations ran out, `NON_FINITE`,
+            `FAILED` or `REPEATED`.
+        time: Seconds inside the loop, shape (k,); solves side by side share them.
+        rows: The records of all iterations of all solves, one after the other, shape
+            (sum of iterations,), of the record layout's dtype; None if no trace was asked for.
+    """
+
+    states: NDArray[np.float64]
+    iterations: NDArray[np.int64]
+    status: NDArray[np.int32]
+    time: NDArray[np.float64]
+    rows: NDArray[Any] | None = None
+
+    @cached_property
+    def trace(self) -> tuple[NDArray[Any], ...]:
+        """The rows of each solve, views into `rows`; empty if no trace was asked for."""
+        return () if self.rows is None else split_rows(self.rows, self.iterations)
+
+
+def run_vm(
+    step: StepGraph,
+    function: ca.Function,
+    result: LoopResult,
+    parameters: NDArray[np.float64],
+    max_iterations: int,
+) -> None:
+    """Solve a batch; `result` has the first states and gets everything else.
+
+    Args:
+        step: The step.
+        function: Its function, row-major.
+        result: As `LoopKernel.run` makes it.
+        parameters: Shape (k, np) or (np,).
+        max_iterations: Budget of each solve.
+    """
+    call = BufferedFunction(function)
+    state, constants = call.inputs
+    new_state, record, code = call.outputs
+    records = None if result.rows is None else _Records(step, result.rows)
+    for i, row in enumerate(np.broadcast_to(parameters, (len(result.states), constants.size))):
+        started = perf_counter()
+        state[:] = result.states[i]
+        constants[:] = row
+        status, iteration, mark = RUNNING, 0, b""
+        while status == RUNNING and iteration < max_iterations:
+            stop_if_cancelled()
+            if not call():
+                status = FAILED
+                break
+            iteration += 1
+            if records is not None:
+                records.add(record)
+            if not (abs(code[0]) < CODE_LIMIT and np.isfinite(new_state).all()):
+                status = NON_FINITE
+            else:
+                state[:] = new_state
+                status = int(code[0])
+                now = state.tobytes()
+                if status == RUNNING and now == mark:
+                    status = REPEATED
+                if iteration >= FIRST_MARK and iteration & (iteration - 1) == 0:
+                    mark = now
+        result.states[i] = state
+        result.iterations[i] = iteration
+        result.status[i] = status
+        result.time[i] = perf_counter() - started
+    if records is not None:
+        records.flush()
+        records.trim()
+
+
+class _Records:
+    """Collects record vectors in a block, so that many are converted to rows at once."""
+
+    def __init__(self, step: StepGraph, rows: NDArray[Any]) -> None:
+        self._layout = step.record
+        self._rows = rows
+        self._written = 0
+        self._block = np.empty((FIRST_ROWS, step.record.size))
+        self._filled = 0
+
+    def add(self, record: NDArray[np.float64]) -> None:
+        if self._filled == len(self._block):
+            self.flush()
+        self._block[self._filled] = record
+        self._filled += 1
+
+    def flush(self) -> None:
+        end = self._written + self._filled
+        if end > len(self._rows):
+            self._rows.resize(max(end, 2 * len(self._rows)), refcheck=False)
+        store_rows(self._layout, self._block[: self._filled], self._rows[self._written : end])
+        self._written, self._filled = end, 0
+
+    def trim(self) -> None:
+        """Give the room back that was not needed."""
+        self._rows.resize(self._written, refcheck=False)
+
 
 SYMBOL = "casadi_ik_loop"
 
@@ -401,3 +522,81 @@ class LoopKernel:
             return 0
         rows = int(SPARE * self._rows_each * count) + FIRST_ROWS
         return min(rows, max(ROOM_BYTES // max(self.step.record.dtype.itemsize, 1), FIRST_ROWS))
+
+
+Vector = NDArray[np.float64]
+
+NextRound = Callable[[int, Vector], tuple[Vector, Vector] | None]
+"""From the status and the last state of a round to the state (ns,) and the parameters (np,) of the
+next one; None if the solve is over."""
+
+
+class Stepper:
+    """Makes the iterations of a loop one by one.
+
+    Iterating over it steps until the solve is over, however long that takes; a budget is the
+    caller's.
+
+    Attributes:
+        graph: The step.
+        iteration: Steps made so far.
+        status: 0 while running, else the code with which the solve ended.
+    """
+
+    def __init__(
+        self,
+        loop: LoopKernel,
+        state: Vector,
+        parameters: Vector,
+        next_round: NextRound | None = None,
+    ) -> None:
+        """Start.
+
+        Args:
+            loop: What makes the steps.
+            state: (ns,) the first state.
+            parameters: (np,) targets, tolerances, gains.
+            next_round: How a solve of several rounds goes on; None: there is one round.
+        """
+        self.graph = loop.step
+        self.iteration = 0
+        self.status = RUNNING
+        self._loop = loop
+        self._state = np.array(state, dtype=float)
+        self._parameters = np.array(parameters, dtype=float)
+        self._next_round = next_round
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """What the next step starts from, by name."""
+        return self.graph.state.unpack(self._state.copy())
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What is constant during a round, by name."""
+        return self.graph.parameters.unpack(self._parameters.copy())
+
+    def step(self) -> dict[str, Any]:
+        """Make one iteration.
+
+        Returns:
+            What is logged of it, by name: the fields of `StepGraph.record`. After the end it
+            steps on from where the solve ended.
+        """
+        result = self._loop.run(self._state[None], self._parameters[None], 1, trace=True)
+        if not len(result.trace[0]):
+            raise KernelError(f"{self.graph.name}: the function reports a failure")
+        (self._state,), (row,) = result.states, result.trace[0]
+        self.status = int(result.status[0])
+        self.iteration += 1
+        if self.status != RUNNING and self._next_round is not None:
+            following = self._next_round(self.status, self._state)
+            if following is not None:
+                self._state, self._parameters = following
+                self.status = RUNNING
+        return {field.name: row[field.name] for field in self.graph.record}
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """The records from here to the end."""
+        while self.status == RUNNING:
+            yield self.step()

@@ -8,9 +8,8 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from casadi_ik.kernels.function_graph import FunctionGraph, Shape
 from casadi_ik.kernels.function_kernel import FunctionKernel
-from casadi_ik.kernels.recipe import recipe
+from casadi_ik.kernels.graphs import FunctionGraph, Shape, recipe
 from casadi_ik.robots import RobotDescription
 from casadi_ik.symbolic.couplings import joint_positions, toggle_margins
 from casadi_ik.symbolic.kinematics import Pose, actuated

@@ -25,7 +25,7 @@ from mcap.records import Chunk, ChunkIndex
 from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError
-from casadi_ik.kernels.rows import opaque
+from casadi_ik.kernels.layout import opaque
 
 RECORD_LIMIT = 2**28
 """No record is larger, nor what a chunk unpacks to: 256 MiB. A chunk of ours holds 2 MiB and the

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.kernels.rows import opaque
+from casadi_ik.kernels.layout import Field, Layout, opaque
 from casadi_ik.logs.detect import as_matrix, words_of
 from casadi_ik.logs.events import EventKind, jacobian_names, measured_jacobians
 from casadi_ik.problem.contacts import NAMES

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.arrays import Counts
 from casadi_ik.errors import LogError, UnknownNameError, printable
-from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.kernels.rows import opaque
+from casadi_ik.kernels.layout import Field, Layout, opaque
 from casadi_ik.logs.container import (
     NothingWrittenError,
     read_attachment,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError
-from casadi_ik.kernels.rows import opaque
+from casadi_ik.kernels.layout import opaque
 from casadi_ik.logs.detect import as_matrix, bits_of
 from casadi_ik.logs.events import SINGULAR, EventKind, Happening
 

@@ -11,7 +11,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.grasps.pose import one_pose
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.kernels.recurrence import Recurrence
+from casadi_ik.kernels.function_kernel import Recurrence
 from casadi_ik.motion.cycle import Cycle
 from casadi_ik.motion.plan import FollowPlan
 from casadi_ik.problem.contacts import LENGTH, Kinds

@@ -25,9 +25,8 @@ from functools import cached_property
 
 import casadi as ca
 
-from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.kernels.recipe import recipe
 from casadi_ik.methods.common.bounded_step import Bounded, damped_step
 from casadi_ik.methods.common.contact_fit import whole_jacobian, whole_residual
 from casadi_ik.motion.limiter import chased, share_within, step_bounds

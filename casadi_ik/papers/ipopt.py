@@ -20,10 +20,14 @@ from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.kernels.cancellation import interrupt_afterwards, is_cancelled, stop_if_cancelled
-from casadi_ik.kernels.forks import ForkSafeLock
+from casadi_ik.kernels.cancellation import (
+    ForkSafeLock,
+    interrupt_afterwards,
+    is_cancelled,
+    stop_if_cancelled,
+)
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.kernels.stepper import Stepper
+from casadi_ik.kernels.loop import Stepper
 from casadi_ik.problem.contacts import Kinds, usual
 from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome

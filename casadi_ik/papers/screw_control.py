@@ -19,7 +19,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.kernels import FunctionKernel, LoopKernel
-from casadi_ik.kernels.stepper import Stepper
+from casadi_ik.kernels.loop import Stepper
 from casadi_ik.logs import McapRecorder
 from casadi_ik.methods.common.limits import coupling_jacobian
 from casadi_ik.papers.screw_tasks import ScrewControlStep, ScrewTask

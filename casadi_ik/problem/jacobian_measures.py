@@ -28,10 +28,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.function_kernel import MeasureKernel
+from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.kernels.layout import Field
-from casadi_ik.kernels.measure_kernel import MeasureKernel
-from casadi_ik.kernels.recipe import recipe
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import CONDITION, PHASE, SIGMA, Q, RecordedJacobian

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
-from casadi_ik.kernels.rows import split_rows
-from casadi_ik.kernels.stepper import Stepper
+from casadi_ik.kernels.layout import split_rows
+from casadi_ik.kernels.loop import Stepper
 from casadi_ik.problem.contacts import Kinds
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.trace import TraceFormat

@@ -35,8 +35,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.kernels.function_graph import FunctionGraph
-from casadi_ik.kernels.recipe import recipe
+from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.proofs.boxes import SLACK, BoxContact, HandSpace, box_contacts
 from casadi_ik.proofs.premises import ArmCones, ArmSpan
 from casadi_ik.symbolic.linear_algebra import solve_spd

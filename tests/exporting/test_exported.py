@@ -14,7 +14,7 @@ import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.errors import InputError
 from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
-from casadi_ik.exporting.scene_targets import SceneTargets
+from casadi_ik.exporting.targets import SceneTargets
 from casadi_ik.exporting.solver import plain
 from casadi_ik.exporting.targets import stored
 

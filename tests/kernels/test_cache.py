@@ -29,8 +29,8 @@ from casadi_ik.kernels import (
     compiler,
 )
 from casadi_ik.kernels.codegen import library_source
-from casadi_ik.kernels.function_graph import FunctionGraph
-from casadi_ik.kernels.recipe import recipe as recipe_of
+from casadi_ik.kernels.graphs import FunctionGraph
+from casadi_ik.kernels.graphs import recipe as recipe_of
 
 from .graphs import counting_step, needs_compiler
 

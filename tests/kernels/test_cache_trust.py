@@ -27,7 +27,7 @@ from casadi_ik.kernels import (
     compiler,
     folders,
 )
-from casadi_ik.kernels.function_graph import FunctionGraph
+from casadi_ik.kernels.graphs import FunctionGraph
 
 from .graphs import needs_compiler
 

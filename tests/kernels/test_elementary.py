@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.kernels.function_graph import FunctionGraph
-from casadi_ik.kernels.measure_kernel import MeasureKernel
+from casadi_ik.kernels.function_kernel import MeasureKernel
+from casadi_ik.kernels.graphs import FunctionGraph
 
 from .graphs import needs_compiler
 

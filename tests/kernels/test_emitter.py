@@ -9,7 +9,7 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.errors import KernelError
 from casadi_ik.kernels import FunctionGraph, FunctionKernel
-from casadi_ik.kernels.measure_kernel import MeasureKernel
+from casadi_ik.kernels.function_kernel import MeasureKernel
 
 from .graphs import needs_compiler, random_expression
 

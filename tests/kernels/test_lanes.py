@@ -19,8 +19,8 @@ from casadi_ik.kernels import (
     LoopResult,
     StepGraph,
 )
+from casadi_ik.kernels.function_kernel import machine_lanes
 from casadi_ik.kernels.loop import FEWEST, ROOM_BYTES, SLOTS, WORTH
-from casadi_ik.kernels.machine_lanes import machine_lanes
 
 from .graphs import (
     COUNT,

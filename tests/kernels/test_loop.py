@@ -24,7 +24,7 @@ from casadi_ik.kernels import (
     LoopResult,
     StepGraph,
 )
-from casadi_ik.kernels.loop_result import FIRST_ROWS
+from casadi_ik.kernels.loop import FIRST_ROWS
 
 from .graphs import (
     COUNT,

@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.kernels.function_graph import FunctionGraph
-from casadi_ik.kernels.measure_kernel import MeasureKernel
+from casadi_ik.kernels.function_kernel import MeasureKernel
+from casadi_ik.kernels.graphs import FunctionGraph
 
 
 def graph() -> FunctionGraph:

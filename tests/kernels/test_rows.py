@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from casadi_ik.kernels import Field, Layout, LoopKernel, StepGraph
-from casadi_ik.kernels.rows import store_rows
+from casadi_ik.kernels.layout import store_rows
 
 from .graphs import needs_compiler
 

@@ -14,7 +14,7 @@ import numpy as np
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.errors import RowError, UnsupportedError
 from casadi_ik.kernels import LoopKernel, StepGraph
-from casadi_ik.kernels.stepper import Stepper
+from casadi_ik.kernels.loop import Stepper
 from casadi_ik.problem.contacts import Kinds
 from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Method, Outcome

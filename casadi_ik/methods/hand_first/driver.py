@@ -22,13 +22,11 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import KernelError
 from casadi_ik.grasps.grasp import LARGE, SMALL, UNIT
 from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
-from casadi_ik.kernels.buffered import memory
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.codegen import define, driver_text
-from casadi_ik.kernels.constants import define_arrays, number
-from casadi_ik.kernels.driver_code import SLICE, DriverCode, check
-from casadi_ik.kernels.loop import SLOTS, Followed
-from casadi_ik.kernels.loop_result import UNBEGUN
+from casadi_ik.kernels.cancellation import SLICE, DriverCode, check
+from casadi_ik.kernels.codegen import define, define_arrays, driver_text, number
+from casadi_ik.kernels.function_kernel import memory
+from casadi_ik.kernels.loop import SLOTS, UNBEGUN, Followed
 from casadi_ik.made import made
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters

@@ -14,7 +14,7 @@ import numpy as np
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionGraph, FunctionKernel
-from casadi_ik.kernels.recipe import recipe
+from casadi_ik.kernels.graphs import recipe
 from casadi_ik.methods.common.posture_table import PostureTable
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.contacts import LENGTH

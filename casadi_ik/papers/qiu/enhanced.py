@@ -8,9 +8,8 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arrays import Array
+from casadi_ik.kernels.graphs import StepGraph, recipe
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.kernels.recipe import recipe
-from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.methods.common.limits import kept_within, limit_mask
 from casadi_ik.papers.qiu.finger_step import finger_step_function, planar_fingers
 from casadi_ik.papers.qiu.parameters import QiuParameters

@@ -7,9 +7,8 @@ from functools import cached_property
 import casadi as ca
 
 from casadi_ik.arrays import Array
+from casadi_ik.kernels.graphs import StepGraph, recipe
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.kernels.recipe import recipe
-from casadi_ik.kernels.step_graph import StepGraph
 from casadi_ik.methods.common.limits import kept_within, limit_mask
 from casadi_ik.papers.qiu.parameters import OriginalParameters
 from casadi_ik.papers.qiu.tasks import (

@@ -1,0 +1,162 @@
+"""Functions that need not be built to be known: signature, recipe, and what builds them."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+
+from casadi_ik.errors import InputError
+from casadi_ik.kernels.layout import Layout
+
+BUILD_NO_GRAPHS = (
+    *("cli", "drawing", "exporting", "files", "importing"),
+    *("palette.py", "viewing", "views"),
+)
+"""What has no code that can change a graph; the code of every other part may, a new one included.
+import-linter checks that none of them uses CasADi."""
+
+
+def recipe(*parts: Any) -> str:
+    """A hash of data and of the code that makes graphs from it, 32 hexadecimal digits.
+
+    Args:
+        parts: Everything the graph depends on; plain picklable data.
+    """
+    digest = hashlib.sha256(_sources())
+    digest.update(pickle.dumps(parts))
+    return digest.hexdigest()[:32]
+
+
+@cache
+def _sources() -> bytes:
+    digest = hashlib.sha256(f"numpy {version('numpy')}".encode())
+    root = Path(__file__).parents[1]
+    for path in sorted(root.rglob("*.[pc]*")):
+        inside = path.relative_to(root)
+        if path.suffix not in (".py", ".c") or inside.parts[0] in BUILD_NO_GRAPHS:
+            continue
+        digest.update(inside.as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.digest()
+
+
+Shape = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class FunctionGraph:
+    """A Function with its signature, built when it is needed.
+
+    Attributes:
+        name: Identifier (letters, digits, underscores), also the kernel's file name.
+        source: Builds the function, with the arguments in the order of `inputs`.
+        inputs: Rows and columns by argument name.
+        outputs: Rows and columns of the results.
+        recipe: See `recipe`; a library of the same recipe is taken without building the function.
+        loops: Whether loops over tables are most of its work.
+    """
+
+    name: str
+    source: Callable[[], ca.Function]
+    inputs: Mapping[str, Shape]
+    outputs: tuple[Shape, ...]
+    recipe: str = ""
+    loops: bool = False
+
+    @classmethod
+    def of(cls, function: ca.Function) -> FunctionGraph:
+        """A function that is there already."""
+        names = function.name_in()
+        return cls(
+            function.name(),
+            lambda: function,
+            {name: function.size_in(i) for i, name in enumerate(names)},
+            tuple(function.size_out(i) for i in range(function.n_out())),
+        )
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """The function, checked against the signature.
+
+        Raises:
+            InputError: It has another.
+        """
+        function = self.source()
+        found = (
+            [function.size_in(i) for i in range(function.n_in())],
+            [function.size_out(i) for i in range(function.n_out())],
+        )
+        expected = list(self.inputs.values()), list(self.outputs)
+        if found != expected:
+            raise InputError(f"function {self.name!r}: sizes {found}, expected {expected}")
+        return function
+
+
+RUNNING = 0
+"""The step's status output while the loop has to go on; any other integer ends it."""
+
+
+@dataclass(frozen=True)
+class StepGraph:
+    """One whole iteration of a method as one graph.
+
+    Attributes:
+        name: Identifier (letters, digits, underscores), also the kernel's file name.
+        source: The function ``(state, parameters) -> (state', record, status)``, or what builds
+            it when it is needed; all dense column vectors, status a scalar: `RUNNING` or the code
+            with which the loop ends.
+        state: Layout of the state, what an iteration hands to the next.
+        parameters: Layout of the parameters, constant during one solve (targets, tolerances,
+            gains), so that one kernel serves every target.
+        record: Layout of what is logged of each iteration.
+        compilable: False if the graph holds a node that has no C code (an Ipopt call); such a
+            graph runs in CasADi's virtual machine.
+        stage: Name of the number in the state by which the step chooses what to do, "" if it does
+            the same always. Solves in the same stage are made side by side.
+        recipe: See `recipe`; a library of the same recipe is taken without building the function.
+    """
+
+    name: str
+    source: ca.Function | Callable[[], ca.Function]
+    state: Layout
+    parameters: Layout
+    record: Layout
+    compilable: bool = True
+    stage: str = ""
+    recipe: str = ""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.source, ca.Function):
+            _ = self.function
+
+    @property
+    def stage_place(self) -> int:
+        """Where in the state the stage is, -1 if there is none."""
+        return self.state.slice(self.stage).start if self.stage else -1
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """The function, checked against the layouts.
+
+        Raises:
+            InputError: Its sizes are others.
+        """
+        function = self.source if isinstance(self.source, ca.Function) else self.source()
+        found = (
+            [function.numel_in(i) for i in range(function.n_in())],
+            [function.numel_out(i) for i in range(function.n_out())],
+        )
+        expected = (
+            [self.state.size, self.parameters.size],
+            [self.state.size, self.record.size, 1],
+        )
+        if found != expected:
+            raise InputError(f"step graph {self.name!r}: sizes {found}, layouts say {expected}")
+        return function
