@@ -14,15 +14,15 @@ from casadi_ik.cli.outputs import say
 from casadi_ik.cli.report import counted, fields, headline
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.exporting.project import uses
 from casadi_ik.exporting.project import (
     c_project,
     check_folder,
     check_method,
     checked_prefix,
+    uses,
+    wasm_project,
     write_folder,
 )
-from casadi_ik.exporting.project import wasm_project
 from casadi_ik.kernels import cache_directory
 from casadi_ik.kernels.compiler import find_compiler
 

@@ -1,31 +1,43 @@
-"""A folder with a solver in it: built beside its place, and put there when it is whole."""
+"""What is written of a robot: a C project, a WebAssembly module, kernels compiled ahead of use.
+
+A folder is built beside its place, and put there when it is whole.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import re
 import shutil
+import subprocess
+import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
-from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.exporting.solver import FollowSources
+from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError
 from casadi_ik.exporting.scene import SceneSources
-from casadi_ik.exporting.targets import IN_TEST_C, IN_TEST_SINGLE, SceneTargets
-from casadi_ik.exporting.single import SinglePrecision, in_single_precision
-from casadi_ik.exporting.solver import SolverSources, hand_first
+from casadi_ik.exporting.single import SinglePrecision, filled, in_single_precision
+from casadi_ik.exporting.solver import FollowSources, SolverSources, hand_first
 from casadi_ik.exporting.targets import (
     COUNT,
+    IN_TEST_C,
+    IN_TEST_MJS,
+    IN_TEST_SINGLE,
     Example,
+    SceneTargets,
     example,
     single_targets_header,
+    stored,
     targets_header,
     written,
 )
-from casadi_ik.exporting.single import filled
+from casadi_ik.grasps import Contact, Grasp
 
 MARK = ".casadi_ik_export"
 """A file by which a folder is known as an export."""
@@ -237,3 +249,117 @@ def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
             raise
     except OSError as error:
         raise InputError(f"--out: {out}: cannot be written: {error.strerror}") from error
+
+
+# No contraction: with fused multiply-adds the answers would be others in the last places.
+COMMAND = (
+    *("-m", "ziglang", "cc", "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c11"),
+    *("-O2", "-msimd128", "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all", "-s"),
+)
+
+
+def wasm_project(
+    robot: ArmHand, prefix: str, capacity: int | None = None, follow: bool = False
+) -> dict[str, str | bytes]:
+    """The files of a module with its wrapper, by path.
+
+    Raises:
+        MissingExtraError: ziglang is not installed.
+        UnsupportedError: The robot's solver cannot be exported.
+        KernelError: The compiler refused.
+    """
+    if importlib.util.find_spec("ziglang") is None:
+        raise MissingExtraError("--target wasm needs ziglang: pip install 'casadi-ik[compiler]'")
+    project = exported(robot, prefix, capacity, follow=follow)
+    marks = (
+        project.marks
+        | tested(project, IN_TEST_MJS)
+        | {
+            "LOWER_JSON": json.dumps(robot.lower.tolist()),
+            "UPPER_JSON": json.dumps(robot.upper.tolist()),
+            "HOME_JSON": json.dumps(robot.home.tolist()),
+            "EXAMPLE_POINTS_JSON": _numbers(project.example.points.ravel().tolist()),
+            "EXAMPLE_NORMALS_JSON": _numbers(project.example.normals.ravel().tolist()),
+        }
+    )
+    files = {
+        f"{prefix}.js": "solver.js",
+        f"{prefix}.d.ts": "solver.d.ts",
+        "example.html": "example.html",
+        "test.mjs": "test.mjs",
+        "README.md": "README_wasm.md",
+    }
+    package = {"name": prefix, "type": "module", "main": f"{prefix}.js"}
+    about = {} if project.scene is None else {"scene.json": project.scene.json()}
+    return {
+        **about,
+        **{path: filled(name, marks) for path, name in files.items()},
+        "package.json": json.dumps(package) + "\n",
+        "targets.json": json.dumps(stored(project.solver, project.scene)) + "\n",
+        f"{prefix}.wasm": _module(project),
+    }
+
+
+def _numbers(values: list[float]) -> str:
+    """A JavaScript array, NaN included."""
+    return "[" + ", ".join("NaN" if value != value else repr(value) for value in values) + "]"
+
+
+def _module(project: Exported) -> bytes:
+    """The sources, compiled.
+
+    Raises:
+        KernelError: The compiler refused.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        for name, text in project.sources.items():
+            path = place / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        (place / "src" / "wasm.c").write_text(filled("wasm.c", project.marks), encoding="utf-8")
+        made = place / "solver.wasm"
+        texts = sorted(str(path) for path in (place / "src").glob("*.c"))
+        include = [f"-I{place / 'include'}", f"-I{place / 'src'}"]
+        command = [sys.executable, *COMMAND, *include, *texts, "-lm", "-o", str(made)]
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        if done.returncode or not made.is_file():
+            complaint = "; ".join(done.stderr.splitlines()[:3]) or "no complaint"
+            raise KernelError(f"zig made no WebAssembly module: {complaint[:500]}")
+        return made.read_bytes()
+
+
+FEW = 16
+"""Targets: enough for solves side by side."""
+
+FAR = 100.0
+"""How far away [m] no robot reaches."""
+
+
+def uses(robot: ArmHand) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Everything that compiles something, in words and as what does it."""
+    solver = Solver(robot)
+    q = robot.random(np.random.default_rng(0), FEW)
+
+    def targets() -> tuple[np.ndarray, np.ndarray]:
+        return robot.contacts(q)
+
+    def one() -> object:
+        points, normals = (array[0] for array in targets())
+        pairs = zip(robot.fingers, points, normals, strict=True)
+        return solver.solve(Grasp({name: Contact(*pair) for name, *pair in pairs}))
+
+    def beyond() -> object:
+        points, normals = targets()
+        return solver.solve_batch(points[:1] + FAR, normals[:1], diagnose=True)
+
+    def logged() -> object:
+        with tempfile.TemporaryDirectory() as place:
+            return solver.solve_batch(*targets(), log=Path(place) / "log.mcap")
+
+    yield "forward kinematics", targets
+    yield "one target", one
+    yield "batches", lambda: solver.solve_batch(*targets())
+    yield "loops that cannot wait", solver.fast
+    yield "logs", logged
+    yield "diagnoses", beyond

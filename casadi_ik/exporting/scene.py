@@ -17,8 +17,7 @@ from casadi_ik.collision.model import CollisionModel, own_solids
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import C_NAMES, EXPORTED
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.exporting.single import ARM_ROUNDING, SinglePrecision
-from casadi_ik.exporting.single import filled
+from casadi_ik.exporting.single import ARM_ROUNDING, SinglePrecision, filled
 from casadi_ik.kernels.codegen import define, define_arrays, driver_text, number
 from casadi_ik.kernels.function_kernel import FunctionKernel
 from casadi_ik.kernels.graphs import FunctionGraph

@@ -1,4 +1,4 @@
-"""The sources of a solver: each kernel of hand-first in a file of its own, and what drives them."""
+"""The sources of a solver and of a follower: templates filled, each kernel in a file of its own."""
 
 from __future__ import annotations
 
@@ -12,23 +12,155 @@ import numpy as np
 
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.exporting.solver import NO_FOLLOWER
-from casadi_ik.exporting.solver import palm_marks
-from casadi_ik.exporting.single import IN_DOUBLE, in_single
 from casadi_ik.exporting.scene import SceneSources, without_scene
-from casadi_ik.exporting.single import FOLLOWING, SinglePrecision, in_single_precision
-from casadi_ik.exporting.single import filled
+from casadi_ik.exporting.single import (
+    FOLLOWING,
+    IN_DOUBLE,
+    SinglePrecision,
+    filled,
+    in_single,
+    in_single_precision,
+)
 from casadi_ik.kernels import FunctionKernel, LoopKernel
-from casadi_ik.kernels.codegen import define, define_arrays, driver_text, row_major, standing_alone
+from casadi_ik.kernels.codegen import (
+    define,
+    define_arrays,
+    driver_text,
+    number,
+    row_major,
+    standing_alone,
+)
 from casadi_ik.kernels.emitter import Form
 from casadi_ik.kernels.graphs import FunctionGraph
+from casadi_ik.kernels.layout import Layout
 from casadi_ik.kernels.lookup import TILE
+from casadi_ik.methods.hand_first.state import terms
 from casadi_ik.methods.hand_first.driver import SearchPlan, source_text
 from casadi_ik.methods.hand_first.method import HandFirstMethod
-from casadi_ik.methods.hand_first.state import terms
+from casadi_ik.motion.asked import contact_weights
+from casadi_ik.motion.cycle import Cycle
+from casadi_ik.motion.follower import PALM_WEIGHT
+from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
+from casadi_ik.motion.plan import FADING
+from casadi_ik.motion.rates import RUN_UP, own_velocities
+from casadi_ik.problem.contacts import usual
 from casadi_ik.problem.problems import Problems, Tolerance
-from casadi_ik.problem.verdict import LIMIT_SLACK
+from casadi_ik.problem.questions import BEYOND, touched
+from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 from casadi_ik.registry import build_method
+
+MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")
+
+
+def palm_marks(robot: ArmHand, prefix: str) -> dict[str, str]:
+    """What stands for the marks of palms; nothing without an arm, or if contacts leave it free."""
+    motors = robot.description.finger_motors
+    own = np.where(np.isin(robot.actuators, motors), robot.home, np.nan)
+    home = robot.palm(robot.home)
+    if not robot.description.arm_actuators or touched(robot, home[None], own[None])[2]:
+        return dict.fromkeys(MARKS, "")
+    pose = np.concatenate([home[:3, :3].ravel(), home[:3, 3]])
+    constants = f"#define POSTURE_ROUNDING {number(BEYOND)}\n" + define_arrays(
+        {"HOME_PALM": pose, "OF_HAND": np.isin(robot.actuators, motors).astype(int)}
+    )
+    marks = {"PREFIX": prefix, "GUARD": prefix.upper()}
+    return {
+        "PALM_CALLS": filled("palm.h", marks),
+        "PALM": "\n" + constants + filled("palm.c", marks),
+        "PALM_WASM": filled("palm_wasm.c", marks),
+        "PALM_JS": filled("palm.js", marks),
+        "PALM_DTS": filled("palm.d.ts", marks),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class FollowSources:
+    """What a follower adds to the sources of a solver.
+
+    Attributes:
+        robot: The robot.
+        prefix: What every name begins with.
+        tolerance: When a contact counts as reached.
+    """
+
+    robot: ArmHand
+    prefix: str
+    tolerance: Tolerance
+
+    def files(self) -> tuple[dict[str, str], dict[str, str]]:
+        """The C file by path, and what stands for the marks of the other templates."""
+        cycle = Cycle(self.robot.description, usual(len(self.robot.fingers)))
+        marks = {
+            "PREFIX": self.prefix,
+            "GUARD": self.prefix.upper(),
+            "CYCLE": standing_alone(row_major(cycle.graph.function), Form()),
+            "FOLLOW_CONSTANTS": self._constants(cycle),
+            "FOLLOW_STATE": str(cycle.state.size),
+            "FOLLOW_ASKED": str(cycle.parameters.size),
+            "FOLLOW_RECORD": str(cycle.record.size),
+        }
+        about = {
+            "FOLLOW_CALLS": filled("follow.h", marks),
+            "FOLLOW_WASM": filled("follow_wasm.c", marks),
+            "FOLLOW_JS": filled("follow.js", marks),
+            "FOLLOW_DTS": filled("follow.d.ts", marks),
+            "FOLLOW_STATUS_JS": (
+                "export const FollowStatus = Object.freeze({\n"
+                "  HOLDING: 0,\n  FOLLOWING: 1,\n  LATE: 2,\n  MISSED: 3,\n});\n"
+            ),
+            "FOLLOW_STATUS_DTS": (
+                "export const FollowStatus: {\n"
+                "  /** The frame was none: the motors come to rest and wait. */\n"
+                "  readonly HOLDING: 0;\n"
+                "  /** Every contact is within tolerance. */\n  readonly FOLLOWING: 1;\n"
+                "  /** Velocities and accelerations permit no more. */\n  readonly LATE: 2;\n"
+                "  /** No posture on this branch meets the contacts. */\n  readonly MISSED: 3;\n"
+                "};\n"
+            ),
+        }
+        return {f"src/{self.prefix}_follow.c": filled("follow.c", marks)}, about
+
+    def _constants(self, cycle: Cycle) -> str:
+        robot, f = self.robot, len(self.robot.fingers)
+        places = {"N_FINGERS": f, "N_MOTORS": len(robot.actuators), "MOVES_PALM": int(cycle.palm)}
+        places |= _places("STATE", cycle.state) | _places("ASKED", cycle.parameters)
+        numbers = {
+            "TOLERANCE_SLACK": TOLERANCE_SLACK,
+            "SETTLING": SETTLING,
+            "FADING": FADING,
+            "PULL": FOLLOWING_PULL,
+            "RUN_UP": RUN_UP,
+            "PALM_WEIGHT": PALM_WEIGHT,
+        }
+        arrays = {
+            "LOWER": robot.lower,
+            "UPPER": robot.upper,
+            "HOME": robot.home,
+            "VELOCITY": own_velocities(robot),
+            "WEIGHTS": contact_weights((self.tolerance,) * f),
+            "POSITION_TOLERANCES": np.full(f, self.tolerance.position),
+            "ANGLE_TOLERANCES": np.full(f, self.tolerance.angle),
+        }
+        return (
+            define(places | _places("RECORD", cycle.record))
+            + "".join(f"#define {name} {number(value)}\n" for name, value in numbers.items())
+            + define_arrays(arrays)
+        )
+
+
+def _places(label: str, layout: Layout) -> dict[str, int]:
+    return {f"{label}_{one.name.upper()}": layout.slice(one.name).start for one in layout}
+
+
+NO_FOLLOWER = dict.fromkeys(
+    (
+        *("FOLLOW_CALLS", "FOLLOW_WASM", "FOLLOW_JS"),
+        *("FOLLOW_DTS", "FOLLOW_STATUS_JS", "FOLLOW_STATUS_DTS"),
+    ),
+    "",
+)
+"""What stands for the marks where an export does not follow."""
+
 
 SIGNATURE = re.compile(r"EXPORT (?:LANES_TARGET )?int casadi_ik_\w+\((\w+) \*job\)")
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,10 +12,18 @@ import numpy as np
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.exporting.targets import SceneTargets
+from casadi_ik.collision.scene import Scene
+from casadi_ik.collision.solids import stated
+from casadi_ik.errors import DescriptionError
 from casadi_ik.exporting.single import in_single_precision
 from casadi_ik.grasps.load import load_grasp, shipped_grasps
 from casadi_ik.kernels.codegen import number, numbers
+from casadi_ik.problem.clearance import SceneCheck
+from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.status import Status
+from casadi_ik.registry import build_method
+from casadi_ik.solving.alternatives.free import resolve_at_once
+from casadi_ik.solving.engine import Engine
 
 COUNT = 1000
 """How many are stored."""
@@ -124,3 +134,156 @@ def written(array: Array) -> str:
     """An array as C text, NaN included."""
     values = (number(v) if np.isfinite(v) else "NAN" for v in array.ravel().tolist())
     return "{" + ", ".join(values) + "}"
+
+
+DRAWN = 64
+"""Random configurations, at whose fingertips solids are put."""
+
+SIZE = 0.15
+"""Of a solid, as a part of how far the robot reaches."""
+
+MARGIN = 1e-3
+"""To be kept [m]."""
+
+GRASPED = 1
+"""Number of the solid that is grasped."""
+
+
+class SceneTargets:
+    """Targets in a scene of a few solids, and the answers to them.
+
+    Attributes:
+        solver: Without a scene.
+        scene: As many solids as fit in, four at most.
+    """
+
+    def __init__(self, solver: Solver, capacity: int) -> None:
+        self.solver, robot = solver, solver.robot
+        q = robot.random(np.random.default_rng(5), DRAWN)
+        tips = robot.contacts(q)[0][:, 0]
+        far = np.linalg.norm(tips, axis=1)
+        places = tips[np.argsort(-far)][[0, 12, 24]]
+        size = SIZE * float(far.max())
+        wall = [0.9 * float(tips[:, 0].max()), 0.0, 0.0]
+        shapes: list[dict[str, Any]] = [
+            {"kind": "box", "size": [size, 0.7 * size, 0.5 * size], "rpy": [0.3, 0.2, 0.1]},
+            {"kind": "capsule", "radius": 0.4 * size, "length": 0.5 * size, "rpy": [1.0, 0.0, 0.5]},
+            {"kind": "cylinder", "radius": 0.4 * size, "length": size, "rpy": [0.0, 0.5, 0.0]},
+            {"kind": "half-space", "rpy": [0.0, -np.pi / 2, 0.0], "xyz": wall},
+        ]
+        solids: dict[str, dict[str, Any]] = {}
+        self._check = SceneCheck(robot, Scene({}, MARGIN))
+        for shape, place in zip(shapes, places.tolist(), strict=False):
+            shape["xyz"] = place
+        self.scene = Scene({}, MARGIN)
+        for shape in shapes[:capacity]:
+            solids = solids | {f"solid {len(solids)}": shape}
+            grasped = f"solid {GRASPED}" if GRASPED in range(len(solids)) else None
+            scene = Scene(solids, MARGIN, grasped)
+            try:
+                self._check = SceneCheck(robot, scene)
+            except DescriptionError:
+                # About a hand alone there is less room: what stands in its base is left out.
+                solids.popitem()
+            else:
+                self.scene = scene
+
+    @cached_property
+    def _engine(self) -> Engine:
+        robot = self.solver.robot
+        method = build_method("hand-first", robot.description, {})
+        return Engine(robot, method, check=self._check)
+
+    def answered(self, target: dict[str, Any]) -> dict[str, Any]:
+        """A stored target with the answer to it in the scene: another arm or hand at the most."""
+        if target["status"] != Status.SOLVED:
+            return target | {"clearance": None}
+        points, normals = (np.reshape(target[key], (1, -1, 3)) for key in ("points", "normals"))
+        found = self._free(points, normals, np.array(target["q"]), target["q0"])
+        if found is None and target["q0"] is not None:
+            usual = self.solver.solve_batch(points, normals)
+            found = self._free(points, normals, usual.q[0], None) if usual.success[0] else None
+        if found is None:
+            return target | {"status": int(Status.COLLISION), "clearance": None}
+        return target | {"q": found[0].tolist(), "clearance": found[1]}
+
+    def _free(
+        self, points: Array, normals: Array, q: Array, q0: list[float] | None
+    ) -> tuple[Array, float] | None:
+        """An answer that touches nothing, beside a given one, and its clearance [m]."""
+        engine, questions = self._engine, Questions(self.solver.robot, self.solver.tolerances, True)
+        prefer = "limits" if q0 is None else "q0"
+        problems = questions.of_arrays(points, normals, None, prefer=prefer)
+        around = engine.around(problems)
+        assert around is not None
+        clear = around.check(q[None])
+        if not clear.free[0]:
+            found = resolve_at_once(
+                engine.finder, problems, around, q, questions.start(q0), others=True
+            )
+            if found is None:
+                return None
+            q, _, clear = found
+        return q, float(clear.distance[0])
+
+    def solids(self) -> list[dict[str, Any]]:
+        """The scene as an export takes it."""
+        found = []
+        for name, item in self.scene.items.items():
+            (solid, place) = item.parts[0]
+            found.append(stated(solid, item.pose @ place) | {"grasped": name == self.scene.grasped})
+        return found
+
+    def header(self) -> str:
+        """The scene as a C header has it."""
+        rows = ",\n".join(
+            f"{{{one['kind']}, {int(one['grasped'])}, {numbers(one['size'])}, "
+            f"{numbers(one['pose'])}}}"
+            for one in self.solids()
+        )
+        return (
+            "typedef struct {\n  int kind, grasped;\n  double size[3], pose[12];\n} standing;\n\n"
+            f"enum {{ STANDING = {len(self.scene.items)} }};\n"
+            f"#define MARGIN {number(self.scene.margin)}\n"
+            f"static const standing scene[STANDING] = {{\n{rows}}};\n\n"
+        )
+
+    def json(self) -> str:
+        """The scene as JavaScript has it."""
+        return json.dumps({"margin": self.scene.margin, "solids": self.solids()}) + "\n"
+
+
+IN_TEST_C = {
+    "SCENE_TEST_SAME": (
+        "      && (!(stored->clearance == stored->clearance)\n"
+        "          || solver->clearance == stored->clearance)\n"
+    ),
+    # What comes nearest to an answer is not compared.
+    "SCENE_TEST_OR": f"stored->status == {int(Status.COLLISION)} || ",
+    "SCENE_TEST_SET": (
+        "  @P_set_margin(&one, MARGIN);\n  @P_set_margin(&other, MARGIN);\n"
+        "  for (i = 0; i < STANDING; ++i) {\n"
+        "    const standing *put = scene + i;\n"
+        "    @P_set_solid(&one, i, put->kind, put->size, put->pose, put->grasped);\n"
+        "    @P_set_solid(&other, i, put->kind, put->size, put->pose, put->grasped);\n"
+        "  }\n"
+    ),
+}
+IN_TEST_SINGLE = IN_TEST_C | {
+    "SCENE_TEST_SAME": "  met &= solver->clearance >= MARGIN;\n",
+}
+IN_TEST_MJS = {
+    "SCENE_TEST_SAME": (
+        "    (target.clearance !== null && target.clearance !== answer.clearance) ||\n"
+    ),
+    "SCENE_TEST_OR": "target.status !== Status.COLLISION && ",
+    "SCENE_TEST_SET": (
+        'const place = new URL("./scene.json", import.meta.url);\n'
+        'const about = JSON.parse(await readFile(place, "utf8"));\n'
+        "for (const one of [solver, other]) {\n"
+        "  one.setMargin(about.margin);\n"
+        "  about.solids.forEach((s, i) => one.setSolid(i, s.kind, s.size, s.pose, s.grasped));\n"
+        "}\n"
+    ),
+}
+"""What the tests of an export have in addition."""

@@ -543,8 +543,8 @@ class _MXBody:
             order = [known.get(place) for place in zip(*after.get_triplet(), strict=True)]
             return self._chosen(name, given[0], order)
         if code == ca.OP_HORZREPMAT:
-            made, value = self._array(name, size), given[0].at(f"k%{given[0].size}")
-            self._lines.append(f"for (int k = 0; k < {size}; ++k) {name}[k]={value};")
+            made, source = self._array(name, size), given[0].at(f"k%{given[0].size}")
+            self._lines.append(f"for (int k = 0; k < {size}; ++k) {name}[k]={source};")
             return made
         if code == ca.OP_SETNONZEROS:
             made = self._array(name, size)

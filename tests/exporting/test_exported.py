@@ -14,9 +14,8 @@ import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.errors import InputError
 from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
-from casadi_ik.exporting.targets import SceneTargets
 from casadi_ik.exporting.solver import plain
-from casadi_ik.exporting.targets import stored
+from casadi_ik.exporting.targets import SceneTargets, stored
 
 STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")

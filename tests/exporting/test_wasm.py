@@ -10,8 +10,7 @@ import subprocess
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.exporting.project import write_folder
-from casadi_ik.exporting.project import wasm_project
+from casadi_ik.exporting.project import wasm_project, write_folder
 
 pytestmark = pytest.mark.skipif(
     shutil.which("node") is None or importlib.util.find_spec("ziglang") is None,

@@ -25,7 +25,6 @@ from casadi_ik.kernels import (
     NoCompilerWarning,
     cache,
     compiler,
-    folders,
 )
 from casadi_ik.kernels.graphs import FunctionGraph
 
@@ -48,7 +47,7 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def forget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "_loaded", {})
-    monkeypatch.setattr(folders, "_warned", set())
+    monkeypatch.setattr(cache, "_warned", set())
 
 
 def kernel() -> FunctionKernel:
@@ -70,14 +69,14 @@ def give_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if os.getuid() == 0:
         os.chown(path, SOMEBODY, SOMEBODY)
         return
-    theirs, others = path.lstat().st_ino, folders._others
+    theirs, others = path.lstat().st_ino, cache._others
 
     def seen(found: os.stat_result, sticky: bool) -> str:
         if found.st_ino == theirs:
             found = os.stat_result((*found[:4], SOMEBODY, *found[5:10]))
         return others(found, sticky)
 
-    monkeypatch.setattr(folders, "_others", seen)
+    monkeypatch.setattr(cache, "_others", seen)
 
 
 def plant(directory: Path) -> Path:
@@ -163,7 +162,7 @@ def test_a_planted_note_is_not_believed(
         give_away(note, monkeypatch)
     other = library.with_name(library.name.replace(library.name.split("-")[1], wrong))
     library.rename(other)
-    monkeypatch.setattr(folders, "_warned", set())
+    monkeypatch.setattr(cache, "_warned", set())
     monkeypatch.setattr(cache, "_loaded", {})
     assert works()
     assert len(list(directory.glob("*.so"))) == 2  # the one of the note was not taken
@@ -172,10 +171,10 @@ def test_a_planted_note_is_not_believed(
 def test_a_sticky_folder_above_is_enough(directory: Path) -> None:
     directory.mkdir(mode=0o700)
     directory.parent.chmod(0o1777)
-    assert folders.trusted_cache() == Path(os.path.realpath(directory))
+    assert cache.trusted_cache() == Path(os.path.realpath(directory))
     directory.parent.chmod(0o777)
     with pytest.warns(CacheWarning, match="can be written by every user"):
-        assert folders.trusted_cache() is None
+        assert cache.trusted_cache() is None
 
 
 def test_a_folder_is_looked_into_and_not_listed(
@@ -188,7 +187,7 @@ def test_a_folder_is_looked_into_and_not_listed(
         raise AssertionError("listed")
 
     monkeypatch.setattr(os, "listdir", listed)
-    assert folders.trusted_cache() == Path(os.path.realpath(directory))
+    assert cache.trusted_cache() == Path(os.path.realpath(directory))
 
 
 def test_a_folder_is_made_for_the_user_alone(
@@ -197,7 +196,7 @@ def test_a_folder_is_made_for_the_user_alone(
     monkeypatch.setenv("CASADI_IK_CACHE", str(directory / "a" / "b"))
     before = os.umask(0)
     try:
-        assert folders.trusted_cache() is not None
+        assert cache.trusted_cache() is not None
     finally:
         os.umask(before)
     for place in (directory, directory / "a", directory / "a" / "b"):
