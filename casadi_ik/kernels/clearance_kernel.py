@@ -18,7 +18,7 @@ from casadi_ik.collision.solids import C_NAMES
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import SLICE, DriverCode, check
-from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
+from casadi_ik.kernels.codegen import c_struct, define, driver_text, library_source, row_major
 from casadi_ik.kernels.function_kernel import FunctionKernel, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.robots import RobotDescription
@@ -32,31 +32,7 @@ BLOCK = 1024
 """Configurations that numpy works on at a time where there is no compiled driver."""
 
 
-class ClearanceJob(ctypes.Structure):
-    """`clearance_job` of drivers/clearance_job.c."""
-
-    _fields_ = (
-        ("q", ctypes.c_void_p),
-        ("poses", ctypes.c_void_p),
-        ("pose_step", ctypes.c_int64),
-        ("n_solids", ctypes.c_int64),
-        ("solids", ctypes.c_void_p),
-        ("planes", ctypes.c_void_p),
-        ("radii", ctypes.c_void_p),
-        ("halves", ctypes.c_void_p),
-        ("pairs", ctypes.c_void_p),
-        ("offsets", ctypes.c_void_p),
-        ("n_pairs", ctypes.c_int64),
-        ("recent", ctypes.c_int64 * RECENT),
-        ("most", ctypes.c_double),
-        ("enough", ctypes.c_double),
-        ("least", ctypes.c_void_p),
-        ("closest", ctypes.c_void_p),
-        ("every", ctypes.c_void_p),
-        ("count", ctypes.c_int64),
-        ("next", ctypes.c_int64),
-        ("slice", ctypes.c_double),
-    )
+ClearanceJob = c_struct("clearance_job", {"RECENT": RECENT})
 
 
 class ClearanceKernel:
@@ -135,7 +111,7 @@ class ClearanceKernel:
 
     def job(
         self, q: Array, poses: Array, table: Table, most: float, enough: float
-    ) -> tuple[ClearanceJob, tuple[Any, ...]]:
+    ) -> tuple[Any, tuple[Any, ...]]:
         """What the driver works on, without memory for results; and what has to be kept meanwhile.
 
         Args:

@@ -6,7 +6,9 @@ know of one function arrives as `#define` lines.
 
 from __future__ import annotations
 
+import ctypes
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib import resources
@@ -25,6 +27,30 @@ def driver_text(name: str) -> str:
     return (resources.files("casadi_ik.kernels") / "drivers" / f"{name}.c").read_text(
         encoding="utf-8"
     )
+
+
+def c_struct(name: str, sizes: Mapping[str, int] | None = None) -> Any:
+    """The struct `<name>` of `drivers/<name>.c` for ctypes; pointers of any kind are addresses.
+
+    Args:
+        name: As C has it.
+        sizes: What names in brackets stand for.
+    """
+    text = re.sub(r"/\*.*?\*/", "", driver_text(name), flags=re.DOTALL)
+    body = text.partition(f"}} {name};")[0].rpartition("typedef struct {")[2]
+    fields: list[tuple[str, Any]] = []
+    for declaration in filter(str.strip, body.split(";")):
+        if called := re.search(r"\(\*(\w+)\)\(", declaration):
+            fields.append((called[1], ctypes.c_void_p))
+            continue
+        kind: Any = ctypes.c_double if "double" in declaration else ctypes.c_int64
+        for one in declaration.split(","):
+            found = re.search(r"(\**)(\w+)(?:\[(\w+)\])?\s*$", one)
+            assert found is not None, one
+            pointer, field, size = found.groups()
+            own = ctypes.c_void_p if pointer else kind
+            fields.append((field, own * (sizes or {})[size] if size else own))
+    return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
 def define(constants: Mapping[str, int]) -> str:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, stop_if_cancelled
-from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
+from casadi_ik.kernels.codegen import c_struct, define, driver_text, library_source, row_major
 from casadi_ik.kernels.graphs import FunctionGraph
 
 logger = logging.getLogger(__name__)
@@ -106,18 +106,7 @@ def machine_lanes() -> int:
 SYMBOL = "casadi_ik_map"
 
 
-class MapJob(ctypes.Structure):
-    """`map_job` of drivers/map_job.c."""
-
-    _fields_ = (
-        ("inputs", ctypes.c_void_p),
-        ("input_steps", ctypes.c_void_p),
-        ("outputs", ctypes.c_void_p),
-        ("output_steps", ctypes.c_void_p),
-        ("count", ctypes.c_int64),
-        ("next", ctypes.c_int64),
-        ("slice", ctypes.c_double),
-    )
+MapJob = c_struct("map_job")
 
 
 class SingleCall:

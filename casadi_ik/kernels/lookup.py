@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, stop_if_cancelled
-from casadi_ik.kernels.codegen import define, driver_text, row_major
+from casadi_ik.kernels.codegen import c_struct, define, driver_text, row_major
 from casadi_ik.kernels.function_kernel import FunctionKernel, memory
 from casadi_ik.kernels.graphs import FunctionGraph
 
@@ -32,20 +32,7 @@ CHUNK = 256
 """Samples that numpy compares at once: what fits into the cache."""
 
 
-class _Job(ctypes.Structure):
-    """`lookup_job` of drivers/lookup_job.c."""
-
-    _fields_ = (
-        ("inputs", ctypes.c_void_p),
-        ("input_steps", ctypes.c_void_p),
-        ("tiles", ctypes.c_void_p),
-        ("found", ctypes.c_void_p),
-        ("rows", ctypes.c_int64),
-        ("wanted", ctypes.c_int64),
-        ("count", ctypes.c_int64),
-        ("next", ctypes.c_int64),
-        ("slice", ctypes.c_double),
-    )
+_Job = c_struct("lookup_job")
 
 
 class LookupKernel:
@@ -135,7 +122,7 @@ class LookupKernel:
         inputs: Sequence[NDArray[np.float64]],
         found: NDArray[np.int64],
         steps: Sequence[int] = (),
-    ) -> tuple[_Job, Any]:
+    ) -> tuple[Any, Any]:
         """A job, and memory that has to live as long."""
         sources = (ctypes.c_void_p * len(inputs))(*map(memory, inputs))
         strides = (ctypes.c_int64 * len(inputs))(*steps)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, stop_if_cancelled
-from casadi_ik.kernels.codegen import define, driver_text, library_source, row_major
+from casadi_ik.kernels.codegen import c_struct, define, driver_text, library_source, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import RUNNING, StepGraph
 from casadi_ik.kernels.layout import opaque, row_driver, split_rows, store_rows
@@ -175,34 +175,7 @@ ROOM_BYTES = 2**24
 """What it begins with at most [bytes]."""
 
 
-class Job(ctypes.Structure):
-    """`loop_job` of drivers/loop_job.c."""
-
-    _fields_ = (
-        ("states", ctypes.c_void_p),
-        ("parameters", ctypes.c_void_p),
-        ("state_step", ctypes.c_int64),
-        ("parameter_step", ctypes.c_int64),
-        ("iterations", ctypes.c_void_p),
-        ("status", ctypes.c_void_p),
-        ("seconds", ctypes.c_void_p),
-        ("slots", ctypes.c_void_p),
-        ("begun", ctypes.c_void_p),
-        ("mark", ctypes.c_void_p),
-        ("slot_count", ctypes.c_int64),
-        ("rows", ctypes.c_void_p),
-        ("places", ctypes.c_void_p),
-        ("capacity", ctypes.c_int64),
-        ("used", ctypes.c_int64),
-        ("count", ctypes.c_int64),
-        ("solve", ctypes.c_int64),
-        ("max_iterations", ctypes.c_int64),
-        ("left", ctypes.c_int64),
-        ("fewest", ctypes.c_int64),
-        ("slice", ctypes.c_double),
-        ("follow", ctypes.c_void_p),
-        ("method", ctypes.c_void_p),
-    )
+Job = c_struct("loop_job")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from bench_view import NO_PAINTING
 from browser import Browser, Page
 
 import casadi_ik as ik
-from casadi_ik.exporting import wasm
+from casadi_ik.exporting import project
 from casadi_ik.kernels.clearance_kernel import ClearanceKernel
 
 BUILD = Path(__file__).parents[2] / "page" / "build.py"
@@ -32,10 +32,10 @@ def build(out: Path, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """
     if shutil.which("npm") is None or importlib.util.find_spec("ziglang") is None:
         pytest.skip("the page needs npm and ziglang")
-    assert "-O2" in wasm.COMMAND
-    plainly = tuple("-O0" if word == "-O2" else word for word in wasm.COMMAND)
+    assert "-O2" in project.COMMAND
+    plainly = tuple("-O0" if word == "-O2" else word for word in project.COMMAND)
     # Without optimisation zig guards the stack by a function that a browser does not have.
-    monkeypatch.setattr(wasm, "COMMAND", (*plainly, "-fno-stack-protector"))
+    monkeypatch.setattr(project, "COMMAND", (*plainly, "-fno-stack-protector"))
     words = ["build", "--robots", ROBOT, "--out", str(out), "--keep", str(kept)]
     monkeypatch.setattr(sys, "argv", words)
     try:
