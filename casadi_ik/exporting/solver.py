@@ -34,9 +34,9 @@ from casadi_ik.kernels.emitter import Form
 from casadi_ik.kernels.graphs import FunctionGraph
 from casadi_ik.kernels.layout import Layout
 from casadi_ik.kernels.lookup import TILE
-from casadi_ik.methods.hand_first.state import terms
 from casadi_ik.methods.hand_first.driver import SearchPlan, source_text
 from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.methods.hand_first.state import terms
 from casadi_ik.motion.asked import contact_weights
 from casadi_ik.motion.cycle import Cycle
 from casadi_ik.motion.follower import PALM_WEIGHT

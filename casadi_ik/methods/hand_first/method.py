@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from casadi_ik.arms.recognise import arm_family
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.kernels import FunctionKernel, LoopResult, StepGraph
-from casadi_ik.kernels.loop import UNBEGUN
+from casadi_ik.kernels.loop import UNBEGUN, Stepper
 from casadi_ik.kernels.robot_kernels import RobotKernels
-from casadi_ik.kernels.loop import Stepper
 from casadi_ik.methods.common.limits import coupling_jacobian
 from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.methods.hand_first.driver import Searches, SearchPlan, SearchPool

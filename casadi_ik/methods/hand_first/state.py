@@ -9,9 +9,8 @@ from functools import cached_property
 
 import casadi as ca
 
-from casadi_ik.kernels.graphs import FunctionGraph
+from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.kernels.graphs import recipe
 from casadi_ik.methods.common.bounded_step import Bounded
 from casadi_ik.methods.common.contact_fit import Tried, WholeContacts, fresh_fit
 from casadi_ik.methods.common.limits import bits, coupling_fields, coupling_values

@@ -24,8 +24,7 @@ import casadi as ca
 
 from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import ArmTrials, Farthest, Nearest
-from casadi_ik.kernels.graphs import recipe
-from casadi_ik.kernels.graphs import StepGraph
+from casadi_ik.kernels.graphs import StepGraph, recipe
 from casadi_ik.methods.common.contact_fit import (
     BALANCE,
     FIT,
