@@ -1,0 +1,40 @@
+"""The page on architecture names files that are there, and no addition takes more than it says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+
+
+def rows(title: str) -> list[list[str]]:
+    """The cells of the first table below a heading, without its head."""
+    section = PAGE.split(f"## {title}\n", 1)[1].split("\n## ", 1)[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def test_a_solve_goes_through_eight_files_at_most() -> None:
+    files = [re.sub("`", "", row[0]) for row in rows("How a target is processed")]
+    assert 1 < len(files) <= 8
+    for file in files:
+        assert (ROOT / file).is_file(), file
+
+
+def test_an_addition_takes_the_files_that_are_named() -> None:
+    found = rows("Adding to it")
+    assert len(found) >= 9
+    for what, most, files, _ in found:
+        named = files.split(" · ")
+        assert len(named) <= max(int(most), 1), what
+        for file in re.findall(r"`([^`]+\.(?:py|c))`", files):
+            assert (ROOT / "casadi_ik" / file).is_file(), f"{what}: {file}"
+
+
+def test_every_folder_has_a_layer() -> None:
+    layers = " ".join(row[0] for row in rows("Layers"))
+    for path in (ROOT / "casadi_ik").iterdir():
+        if path.is_dir() and (path / "__init__.py").is_file():
+            assert f"`{path.name}`" in layers, path.name
