@@ -34,27 +34,6 @@ TOTALS = Keep(failed=False, singular=False, sample=0.0)
 """The totals of a solve tell how often each kind of event happened."""
 
 
-READING = """
-## Reading it
-
-A threshold is of use where many of the failed solves pass it and few of the solved ones. For the
-closed chain and for the arm the ratio falls as the threshold is loosened, while the share of
-failures it accounts for grows; the rule stands between a tighter one, which misses most failures,
-and a looser one, which every other solve passes. It tells where to look, not that a solve has
-failed: some solved ones pass it too, those of hand-first and thumb-first among them.
-
-The hand's rule tells of postures, not of failures: of the paper's methods' solves a third passes
-it on the way, solved ones hardly less often than failed ones. Three times the rule all of them
-pass, for the posture at home does. The Jacobians of thumb and palm have a
-redundant arm before them and hardly ever come near singular on these targets; their rules stand
-below what every solve passes (the loose end of the table), so that the event is rare and means
-something. Stalls and oscillations do not hang on their thresholds: over two orders of magnitude
-they catch nearly the same solves. The lead screws and four-bars of Baxter's hand did not come as
-near to their toggle positions; its arm, which has no closed form, often comes near singular and
-arrives nevertheless.
-"""
-
-
 class Kept:
     """A recorder that keeps the blocks in memory."""
 
@@ -118,14 +97,13 @@ def trials(block: Any, factors: Sequence[float] = FACTORS) -> Iterator[Trial]:
                 rules = EventRules(singular=silent[0], condition=silent[1] | {name: value})
                 yield Trial(EventKind.ILL_CONDITIONED, name, value, factor == 1, rules)
     usual = EventRules()
-    for factor in factors:
-        value = factor * usual.stall_change
-        rules = EventRules(stall_change=value)
-        yield Trial(EventKind.STALL, "relative spread", value, factor == 1, rules)
-    for factor in factors:
-        value = factor * usual.oscillation_step
-        rules = EventRules(oscillation_step=value)
-        yield Trial(EventKind.OSCILLATION, "shortest step", value, factor == 1, rules)
+    for kind, subject, rule in (
+        (EventKind.STALL, "relative spread", "stall_change"),
+        (EventKind.OSCILLATION, "shortest step", "oscillation_step"),
+    ):
+        for factor in factors:
+            value = factor * getattr(usual, rule)
+            yield Trial(kind, subject, value, factor == 1, EventRules(**{rule: value}))
 
 
 def caught(blocks: Sequence[Any], trial: Trial) -> Caught:
@@ -210,7 +188,7 @@ targets are shipped grasps on random arms, half are random hands on random arms,
 start from `robot.home`, within limits. A row is a threshold, the rule in bold, and the share of the
 solves that failed and of those that were solved in which the event happened at all.
 """
-    write_page("What the thresholds of events catch", [text, *parts, READING], options.report)
+    write_page("What the thresholds of events catch", [text, *parts], options.report)
 
 
 if __name__ == "__main__":

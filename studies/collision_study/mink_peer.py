@@ -18,6 +18,7 @@ import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.collision.solids import Kind
 from casadi_ik.problem.clearance import SceneCheck, Surroundings
+from collision_study.oracles import with_shapes
 from collision_study.search import Piece, grasps_at, surroundings
 
 STARTS, STEPS, CAP, WAIT, STALL = 25, 60, 0.5, 8, 0.98
@@ -41,47 +42,7 @@ class MinkAmong(Mink):
 
     def _spec(self, robot: ik.ArmHand) -> Any:
         spec = super()._spec(robot)
-        mujoco, table = self._mujoco, self._around.table
-        bodies = {body.name: body for body in spec.bodies}
-        world = spec.worldbody
-        for geom in list(spec.geoms):
-            spec.delete(geom)
-        shapes = robot.description.shapes
-        for i, one in enumerate(shapes.capsules):
-            body = bodies.get(one.link, world)
-            ends = np.concatenate([one.center - one.half, one.center + one.half])
-            if np.any(one.half):
-                body.add_geom(
-                    name=f"g{i}",
-                    type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-                    fromto=ends,
-                    size=[one.radius, 0, 0],
-                )
-            else:
-                body.add_geom(
-                    name=f"g{i}",
-                    type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                    pos=one.center,
-                    size=[one.radius, 0, 0],
-                )
-        poses = self._around.poses.reshape(-1, 12)
-        for k, solid in enumerate(table.solids):
-            if k < table.own:
-                own = shapes.solids[k]
-                body, pose = bodies.get(own.link, world), own.pose
-            else:
-                flat, pose, body = poses[k - table.own], np.eye(4), world
-                pose[:3, :3], pose[:3, 3] = flat[:9].reshape(3, 3), flat[9:]
-            kinds = mujoco.mjtGeom
-            kind = {
-                Kind.BOX: kinds.mjGEOM_BOX,
-                Kind.CYLINDER: kinds.mjGEOM_CYLINDER,
-                Kind.CAPSULE: kinds.mjGEOM_CAPSULE if solid.size[1] else kinds.mjGEOM_SPHERE,
-            }[solid.kind]
-            turn = np.empty(4)
-            mujoco.mju_mat2Quat(turn, pose[:3, :3].ravel())
-            name = f"g{len(shapes.capsules) + k}"
-            body.add_geom(name=name, type=kind, pos=pose[:3, 3], quat=turn, size=solid.size)
+        with_shapes(spec, robot, self._around)
         return spec
 
     def _limits_of(self, around: Surroundings) -> list[Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from importlib import import_module
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,90 +135,81 @@ class CoalOracle:
         return found
 
 
+def with_shapes(
+    spec: Any, robot: ik.ArmHand, around: Surroundings, covers: bool = True
+) -> dict[int, str]:
+    """Put our shapes into a MuJoCo specification instead of its own, geom "g0", "g1" and so on.
+
+    Args:
+        spec: Of the robot, a body per link.
+        robot: The robot.
+        around: What is checked; a solid of the scene is a body of its own.
+        covers: Whether capsules that only enclose others are there as well.
+
+    Returns:
+        The body of each shape, by its number in the pairs of the check.
+    """
+    table, kinds, world = around.table, mujoco.mjtGeom, spec.worldbody
+    for geom in list(spec.geoms):
+        spec.delete(geom)
+    bodies = {body.name: body for body in spec.bodies}
+    shapes, found = robot.description.shapes, dict[int, str]()
+    for i, one in enumerate(shapes.capsules):
+        if one.covers >= 0 and not covers:
+            continue
+        body = bodies.get(one.link, world)
+        found[i] = body.name
+        size, place = [one.radius, 0, 0], {"pos": one.center}
+        if np.any(one.half):
+            place = {"fromto": np.concatenate([one.center - one.half, one.center + one.half])}
+        kind = kinds.mjGEOM_CAPSULE if np.any(one.half) else kinds.mjGEOM_SPHERE
+        body.add_geom(name=f"g{i}", type=kind, size=size, **place)
+    poses = around.poses.reshape(-1, 12)
+    for k, solid in enumerate(table.solids):
+        turn, number = np.empty(4), len(shapes.capsules) + k
+        if k < table.own:
+            own = shapes.solids[k]
+            body, rotation, at = bodies.get(own.link, world), own.pose[:3, :3], own.pose[:3, 3]
+        else:
+            flat = poses[k - table.own]
+            body, rotation, at = world.add_body(name=f"solid{k}"), flat[:9], flat[9:]
+        kind = {
+            Kind.BOX: kinds.mjGEOM_BOX,
+            Kind.CYLINDER: kinds.mjGEOM_CYLINDER,
+            Kind.CAPSULE: kinds.mjGEOM_CAPSULE if solid.size[1] else kinds.mjGEOM_SPHERE,
+        }[solid.kind]
+        mujoco.mju_mat2Quat(turn, np.ascontiguousarray(rotation).ravel())
+        body.add_geom(name=f"g{number}", type=kind, pos=at, quat=turn, size=solid.size)
+        found[number] = body.name
+    return found
+
+
 class MuJoCoOracle:
     """MuJoCo's kinematics and collisions."""
 
     def __init__(self, robot: ik.ArmHand, around: Surroundings) -> None:
-        """Write the robot and the solids as MJCF."""
-        self._robot = robot
-        description, table = robot.description, around.table
-        top = ElementTree.Element("mujoco")
-        ElementTree.SubElement(top, "compiler", angle="radian", autolimits="true")
-        ElementTree.SubElement(top, "option", gravity="0 0 0")
-        world = ElementTree.SubElement(top, "worldbody")
-        bodies = {description.root: ElementTree.SubElement(world, "body", name=description.root)}
-        for joint in description.joints:
-            body = ElementTree.SubElement(
-                bodies[joint.parent],
-                "body",
-                name=joint.child,
-                pos=_text(joint.placement[:3, 3]),
-                quat=_quaternion(joint.placement[:3, :3]),
-            )
-            bodies[joint.child] = body
-            if joint.type != "fixed":
-                kind = "slide" if joint.type == "prismatic" else "hinge"
-                ElementTree.SubElement(
-                    body, "joint", name=joint.name, type=kind, axis=_text(joint.axis)
-                )
-            ElementTree.SubElement(body, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
-        links: dict[int, str] = {}
-        for i, one in enumerate(description.shapes.capsules):
-            if one.covers >= 0:
-                continue
-            links[i] = one.link
-            a, b = one.center - one.half, one.center + one.half
-            if np.any(one.half):
-                ElementTree.SubElement(
-                    bodies[one.link],
-                    "geom",
-                    type="capsule",
-                    size=repr(one.radius),
-                    fromto=f"{_text(a)} {_text(b)}",
-                )
-            else:
-                ElementTree.SubElement(
-                    bodies[one.link],
-                    "geom",
-                    type="sphere",
-                    size=repr(one.radius),
-                    pos=_text(one.center),
-                )
-        count = len(description.shapes.capsules)
-        poses = around.poses if around.poses.ndim == 2 else around.poses[0]
-        for k, solid in enumerate(table.solids):
-            x, y, z = solid.size.tolist()
-            kinds = {Kind.BOX: ("box", f"{x} {y} {z}"), Kind.CYLINDER: ("cylinder", f"{x} {y}")}
-            kind, size = kinds[solid.kind]
-            if k < table.own:
-                own = description.shapes.solids[k]
-                turn, at, holder = own.pose[:3, :3], own.pose[:3, 3], bodies[own.link]
-                links[count + k] = own.link
-            else:
-                flat = poses[k - table.own]
-                turn, at = flat[:9].reshape(3, 3), flat[9:]
-                holder = ElementTree.SubElement(world, "body", name=f"solid{k}")
-                links[count + k] = f"solid{k}"
-            ElementTree.SubElement(
-                holder, "geom", type=kind, size=size, pos=_text(at), quat=_quaternion(turn)
-            )
+        """Read the robot's URDF and put the shapes in."""
+        self._robot, table = robot, around.table
+        compiler = '<compiler fusestatic="false" boundmass="0.01" boundinertia="0.001"/>'
+        urdf = robot.urdf().replace("<link", f"<mujoco>{compiler}</mujoco><link", 1)
+        spec = mujoco.MjSpec.from_string(urdf)
+        links = with_shapes(spec, robot, around, covers=False)
         # What is no pair of the table is excluded; those that may overlap a little are left out.
         kept = {
             frozenset((links.get(i, table.names[p][0]), links[j]))
             for p, (i, j) in enumerate(table.pairs.tolist())
             if not table.offsets[p]
         }
-        contact = ElementTree.SubElement(top, "contact")
         names = sorted(set(links.values()))
         for a, one in enumerate(names):
             for other in names[a + 1 :]:
                 if frozenset((one, other)) not in kept:
-                    ElementTree.SubElement(contact, "exclude", body1=one, body2=other)
-        self._model = mujoco.MjModel.from_xml_string(ElementTree.tostring(top, encoding="unicode"))
+                    spec.add_exclude(bodyname1=one, bodyname2=other)
+        self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._places = {
             joint.name: self._model.jnt_qposadr[self._model.joint(joint.name).id]
-            for joint in description.movable
+            for joint in robot.description.movable
         }
 
     def _configurations(self, q: Array) -> Array:
@@ -244,13 +234,3 @@ class MuJoCoOracle:
             mujoco.mj_collision(self._model, self._data)
             found[row] = self._data.ncon > 0 and bool((self._data.contact.dist < -depth).any())
         return found
-
-
-def _text(values: Array) -> str:
-    return " ".join(repr(float(value)) for value in values)
-
-
-def _quaternion(rotation: Array) -> str:
-    found = np.empty(4)
-    mujoco.mju_mat2Quat(found, np.ascontiguousarray(rotation).ravel())
-    return _text(found)
