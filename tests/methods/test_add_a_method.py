@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import registry
-from casadi_ik.errors import InputError
+from casadi_ik import errors, registry
 
 PAGE = Path(__file__).parents[2] / "docs" / "add_a_method.md"
 
@@ -75,21 +74,21 @@ def test_a_budget_that_is_used_up_is_a_status(page, near_home):
 def test_a_free_finger_is_refused_by_name(page, near_home):
     points, normals = (array.copy() for array in near_home)
     points[3, 1] = normals[3, 1] = np.nan
-    with pytest.raises(InputError, match=r"'damped-least-squares' needs a contact .* row 3"):
+    with pytest.raises(errors.InputError, match=r"'damped-least-squares' needs a contact .* row 3"):
         page.solver.solve_batch(points, normals)
 
 
 def test_names_are_taken_once(page):
     method, known = page.DampedLeastSquares, page.DampedParameters
-    with pytest.raises(InputError, match="there is a method 'damped-least-squares' already"):
+    with pytest.raises(errors.InputError, match="there is a method 'damped-least-squares' already"):
         ik.register_method(method.name, "again", known, method)
     ik.register_method(method.name, "again", known, method, replace=True)
     assert registry.method_summary(method.name) == "again"
     assert registry.method_names() == (*ik.METHODS, method.name)
-    with pytest.raises(InputError, match="there is a method 'ipopt' already"):
+    with pytest.raises(errors.InputError, match="there is a method 'ipopt' already"):
         ik.register_method("ipopt", "mine", known, method, replace=True)
-    with pytest.raises(InputError, match="expected a dataclass"):
+    with pytest.raises(errors.InputError, match="expected a dataclass"):
         ik.register_method("other", "mine", dict, method)
     ik.register_method("misnamed", "calls itself otherwise", known, method)
-    with pytest.raises(InputError, match="calls itself 'damped-least-squares'"):
+    with pytest.raises(errors.InputError, match="calls itself 'damped-least-squares'"):
         ik.Solver(page.robot, "misnamed")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import UnsupportedError
+from casadi_ik import errors
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
 
@@ -79,7 +79,7 @@ def test_without_limits_a_slider_keeps_to_its_triangle(robot, method, rng):
 @pytest.mark.parametrize("method", ["enhanced-dls", "enhanced-sdls"])
 def test_the_papers_methods_say_why_not(robot, method):
     """They spread fingers and distribute flexion; the AR10's fingers do neither."""
-    with pytest.raises(UnsupportedError, match=f"robot '{robot.name}': "):
+    with pytest.raises(errors.UnsupportedError, match=f"robot '{robot.name}': "):
         ik.Solver(robot, method)
 
 

@@ -10,7 +10,7 @@ import pytest
 from pinocchio_oracle import PinocchioRobot, verdict
 
 import casadi_ik as ik
-from casadi_ik.errors import UnsupportedError
+from casadi_ik import errors
 
 PAIRS = (
     "panda+allegro_right",
@@ -45,7 +45,9 @@ def test_verdict_on_targets_near_home(robot, oracle, method):
     q = robot.home + rng.uniform(-1, 1, (2, len(reach))) * reach
     points, normals = robot.contacts(np.clip(q, robot.lower, robot.upper))
     if method.startswith("enhanced") and robot.name not in PLANAR:
-        with pytest.raises(UnsupportedError, match=rf"'{re.escape(robot.name)}': finger .* planar"):
+        with pytest.raises(
+            errors.UnsupportedError, match=rf"'{re.escape(robot.name)}': finger .* planar"
+        ):
             ik.Solver(robot, method, compiled=False)
         return
     options = {"finger_step": "closed-form"} if method.startswith("enhanced") else {}

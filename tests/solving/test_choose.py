@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik import errors
 
 ROBOT = "kuka_lwr_barrett"
 COUNT = 12
@@ -236,8 +236,8 @@ def test_bad_questions_are_one_clear_line(solver, robot, candidates, cup):
         ({"q0": [0.0]}, r"q0: found shape \(1,\)"),
         ({"grasps": [candidates[0], "cup"]}, r"grasps\[1\]: found str, expected a Grasp"),
     ):
-        with pytest.raises(InputError, match=text) as raised:
+        with pytest.raises(errors.InputError, match=text) as raised:
             solver.choose(**{"grasps": candidates, "object_pose": cup.object_pose} | words)
         assert "\n" not in str(raised.value)
-    with pytest.raises(UnsupportedError, match="gives one solution"):
+    with pytest.raises(errors.UnsupportedError, match="gives one solution"):
         ik.Solver(robot, "thumb-first", compiled=False).choose(candidates, cup.object_pose)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik import errors
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +69,10 @@ def test_one_instance_per_thread(robot, targets):
 def test_a_malformed_target_is_refused_in_words(robot, targets, change, message):
     points, normals = targets[0][100], targets[1][100]
     fast = ik.Solver(robot).fast()
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(errors.InputError, match=message):
         fast(*change(points, normals))
     assert fast(points, normals)[1] is ik.Status.SOLVED
-    with pytest.raises(InputError, match="q0"):
+    with pytest.raises(errors.InputError, match="q0"):
         fast(points, normals, np.full(14, np.nan))
 
 
@@ -92,5 +92,7 @@ def test_without_a_compiler_it_is_slow_but_right(robot, targets):
 
 
 def test_only_hand_first(robot):
-    with pytest.raises(UnsupportedError, match="expected method 'hand-first', found 'thumb-first'"):
+    with pytest.raises(
+        errors.UnsupportedError, match="expected method 'hand-first', found 'thumb-first'"
+    ):
         ik.Solver(robot, method="thumb-first").fast()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik import errors
 
 EXACT = ik.Tolerance(1e-6, 1e-6)
 
@@ -101,9 +101,9 @@ def test_manipulability(robot, rng):
 
 def test_what_cannot_be_preferred(robot):
     q = robot.home
-    with pytest.raises(InputError, match="prefer: found 'near', expected one of"):
+    with pytest.raises(errors.InputError, match="prefer: found 'near', expected one of"):
         ik.Solver(robot, compiled=False).solve(_grasp(robot, q), prefer="near")
-    with pytest.raises(UnsupportedError, match="method 'ipopt' cannot choose"):
+    with pytest.raises(errors.UnsupportedError, match="method 'ipopt' cannot choose"):
         ik.Solver(robot, "ipopt").solve(_grasp(robot, q), q0=q, prefer="q0")
 
 
