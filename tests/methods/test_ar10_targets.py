@@ -13,9 +13,25 @@ from casadi_ik import errors
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
 
-import ar10_success as study
+from samplers import SAMPLERS, near_limits
 
 EXACT = ik.Tolerance(1e-6, 1e-6)
+FINGERS = ("thumb", "index", "middle")
+SETS = {
+    "anywhere": ("random", FINGERS),
+    "near limits": ("limits", FINGERS),
+    "anywhere, thumb and index": ("random", FINGERS[:2]),
+    "anywhere, thumb alone": ("random", FINGERS[:1]),
+    "anywhere, all five fingers": ("random", (*FINGERS, "ring", "little")),
+}
+
+
+def contacts(robot, q, fingers):
+    """Targets (k, f, 3): contacts of some fingers [m], NaN for the others."""
+    points, normals = robot.contacts(q)
+    free = [finger not in fingers for finger in robot.fingers]
+    points[:, free], normals[:, free] = np.nan, np.nan
+    return points, normals
 
 
 @pytest.fixture(scope="module", params=["ar10", "baxter_ar10"])
@@ -24,11 +40,12 @@ def robot(request) -> ik.ArmHand:
 
 
 @pytest.mark.parametrize("tolerance", [ik.Tolerance(), EXACT], ids=["usual", "exact"])
-@pytest.mark.parametrize("targets", study.SETS)
+@pytest.mark.parametrize("targets", SETS)
 def test_reachable_targets_are_solved(robot, targets, tolerance):
-    made, fingers = study.SETS[targets]
+    sampler, fingers = SETS[targets]
+    _, made = SAMPLERS[sampler]
     rng = np.random.default_rng(2019)
-    points, normals = study.contacts(robot, made(robot, rng, 300), fingers)
+    points, normals = contacts(robot, made(robot, rng, 300), fingers)
     assert np.isnan(points[:, :, 0]).sum(axis=1).tolist() == [5 - len(fingers)] * 300
     batch = ik.Solver(robot, tolerance=tolerance).solve_batch(points, normals)
     assert np.flatnonzero(~batch.success).tolist() == []
@@ -37,7 +54,7 @@ def test_reachable_targets_are_solved(robot, targets, tolerance):
 
 
 def test_joints_keep_to_their_own_limits(robot, rng):
-    points, normals = study.contacts(robot, study.near_limits(robot, rng, 200), study.FINGERS)
+    points, normals = contacts(robot, near_limits(robot, rng, 200), FINGERS)
     batch = ik.Solver(robot).solve_batch(points, normals)
     theta = np.stack(list(robot.joints(batch.q).values()), axis=1)
     assert np.all(theta >= robot.description.joint_lower)
@@ -46,7 +63,7 @@ def test_joints_keep_to_their_own_limits(robot, rng):
 
 def test_free_fingers_stay(robot, rng):
     q0 = robot.random(rng, 20)
-    points, normals = study.contacts(robot, robot.random(rng, 20), ["thumb", "middle"])
+    points, normals = contacts(robot, robot.random(rng, 20), ["thumb", "middle"])
     batch = ik.Solver(robot).solve_batch(points, normals, q0=q0)
     for finger in ("index", "ring", "little"):
         columns = list(robot.description.finger_actuators(finger))
@@ -54,7 +71,7 @@ def test_free_fingers_stay(robot, rng):
 
 
 def test_ipopt_agrees(robot, rng):
-    points, normals = study.contacts(robot, robot.random(rng, 6), study.FINGERS)
+    points, normals = contacts(robot, robot.random(rng, 6), FINGERS)
     batch = ik.Solver(robot, "ipopt", EXACT).solve_batch(points, normals)
     assert batch.success.all(), batch.status_names
     found, facing = robot.contacts(batch.q)
@@ -85,7 +102,7 @@ def test_the_papers_methods_say_why_not(robot, method):
 
 def test_out_of_reach_is_a_status(robot):
     """And the sliders stay within their limits, everything finite."""
-    points, normals = study.contacts(robot, robot.home[None], study.FINGERS)
+    points, normals = contacts(robot, robot.home[None], FINGERS)
     solution = ik.Solver(robot).solve_batch(points + 3.0, normals)
     assert not solution.success[0]
     assert solution.limits_ok[0]
