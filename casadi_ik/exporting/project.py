@@ -329,17 +329,10 @@ def _module(project: Exported) -> bytes:
         return made.read_bytes()
 
 
-FEW = 16
-"""Targets: enough for solves side by side."""
-
-FAR = 100.0
-"""How far away [m] no robot reaches."""
-
-
 def uses(robot: ArmHand) -> Iterator[tuple[str, Callable[[], object]]]:
     """Everything that compiles something, in words and as what does it."""
     solver = Solver(robot)
-    q = robot.random(np.random.default_rng(0), FEW)
+    q = robot.random(np.random.default_rng(0), 16)  # enough for solves side by side
 
     def targets() -> tuple[np.ndarray, np.ndarray]:
         return robot.contacts(q)
@@ -351,7 +344,7 @@ def uses(robot: ArmHand) -> Iterator[tuple[str, Callable[[], object]]]:
 
     def beyond() -> object:
         points, normals = targets()
-        return solver.solve_batch(points[:1] + FAR, normals[:1], diagnose=True)
+        return solver.solve_batch(points[:1] + 100.0, normals[:1], diagnose=True)
 
     def logged() -> object:
         with tempfile.TemporaryDirectory() as place:

@@ -46,8 +46,6 @@ from casadi_ik.kernels.compiler import (
     warn_no_compiler,
 )
 
-ROOT = 0
-
 
 class CacheWarning(RuntimeWarning):
     """The folder for compiled kernels cannot be used: they are kept in a temporary one."""
@@ -175,7 +173,7 @@ def _others(found: os.stat_result, sticky: bool) -> str:
         found: Of a folder or file.
         sticky: Whether it is enough that others cannot move what it holds.
     """
-    if found.st_uid not in (os.getuid(), ROOT) and not (sticky and _hidden_owner(found.st_uid)):
+    if found.st_uid not in (os.getuid(), 0) and not (sticky and _hidden_owner(found.st_uid)):
         return f"belongs to another user (uid {found.st_uid})"
     kept = sticky and found.st_mode & stat.S_ISVTX
     if found.st_mode & stat.S_IWOTH and not kept:
@@ -241,9 +239,6 @@ def workshop(directory: Path) -> Iterator[Path]:
 
 KEY = re.compile("[0-9a-f]{32}")
 
-NAME = 100
-"""Characters of a kernel's name that its file's name has at most; the key tells the rest."""
-
 _lock = ForkSafeLock()
 _loaded: dict[str, ctypes.CDLL] = {}
 
@@ -280,7 +275,8 @@ def load_library(
     if compiler is None:
         warn_no_compiler()
         return None
-    short = name[:NAME]
+    # The key tells apart what is called alike that far.
+    short = name[:100]
     with _lock:
         places = _places()
         brief = (

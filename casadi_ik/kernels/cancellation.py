@@ -6,6 +6,7 @@ few times a second to be told.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -96,6 +97,17 @@ class DriverCode(IntEnum):
     GOES_ON = 3
     FEW_LEFT = 4
     NO_MEMORY = -1
+
+
+def drive(name: str, entry: Any, job: ctypes.Structure) -> None:
+    """Call a driver until its job is done.
+
+    Raises:
+        MemoryError: No work memory.
+        CancelledError: This thread has been told to stop.
+    """
+    while (code := entry(ctypes.byref(job))) != DriverCode.DONE:
+        check(name, code)
 
 
 def check(name: str, code: int) -> None:

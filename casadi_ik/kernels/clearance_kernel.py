@@ -17,7 +17,7 @@ from casadi_ik.collision.model import placed, size_of
 from casadi_ik.collision.solids import C_NAMES
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.cancellation import SLICE, DriverCode, check
+from casadi_ik.kernels.cancellation import SLICE, drive
 from casadi_ik.kernels.codegen import c_struct, define, driver_text, library_source, row_major
 from casadi_ik.kernels.function_kernel import FunctionKernel, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
@@ -169,8 +169,7 @@ class ClearanceKernel:
         job, _kept = self.job(given, poses, table, most, enough)
         job.least, job.closest = memory(least), memory(closest)
         job.every = None if every is None else memory(every)
-        while (code := self.entry(ctypes.byref(job))) != DriverCode.DONE:
-            check(self._graph.name, code)
+        drive(self._graph.name, self.entry, job)
         return least, closest
 
     def _by_numpy(

@@ -171,10 +171,6 @@ def library_source(
     )
 
 
-WIDTH = 96
-"""Characters of a line of numbers."""
-
-
 def number(value: float) -> str:
     """A double as C writes it."""
     if not math.isfinite(value):
@@ -194,7 +190,7 @@ def numbers(values: Iterable[Any]) -> str:
     ]
     lines, line = [], ""
     for part in parts:
-        if line and len(line) + len(part) + 2 > WIDTH:
+        if line and len(line) + len(part) + 2 > 96:
             lines.append(line)
             line = ""
         line += ("" if not line else " ") + part + ","

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, KernelError
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, stop_if_cancelled
+from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, drive, stop_if_cancelled
 from casadi_ik.kernels.codegen import c_struct, define, driver_text, library_source, row_major
 from casadi_ik.kernels.graphs import FunctionGraph
 
@@ -322,8 +322,7 @@ class FunctionKernel:
             0,
             SLICE,
         )
-        while (code := self.entry(ctypes.byref(job))) != DriverCode.DONE:
-            check(self.name, code)
+        drive(self.name, self.entry, job)
 
     def _run_vm(
         self,
@@ -427,8 +426,7 @@ class MeasureKernel:
             0,
             SLICE,
         )
-        while (code := self._map(ctypes.byref(job))) != DriverCode.DONE:
-            check(self._graph.name, code)
+        drive(self._graph.name, self._map, job)
         return values
 
 
@@ -526,8 +524,7 @@ class Recurrence:
         into, out = (ctypes.c_int64 * 2)(*sizes[:2]), (ctypes.c_int64 * 2)(sizes[0], sizes[2])
         pointers = map(ctypes.addressof, (inputs, into, outputs, out))
         job = MapJob(*pointers, count=count, next=0, slice=SLICE)
-        while (code := self._kernel.entry(ctypes.byref(job))) != DriverCode.DONE:
-            check(self._kernel.name, code)
+        drive(self._kernel.name, self._kernel.entry, job)
         return states[1:], records
 
     def _evaluate(self, state: Array, parameters: Array, after: Array, record: Array) -> None:

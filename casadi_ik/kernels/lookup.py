@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, stop_if_cancelled
+from casadi_ik.kernels.cancellation import SLICE, drive, stop_if_cancelled
 from casadi_ik.kernels.codegen import c_struct, define, driver_text, row_major
 from casadi_ik.kernels.function_kernel import FunctionKernel, memory
 from casadi_ik.kernels.graphs import FunctionGraph
@@ -114,8 +114,7 @@ class LookupKernel:
         self, arrays: list[NDArray[np.float64]], steps: list[int], found: NDArray[np.int64]
     ) -> None:
         job, _kept = self._job(arrays, found, steps)
-        while (code := self.entry(ctypes.byref(job))) != DriverCode.DONE:
-            check(self.key.name, code)
+        drive(self.key.name, self.entry, job)
 
     def _job(
         self,
