@@ -160,7 +160,7 @@ class Shard:
             pairs = list(self._rows(found, solves, fields))
             times = np.concatenate([np.zeros(0, np.uint64), *(each for each, _ in pairs)])
             none = _chosen(np.zeros(0, found.layout.dtype), fields)
-            rows = np.concatenate([opaque(each) for each in (none, *(rows for _, rows in pairs))])
+            rows = np.concatenate([opaque(none), *(each for _, each in pairs)])
             rows = rows.view(none.dtype)
             if solves is None and len(times) != self.count(method, kind):
                 raise LogError(
@@ -178,7 +178,7 @@ class Shard:
     def _rows(
         self, found: Topic, solves: Counts | None, fields: Sequence[str] | None
     ) -> Iterator[tuple[NDArray[np.uint64], NDArray[Any]]]:
-        """Log times and rows, chunk by chunk; views where nothing had to be left out."""
+        """Log times and rows as bytes, chunk by chunk."""
         with reading(self.path) as stream:
             for index in self.contents.chunks:
                 if not self._may_hold(index, found.channel, solves):
@@ -191,7 +191,8 @@ class Shard:
                         if solves is not None:
                             wanted = np.isin(self.clock.locate(times)[0], solves)
                             times, rows = times[wanted], rows[wanted]
-                        yield times, _chosen(rows, fields)
+                        # A copy, so that the chunk need not be kept.
+                        yield times, opaque(_chosen(rows, fields))
 
     def _may_hold(self, index: ChunkIndex, channel: int, solves: Counts | None) -> bool:
         """Whether a chunk may hold messages of a channel and of some solves."""
