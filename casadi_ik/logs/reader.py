@@ -200,6 +200,7 @@ class Log:
             >>> len(ik.logs.open("cup.mcap").solves(status="SOLVED").array())
             1
         """
+        _check_filters(filters)
         wanted = _numbers(filters.get("solve"))
         status, event, phase = (filters.get(name) for name in ("status", "event", "phase"))
         parts = [self._read(name, "solve") for name in self._methods(filters.get("method"))]
@@ -256,6 +257,7 @@ class Log:
         return self._rows("event", None, filters)
 
     def _rows(self, kind: str, fields: Sequence[str] | None, filters: Filters) -> Table:
+        _check_filters(filters)
         event, phase = filters.get("event"), filters.get("phase")
         if filters.get("status") is None and event is None and phase is None:
             numbers = _numbers(filters.get("solve"))
@@ -356,6 +358,13 @@ class Log:
                     f"{self.shards[0].path}: no {what} {name!r}; there are: "
                     f"{', '.join(filter(None, known))}"
                 )
+
+
+def _check_filters(filters: Filters) -> None:
+    for name in filters:
+        if name not in Filters.__annotations__:
+            known = ", ".join(Filters.__annotations__)
+            raise TypeError(f"a log has no filter {name!r}; there are: {known}")
 
 
 def _joined(parts: Sequence[MethodRows]) -> MethodRows:

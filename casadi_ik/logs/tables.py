@@ -228,7 +228,7 @@ def happening(record: Mapping[str, Any]) -> Happening:
         kind=record["kind"],
         jacobian=record["subject"] if singular else "",
         joints=tuple(record["joint_mask"]),
-        phase=record["phase"],
+        phase=record["phase"] if isinstance(record["phase"], str) else "",
         value=record["value"],
         threshold=record["threshold"],
     )

@@ -98,6 +98,13 @@ def test_names_that_are_not_there(write: Write, question: dict[str, str], reason
             ask(**question)  # type: ignore[arg-type]
 
 
+def test_a_filter_that_is_not_there(write: Write) -> None:
+    log = logs.open(write(make_block(3)))
+    for ask in (log.solves, log.iterations, log.events):
+        with pytest.raises(TypeError, match="no filter 'stauts'; there are: method, solve, status"):
+            ask(stauts="SOLVED")  # type: ignore[call-arg]
+
+
 def test_a_field_that_is_not_there(write: Write) -> None:
     with pytest.raises(errors.UnknownNameError, match="no field 'costs'; there are: q, palm, cost"):
         logs.open(write(make_block(3))).iterations(fields=["costs"])
