@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import IO, Any
 
 import numpy as np
-from rich.console import Console
+from rich.console import Console, Group
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from casadi_ik.api import Solver
@@ -171,9 +171,7 @@ class _Totals:
         self.first_faults += texts[: ROWS_SHOWN - len(self.first_faults)]
 
 
-def _report(name: str, solver: Solver, found: _Totals, written: dict[str, Path | None]) -> Any:
-    from rich.console import Group
-
+def _report(name: str, solver: Solver, found: _Totals, written: dict[str, Path | None]) -> Group:
     count, solved, times = found.count, found.solved, np.concatenate(found.times)
     (iterations, most), (restarts, most_restarts) = found.efforts.values()
     rest = count - solved - len(found.missed)

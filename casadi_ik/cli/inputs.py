@@ -21,6 +21,8 @@ from casadi_ik.errors import (
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.files.shipped import resolve, resolve_robot
 from casadi_ik.grasps import Grasp, Tolerance, load_grasp
+from casadi_ik.logs import Log
+from casadi_ik.logs.solve import check_robot
 from casadi_ik.problem.problems import fixed_array
 from casadi_ik.registry import METHODS
 
@@ -70,6 +72,19 @@ def the_robot(name: str | None, path: Path | None = None, grasp: Grasp | None = 
     with located(f"{path}: robot", (UnknownNameError, DescriptionError)):
         found = resolve_robot(grasp.robot, beside=path)
     return load_robot(grasp.robot if isinstance(found, tuple) else found)
+
+
+def robot_of_log(log: Log, file: str, name: str) -> ArmHand:
+    """A robot, after making sure that it is the one of a log.
+
+    Raises:
+        UnknownNameError: No shipped robot has that name.
+        LogError: The log was written for another robot.
+    """
+    with located(f"{file}: robot (say --robot)", (UnknownNameError,)):
+        robot = load_robot(name)
+    check_robot(robot, log.attachment("robot.urdf").decode(), file)
+    return robot
 
 
 def the_method(said: Said) -> str:

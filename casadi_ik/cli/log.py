@@ -16,9 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from casadi_ik import logs
-from casadi_ik.arm_hand import load_robot
 from casadi_ik.cli import options as opt
-from casadi_ik.cli.inputs import located
+from casadi_ik.cli.inputs import located, robot_of_log
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.report import (
     counted,
@@ -37,7 +36,7 @@ from casadi_ik.logs.events import SERIOUS, plain_name, told
 from casadi_ik.logs.explanation import explain
 from casadi_ik.logs.repair import finish_log, merge_logs
 from casadi_ik.logs.shards import log_files
-from casadi_ik.logs.solve import OneSolve, check_robot, one_solve
+from casadi_ik.logs.solve import OneSolve, one_solve
 from casadi_ik.logs.tables import happening
 
 SHOWN = 12
@@ -309,9 +308,7 @@ def _exported_view(said: Said, file: Path) -> Answer:
     check_outputs({"--out": file, "the layout": layout}, inputs=[Path(said.file)])
     log = logs.open(said.file)
     solve = _the_solve(said, log)
-    with located(f"{said.file}: robot (say --robot)", (UnknownNameError,)):
-        robot = load_robot(said.robot or solve.robot)
-    check_robot(robot, log.attachment("robot.urdf").decode(), said.file)
+    robot = robot_of_log(log, said.file, said.robot or solve.robot)
     write_view(file, solve, robot)
     write_layout(layout, layout_of(solve, robot))
     return Answer(Group(*files({"viewer": file, "layout": layout})))

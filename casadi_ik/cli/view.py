@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from casadi_ik.cli import options as opt
 from casadi_ik.cli.choose import read_ranked
 from casadi_ik.cli.inputs import (
     located,
+    robot_of_log,
     the_grasp,
     the_method,
     the_object_pose,
@@ -30,7 +32,7 @@ from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.logs.solve import OneSolve, check_robot, one_solve
+from casadi_ik.logs.solve import OneSolve, one_solve
 
 if TYPE_CHECKING:
     from casadi_ik.viewing import PageRequest, Settings, Viewer
@@ -165,9 +167,12 @@ def _kind(name: str) -> str:
     kinds = ("arm_hands", "arms", "hands")
     if "+" in name or any(name in shipped_names(kind) for kind in kinds):
         return "robot"
+    known = [one for kind in ("grasps", *kinds) for one in shipped_names(kind)]
+    near = difflib.get_close_matches(name, known, 1)
+    meant = f"did you mean {near[0]!r}?" if near else "or give the path of a file"
     raise UnknownNameError(
         f"{name!r} is neither a shipped grasp (casadi-ik grasps) nor a shipped robot (casadi-ik "
-        "robots); or give the path of a file"
+        f"robots); {meant}"
     )
 
 
@@ -198,10 +203,7 @@ def _the_logs(said: Said) -> list[tuple[OneSolve, ArmHand]]:
         log = logs.open(file)
         with located(f"{file} (say --solve, --method)", (UnknownNameError,)):
             solve = one_solve(log, numbers[i] if i < len(numbers) else None, said.method)
-        with located(f"{file}: robot (say --robot)", (UnknownNameError,)):
-            robot = load_robot(said.robot or solve.robot)
-        check_robot(robot, log.attachment("robot.urdf").decode(), file)
-        found.append((solve, robot))
+        found.append((solve, robot_of_log(log, file, said.robot or solve.robot)))
     return found
 
 
