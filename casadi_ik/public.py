@@ -10,14 +10,11 @@ from casadi_ik.datasets import Candidates, load_candidates
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.grasps import Contact, Grasp, Tolerance, load_grasp, shipped_grasps
-from casadi_ik.motion.approaching import Approach, ReachStatus
-from casadi_ik.motion.follower import Follower
-from casadi_ik.motion.following import FollowState, FollowStatus
+from casadi_ik.motion.follower import Follower, FollowState, FollowStatus
 from casadi_ik.motion.motion import Motion
-from casadi_ik.motion.path import Jump
-from casadi_ik.motion.reaching import Reach
+from casadi_ik.motion.reach import Approach, Reach, ReachStatus
 from casadi_ik.motion.retarget import Retargeter, load_retarget
-from casadi_ik.motion.tracking import Track
+from casadi_ik.motion.track import Jump, Track
 from casadi_ik.problem.status import Phase, Status
 from casadi_ik.problem.trajectory import Trajectory
 from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict

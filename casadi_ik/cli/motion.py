@@ -23,10 +23,9 @@ from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.files.limits import LIMITS, RAISED, limit
 from casadi_ik.files.npz import read_npz
 from casadi_ik.grasps import Grasp
-from casadi_ik.motion.follower import Follower
-from casadi_ik.motion.following import FollowStatus
+from casadi_ik.motion.follower import Follower, FollowStatus
 from casadi_ik.motion.motion import Motion
-from casadi_ik.motion.reaching import PARTS, Reach
+from casadi_ik.motion.reach import PARTS, Reach
 from casadi_ik.motion.retarget import KEYPOINTS, Retargeter, load_retarget, usual_retarget
 
 MOTION = opt.out("MOTION.mcap", "write the motion", opt.file_name(".mcap", ".npz", ".csv"))

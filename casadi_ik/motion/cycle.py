@@ -29,7 +29,7 @@ from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.bounded_step import Bounded, damped_step
 from casadi_ik.methods.common.contact_fit import whole_jacobian, whole_residual
-from casadi_ik.motion.limiter import chased, share_within, step_bounds
+from casadi_ik.motion.cycle import chased, share_within, step_bounds
 from casadi_ik.problem.contacts import (
     LENGTH,
     ContactRows,

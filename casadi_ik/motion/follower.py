@@ -2,20 +2,84 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import Enum
+
 import numpy as np
 from numpy.typing import ArrayLike
 
+from casadi_ik.answers.solution import Pair
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.grasp import real_array
-from casadi_ik.motion.asked import Asked
-from casadi_ik.motion.following import FollowState, FollowStatus
-from casadi_ik.motion.guard import OBSTACLES, Guard
-from casadi_ik.motion.plan import FollowPlan
-from casadi_ik.motion.stopping import stopping_way
+from casadi_ik.motion.clear import OBSTACLES, Guard, stopping_way
+from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
 from casadi_ik.problem.contacts import Kinds, by_kinds, usual
 from casadi_ik.problem.verdict import TOLERANCE_SLACK
+
+
+class FollowStatus(Enum):
+    """How a cycle went.
+
+    Example:
+        >>> ik.FollowStatus.LATE.name
+        'LATE'
+    """
+
+    FOLLOWING = "following"
+    """Every contact is within tolerance."""
+    LATE = "late"
+    """The motors are under way: velocities and accelerations permit no more."""
+    MISSED = "missed"
+    """No posture was found on this branch that meets the contacts: out of reach, or behind a
+    limit."""
+    BLOCKED = "blocked"
+    """Going on would touch something: the motors stop short."""
+    HOLDING = "holding"
+    """The frame was none: the motors come to rest and wait."""
+
+
+@dataclass(frozen=True, eq=False)
+class FollowState:
+    """How the last cycle went.
+
+    Attributes:
+        status: In one word.
+        reason: What was wrong with the frame, "" if nothing was.
+        q: (n,) where the motors are told to be [rad or m].
+        velocity: (n,) how fast they go there [rad/s or m/s].
+        position_error: (f,) how far the fingertips are from their contacts then [m], NaN where
+            free.
+        angle_error: (f,) likewise [rad].
+        goal: (n,) the posture they are on their way to.
+        goal_position_error: (f,) how far off the contacts that is [m], NaN where free.
+        goal_angle_error: (f,) likewise [rad].
+        clearance: Distance of the pair nearest to being too near [m]; None without a scene.
+        closest: That pair.
+        cycles: How many there were.
+
+    Example:
+        >>> follower = solver.follow(q0=solution.q)
+        >>> q = follower(grasp)
+        >>> state = follower.state
+        >>> bool(state.position_error.max() < 5e-3), state.cycles
+        (True, 1)
+    """
+
+    status: FollowStatus
+    reason: str
+    q: Array
+    velocity: Array
+    position_error: Array
+    angle_error: Array
+    goal: Array
+    goal_position_error: Array
+    goal_angle_error: Array
+    clearance: float | None
+    closest: Pair | None
+    cycles: int
+
 
 NO_FRAME = "no frame yet"
 
@@ -57,18 +121,18 @@ class Follower:
         self._n, self._shape = len(robot.actuators), (len(robot.fingers), 3)
         self._usual = usual(self._shape[0])
         self._tolerances = self._own = tuple(plan.questions.tolerances.values())
-        self._all_asked: dict[Kinds, Asked] = {}
+        self._all_asked: dict[Kinds, FollowerInputs] = {}
         self._posture = plan.posture
         self._guard = None if plan.check is None else Guard(plan)
         self._asked = self._of(self._usual)
         self.reset(plan.q0)
 
-    def _of(self, kinds: Kinds) -> Asked:
+    def _of(self, kinds: Kinds) -> FollowerInputs:
         """The memory for some kinds of contacts."""
         found = self._all_asked.get(kinds)
         if found is None:
             obstacles = 0 if self._guard is None else OBSTACLES
-            found = self._all_asked[kinds] = Asked(self._plan, kinds, obstacles)
+            found = self._all_asked[kinds] = FollowerInputs(self._plan, kinds, obstacles)
             found.lead_to(self._posture)
         return found
 
@@ -216,7 +280,7 @@ class Follower:
         if self._guard is not None:
             self._guard.surround(problem)
 
-    def _go_to_rest(self, asked: Asked) -> None:
+    def _go_to_rest(self, asked: FollowerInputs) -> None:
         """Make the place where the motors can stop their goal."""
         n, state = self._n, asked.run.state
         state[2 * n : 3 * n] = state[:n] + stopping_way(state[n : 2 * n], self._change)

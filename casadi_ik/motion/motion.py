@@ -15,7 +15,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.files.writing import written_whole
 from casadi_ik.logs.cdr import JOINT_STATE, JOINT_TRAJECTORY, STRING, cdr_message
-from casadi_ik.motion.rates import differences
+from casadi_ik.motion.timing import differences
 
 SUFFIXES = (".npz", ".csv", ".mcap")
 """Kinds of files."""

@@ -16,13 +16,20 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.grasps import Grasp
 from casadi_ik.methods.hand_first.method import UNBOUNDED
-from casadi_ik.motion.approaching import Approach, ApproachPlan, approach
 from casadi_ik.motion.follower import Follower
-from casadi_ik.motion.plan import FollowPlan
-from casadi_ik.motion.rates import Rates, a_direction, length, rates_of, seconds, unbounded
-from casadi_ik.motion.reaching import Pace, Reach, ReachPlan, move, reach
-from casadi_ik.motion.tracking import Track, track
-from casadi_ik.motion.walker import Walker
+from casadi_ik.motion.inputs import FollowPlan
+from casadi_ik.motion.reach import (
+    Approach,
+    ApproachPlan,
+    Pace,
+    Reach,
+    ReachPlan,
+    approach,
+    move,
+    reach,
+)
+from casadi_ik.motion.timing import Rates, a_direction, length, rates_of, seconds, unbounded
+from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import Questions
@@ -147,9 +154,11 @@ class MovingSolver:
         if period is not None:
             travel = rates_of(self.robot, velocity, None).steps(seconds("period", period))[0]
         bounds, rates = self._bounds(problems), unbounded(self.robot)
-        walker = Walker(self._plan(start, bounds, 1.0, rates, start, math.inf, PATH_PULL), kinds)
+        tracker = PathTracker(
+            self._plan(start, bounds, 1.0, rates, start, math.inf, PATH_PULL), kinds
+        )
         prefer = "limits" if q0 is None else "q0"
-        return track(engine, problems, start, prefer, walker, travel, seed)
+        return track(engine, problems, start, prefer, tracker, travel, seed)
 
     def reach(
         self,

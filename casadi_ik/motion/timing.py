@@ -1,30 +1,182 @@
-"""When a robot is where on a path: as fast as velocities and accelerations permit."""
+"""How fast motors may move, and when a robot is where on a path."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.errors import MissingExtraError
-from casadi_ik.motion.rates import Rates, shares
+from casadi_ik.errors import InputError, MissingExtraError
 
-SAME = 1e-9
-"""A shorter way is none [rad or m]."""
+CROSSING = 1.0
+"""Seconds in which a motor whose velocity limit nobody states crosses its range."""
 
-TINY = 1e-6
-"""A posture is left out that is nearer to the next than this part of the whole way."""
+RUN_UP = 0.25
+"""Seconds in which a motor comes from rest to its velocity limit, if no acceleration is given."""
 
-GRID = 200
-"""Places of a path at which its speed is found, at least."""
 
-SPARE = 0.99
-"""Part of the limits that the speed is found for: between the places it is a little higher."""
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """Limits of the motors' motion.
 
-BEFORE = 0.1
-"""How far before a posture the speed is found, too, as a part of the way from the place before."""
+    Attributes:
+        velocity: (n,) [rad/s or m/s].
+        acceleration: (n,) [rad/s^2 or m/s^2].
+    """
+
+    velocity: Array
+    acceleration: Array
+
+    def steps(self, period: float) -> tuple[Array, Array]:
+        """Longest step of a cycle and by how much it may differ from the last, (n,) each."""
+        return self.velocity * period, self.acceleration * period**2
+
+
+def own_velocities(robot: ArmHand) -> Array:
+    """(n,) velocity limits of the description; a range in `CROSSING` where it has none."""
+    stated = np.array([actuator.velocity for actuator in robot.description.actuators])
+    ranges = robot.upper - robot.lower
+    return np.where(np.isfinite(stated), stated, ranges / CROSSING)
+
+
+def rates_of(robot: ArmHand, velocity: Any, acceleration: Any) -> Rates:
+    """The limits that are asked for.
+
+    Args:
+        robot: The robot.
+        velocity: (n,) or a number; None: the description's.
+        acceleration: (n,) or a number; None: the velocity limit within `RUN_UP`.
+
+    Raises:
+        InputError: Other than positive numbers.
+    """
+    fastest = own_velocities(robot) if velocity is None else each(robot, "velocity", velocity)
+    if acceleration is None:
+        return Rates(fastest, fastest / RUN_UP)
+    return Rates(fastest, each(robot, "acceleration", acceleration))
+
+
+def shares(q: Array, period: float, rates: Rates) -> tuple[float, float]:
+    """The largest parts of the limits that samples take, at rest before and after.
+
+    Args:
+        q: (m, n) where the motors are, one period after the other.
+        period: [s].
+        rates: The limits.
+
+    Returns:
+        Of the velocity, by first differences; of the acceleration, by second differences.
+    """
+    velocity, acceleration = differences(q, period)
+    return (
+        float((np.abs(velocity) / rates.velocity).max(initial=0.0)),
+        float((np.abs(acceleration) / rates.acceleration).max(initial=0.0)),
+    )
+
+
+def differences(q: Array, period: float) -> tuple[Array, Array]:
+    """First (m - 1, n) and second (m, n) differences of samples over time.
+
+    Before the first sample and after the last the motors move mirrored: the velocity there is zero,
+    and the second difference twice the step over the time squared.
+    """
+    steps = np.diff(q, axis=0)
+    if not len(steps):
+        return steps, np.zeros_like(q)
+    around = np.concatenate([-steps[:1], steps, -steps[-1:]])
+    return steps / period, np.diff(around, axis=0) / period**2
+
+
+def each(robot: ArmHand, name: str, value: Any) -> Array:
+    """One positive number per motor.
+
+    Raises:
+        InputError: Something else.
+    """
+    n = len(robot.actuators)
+    try:
+        array = np.array(np.broadcast_to(np.asarray(value, dtype=float), (n,)))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{name}: found {value!r}, expected a number > 0, or {n} of them"
+        ) from error
+    if not (np.isfinite(array).all() and (array > 0).all()):
+        raise InputError(f"{name}: found {value!r}, expected a number > 0, or {n} of them")
+    return array
+
+
+def seconds(name: str, value: Any) -> float:
+    """A positive number of seconds.
+
+    Raises:
+        InputError: Something else.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise InputError(f"{name}: found {value!r}, expected a number of seconds > 0")
+    return number
+
+
+def length(name: str, value: Any) -> float:
+    """A number of metres >= 0.
+
+    Raises:
+        InputError: Something else.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not 0 <= number < math.inf:
+        raise InputError(f"{name}: found {value!r}, expected a number of metres >= 0")
+    return number
+
+
+def a_direction(name: str, value: Any) -> Array:
+    """(3,) a direction.
+
+    Raises:
+        InputError: Something else.
+    """
+    try:
+        way = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        way = np.zeros(0)
+    if way.shape != (3,) or not np.isfinite(way).all() or not way.any():
+        raise InputError(f"{name}: found {value!r}, expected three numbers, not all zero")
+    return way
+
+
+def unbounded(robot: ArmHand) -> Rates:
+    """No limits, for cycles of one second."""
+    anything = 1e6 * np.maximum(robot.upper - robot.lower, 1.0)
+    return Rates(anything, anything)
+
+
+@dataclass(frozen=True)
+class TimingTuning:
+    """Numbers of the timing of a path.
+
+    Attributes:
+        shortest: A posture is left out that is nearer to the next than this part of the whole way.
+        grid: Places of a path at which its speed is found, at least.
+        spare: Part of the limits that the speed is found for: between the places it is a little
+            higher.
+        before: How far before a posture the speed is found, too, as a part of the way from the
+            place before.
+    """
+
+    shortest: float = 1e-6
+    grid: int = 200
+    spare: float = 0.99
+    before: float = 0.1
 
 
 def timed(path: Array, rates: Rates, period: float) -> Array:
@@ -57,20 +209,24 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
         raise MissingExtraError(
             "timing needs toppra, which is not installed: pip install casadi-ik[motion]"
         ) from error
+    tuning = TimingTuning()
     lengths = np.abs(np.diff(path, axis=0)).sum(axis=0)
-    if not lengths.max(initial=0.0) > SAME:
+    if not lengths.max(initial=0.0) > 1e-9:
         return path[:1]
     toppra.setup_logging("ERROR")
     # In units of what it may take and what a motor goes in it at full acceleration: near one.
     takes = max(lengths / rates.velocity) + math.sqrt(max(lengths / rates.acceleration))
     unit = rates.acceleration * takes**2
     ways = np.linalg.norm(np.diff(path / unit, axis=0), axis=1)
-    kept = path[np.append(ways > TINY * ways.sum(), True)] / unit
+    kept = path[np.append(ways > tuning.shortest * ways.sum(), True)] / unit
     ways = np.linalg.norm(np.diff(kept, axis=0), axis=1)
     along = np.append(0.0, np.cumsum(ways))
     along /= along[-1]
     slopes = PchipInterpolator(along, kept).derivative()(along)
-    fastest, strongest = SPARE * rates.velocity * takes / unit, np.full(len(unit), SPARE)
+    fastest, strongest = (
+        tuning.spare * rates.velocity * takes / unit,
+        np.full(len(unit), tuning.spare),
+    )
     both_ends = constraint.DiscretizationType.Interpolation
     asked = [
         constraint.JointVelocityConstraint(np.stack([-fastest, fastest], axis=1)),
@@ -78,11 +234,11 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
             np.stack([-strongest, strongest], axis=1), discretization_scheme=both_ends
         ),
     ]
-    cuts = max(2, math.ceil(GRID / (len(kept) - 1)))
+    cuts = max(2, math.ceil(tuning.grid / (len(kept) - 1)))
     parts = np.linspace(0.0, 1.0, cuts, endpoint=False)
     way: Any = None
     # The short stretches before postures are sometimes too short for its linear programs.
-    for some in (np.append(parts, 1.0 - BEFORE / cuts), parts):
+    for some in (np.append(parts, 1.0 - tuning.before / cuts), parts):
         grid = np.append((along[:-1, None] + np.diff(along)[:, None] * some).ravel(), 1.0)
         way = algorithm.TOPPRA(
             asked,

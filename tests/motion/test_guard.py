@@ -8,8 +8,7 @@ from dense_ways import dense
 from samplers import smooth_path
 
 import casadi_ik as ik
-from casadi_ik.motion.clear_between import RESOLUTION, between
-from casadi_ik.motion.free_space import motor_units
+from casadi_ik.motion.clear import RESOLUTION, between, motor_units
 
 PERIOD = 0.004
 

@@ -11,9 +11,8 @@ from dense_ways import dense
 
 import casadi_ik as ik
 from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.motion.free_space import free_way, motor_units
-from casadi_ik.motion.rates import rates_of, shares
-from casadi_ik.motion.timing import timed
+from casadi_ik.motion.clear import free_way, motor_units
+from casadi_ik.motion.timing import rates_of, shares, timed
 
 
 @pytest.fixture(scope="module")

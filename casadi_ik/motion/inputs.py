@@ -1,8 +1,9 @@
-"""What a follower is asked in a cycle, written where its graph reads it."""
+"""What a follower keeps to all the time, and what it is asked in a cycle."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,10 +14,66 @@ from casadi_ik.grasps.pose import one_pose
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.function_kernel import Recurrence
 from casadi_ik.motion.cycle import Cycle
-from casadi_ik.motion.plan import FollowPlan
+from casadi_ik.motion.timing import Rates
+from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.contacts import LENGTH, Kinds
 from casadi_ik.problem.problems import Problems, Tolerance
+from casadi_ik.problem.questions import Questions
 from casadi_ik.problem.verdict import deviations
+
+FADING = 0.05
+"""Seconds in which an error of the contacts fades."""
+
+
+@dataclass(frozen=True, eq=False)
+class FollowPlan:
+    """What a follower keeps to all the time.
+
+    Attributes:
+        questions: Robot and tolerances.
+        check: The scene about the robot; None: collisions are not checked.
+        compiled: Whether in compiled code.
+        q0: (n,) where the robot is [rad or m].
+        bounds: (n,) lower and upper, what is held included.
+        period: Time from cycle to cycle [s].
+        rates: Limits of the motors' motion.
+        posture: (n,) where motions lead that the contacts leave free.
+        settling: Time in which they come there [s]; infinite: they do not.
+        pull: See `Cycle`.
+    """
+
+    questions: Questions
+    check: SceneCheck | None
+    compiled: bool
+    q0: Array
+    bounds: tuple[Array, Array]
+    period: float
+    rates: Rates
+    posture: Array
+    settling: float
+    pull: float
+
+    @property
+    def robot(self) -> ArmHand:
+        """The robot."""
+        return self.questions.robot
+
+    @property
+    def habits(self) -> dict[str, float]:
+        """How free motions and errors fade from cycle to cycle, as parameters of a cycle.
+
+        A free motion is that of a critically damped spring between the motors and their posture.
+        """
+        if math.isinf(self.settling):
+            return {"pull": self.pull, "keep": 0.0, "drift": 0.0, "patience": 0.0}
+        kept = math.exp(-self.period / self.settling)
+        return {
+            "pull": self.pull,
+            "keep": kept**2,
+            "drift": (1 - kept) ** 2,
+            "patience": math.exp(-self.period / FADING),
+        }
+
 
 WHOLE, PLACES = "points and normals", "points"
 """What all fingers are asked for."""
@@ -25,7 +82,7 @@ ANY = (1.0, 0.0, 0.0)
 """A normal that does not count, as a unit vector all the same."""
 
 
-class Asked:
+class FollowerInputs:
     """One graph's memory, for contacts of some kinds.
 
     Attributes:
@@ -53,7 +110,7 @@ class Asked:
     def state_at(self, q: Array) -> Array:
         """The state of rest at a posture (n,)."""
         rest = {item.name: np.zeros(item.shape) for item in self.cycle.state}
-        return self.cycle.state.pack(rest | {"q": q, "goal": q, "there": 1.0})
+        return self.cycle.state.pack(rest | {"q": q, "goal": q, "locked_on": 1.0})
 
     def _fill(self, **values: ArrayLike) -> None:
         for name, value in values.items():

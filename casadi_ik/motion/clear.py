@@ -1,0 +1,422 @@
+"""Motions that touch nothing: between postures, from one to another, from cycle to cycle.
+
+*Between postures*, all along and not at samples alone (`between`). How far two shapes are apart
+changes by no more than they move. So between two postures they keep at least half of what they have
+at both ends together, less half of what they move on the way; where that is not enough, the middle
+is looked at, and both halves. What moves by less than `RESOLUTION` between two postures that are
+free is taken as free.
+
+*From cycle to cycle* (`Guard`) two things keep a follower clear. The goal keeps away softly, as far
+as the contacts leave it free: small clearances are rows of its least squares. And a step is made
+only if the robot can come to rest after it without being too near to anything; else the motors
+brake. Since the step before was made under the same condition, braking is safe: by induction the
+robot never comes nearer than the margin to what stands still.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array, Bools
+from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
+from casadi_ik.problem.clearance import ROUNDING, Clearances, Surroundings
+from casadi_ik.problem.problems import Problems
+
+
+def stopping_way(moved: Array, change: Array) -> Array:
+    """(n,) how far motors go on that come to rest as fast as they may.
+
+    Args:
+        moved: (n,) their last steps.
+        change: (n,) by how much a step may differ from the last.
+    """
+    after = np.floor(np.abs(moved) / change)
+    return np.sign(moved) * (np.abs(moved) * after - change * after * (after + 1) / 2)
+
+
+def stopping_path(q: Array, moved: Array, change: Array, count: int) -> Array:
+    """Where motors are on the way to rest.
+
+    Args:
+        q: (n,) where they are.
+        moved: (n,) their last steps.
+        change: (n,) by how much a step may differ from the last.
+        count: How many places, evenly spaced in time.
+
+    Returns:
+        (count, n), q itself the first and the place of rest the last.
+    """
+    speed = np.abs(moved)
+    after = np.floor(speed / change)
+    number = np.ceil(np.linspace(0.0, after.max(), count))[:, None]
+    steps = np.minimum(number, after)
+    return q + np.sign(moved) * (speed * steps - change * steps * (steps + 1) / 2)
+
+
+RESOLUTION = 1e-4
+"""Motion [m] that is not looked into: by half of it things may be nearer than their margin."""
+
+
+@dataclass(frozen=True, eq=False)
+class Between:
+    """What was found on k - 1 straight ways.
+
+    Attributes:
+        free: (k - 1,) whether they touch nothing.
+        worst: (k - 1, n) the posture with least room that was looked at on each.
+        room: (k - 1,) its room [m]; no posture on a free way has less by more than what it moves
+            to the next that was looked at.
+        distance: (k - 1,) its clearance, see `Clearances` [m].
+        pairs: (k - 1,) number of its pair, see `Clearances`.
+    """
+
+    free: Bools
+    worst: Array
+    room: Array
+    distance: Array
+    pairs: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Postures:
+    """Postures, and all that is known of them.
+
+    Attributes:
+        q: (m, n).
+        poses: (m, s, 12) of the solids.
+        places: (m, p) where shapes are, see `ClearanceKernel.placed`.
+        found: (m, 3) room, clearance and number of its pair.
+    """
+
+    q: Array
+    poses: Array
+    places: Array
+    found: Array
+
+    @property
+    def room(self) -> Array:
+        return self.found[:, 0]
+
+    def rows(self, rows: NDArray[np.intp] | slice) -> _Postures:
+        return _Postures(self.q[rows], self.poses[rows], self.places[rows], self.found[rows])
+
+    @classmethod
+    def joined(cls, one: _Postures, other: _Postures) -> _Postures:
+        pairs = (
+            (one.q, other.q),
+            (one.poses, other.poses),
+            (one.places, other.places),
+            (one.found, other.found),
+        )
+        return cls(*(np.concatenate(pair) for pair in pairs))
+
+
+class _Looking:
+    """What is looked at, in surroundings whose solids may move with the postures."""
+
+    def __init__(self, around: Surroundings) -> None:
+        self._around, table = around, around.table
+        reach = np.array([solid.reach for solid in table.solids])
+        # What is unbounded (a half-space) may move, too, but no scene turns it under a robot.
+        self._own = np.where(np.isfinite(reach), reach, 0.0)[: table.own]
+        self._reach = np.where(np.isfinite(reach), reach, 0.0)[table.own :]
+        self._capsules = len(table.radii)
+
+    def at(self, q: Array, poses: Array, together: int = 4096) -> _Postures:
+        """Postures (m, n) with solids at (m, s, 12), so many checked at once."""
+        parts = [slice(i, i + together) for i in range(0, len(q), together)]
+        around, found, places = self._around, list[Array](), list[Array]()
+        for part in parts:
+            here = Surroundings(around.kernel, around.table, poses[part], around.margin)
+            seen = here.check(q[part])
+            found.append(np.stack([seen.room, seen.distance, seen.pairs.astype(float)], axis=1))
+            places.append(around.kernel.placed(q[part])[0])
+        return _Postures(q, poses, np.concatenate(places), np.concatenate(found))
+
+    def motion(self, one: _Postures, other: _Postures) -> Array:
+        """(m,) how much nearer two shapes may come on the way [m], twice the largest motion."""
+        split = 6 * self._capsules
+        both = (other.places - one.places)[:, :split].reshape(len(one.q), -1, 2, 3)
+        ends = np.stack([both[:, :, 0] + both[:, :, 1], both[:, :, 0] - both[:, :, 1]])
+        moved = np.linalg.norm(ends, axis=-1).max(axis=(0, 2), initial=0.0)
+        for change, reach in (
+            ((other.places - one.places)[:, split:].reshape(len(one.q), -1, 12), self._own),
+            (other.poses - one.poses, self._reach),
+        ):
+            if change.shape[1]:
+                turned = np.linalg.norm(change[..., :9], axis=-1) * reach
+                solids = np.linalg.norm(change[..., 9:], axis=-1) + turned
+                moved = np.maximum(moved, solids.max(axis=1))
+        # Joints that turn move things on arcs: how far these are off the straight line at most.
+        far = np.linalg.norm(one.places[:, :split].reshape(len(one.q), -1, 3), axis=-1).max(
+            axis=1, initial=0.0
+        )
+        turn = np.abs(other.q - one.q).sum(axis=1)
+        return 2 * (moved + far * turn**2 / 4)
+
+    def middle(self, one: _Postures, other: _Postures) -> _Postures:
+        """The postures half way; what is carried turns half way, too."""
+        return self.at((one.q + other.q) / 2, _half_way(one.poses, other.poses))
+
+
+def between(around: Surroundings, q: Array, least: bool = False) -> Between:
+    """What is on the straight ways from each of k postures to the next.
+
+    Args:
+        around: What must not be touched, the same for all, or at each posture.
+        q: (k, n).
+        least: Whether the least room of all is looked for, too: where all is free it is nowhere
+            less than the smallest of `Between.room` by more than `RESOLUTION`.
+    """
+    count, n = max(len(q) - 1, 0), q.shape[1]
+    poses = around.poses
+    if poses.ndim == 2 or len(poses) != len(q):
+        poses = np.broadcast_to(
+            poses.reshape(-1, *poses.shape[-2:])[:1], (len(q), *poses.shape[-2:])
+        )
+    looking = _Looking(around)
+    free, found = np.ones(count, dtype=bool), np.full((count, 3), np.inf)
+    found[:, 2] = -1
+    room, worst = found[:, 0], np.empty((count, n))
+    every = looking.at(q, np.ascontiguousarray(poses))
+    way = np.arange(count)
+    one, other = every.rows(slice(0, count)), every.rows(slice(1, count + 1))
+
+    def seen(some: _Postures, whose: NDArray[np.intp]) -> None:
+        order = np.argsort(-some.room, kind="stable")
+        less = order[some.room[order] < room[whose[order]]]
+        # Behind each other the least comes last, and is what stays.
+        found[whose[less]], worst[whose[less]] = some.found[less], some.q[less]
+        free[whose[~(some.room >= -ROUNDING)]] = False
+
+    seen(one, way)
+    seen(other, way)
+    while len(way):
+        motion = looking.motion(one, other)
+        floor = max(float(room.min()) - RESOLUTION, 0.0) if least else 0.0
+        near = one.room + other.room < motion + 2 * floor
+        kept = near & (motion > 2 * RESOLUTION) & free[way]
+        rows = np.flatnonzero(kept)
+        if not len(rows):
+            break
+        one, other, way = one.rows(rows), other.rows(rows), way[rows]
+        middle = looking.middle(one, other)
+        seen(middle, way)
+        one, other = _Postures.joined(one, middle), _Postures.joined(middle, other)
+        way = np.concatenate([way, way])
+    return Between(free, worst, room, found[:, 1], found[:, 2].astype(np.int64))
+
+
+def least_clearance(around: Surroundings, q: Array) -> tuple[float, str]:
+    """The least clearance on the straight ways from each of k postures to the next.
+
+    Args:
+        around: As for `between`.
+        q: (k, n).
+
+    Returns:
+        The clearance [m]: it is nowhere less by more than `RESOLUTION`, if all is free; and what
+        touches, "": nothing does.
+    """
+    if len(q) < 2:
+        q = np.concatenate([q, q])
+    ways = between(around, q, least=True)
+    clearance = float(ways.distance.min())
+    if ways.free.all():
+        return clearance, ""
+    pair = around.table.names[ways.pairs[int(ways.room.argmin())]]
+    return clearance, f"{pair[0]} and {pair[1]} touch"
+
+
+def _half_way(one: Array, other: Array) -> Array:
+    """(m, s, 12) poses half way: origins and rotations."""
+    mean = (one + other) / 2
+    turned = np.flatnonzero((one[..., :9] != other[..., :9]).any(axis=(1, 2)))
+    if len(turned):
+        u, _, v = np.linalg.svd(mean[turned, :, :9].reshape(len(turned), -1, 3, 3))
+        mean[turned, :, :9] = (u @ v).reshape(len(turned), -1, 9)
+    return mean
+
+
+STRIDES = (0.02, 0.005, 0.002)
+"""Longest steps of a motor between postures that a planner looks at [rad, or part of its range]:
+finer ones where a way turns out not to be free between them."""
+
+
+def motor_units(robot: ArmHand) -> Array:
+    """(n,) what counts as a unit of each motor: 1 rad, or the range of a slider."""
+    slides = np.array([actuator.unit == "m" for actuator in robot.description.actuators])
+    return np.where(slides, robot.upper - robot.lower, 1.0)
+
+
+def free_way(
+    robot: ArmHand,
+    start: Array,
+    end: Array,
+    around: Surroundings | None,
+    seed: int,
+    limit: float = 5.0,
+) -> tuple[Array | None, str]:
+    """Corners (k, n) of a way that touches nothing, straight if that is free.
+
+    Args:
+        robot: The robot.
+        start: (n,).
+        end: (n,).
+        around: What must not be touched; None: nothing is checked.
+        seed: Of the planner.
+        limit: Time that it has [s].
+
+    Returns:
+        The corners, None if no way was found; and how it was found, or why not.
+    """
+    units, straight = motor_units(robot), np.stack([start, end])
+    if around is None or between(around, straight).free.all():
+        return straight, "straight"
+    for posture, name in ((start, "start"), (end, "pre-grasp")):
+        found = around.check(posture[None])
+        if not found.free[0]:
+            return None, f"the {name} is not free: {' and '.join(found.pair(0) or ())} touch"
+    try:
+        from ompl import base, geometric, util
+    except ImportError:
+        return None, "the straight way is not free, and OMPL is not installed (casadi-ik[motion])"
+    util.setLogLevel(util.LogLevel.LOG_NONE)
+    util.RNG.setSeed(seed + 1)  # OMPL takes the first of a process
+    n = len(start)
+    space = base.RealVectorStateSpace(n)
+    bounds = base.RealVectorBounds(n)
+    for i in range(n):
+        bounds.setLow(i, float(robot.lower[i] / units[i]))
+        bounds.setHigh(i, float(robot.upper[i] / units[i]))
+    space.setBounds(bounds)
+    setup = geometric.SimpleSetup(space)
+    setup.setStateValidityChecker(
+        lambda state: bool(around.free(units * _numbers(state, n)[None])[0])
+    )
+    states: list[Any] = []
+    for posture in (start, end):
+        state: Any = space.allocState()
+        for i in range(n):
+            state[i] = float(posture[i] / units[i])
+        states.append(state)
+    setup.setStartAndGoalStates(*states)
+    information = setup.getSpaceInformation()
+    for stride in STRIDES:
+        setup.clear()
+        information.setStateValidityCheckingResolution(stride / space.getMaximumExtent())
+        setup.setPlanner(geometric.RRTConnect(information))
+        setup.solve(limit)
+        if not setup.haveExactSolutionPath():
+            return None, f"the straight way is not free, and OMPL found no other in {limit:g} s"
+        setup.simplifySolution(limit / 5)
+        found_way = setup.getSolutionPath().getStates()
+        corners = units * np.array([_numbers(state, n) for state in found_way])
+        corners[0], corners[-1] = start, end
+        if between(around, corners).free.all():
+            return corners, "OMPL, RRT-Connect"
+    return None, "the ways that OMPL found are not free between the postures it looked at"
+
+
+def _numbers(state: Any, n: int) -> Array:
+    """A state of OMPL, whose annotations do not know that it has elements, as (n,)."""
+    return np.array([state[i] for i in range(n)])
+
+
+OBSTACLES = 4
+"""Clearances that the goal minds at once."""
+
+
+class Guard:
+    """The scene about a follower.
+
+    Attributes:
+        near: Clearance beyond the margin from which on the goal keeps away [m].
+        nudge: Part of a motor's unit by which slopes of clearances are measured [rad or m].
+        places: Places on the way to rest that are looked at.
+        shares: Parts of the wanted step, between it and braking, that are tried in turn.
+    """
+
+    near = 0.01
+    nudge = 1e-4
+    places = 9
+    shares = (1.0, 0.5)
+
+    def __init__(self, plan: FollowPlan) -> None:
+        """Take the scene, every finger in contact."""
+        assert plan.check is not None
+        self._check, self._plan = plan.check, plan
+        fingers = len(plan.robot.fingers)
+        anywhere = np.zeros((1, fingers, 3))
+        self._around = self._at(plan.questions.of_arrays(anywhere, anywhere + 1.0, None))
+        self._n = len(plan.robot.actuators)
+        self._change = plan.rates.steps(plan.period)[1]
+
+    def surround(self, problem: Problems) -> None:
+        """Mind one target: which fingers touch, and where the object is."""
+        self._around = self._at(problem)
+
+    def _at(self, problem: Problems) -> Surroundings:
+        return self._check.around(problem).rows(np.zeros(1, dtype=np.intp))
+
+    def clearance(self, q: Array) -> Clearances:
+        """Of a configuration (n,)."""
+        return self._around.check(q[None])
+
+    def step(self, asked: FollowerInputs) -> tuple[Array, bool]:
+        """One step of the graph, or less of it.
+
+        Returns:
+            The state, and whether the motors had to brake.
+        """
+        n, run = self._n, asked.run
+        before = run.state.copy()
+        self._keep_away(asked, before[2 * n : 3 * n])
+        after = run.step()
+        q, moved = before[:n], after[n : 2 * n].copy()
+        braked = np.sign(before[n : 2 * n]) * np.maximum(
+            np.abs(before[n : 2 * n]) - self._change, 0.0
+        )
+        for share in self.shares:
+            step = braked + share * (moved - braked)
+            if self._can_rest(q + step, step):
+                break
+        else:
+            share, step = 0.0, braked
+            if not moved.any() or self._gets_free(q, moved):
+                share, step = 1.0, moved
+        if share < 1.0:
+            after[:n], after[n : 2 * n] = q + step, step
+            # A goal that runs ahead where nobody can follow would be reached through the obstacle.
+            after[2 * n : 3 * n] = q + step + stopping_way(step, self._change)
+            after[3 * n] = 0.0
+        return after, share < 1.0
+
+    def _can_rest(self, q: Array, moved: Array) -> bool:
+        path = stopping_path(q, moved, self._change, self.places)
+        return bool(self._around.free(path).all())
+
+    def _gets_free(self, q: Array, moved: Array) -> bool:
+        """Whether a robot that is too near already gets away."""
+        room = self._around.check(np.stack([q, q + moved])).room
+        return bool(room[0] < 0 and room[1] > room[0])
+
+    def _keep_away(self, asked: FollowerInputs, goal: Array) -> None:
+        around = self._around
+        rooms, slopes = asked.views["rooms"], asked.views["slopes"]
+        rooms[...] = 0.0
+        most = around.margin + self.near
+        least, _ = around.kernel.least(goal[None], around.poses, around.table, most)
+        if least[0] >= most:
+            return
+        nudged = goal + np.concatenate([np.zeros((1, self._n)), self.nudge * np.eye(self._n)])
+        every = around.kernel.every(nudged, around.poses, around.table)
+        nearest = np.argsort(every[0])[: len(rooms)]
+        count = len(nearest)
+        rooms[:count] = np.maximum(most - every[0, nearest], 0.0)
+        slopes[:count] = ((every[1:, nearest] - every[0, nearest]) / self.nudge).T
