@@ -1,10 +1,23 @@
-"""Product of exponentials by dual quaternions (Chandra) against frames multiplied (SE(3))."""
+"""Dual quaternions, and kinematics by them, against pinocchio and products of frames."""
 
 from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 import pytest
+from algebra_samples import (
+    PROPERTY,
+    central_difference,
+    coordinate,
+    gradient,
+    graph,
+    rotation_vectors,
+    unit_vectors,
+    vectors,
+)
+from hypothesis import given
+from hypothesis import strategies as st
 
 from casadi_ik.errors import UnknownNameError
 from casadi_ik.symbolic import dual_quaternion as dq
@@ -132,3 +145,161 @@ def test_unknown_names(robot):
         screw_chain_to_contact(robot.description, "x")
     with pytest.raises(UnknownNameError, match="no link 'x'"):
         screw_chain_to_link(robot.description, "x")
+
+
+X, V, M, S, Q = (8, 1), (3, 1), (3, 3), (1, 1), (4, 1)
+multiply = graph(dq.multiply, X, X)
+conjugate = graph(dq.conjugate, X)
+norm = graph(dq.norm, X)
+normalise = graph(dq.normalise, X)
+from_pose = graph(dq.from_pose, M, V)
+from_translation = graph(dq.from_translation, V)
+from_quaternion = graph(dq.from_quaternion, Q, V)
+to_pose = graph(dq.to_pose, X)
+exp_screw = graph(dq.exp_screw, S, S, V, V)
+exp = graph(dq.exp, V, V)
+log = graph(dq.log, X)
+on_point = graph(dq.act_on_point, X, V)
+on_line = graph(dq.act_on_line, X, V, V)
+error = graph(dq.error, X, X)
+error_norm = graph(dq.screw_error_norm, X)
+power = graph(dq.power, X, S)
+sclerp = graph(dq.sclerp, X, X, S)
+poses = st.builds(lambda w, p: pin.SE3(pin.exp3(w), p), rotation_vectors, vectors)
+numbers = st.tuples(*[coordinate] * 8).map(np.array)
+
+
+def number(pose: pin.SE3) -> np.ndarray:
+    return from_pose(pose.rotation, pose.translation).full()[:, 0]
+
+
+def same_pose(a: np.ndarray, b: np.ndarray, atol: float = 4e-15) -> bool:
+    return min(np.abs(a - b).max(), np.abs(a + b).max()) < atol
+
+
+def full(x) -> np.ndarray:
+    return x.full()[:, 0]
+
+
+@PROPERTY
+@given(numbers, numbers, numbers)
+def test_ring(a, b, c):
+    left, right = full(multiply(multiply(a, b), c)), full(multiply(a, multiply(b, c)))
+    assert np.allclose(left, right, rtol=0, atol=1e-14)
+    reversed_ = full(multiply(conjugate(b), conjugate(a)))
+    assert np.allclose(full(conjugate(multiply(a, b))), reversed_, rtol=0, atol=4e-15)
+    assert np.array_equal(full(multiply(a, dq.identity())), a)
+    if np.linalg.norm(a[:4]) > 0.1:
+        assert np.allclose(full(norm(normalise(a))), [1, 0], rtol=0, atol=1e-14)
+        length = full(norm(a))
+        squared = full(multiply(a, conjugate(a)))
+        assert np.allclose(squared[[0, 4]], [length[0] ** 2, 2 * length[0] * length[1]], atol=1e-14)
+
+
+@PROPERTY
+@given(poses, poses, vectors)
+def test_poses_multiply_like_transforms(A, B, x):
+    a, b = number(A), number(B)
+    assert same_pose(full(multiply(a, b)), number(A * B))
+    assert same_pose(full(multiply(a, conjugate(a))), dq.identity().full()[:, 0])
+    assert same_pose(full(conjugate(a)), number(A.inverse()))
+    R, p = to_pose(multiply(a, b))
+    assert np.allclose(R.full(), (A * B).rotation, rtol=0, atol=4e-15)
+    assert np.allclose(full(p), (A * B).translation, rtol=0, atol=4e-15)
+    assert np.allclose(full(on_point(-a, x)), A.act(x), rtol=0, atol=4e-15)
+    rotation = from_quaternion(a[:4], np.zeros(3))
+    shift = from_translation(A.translation)
+    assert np.allclose(full(multiply(shift, rotation)), a, rtol=0, atol=1e-15)
+
+
+@PROPERTY
+@given(poses, unit_vectors, vectors)
+def test_lines_move_with_their_points(A, direction, point):
+    moment = np.cross(point, direction)
+    moved, moved_moment = (full(x) for x in on_line(number(A), direction, moment))
+    assert np.allclose(moved, A.rotation @ direction, rtol=0, atol=4e-15)
+    assert np.allclose(moved_moment, np.cross(A.act(point), moved), rtol=0, atol=6e-15)
+    # Eq. (6) literally: x s x* with the classical conjugate.
+    x = number(A)
+    s = np.concatenate([[0], direction, [0], moment])
+    literal = full(multiply(multiply(x, s), conjugate(x)))
+    assert np.allclose(literal, [0, *moved, 0, *moved_moment], rtol=0, atol=6e-15)
+
+
+@PROPERTY
+@given(rotation_vectors, vectors)
+def test_exp_and_log_are_those_of_se3(w, v):
+    x = full(exp(w, v))
+    expected = pin.exp6(pin.Motion(v, w))
+    assert same_pose(x, number(expected))
+    found_w, found_v = (full(y) for y in log(x))
+    assert np.allclose(found_w, w, rtol=0, atol=4e-15)
+    assert np.allclose(found_v, v, rtol=0, atol=2e-14)
+    minus_w, minus_v = (full(y) for y in log(-x))
+    assert np.array_equal(minus_w, found_w)
+    assert np.array_equal(minus_v, found_v)
+    size = np.hypot(np.linalg.norm(w), np.linalg.norm(v))
+    assert abs(float(error_norm(x)) - size) < 2e-14
+
+
+@PROPERTY
+@given(st.floats(-np.pi + 1e-6, np.pi - 1e-6), coordinate, unit_vectors, vectors)
+def test_screw_of_eq_1_has_the_logarithm_of_eq_14(theta, d, direction, point):
+    moment = np.cross(point, direction)
+    x = full(exp_screw(theta, d, direction, moment))
+    assert np.allclose(full(norm(x)), [1, 0], rtol=0, atol=1e-15)
+    w, v = (full(y) for y in log(x))
+    assert np.allclose(w, theta * direction, rtol=0, atol=4e-15)
+    assert np.allclose(v, theta * moment + d * direction, rtol=0, atol=2e-14)
+    # A point of the axis only slides along it.
+    assert np.allclose(full(on_point(x, point)), point + d * direction, rtol=0, atol=6e-15)
+
+
+@PROPERTY
+@given(unit_vectors, vectors)
+def test_prismatic_screw_is_a_translation(direction, point):
+    x = full(exp_screw(0, 0.3, direction, np.cross(point, direction)))
+    assert np.allclose(x, full(from_translation(0.3 * direction)), rtol=0, atol=1e-16)
+    w, v = (full(y) for y in log(x))
+    assert np.array_equal(w, np.zeros(3))
+    assert np.allclose(v, 0.3 * direction, rtol=0, atol=1e-16)
+
+
+@PROPERTY
+@given(poses, poses, st.floats(0, 1))
+def test_error_and_interpolation(A, B, fraction):
+    a, b = number(A), number(B)
+    e = full(error(a, b))
+    assert same_pose(full(multiply(e, b)), a, atol=1e-14)
+    assert same_pose(full(sclerp(a, b, 0)), a, atol=1e-14)
+    relative = A.actInv(B)
+    if np.linalg.norm(pin.log3(relative.rotation)) < np.pi - 1e-3:
+        assert same_pose(full(sclerp(a, b, 1)), b, atol=1e-13)
+        expected = A * pin.exp6(fraction * pin.log6(relative))
+        assert same_pose(full(sclerp(a, b, fraction)), number(expected), atol=1e-11)
+        step = full(power(number(relative), fraction))
+        rest = full(power(number(relative), 1 - fraction))
+        assert same_pose(full(multiply(step, rest)), number(relative), atol=1e-13)
+
+
+@PROPERTY
+@given(rotation_vectors.filter(lambda w: np.linalg.norm(w) < 3), vectors)
+def test_derivatives(w, v):
+    through = LOG_OF_EXP_GRADIENT(w, v).full()
+    assert np.allclose(through, np.eye(6), rtol=0, atol=1e-10)
+    ad = EXP_GRADIENT(w, v).full()
+    assert np.allclose(ad, central_difference(exp, w, v), rtol=0, atol=1e-9)
+
+
+LOG_OF_EXP_GRADIENT = gradient(lambda w, v: dq.log(dq.exp(w, v)), V, V)
+EXP_GRADIENT = gradient(dq.exp, V, V)
+
+
+def test_derivatives_are_finite_at_no_rotation_and_at_half_a_turn():
+    log_gradient, norm_gradient = gradient(dq.log, X), gradient(dq.screw_error_norm, X)
+    for x in (dq.identity(), from_translation([0.1, 0.2, 0.3]), exp([np.pi, 0, 0], [0, 1, 0])):
+        assert log_gradient(x).is_regular()
+        assert norm_gradient(x).is_regular()
+    assert log_gradient([0, 0, 1, 0, 0.1, 0.2, 0, 0]).is_regular()
+    assert gradient(dq.from_pose, M, V)(np.eye(3), np.zeros(3)).is_regular()
+    assert gradient(dq.power, X, S)(dq.identity(), 0.5).is_regular()

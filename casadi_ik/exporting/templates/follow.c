@@ -96,7 +96,7 @@ static void ask_rest(@PREFIX@_follower *follower) {
     const double way = speed * steps - change * steps * (steps + 1) / 2;
     state[STATE_GOAL + i] = state[STATE_Q + i] + (moved < 0 ? -way : way);
   }
-  state[STATE_THERE] = 0.0;
+  state[STATE_LOCKED_ON] = 0.0;
 }
 
 /* One step; 0: a number was out of range, and the state is what it was. */
@@ -146,7 +146,7 @@ int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double p
     asked[ASKED_CHANGE + i] = follower->change[i] = change * (period * period);
     follower->q[i] = follower->state[STATE_Q + i] = follower->state[STATE_GOAL + i] = q;
   }
-  follower->state[STATE_THERE] = 1.0;
+  follower->state[STATE_LOCKED_ON] = 1.0;
   return sound ? 0 : @GUARD@_BAD_INPUT;
 }
 
