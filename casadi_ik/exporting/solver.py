@@ -37,11 +37,10 @@ from casadi_ik.kernels.lookup import TILE
 from casadi_ik.methods.hand_first.driver import SearchPlan, source_text
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.state import terms
-from casadi_ik.motion.inputs import contact_weights
 from casadi_ik.motion.cycle import Cycle
 from casadi_ik.motion.follower import PALM_WEIGHT
+from casadi_ik.motion.inputs import FADING, contact_weights
 from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
-from casadi_ik.motion.inputs import FADING
 from casadi_ik.motion.timing import RUN_UP, own_velocities
 from casadi_ik.problem.contacts import usual
 from casadi_ik.problem.problems import Problems, Tolerance
