@@ -2,7 +2,7 @@
 
 Where it is to go, the *goal*, is found by a few Gauss-Newton steps of all motors together,
 
-    min |r + J s - left|^2 + stir |r|^2 |s|^2 + |clearances|^2 + pull |goal + s - anchor|^2
+    min |r + J s - left|^2 + damping |r|^2 |s|^2 + |clearances|^2 + pull |goal + s - anchor|^2
 
 within bounds, r and J the contacts' residual (`ContactRows`), every motor in its own unit. They
 begin where the goal before was, so it stays on its branch.
@@ -15,7 +15,18 @@ there), since bounds and errors that have to vanish at once would fight each oth
 
 When contacts cannot be met so (they leap, or are too fast, or out of reach), goal and motors part:
 the goal goes on within the limits of position and velocity, and the motors run after it as fast as
-they may and without going past it (`limiter`), until they are there.
+they may and without going past it (`track_goal`), until they are there.
+
+How fast motors are. Lengths are steps: a velocity is counted as the way of one cycle, an
+acceleration as what a step may differ from the one before. A motor whose steps shrink by ``change``
+each stops after
+
+    w + (w - c) + (w - 2 c) + ...        (w its step, c the change)
+
+so the longest step from which it can stop within a distance follows in closed form (`brake`). It is
+asked twice: to come to rest at the goal, relative to the goal's own motion, and at the limits,
+whatever the goal does. A step that keeps the second can be followed by one that does too, so the
+bounds below are never empty.
 """
 
 from __future__ import annotations
@@ -29,7 +40,6 @@ from casadi_ik.kernels.graphs import FunctionGraph, recipe
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.methods.common.bounded_step import Bounded, damped_step
 from casadi_ik.methods.common.contact_fit import whole_jacobian, whole_residual
-from casadi_ik.motion.cycle import chased, share_within, step_bounds
 from casadi_ik.problem.contacts import (
     LENGTH,
     ContactRows,
@@ -43,26 +53,100 @@ from casadi_ik.symbolic.kinematics import actuated, motor_scales
 from casadi_ik.symbolic.se3 import skew
 from casadi_ik.symbolic.smooth import Expr, shared
 
-STEPS = 2
-"""Gauss-Newton steps of a cycle; the second goes on with the motors that the first held."""
 
-PASSES = 2
-"""Corrections of the set of motors at their bounds in a step."""
+@dataclass(frozen=True)
+class CycleTuning:
+    """Numbers of a cycle, chosen with ``studies/moving.py``.
 
-STIR = 0.03
-"""How much damping grows with the squared residual: where contacts are out of reach the least
-residual is not small, and undamped Gauss-Newton swings about it."""
+    Attributes:
+        steps: Gauss-Newton steps; the second goes on with the motors that the first held.
+        passes: Corrections of the set of motors at their bounds in a step.
+        residual_damping: How much damping grows with the squared residual: where contacts are out
+            of reach the least residual is not small, and undamped Gauss-Newton swings about it.
+        cap: Farthest that a motor's goal moves in a cycle [rad, or part of a slider's range],
+            however fast the motor is: a goal that leaps may come down on another branch.
+        avoidance: How much a clearance counts, a contact counting 1: it may use what contacts
+            leave free, and hardly moves a contact.
+        spare: Part of the acceleration that motors count on to come to rest at their goal: the
+            rest is for what the goal itself does meanwhile.
+        locked_on: So near to its goal a motor is there [rad or m].
+    """
 
-CAP = 0.1
-"""Farthest that a motor's goal moves in a cycle [rad, or part of a slider's range], however fast
-the motor is: a goal that leaps may come down on another branch."""
+    steps: int = 2
+    passes: int = 2
+    residual_damping: float = 0.03
+    cap: float = 0.1
+    avoidance: float = 0.1
+    spare: float = 0.7
+    locked_on: float = 1e-9
 
-AVOIDANCE = 0.1
-"""How much a clearance counts, a contact counting 1: it may use what contacts leave free, and
-hardly moves a contact."""
 
-SAME = 1e-9
-"""So near to its goal a motor is there [rad or m]."""
+TUNING = CycleTuning()
+
+
+def brake(distance: Expr, change: Expr) -> Expr:
+    """The longest step now from which a motor can stop within a distance.
+
+    Args:
+        distance: (n, 1) >= 0.
+        change: (n, 1) > 0 by how much steps may shrink.
+
+    Returns:
+        (n, 1); with u = distance / change and N the number of steps that follow, of which
+        N (N + 1) / 2 <= u: change (u + N (N + 1) / 2) / (N + 1).
+    """
+    u = distance / change
+    after = ca.floor((ca.sqrt(1 + 8 * u) - 1) / 2)
+    return change * (u + after * (after + 1) / 2) / (after + 1)
+
+
+def step_bounds(s: dict[str, Expr], p: dict[str, Expr]) -> tuple[Expr, Expr]:
+    """Least and largest step of the motors, (n, 1) each.
+
+    Args:
+        s: "q", "moved".
+        p: "lower", "upper", "fastest", "change".
+    """
+    fastest, change = p["fastest"], p["change"]
+    low = ca.fmax(-fastest, s["moved"] - change)
+    low = ca.fmax(low, -brake(ca.fmax(s["q"] - p["lower"], 0.0), change))
+    high = ca.fmin(fastest, s["moved"] + change)
+    high = ca.fmin(high, brake(ca.fmax(p["upper"] - s["q"], 0.0), change))
+    # Rounding may leave them a hair past each other.
+    return ca.fmin(low, high), high
+
+
+def share_within(start: Expr, end: Expr, low: Expr, high: Expr) -> Expr:
+    """As far from a place towards another as bounds permit, (n, 1): all motors the same share.
+
+    Args:
+        start: (n, 1) within the bounds.
+        end: (n, 1).
+        low: (n, 1).
+        high: (n, 1).
+    """
+    way = end - start
+    room = ca.if_else(way > 0, high - start, start - low)
+    length = ca.fmax(ca.fabs(way), 1e-15)
+    share = ca.fmin(1.0, ca.mmin((room + 1e-15) / length))
+    return ca.fmin(ca.fmax(start + share * way, low), high)
+
+
+def track_goal(s: dict[str, Expr], goal: Expr, drawn: Expr, p: dict[str, Expr]) -> Expr:
+    """Where motors are after the cycle that run after a goal, (n, 1).
+
+    Args:
+        s: "q", "moved".
+        goal: (n, 1) where they are to go.
+        drawn: (n, 1) the goal's own motion that they may count on.
+        p: "lower", "upper", "fastest", "change".
+    """
+    left = goal - s["q"] - drawn
+    wanted = drawn + ca.sign(left) * brake(ca.fabs(left), TUNING.spare * p["change"])
+    low, high = step_bounds(s, p)
+    q = s["q"] + ca.fmin(ca.fmax(wanted, low), high)
+    return ca.fmin(ca.fmax(q, p["lower"]), p["upper"])
+
 
 PALM_ROWS = 12
 """Of the palm's residual: its place, and its three axes."""
@@ -101,7 +185,7 @@ class Cycle:
                 Field("q", (n,), unit="rad or m", doc="where the motors are told to be"),
                 Field("moved", (n,), unit="rad or m", doc="their last step"),
                 Field("goal", (n,), unit="rad or m", doc="where they are going"),
-                Field("there", doc="1: they go with the goal; 0: they run after it"),
+                Field("locked_on", doc="1: they go with the goal; 0: they run after it"),
                 Field("left", (rows,), doc="residual of contacts and palm"),
             )
         )
@@ -167,7 +251,7 @@ class Cycle:
         parameters = ca.MX.sym("parameters", self.parameters.size)
         first, low, high, *others = begin(state, parameters)
         goal = first
-        for _ in range(STEPS):
+        for _ in range(TUNING.steps):
             goal = step(goal, low, high, *others, parameters)
         after, record = end(state, first, goal, low, high, parameters)
         return ca.Function(
@@ -187,19 +271,19 @@ class Cycle:
         """``(state, parameters) -> (first, low, high, anchor, left)`` of the goal."""
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
         s, p = self.state.unpack(state), self.parameters.unpack(parameters)
-        there = s["there"] > 0.5
+        locked_on = s["locked_on"] > 0.5
         low, high = step_bounds(s, p)
-        most = ca.fmin(p["fastest"], CAP * motor_scales(self.robot))
+        most = ca.fmin(p["fastest"], TUNING.cap * motor_scales(self.robot))
         # Rounding of what stops at a limit must not lead past it: both are within the limits.
         low, high = (
-            ca.fmin(ca.fmax(s["goal"] + ca.if_else(there, step, free), p["lower"]), p["upper"])
+            ca.fmin(ca.fmax(s["goal"] + ca.if_else(locked_on, step, free), p["lower"]), p["upper"])
             for step, free in ((low, -most), (high, most))
         )
-        along = ca.if_else(there, s["moved"], 0.0)
+        along = ca.if_else(locked_on, s["moved"], 0.0)
         first = ca.fmin(ca.fmax(s["goal"] + along, low), high)
         free = p["keep"] * s["moved"] + p["drift"] * (p["posture"] - s["goal"])
-        anchor = s["goal"] + ca.if_else(there, free, 0.0)
-        left = ca.if_else(there, p["patience"] * s["left"], 0.0)
+        anchor = s["goal"] + ca.if_else(locked_on, free, 0.0)
+        left = ca.if_else(locked_on, p["patience"] * s["left"], 0.0)
         outputs = shared(first, low, high, anchor, left)
         return ca.Function("begin", [state, parameters], outputs)
 
@@ -218,19 +302,19 @@ class Cycle:
         """``(state, first, goal', low, high, parameters) -> (state', record)``."""
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
         s, p = self.state.unpack(state), self._unpacked(parameters)
-        there = s["there"] > 0.5
+        locked_on = s["locked_on"] > 0.5
         first, wanted, low, high = self._symbols("first", "wanted", "low", "high")
         goal = share_within(first, wanted, low, high)
         position, angle = self._errors(goal, p)
         met = within_tolerance(position, angle, p["position_tolerance"], p["angle_tolerance"])
         drawn = ca.if_else(met, goal - s["goal"], 0.0)
-        q = ca.if_else(there, goal, chased(s, goal, drawn, p))
-        arrived = ca.mmax(ca.fabs(goal - q)) <= SAME
+        q = ca.if_else(locked_on, goal, track_goal(s, goal, drawn, p))
+        arrived = ca.mmax(ca.fabs(goal - q)) <= TUNING.locked_on
         after = {
             "q": q,
             "moved": q - s["q"],
             "goal": goal,
-            "there": ca.if_else(ca.logic_and(met, ca.logic_or(there, arrived)), 1.0, 0.0),
+            "locked_on": ca.if_else(ca.logic_and(met, ca.logic_or(locked_on, arrived)), 1.0, 0.0),
             "left": self._residual(q, p),
         }
         own_position, own_angle = self._errors(q, p)
@@ -262,15 +346,17 @@ class Cycle:
         residual = residual - left
         if self.obstacles:
             rooms = ca.fmax(p["rooms"], 0.0)
-            felt = AVOIDANCE / LENGTH * ca.if_else(rooms > 0, 1.0, 0.0)
-            residual = ca.vertcat(residual, AVOIDANCE / LENGTH * rooms)
+            felt = TUNING.avoidance / LENGTH * ca.if_else(rooms > 0, 1.0, 0.0)
+            residual = ca.vertcat(residual, TUNING.avoidance / LENGTH * rooms)
             jacobian = ca.vertcat(jacobian, -p["slopes"] * ca.repmat(felt, 1, n))
         pull = ca.sqrt(p["pull"])
         residual = ca.vertcat(residual, pull * (here - anchor) / scales)
         jacobian = ca.vertcat(jacobian @ ca.diag(scales), pull * ca.SX.eye(n))
         at, (low, high) = here / scales, bounds
         box = Bounded(at, low / scales, high / scales, first=0)
-        found = damped_step(ca.sparsify(jacobian), residual, STIR * missed, box, PASSES)
+        found = damped_step(
+            ca.sparsify(jacobian), residual, TUNING.residual_damping * missed, box, TUNING.passes
+        )
         return here + found.step * scales
 
     def _residual(self, q: Expr, p: dict[str, Expr]) -> Expr:
