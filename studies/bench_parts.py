@@ -24,6 +24,9 @@ from samplers import SAMPLERS, grasps_of, random_arm_targets, suits
 
 import casadi_ik as ik
 
+PROBES = Path(__file__).parent / "probes"
+"""Programs beside those that are measured; `stack.c` marks the stack of a solve."""
+
 Found = dict[str, float]
 Case = tuple[Any, ...]
 Targets = tuple[Any, Any]
@@ -362,46 +365,6 @@ def _children() -> float:
     return sum(os.times()[2:4])
 
 
-STACK = """
-#define _DEFAULT_SOURCE
-#include <math.h>
-#include <pthread.h>
-#include <stdio.h>
-#include <string.h>
-#include "arm.h"
-#include "targets.h"
-static arm_solver solver;
-static unsigned char stack[1 << 20] __attribute__((aligned(4096)));
-static REAL points[3 * ARM_FINGERS], normals[3 * ARM_FINGERS];
-static void *work(void *given) {
-  int i, k;
-  for (i = 0; i < TARGETS; ++i) {
-    for (k = 0; k < 3 * ARM_FINGERS; ++k) {
-      points[k] = (REAL) targets[i].points[k];
-      normals[k] = (REAL) targets[i].normals[k];
-    }
-    arm_solve(&solver, points, normals, 0);
-  }
-  return given;
-}
-int main(void) {
-  pthread_attr_t attributes;
-  pthread_t thread;
-  size_t least = 0;
-  memset(stack, 0xa5, sizeof stack);
-  arm_init(&solver);
-  pthread_attr_init(&attributes);
-  pthread_attr_setstack(&attributes, stack, sizeof stack);
-  if (pthread_create(&thread, &attributes, work, 0)) return 1;
-  pthread_join(thread, 0);
-  while (least < sizeof stack && stack[least] == 0xa5) ++least;
-  printf("%zu %zu\\n", sizeof stack - least, sizeof solver);
-  return 0;
-}
-"""
-"""Solves the stored targets on a stack that is marked before; prints what of it was used."""
-
-
 def export(robot: str, target: str, *flags: str) -> Callable[[], Found]:
     """The exported solver, built with the machine's compiler."""
     folder = Path(tempfile.mkdtemp(prefix="casadi_ik-bench-")) / "solver"
@@ -421,7 +384,7 @@ def export(robot: str, target: str, *flags: str) -> Callable[[], Found]:
     texts = {line.split()[5]: int(line.split()[0]) for line in table}
     tables = sum(size for name, size in texts.items() if "tables" in name)
     whole = next(size for name, size in texts.items() if name.startswith("(TOTALS)"))
-    (folder / "stack.c").write_text(STACK)
+    (folder / "stack.c").write_text((PROBES / "stack.c").read_text())
     real = "-DREAL=float" if "--single" in flags else "-DREAL=double"
     flags_of = (real, "-O2", "-Iinclude", "-Itest", "stack.c", "build/libarm.a", "-lm", "-pthread")
     _run("cc", *flags_of, "-o", "build/stack", folder=folder)

@@ -55,102 +55,15 @@ BOX = (
 HANDLE = 0.06
 """Length of the axes by which a contact is held [m]."""
 
-COMMON = """
-window.rows = []; window.row = null;
-addEventListener('pointermove', e => { window.row = {event: e.timeStamp}; }, true);
-window.painted = canvas => {
-  const gl = canvas.getContext('webgl2');
-  gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
-  return performance.now();
-};
-"""
-
-SERVED = (
-    COMMON
-    + """
-const verdict = m => m.type === 'GuiUpdateMessage' && /ik-status/.test(m.updates?.content ?? '');
-const done = row => { if (row.told && row.painted) {
-  row.drawn = Math.max(row.told, row.painted); window.rows.push(row); } };
-window.messages = 0;
-window.Worker = class extends Worker {
-  constructor(...given) {
-    super(...given);
-    this.addEventListener('message', e => {
-      if (e.data?.type !== 'message_batch') return;
-      window.messages += e.data.messages.length;
-      const row = window.row;
-      if (!row?.sent || row.came || !e.data.messages.some(verdict)) return;
-      row.came = performance.now();
-      requestAnimationFrame(() => setTimeout(() => {
-        row.painted = window.painted(document.querySelector('canvas'));
-        done(row);
-      }));
-    });
-  }
-  postMessage(data, ...more) {
-    const row = window.row;
-    if (row && !row.sent && data?.message?.type === 'TransformControlsUpdateMessage')
-      row.sent = performance.now();
-    super.postMessage(data, ...more);
-  }
-};
-const told = n => n.querySelector && n.querySelector('.ik-status') !== null;
-new MutationObserver(records => {
-  const row = window.row;
-  if (!row?.came || row.told) return;
-  if (!records.some(r => told(r.target) || [...r.addedNodes].some(told))) return;
-  row.told = performance.now();
-  done(row);
-}).observe(document, {subtree: true, childList: true, characterData: true});
-"""
+PROBES = Path(__file__).parent / "probes"
+COMMON, SERVED, ALONE, NO_PAINTING, STILL = (
+    (PROBES / f"{name}.js").read_text(encoding="utf-8")
+    for name in ("common", "served", "alone", "no_painting", "still")
 )
-"""For the page of `casadi-ik view`."""
-
-ALONE = (
-    COMMON
-    + """
-(() => {
-  const { stage, now } = casadiIk, render = stage.renderer.render, { solving } = now;
-  const tried = solving.tried;
-  solving.tried = function (...given) {
-    const asked = performance.now(), answer = tried.apply(this, given);
-    if (window.row) Object.assign(window.row, {asked, solved: performance.now()});
-    return answer;
-  };
-  stage.renderer.render = function (...given) {
-    const row = window.row;
-    window.row = null;
-    if (row) row.placed = performance.now();
-    render.apply(this, given);
-    if (!row?.solved) return;
-    row.submitted = performance.now();
-    row.drawn = window.painted(this.domElement);
-    window.rows.push(row);
-  };
-})()
-"""
-)
-"""For the page without a server, once it is there."""
-
-NO_PAINTING = """
-for (const kind of ['drawElements', 'drawArrays', 'drawElementsInstanced', 'drawArraysInstanced',
-    'clear', 'clearBufferfv', 'clearBufferiv', 'clearBufferuiv', 'clearBufferfi',
-    'blitFramebuffer'])
-  WebGL2RenderingContext.prototype[kind] = () => {};
-"""
-"""Leaves out what a graphics card is for, clearing too: all that the page itself does remains.
-
-A picture that is only cleared is put on the screen as well, in software too: 25 ms of a processor.
-"""
-
-STILL = """new Promise(done => {
-  const took = [], canvas = document.querySelector('canvas');
-  const next = () => requestAnimationFrame(begun => setTimeout(() => {
-    took.push(window.painted(canvas) - begun);
-    took.length < 8 ? next() : done(took.slice(2)); }));
-  DRAW; next(); })"""
-"""Times [ms] of painting one and the same picture again and again."""
-
+"""Scripts: for every page, for that of `casadi-ik view`, for the one without a server once it is
+there. The fourth leaves out what a graphics card is for, clearing too: a picture that is only
+cleared is put on the screen as well, in software too, 25 ms of a processor. The last gives times
+[ms] of painting one and the same picture again and again."""
 
 STAGES = {
     "server": ("event", "sent", "came", "told", "drawn"),
@@ -272,7 +185,7 @@ def _on_view(
             solves.append(1e3 * answer.seconds)
             begun[0] = 0.0
 
-    page = _opened(browser, viewer.url, SERVED, *([] if painted else [NO_PAINTING]))
+    page = _opened(browser, viewer.url, COMMON + SERVED, *([] if painted else [NO_PAINTING]))
     page.wait("document.querySelector('.ik-status') !== null")
     time.sleep(4.0)  # the camera comes to rest
     client = list(viewer._server.get_clients().values())[-1]
@@ -310,7 +223,7 @@ def _on_page(
     page = _opened(browser, url, *scripts)
     page.wait("globalThis.casadiIk?.now.answer && !casadiIk.stage.asked", 60.0)
     time.sleep(1.0)
-    page.evaluate(ALONE)
+    page.evaluate(COMMON + ALONE)
     still = STILL.replace("DRAW; next()", "next()")
     still = still.replace("took.push(", "casadiIk.stage.draw(); took.push(")
     found: Found = {}

@@ -32,21 +32,8 @@ AWAY = 0.3
 SLACK = 1e-9
 """Part of a tolerance, and distance beyond a limit [rad or m], that is rounding."""
 
-MANY = """
-#include "arm.h"
-static arm_solver solver;
-void many(int count, REAL position, REAL angle, const REAL *points, const REAL *normals,
-          const REAL *q0, REAL *q, int *status) {
-  int i, k;
-  arm_init(&solver);
-  arm_set_tolerance(&solver, -1, position, angle);
-  for (i = 0; i < count; ++i) {
-    status[i] = arm_solve(&solver, points + i * 3 * ARM_FINGERS, normals + i * 3 * ARM_FINGERS,
-                          q0 ? q0 + i * ARM_MOTORS : 0);
-    for (k = 0; k < ARM_MOTORS; ++k) q[i * ARM_MOTORS + k] = solver.q[k];
-  }
-}
-"""
+MANY = (Path(__file__).parent / "probes" / "many.c").read_text(encoding="utf-8")
+"""Solves many targets in a call."""
 
 INTRODUCTION = """
 Random arms and hands within limits, {count:,} targets a row; from home a solution far from limits
