@@ -18,9 +18,8 @@ import polars as pl
 import pytest
 import small_study
 from dask_processes import scheduler_process, worker_process
-from runner import study
 from runner.report import interval_text, mean_metric, median_metric, rate_metric
-from runner.study import STUDY_FILE, claim, missing, read_results, run, solve_block
+from runner.study import STUDY_FILE, claim, missing, read_results, run
 
 import casadi_ik as ik
 from casadi_ik.batches import backend
@@ -152,14 +151,6 @@ def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
     assert iterations == contents(tmp_path)["iterations"].sum()
 
 
-def test_a_study_grows(done, tmp_path):
-    small = dataclasses.replace(STUDY, count=STUDY.block, settings=STUDY.settings[:1])
-    run(small, tmp_path)
-    assert len(contents(tmp_path, small)) == 2 * STUDY.block
-    run(STUDY, tmp_path)
-    assert contents(tmp_path).equals(contents(done))
-
-
 def test_as_many_targets_as_are_asked_for(done, tmp_path):
     """A block cut short holds the first targets of the whole one, and is filled up later."""
     few = dataclasses.replace(STUDY, count=STUDY.block + 1, settings=STUDY.settings[:1])
@@ -170,24 +161,6 @@ def test_as_many_targets_as_are_asked_for(done, tmp_path):
     assert table.equals(first)
     run(STUDY, tmp_path)
     assert contents(tmp_path).equals(contents(done))
-
-
-def test_no_time_holds_a_first_use(monkeypatch):
-    """Before the targets of a block its solver has solved others."""
-    study._used.cache_clear()
-    solved = []
-    whole = ik.Solver.solve_batch
-    monkeypatch.setattr(
-        ik.Solver,
-        "solve_batch",
-        lambda self, points, *rest, **more: (
-            solved.append(len(points)) or whole(self, points, *rest, **more)
-        ),
-    )
-    (block, *_) = STUDY.blocks()
-    solve_block(STUDY, block)
-    solve_block(STUDY, block)
-    assert solved == [study.FIRST_USE, block.size, block.size]
 
 
 def test_a_changed_seed_is_one_line(done):
