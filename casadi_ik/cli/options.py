@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from casadi_ik.problem.questions import PREFERENCES
-
 PROGRAM = "casadi-ik"
 """What the command is called."""
 
@@ -232,7 +230,7 @@ Q0 = Option(
     otherwise="home",
 )
 PREFER = Option(
-    f"--prefer {'|'.join(PREFERENCES)}",
+    "--prefer limits|manipulability|q0|clearance",
     "which of several solutions comes first: far from its limits, with a manipulable arm, near the "
     "start, or with --scene far from what may be hit",
     otherwise="q0 if it is given, else limits",
