@@ -36,6 +36,7 @@ from casadi_ik.kernels.layout import Layout
 from casadi_ik.kernels.lookup import TILE
 from casadi_ik.methods.hand_first.driver import SearchPlan, source_text
 from casadi_ik.methods.hand_first.method import HandFirstMethod
+from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import terms
 from casadi_ik.motion.cycle import Cycle
 from casadi_ik.motion.follower import PALM_WEIGHT
@@ -46,7 +47,6 @@ from casadi_ik.problem.contacts import usual
 from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.questions import BEYOND, touched
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
-from casadi_ik.registry import build_method
 
 MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")
 
@@ -369,8 +369,7 @@ class SolverSources:
 
 def hand_first(robot: ArmHand) -> HandFirstMethod:
     """The method whose solver is exported, compiled."""
-    method = build_method("hand-first", robot.description, {})
-    assert isinstance(method, HandFirstMethod)
+    method = HandFirstMethod(robot.description, HandFirstParameters())
     method.prepare()
     return method
 
