@@ -2,20 +2,20 @@
  *
  * A search makes rounds until a target is solved or none is left that may help. A round takes up to
  * N_CANDIDATES hand postures (seeds.c), one after the other. Of each it takes the palm pose that
- * suits it best (candidate), fits palm and hand to the contacts as if the hand could fly (hand fit),
- * has the arm carry the palm there in closed form (arm placement, or arm choice if what is near q0
- * is wanted), moves all motors where the arm cannot follow exactly (refinement), and brings the
- * largest error down where contacts contradict each other (balance): one iteration of the compiled
- * step in whichever stage the solve is (step.py).
+ * suits it best (candidate), fits palm and hand to the contacts as if the hand could fly (hand
+ * fit), has the arm carry the palm there in closed form (arm placement, or arm choice if what is
+ * near q0 is wanted), moves all motors where the arm cannot follow exactly (refinement), and brings
+ * the largest error down where contacts contradict each other (balance): one iteration of the
+ * compiled step in whichever stage the solve is (step.py).
  *
  * The loop (kernels/drivers/loop.c) makes the iterations, of many targets side by side or of one,
- * and asks `follow` whenever they end. A batch, one target, `fast`, a solve by steps and an exported
- * solver all come here.
+ * and asks `follow` whenever they end. A batch, one target, `fast`, a solve by steps and an
+ * exported solver all come here.
  *
- * BEGIN, SOLVE and JUDGE call the compiled kernels, as in seeds.c; the constants come from driver.py.
+ * BEGIN, SOLVE and JUDGE call compiled kernels, as in seeds.c; the constants come from driver.py.
  */
 
-/* The first state and the parameters of the round, from its postures; what was found before stays. */
+/* First state and parameters of the round, from its postures; what was found before stays. */
 static int begin_round(search *job) {
   const int64_t number = job->round, later = number - ROUNDS;
   const double *inputs[5 + N_MORE];
@@ -74,7 +74,8 @@ static int begin_round(search *job) {
 static int may_help(const search *job) {
   const double returns = job->state[STATE_RETURNS], cost = job->state[STATE_BEST_COST];
   const int held = job->state[STATE_HELD] > 0;
-  const double most = held ? SAME_MINIMUM_MANY : SAME_MINIMUM, near = held ? FAR_COST_MANY : FAR_COST;
+  const double most = held ? SAME_MINIMUM_MANY : SAME_MINIMUM;
+  const double near = held ? FAR_COST_MANY : FAR_COST;
   const int64_t rugged = job->round - FIRST_RUGGED;
   if (rugged >= 0) {
     return returns < most && cost < near && cost < FAR_COST_SHRINKS / (double) (rugged + 1);
@@ -150,7 +151,7 @@ static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
   return code;
 }
 
-/* So many steps of what is in `state`; `next` says what comes after it. SLICE_OVER: there is more. */
+/* So many steps of what is in `state`; `next` says what follows. SLICE_OVER: there is more. */
 static int iterate(search *job, int64_t steps,
                    int (*next)(void *, int64_t, int64_t, int32_t *)) {
   int32_t status = (int32_t) job->loop_status;
