@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,41 +25,47 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import Verdict, deviations, judge, judge_palms
 from casadi_ik.proofs.proof import Proof, ProofKind
 from casadi_ik.proofs.prove import EFFORT, Prover
-from casadi_ik.solving.diagnosis.minimax import Closest, closest
-from casadi_ik.solving.diagnosis.palm_free import HandFits, PalmFree
+from casadi_ik.solving.diagnosis.closest import Closest, FloatingPalmFit, HandFits, closest
 from casadi_ik.solving.diagnosis.remedies import RemedyFinder
 from casadi_ik.solving.trials import Descent, HandMethod, Rows, Trials
 
-TOGETHER = 64
-"""Targets that are diagnosed in the same runs of the compiled loop."""
 
-PLACED = 2
-"""Fitted hands that the arm follows, in addition to the one of hand-first."""
+@dataclass(frozen=True)
+class DiagnosisEffort:
+    """How long a diagnosis goes on; chosen with ``studies/diagnosis.py``.
 
-SEARCHES = ((8.0, 24, 4), (4.0, 96, 8), (1.5, 256, 32))
-"""If the contacts are missed by less than a factor, so many further starts are tried, whatever hand
-and reach say, and so many of the minima they lead to are followed."""
+    Attributes:
+        together: Targets that are diagnosed in the same runs of the compiled loop.
+        placed: Fitted hands that the arm follows, in addition to the one of hand-first.
+        searches: If the contacts are missed by less than a factor, so many further starts are
+            tried, whatever hand and reach say, and so many of the minima they lead to are followed.
+        alike: Every third of these starts has a hand that looks like the grasp, the others the
+            nearest.
+        certain: If hand and arm-hand both miss the contacts by this factor where they come
+            closest, no arm is looked for that would help a hand that does not fit.
+        barely: If they are missed by less than this, limits are lifted that nothing presses
+            against, too.
+        clearly: A proof may take all its boxes where the tolerances would have to be so many times
+            as large. What is missed by little is hardly ever proved: no box is excluded before it
+            is small.
+        least: Boxes it may take in any case.
+        at_limit: How near to a limit counts as at it [rad or m].
+        missed_reach: How far an arm's reach has to be missed to be the reason [m].
+    """
 
-ALIKE = 3
-"""Every third of these starts has a hand that looks like the grasp, the others the nearest."""
+    together: int = 64
+    placed: int = 2
+    searches: tuple[tuple[float, int, int], ...] = ((8.0, 24, 4), (4.0, 96, 8), (1.5, 256, 32))
+    alike: int = 3
+    certain: float = 1.1
+    barely: float = 2.0
+    clearly: float = 2.5
+    least: int = 5000
+    at_limit: float = 1e-6
+    missed_reach: float = 1e-3
 
-CERTAIN = 1.1
-"""If hand and arm-hand both miss the contacts by this factor where they come closest, no arm is
-looked for that would help a hand that does not fit."""
 
-BARELY = 2.0
-"""If they are missed by less than this, limits are lifted that nothing presses against, too."""
-
-AT_LIMIT = 1e-6
-"""How near to a limit counts as at it [rad or m]."""
-
-CLEARLY, LEAST = 2.5, 5000
-"""A proof may take all its boxes where the tolerances would have to be so many times as large, and
-so many in any case. In between no box is excluded before it is small: what is missed by little is
-hardly ever proved, and took a quarter of a second to be given up."""
-
-REAL = 1e-3
-"""How far an arm's reach has to be missed to be the reason [m]."""
+DIAGNOSIS = DiagnosisEffort()
 
 
 class Diagnostician:
@@ -75,7 +81,7 @@ class Diagnostician:
         self.robot = robot
         self.method = method
         self._trials = Trials(robot, method)
-        self._palm_free = PalmFree(self._trials)
+        self._palm_free = FloatingPalmFit(self._trials)
         self._prover = Prover(robot.description, compiled)
 
     def diagnose(self, problems: Problems, q0: Array, nearest: Array | None) -> list[Diagnosis]:
@@ -107,8 +113,8 @@ class Diagnostician:
             (near,) = self._nearest(one, nearest[row : row + 1])
             found[row] = _reachable(one, nearest[row], near, clock.seconds[row])
         rest = np.flatnonzero(~known)
-        for start in range(0, len(rest), TOGETHER):
-            rows = rest[start : start + TOGETHER]
+        for start in range(0, len(rest), DIAGNOSIS.together):
+            rows = rest[start : start + DIAGNOSIS.together]
             some, spent = problems.rows(rows), clock.seconds[rows]
             whys = self._together(some, q0[rows], nearest[rows], _Clock(spent))
             found |= zip(rows.tolist(), whys, strict=True)
@@ -126,7 +132,7 @@ class Diagnostician:
         searches = np.bincount(targets, minlength=len(every))
         if fits is not None:
             searches += np.bincount(fits.targets, minlength=len(every))
-        best = closest(descent, targets, ends, PLACED + 1)
+        best = closest(descent, targets, ends, DIAGNOSIS.placed + 1)
         clock.lap(every)
         proofs: list[Proof | None] = [None] * len(every)
         rows = np.flatnonzero(~self._solved(problems, best.fair))
@@ -140,7 +146,7 @@ class Diagnostician:
         unsure = np.array([reason is None for reason in refused])
         certain = self._certain(problems, fits, best)
         certain |= np.array([proof is not None for proof in proofs])
-        for below, count, followed in SEARCHES:
+        for below, count, followed in DIAGNOSIS.searches:
             rows = np.flatnonzero(unsure | ((best.ratio < below) & ~certain))
             rows = rows[~self._solved(problems.rows(rows), best.fair[rows])]
             if len(rows):
@@ -153,7 +159,7 @@ class Diagnostician:
         solved, enough = fair.solved(problems.enforce_limits), _enough(problems, fair)
         near = self._nearest(problems, np.where(solved[:, None], best.fair, best.q))
         held = self._at_limit(best.q)
-        pressed = held | self._at_limit(best.fair) | (best.ratio <= BARELY)[:, None]
+        pressed = held | self._at_limit(best.fair) | (best.ratio <= DIAGNOSIS.barely)[:, None]
         clock.lap(every)
         for i in every.tolist():
             if solved[i]:
@@ -196,13 +202,13 @@ class Diagnostician:
         """(k,) whether the hand alone already says no, however the arm holds it."""
         if fits is None:
             return np.zeros(len(problems), dtype=bool)
-        return np.minimum(fits.ratio(problems), best.ratio) >= CERTAIN
+        return np.minimum(fits.ratio(problems), best.ratio) >= DIAGNOSIS.certain
 
     def _placed(self, fits: HandFits | None) -> tuple[Rows, Array]:
         """Configurations (m, n) that the best fits of each target lead to, and their targets."""
         if fits is None:
             return np.zeros(0, np.intp), np.zeros((0, len(self.robot.actuators)))
-        rows = fits.best(PLACED)
+        rows = fits.best(DIAGNOSIS.placed)
         return fits.targets[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
 
     def _search(self, problems: Problems, best: Closest, count: int, followed: int) -> Closest:
@@ -218,7 +224,9 @@ class Diagnostician:
             hand = list(self.robot.description.hand_actuators)
             starts[:, ::2, hand] = best.fair[:, None, hand]
             starts[:, 1::2, hand] = best.q[:, None, hand]
-            starts[:, ::ALIKE, hand] = self._alike(problems, -(-count // ALIKE))
+            starts[:, :: DIAGNOSIS.alike, hand] = self._alike(
+                problems, -(-count // DIAGNOSIS.alike)
+            )
         starts = np.concatenate([best.q[:, None], best.fair[:, None], starts], axis=1)
         descent = Descent(self._trials, problems)
         ends = descent.run(targets, starts.reshape(len(targets), -1))
@@ -254,7 +262,9 @@ class Diagnostician:
         ]
 
     def _at_limit(self, q: Array) -> NDArray[np.bool_]:
-        return (q - self.robot.lower <= AT_LIMIT) | (self.robot.upper - q <= AT_LIMIT)
+        return (q - self.robot.lower <= DIAGNOSIS.at_limit) | (
+            self.robot.upper - q <= DIAGNOSIS.at_limit
+        )
 
 
 class _Clock:
@@ -276,15 +286,15 @@ def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) 
         return Reason.HAND
     if proof is not None:
         return Reason.REACH
-    if reach is not None and abs(reach.excess) > REAL:
+    if reach is not None and abs(reach.excess) > DIAGNOSIS.missed_reach:
         return Reason.REACH
     return None
 
 
 def _worth(ratio: Array) -> Counts:
     """(k,) boxes a proof may take of targets that are missed by a factor (k,)."""
-    share = np.clip((ratio - 1) / (CLEARLY - 1), 0.0, 1.0)
-    return np.maximum(EFFORT.most * share, LEAST).astype(np.int64)
+    share = np.clip((ratio - 1) / (DIAGNOSIS.clearly - 1), 0.0, 1.0)
+    return np.maximum(EFFORT.most * share, DIAGNOSIS.least).astype(np.int64)
 
 
 def _enough(problems: Problems, fair: Verdict) -> list[Tolerance]:

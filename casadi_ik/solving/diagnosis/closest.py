@@ -1,4 +1,10 @@
-"""The hand with its palm free to move: how well it fits contacts, and where it takes the wrist."""
+"""How near a hand comes to contacts: with the arm at its fairest, and alone, its palm floating.
+
+With weights w_i >= 0 the smallest ``sum w_i e_i^2`` of the errors e_i bounds what is possible: if
+it exceeds ``sum w_i t_i^2`` the tolerances t_i cannot all be kept. Weights that grow where the
+tolerance is exceeded most tighten that bound (Lawson's algorithm), and lead to the configuration
+whose largest error, as a part of its tolerance, is smallest (minimax).
+"""
 
 from __future__ import annotations
 
@@ -18,13 +24,109 @@ from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
 from casadi_ik.problem.verdict import ContactVerdict, judge
-from casadi_ik.solving.trials import NEVER, Rows, Trials, allowed, smallest
+from casadi_ik.solving.trials import NEVER, Descent, Rows, Trials, allowed, smallest
 
-FIRST = 4
-"""Hand postures tried for every target; where none of them fits, two rounds of them."""
 
-SLID = 2
-"""Hands that fit but are out of the arm's reach, and are slid towards it."""
+@dataclass(frozen=True)
+class ClosestTuning:
+    """Numbers of the search for the nearest contacts, chosen with ``studies/diagnosis.py``.
+
+    Attributes:
+        rounds: Adaptations of the minimax weights, at most.
+        settled: The weights are adapted no further when the bound is this close to what was
+            reached, or when it says no and a round gains less than this.
+        margin: By which factor the contacts have to be missed for a grasp to count as unreachable.
+        lightest: Smallest weight.
+        first: Hand postures tried for every target; where none of them fits, two rounds of them.
+        slid: Hands that fit but are out of the arm's reach, and are slid towards it.
+    """
+
+    rounds: int = 16
+    settled: float = 0.01
+    margin: float = 1.02
+    lightest: float = 1e-4
+    first: int = 4
+    slid: int = 2
+
+
+TUNING = ClosestTuning()
+
+
+@dataclass(frozen=True, eq=False)
+class Closest:
+    """What came closest to k targets.
+
+    Attributes:
+        q: (k, n) configurations with the smallest squared error.
+        fair: (k, n) configurations with the smallest largest error.
+        ratio: (k,) by which factor the tolerances would have to grow at least, near any of the
+            minima.
+    """
+
+    q: Array
+    fair: Array
+    ratio: Array
+
+    def rows(self, rows: Rows) -> Closest:
+        """What came closest to some of the targets."""
+        return Closest(self.q[rows], self.fair[rows], self.ratio[rows])
+
+    def put(self, rows: Rows, found: Closest) -> None:
+        """Take what came closer to some of the targets."""
+        self.q[rows], self.fair[rows], self.ratio[rows] = found.q, found.fair, found.ratio
+
+
+def closest(descent: Descent, targets: Rows, q: Array, followed: int) -> Closest:
+    """Follow the best of some configurations to the end.
+
+    Args:
+        descent: Of k targets.
+        targets: (m,) which target a configuration is for; every target has one at least.
+        q: (m, n).
+        followed: How many of a target at most.
+    """
+    cost = (descent.misses(targets, q) ** 2).sum(axis=(1, 2))
+    kept = smallest(targets, cost, followed)
+    targets, q = targets[kept], q[kept]
+    count, first = len(q), np.searchsorted(targets, np.arange(len(descent.problems)))
+    tolerated = allowed(descent.problems)[targets]
+    counted = tolerated > 0
+    total = (tolerated**2).sum(axis=(1, 2))
+    weights = counted.astype(float)
+    worst, bound = np.full(count, np.inf), np.zeros(count)
+    best = np.full(len(first), np.inf)
+    done = np.zeros(len(first), dtype=bool)
+    fair, plain, cost = q.copy(), q, np.zeros(count)
+    rows = np.arange(count)
+    for number in range(TUNING.rounds):
+        here = targets[rows]
+        q[rows] = descent.run(here, q[rows], weights=np.sqrt(weights[rows]))
+        misses = descent.misses(here, q[rows])
+        if number == 0:
+            plain, cost = q.copy(), (misses**2).sum(axis=(1, 2))
+        parts = np.divide(misses, tolerated[rows], where=counted[rows], out=np.zeros_like(misses))
+        largest = parts.max(axis=(1, 2))
+        better = rows[largest < worst[rows]]
+        fair[better] = q[better]
+        worst[rows] = np.minimum(worst[rows], largest)
+        squares = (weights[rows] * misses**2).sum(axis=(1, 2))
+        bound[rows] = np.maximum(bound[rows], np.sqrt(squares / total[rows]))
+        before, best = best, np.minimum.reduceat(worst, first)
+        least = np.minimum.reduceat(bound, first)
+        stuck = best > (1 - TUNING.settled) * before
+        done |= (
+            (best <= 1) | ((least > TUNING.margin) & stuck) | (least > (1 - TUNING.settled) * best)
+        )
+        # A minimum that cannot come closer than another one already has is followed no further.
+        going = ~done[here] & (bound[rows] < best[here])
+        if not going.any():
+            break
+        new = np.where(counted[rows], np.maximum(weights[rows] * parts, TUNING.lightest), 0.0)
+        scale = total[rows] / (new * tolerated[rows] ** 2).sum(axis=(1, 2))
+        weights[rows] = new * scale[:, None, None]
+        rows = rows[going]
+    ratio = np.minimum.reduceat(bound, first)
+    return Closest(plain[smallest(targets, cost, 1)], fair[smallest(targets, worst, 1)], ratio)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +180,7 @@ class HandFits:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-class PalmFree:
+class FloatingPalmFit:
     """Fits the hand alone to targets, whatever the arm could do."""
 
     def __init__(self, trials: Trials) -> None:
@@ -127,14 +229,14 @@ class PalmFree:
         """
         method, every = self._trials.method, np.arange(len(problems))
         nearest = method.postures(problems, 0)
-        fits = self._fitted(problems, q0, every, nearest[:, :FIRST])
+        fits = self._fitted(problems, q0, every, nearest[:, : TUNING.first])
         without = fits.without()
         if len(without):
             wide = method.postures(problems.rows(without), 1)
-            more = np.concatenate([nearest[without, FIRST:], wide], axis=1)
+            more = np.concatenate([nearest[without, TUNING.first :], wide], axis=1)
             fits = HandFits.joined([fits, self._fitted(problems, q0, without, more)])
         rows = np.flatnonzero(fits.ok & np.isin(fits.targets, fits.without()))
-        rows = rows[smallest(fits.targets[rows], fits.outside[rows], SLID)]
+        rows = rows[smallest(fits.targets[rows], fits.outside[rows], TUNING.slid)]
         if len(rows):
             fits = HandFits.joined([fits, self._slid(problems, fits, rows)])
         return fits
