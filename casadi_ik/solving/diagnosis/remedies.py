@@ -1,4 +1,4 @@
-"""What would make a grasp solvable: limits lifted as little as it takes, fingers or normals free."""
+"""What would make a grasp solvable: limits lifted a little, fingers or normals left free."""
 
 from __future__ import annotations
 
