@@ -126,10 +126,11 @@ def sharp(body: Surface, degrees: float = 35.0) -> Surface:
     kept = areas > 1e-12
     corners = corners[kept].reshape(-1, 3)
     normals = np.repeat(normals[kept] / areas[kept, None], 3, axis=0)
-    _, place, counts = np.unique(
-        np.round(corners, 7), axis=0, return_inverse=True, return_counts=True
-    )
-    place = place.reshape(-1)
+    # Places and sides as whole numbers of 63 bits, which are sorted ten times as fast as rows.
+    steps = (2**21 - 1) / max(float(np.ptp(corners, axis=0).max()), 1e-9)
+    cells = np.round(steps * (corners - corners.min(axis=0))).astype(np.int64)
+    cells = cells @ np.array([2**42, 2**21, 1])
+    _, place, counts = np.unique(cells, return_inverse=True, return_counts=True)
     # All pairs of corners at the same place: corners of one side have the same mean normal.
     size, order = counts[place], np.argsort(place, kind="stable")
     one = np.repeat(np.arange(len(place)), size)
@@ -139,8 +140,8 @@ def sharp(body: Surface, degrees: float = 35.0) -> Surface:
     mean = np.zeros_like(normals)
     np.add.at(mean, one[alike], normals[other[alike]])
     mean /= np.linalg.norm(mean, axis=1, keepdims=True)
-    sides = np.column_stack([place, np.round(mean, 3) + 0.0])
-    _, first, of = np.unique(sides, axis=0, return_index=True, return_inverse=True)
+    sides = np.round(1e3 * (mean + 1)).astype(np.int64) @ np.array([2**22, 2**11, 1])
+    _, first, of = np.unique(place * 2**33 + sides, return_index=True, return_inverse=True)
     return Surface(corners[first], of.reshape(-1, 3))
 
 

@@ -13,7 +13,7 @@ try:
         import pyvista as _pyvista  # noqa: F401
 except ImportError as error:
     raise MissingExtraError(
-        f"pictures need {error.name}, which is not installed: pip install casadi-ik[plots]"
+        f"pictures need {error.name}, which is not installed: pip install 'casadi-ik[plots]'"
     ) from error
 
 from casadi_ik.views.charts import draw_convergence

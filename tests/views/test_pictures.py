@@ -170,7 +170,7 @@ def test_without_the_extra_the_error_says_what_to_install(missing: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout.startswith(f"MissingExtraError pictures need {missing},")
-    assert "pip install casadi-ik[plots]" in done.stdout
+    assert "pip install 'casadi-ik[plots]'" in done.stdout
     assert done.stdout.count("\n") == 1
 
 
