@@ -181,9 +181,10 @@ class ArmSearch:
         """
         self._robot, self._family, self._manipulability = robot, family, manipulability
         self._columns = np.array(robot.description.arm_actuators, dtype=np.int64)
-        self._low = doubles(robot.lower[self._columns])
-        self._range = doubles(robot.upper[self._columns] - self._low)
-        self.values = SearchValues.of(family, self._low, self._low + self._range)
+        lower, upper = robot.lower[self._columns], robot.upper[self._columns]
+        self._low, self._range = doubles(lower), doubles(upper - lower)
+        # Of the very limits, as exports have them: the sum of low and range may differ from high.
+        self.values = SearchValues.of(family, lower, upper)
         name = ca.Function.fix_name(f"{robot.name}_all_arms")
         self._arms = MeasureKernel(
             arms_graph(family, name, recipe(name, robot.description)), compiled
