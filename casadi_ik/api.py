@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.answers.recorder import Recorder
-from casadi_ik.answers.solution import BatchSolution, Ranking, Solution
+from casadi_ik.answers.solution import Alternative, BatchSolution, Ranking, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.errors import InputError
@@ -26,7 +26,7 @@ from casadi_ik.problem.clearance import Clearances, SceneCheck
 from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
 from casadi_ik.problem.questions import Questions, hand_postures, tolerances_by_finger
 from casadi_ik.registry import METHODS, build_method, with_finger_step
-from casadi_ik.solving.alternatives.finder import APART, Alternative
+from casadi_ik.solving.alternatives.finder import APART
 from casadi_ik.solving.choose import Judgement, choose
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.fast import FastSolver

@@ -64,7 +64,7 @@ def translation(target: dict[str, Array]) -> Array:
 def draw_run(
     path: Axes,
     norms: Axes,
-    run: ik.Trajectory,
+    run: ik.papers.Trajectory,
     label: str,
     color: str,
     style: str,

@@ -129,7 +129,7 @@ def _seconds(call: Callable[[], object]) -> float:
     return time.thread_time() - begin
 
 
-def _kept(name: str, points: Array, whys: tuple[ik.Diagnosis | None, ...]) -> Kept:
+def _kept(name: str, points: Array, whys: tuple[ik.answers.Diagnosis | None, ...]) -> Kept:
     nearest = [
         np.nan if why is None else max(near.position_error for near in why.nearest.values())
         for why in whys

@@ -138,7 +138,7 @@ def _leaping(solver: ik.Solver, number: int) -> dict[str, Any]:
         goal = start + 0.2 * (robot.random(rng, 1)[0] - start)
         target = robot.contacts(goal)
         q += [follower(*target) for _ in range(WAIT)]
-        met += follower.state.status is ik.FollowStatus.FOLLOWING
+        met += follower.state.status is ik.motion.FollowStatus.FOLLOWING
     return {"leaps_met": met / LEAPS, **_kept("leaping", follower, np.array(q))}
 
 
@@ -161,7 +161,7 @@ def _anew(solver: ik.Solver, path: Array) -> dict[str, Any]:
     }
 
 
-def _kept(what: str, follower: ik.Follower, q: Array) -> dict[str, float]:
+def _kept(what: str, follower: ik.motion.Follower, q: Array) -> dict[str, float]:
     """Largest velocity and acceleration as parts of their limits, and how far beyond a limit."""
     steps = np.diff(q, axis=0)
     changes = np.diff(steps, axis=0, prepend=np.zeros((1, q.shape[1])))
@@ -207,7 +207,7 @@ def again(solver: ik.Solver, number: int) -> dict[str, Any]:
 
 
 def _met(
-    robot: ik.ArmHand, follower: ik.Follower, points: Array, normals: Array
+    robot: ik.ArmHand, follower: ik.motion.Follower, points: Array, normals: Array
 ) -> tuple[Array, Array]:
     """(k,) whether each cycle is within tolerance, and (k, n) where the motors were."""
     q = np.array([follower(*target) for target in zip(points, normals, strict=True)])

@@ -20,7 +20,7 @@ class Reason(StrEnum):
     """Why a grasp is not solved: established by a proof, else what is likely.
 
     Example:
-        >>> far.diagnosis.reason is ik.Reason.REACH
+        >>> far.diagnosis.reason is ik.answers.Reason.REACH
         True
     """
 

@@ -442,3 +442,64 @@ class Ranking(Sequence[Choice]):
 
     def __str__(self) -> str:
         return "\n".join(self.lines)
+
+
+@dataclass(frozen=True)
+class ArmBranch:
+    """One way to bend an arm, and how far it may be varied.
+
+    Attributes:
+        shoulder: +1 or -1. Of an arm with a spherical shoulder, elbow and spherical wrist (S-R-S):
+            sign of joint 2 from where axes 1 and 3 are aligned.
+        elbow: +1 or -1; S-R-S: sign of joint 4 from the stretched arm.
+        wrist: +1 or -1; S-R-S: sign of joint 6 from where axes 5 and 7 are aligned.
+        swivel: (start, end) [rad] of an interval of the arm's freedom within limits, start <= end;
+            None for an arm without one. S-R-S: the angle of the elbow about the line from shoulder
+            to wrist, a whole turn if none is out. Other arms of seven joints: the position of the
+            joint that is swept, see `casadi_ik.arms.six_joints`.
+        root: Number of the arm among those of the same signs, at each position of a swept joint:
+            a wrist whose last axis passes by it may have several. 0 of other arms.
+
+    Example:
+        >>> branch = solver.solve_all(grasp, limit=1)[0].branch
+        >>> branch.elbow in (-1, 1), branch.swivel[0] <= branch.swivel[1]
+        (True, True)
+    """
+
+    shoulder: int
+    elbow: int
+    wrist: int
+    swivel: tuple[float, float] | None
+    root: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """One of several solutions of a grasp.
+
+    Attributes:
+        q: (n,) actuator positions [rad or m], within limits unless they are ignored.
+        contacts: Verdict by finger; all are met.
+        posture: Number of the hand posture, the same for all solutions that share it.
+        branch: How the arm is bent and how far it may be varied; None for an arm without a
+            closed form, and for a hand without an arm.
+        swivel: The swivel [rad] of q within `branch.swivel`, or None.
+        margin: Smallest distance of any actuator from its limits as a part of half its range: 1
+            in the middle of the range, 0 at a limit.
+        manipulability: Yoshikawa's measure of the arm [m^3]; 0 for a hand without an arm.
+        distance: Euclidean distance from q0, every actuator as a part of its range.
+
+    Example:
+        >>> first, second = solver.solve_all(grasp, limit=2)
+        >>> first.margin >= second.margin, first.q.shape
+        (True, (14,))
+    """
+
+    q: Array
+    contacts: Mapping[str, ContactVerdict]
+    posture: int
+    branch: ArmBranch | None
+    swivel: float | None
+    margin: float
+    manipulability: float
+    distance: float

@@ -1,1 +1,21 @@
-"""Robots that move: targets followed cycle by cycle, motions along paths, ways to a grasp."""
+"""Motion: targets followed cycle by cycle, known paths, teleoperation, the way to a grasp."""
+
+from casadi_ik.motion.follower import Follower, FollowState, FollowStatus
+from casadi_ik.motion.motion import Motion
+from casadi_ik.motion.reach import Approach, Reach, ReachStatus
+from casadi_ik.motion.retarget import Retargeter, load_retarget
+from casadi_ik.motion.track import Jump, Track
+
+__all__ = [
+    "Approach",
+    "FollowState",
+    "FollowStatus",
+    "Follower",
+    "Jump",
+    "Motion",
+    "Reach",
+    "ReachStatus",
+    "Retargeter",
+    "Track",
+    "load_retarget",
+]

@@ -23,7 +23,7 @@ class FollowStatus(Enum):
     """How a cycle went.
 
     Example:
-        >>> ik.FollowStatus.LATE.name
+        >>> ik.motion.FollowStatus.LATE.name
         'LATE'
     """
 

@@ -37,7 +37,7 @@ class Motion:
 
     Example:
         >>> times, q = np.array([0.0, 0.1]), np.stack([robot.home, robot.home])
-        >>> motion = ik.Motion(robot, times, q, 0 * q, 0 * q)
+        >>> motion = ik.motion.Motion(robot, times, q, 0 * q, 0 * q)
         >>> motion.write("still.csv")
     """
 

@@ -132,7 +132,7 @@ class ReachStatus(Enum):
     """How it went.
 
     Example:
-        >>> solver.reach(grasp).status is ik.ReachStatus.REACHED
+        >>> solver.reach(grasp).status is ik.motion.ReachStatus.REACHED
         True
     """
 

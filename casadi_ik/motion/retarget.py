@@ -86,7 +86,7 @@ def load_retarget(path: str | Path) -> Retarget:
     Example:
         >>> text = "fingers: {thumb: 4, finger_2: 8, finger_3: 12}"
         >>> _ = Path("hand.yaml").write_text(text)
-        >>> ik.load_retarget("hand.yaml").fingers["thumb"]
+        >>> ik.motion.load_retarget("hand.yaml").fingers["thumb"]
         4
     """
     found, _ = read(Path(path), Retarget)
@@ -156,8 +156,8 @@ class Retargeter:
             where the wrist is cannot be told; known from the first frame on.
 
     Example:
-        >>> config = ik.load_retarget("hand.yaml")
-        >>> retargeter = ik.Retargeter(config, robot, robot.home)
+        >>> config = ik.motion.load_retarget("hand.yaml")
+        >>> retargeter = ik.motion.Retargeter(config, robot, robot.home)
         >>> wanted = retargeter(keypoints)
         >>> wanted.points.shape, wanted.palm.shape
         ((3, 3), (4, 4))

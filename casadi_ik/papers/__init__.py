@@ -4,7 +4,7 @@
 Chandra et al. 2019 (`ScrewControl`), `ipopt` solves the whole arm-hand as one nonlinear program.
 """
 
-from casadi_ik.papers.screw_control import ScrewControl
+from casadi_ik.papers.screw_control import ScrewControl, Trajectory
 from casadi_ik.papers.screw_tasks import ScrewTask
 
-__all__ = ["ScrewControl", "ScrewTask"]
+__all__ = ["ScrewControl", "ScrewTask", "Trajectory"]

@@ -59,7 +59,7 @@ class Phase(IntEnum):
     """What an iteration is working on.
 
     Example:
-        >>> ik.Phase.HAND_FIT.label
+        >>> ik.answers.Phase.HAND_FIT.label
         'hand-fit'
     """
 

@@ -16,6 +16,7 @@ import numpy as np
 import viser
 
 from casadi_ik import palette
+from casadi_ik.answers.solution import Alternative
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.drawing.drawables import links_seen
@@ -26,7 +27,6 @@ from casadi_ik.importing.surfaces import Surface
 from casadi_ik.problem.problems import LIMITS
 from casadi_ik.problem.questions import CLEARANCE, PREFERENCES
 from casadi_ik.registry import METHODS
-from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.viewing.drawn import (
     OBJECT,
     Drags,

@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from casadi_ik.answers.solution import Solution
+from casadi_ik.answers.solution import Alternative, Solution
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
@@ -25,7 +25,6 @@ from casadi_ik.problem.questions import CLEARANCE, Questions, tolerances_by_fing
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.registry import METHODS
-from casadi_ik.solving.alternatives.finder import Alternative
 
 NOT_MET = "NOT MET"
 """Said of a configuration that has not all it is asked for."""

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from PIL import Image as Pillow
 
 from casadi_ik import palette
-from casadi_ik.answers.solution import Solution
+from casadi_ik.answers.solution import Alternative, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
@@ -40,7 +40,6 @@ from casadi_ik.grasps.pose import inverse
 from casadi_ik.importing.surfaces import Surface
 from casadi_ik.motion.motion import Motion
 from casadi_ik.problem.clearance import closest_points
-from casadi_ik.solving.alternatives.finder import Alternative
 from casadi_ik.views.charts import DARK, DPI, LIGHT, Ground, new_figure, save_picture
 from casadi_ik.views.stage import Image, Stage, View, close_view, over, points_of, whole_view
 

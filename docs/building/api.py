@@ -10,7 +10,13 @@ from sphinx.domains.python import PyObject
 
 import casadi_ik
 
-PAGES = {"logs": "logs.md", "papers": "../slider_hands.md"}
+PAGES = {
+    "answers": "#answers",
+    "errors": "errors.md",
+    "logs": "logs.md",
+    "motion": "#motion",
+    "papers": "../slider_hands.md",
+}
 """Where submodules are described."""
 
 

@@ -58,7 +58,7 @@ def test_the_stretches_are_all_that_is_allowed_and_no_more(name):
         margins = arm.branches._margins(palm, scan, *arm.bounds)
         for kind in KINDS:
             of_kind = [b.swivel for b in found if (b.shoulder, b.elbow, b.wrist) == kind]
-            arms = arm.branches.arms(palm, ik.ArmBranch(*kind, arm.range), scan)
+            arms = arm.branches.arms(palm, ik.answers.ArmBranch(*kind, arm.range), scan)
             row = np.abs(arm.branches._at(palm[:3, :3], palm[:3, 3], scan)[0] - arms[:, None])
             (row,) = np.flatnonzero(row.max(axis=(0, 2)) == 0)
             inside = np.any([arm.contains(b, scan) for b in of_kind] or [scan > 1e9], axis=0)

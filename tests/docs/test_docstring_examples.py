@@ -12,11 +12,11 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik import registry
+from casadi_ik.public import SUBMODULES
 
 WITHOUT = {
     "METHODS",  # a tuple of names
-    "logs",  # modules; their names have their own
-    "papers",
+    *SUBMODULES,  # their names have their own
     "logs.Compression",  # three words
     "logs.detect_events",  # takes what a recorder is given while a batch runs
 }
@@ -36,11 +36,13 @@ PLAIN = {
 
 
 def public_names() -> list[str]:
-    return [
-        *ik.__all__,
-        *(f"logs.{name}" for name in ik.logs.__all__),
-        *(f"papers.{name}" for name in ik.papers.__all__),
-    ]
+    inside = (
+        f"{module}.{name}"
+        for module in SUBMODULES
+        if module != "errors"
+        for name in getattr(ik, module).__all__
+    )
+    return [*ik.__all__, *inside]
 
 
 def found(name: str) -> Any:

@@ -41,7 +41,7 @@ def test_what_moves_smoothly_is_followed_within_tolerance(robot, solver, seed):
         states.append(follower.state)
     check_limits(robot, follower, np.array(q))
     statuses = [state.status for state in states]
-    assert set(statuses) == {ik.FollowStatus.FOLLOWING}
+    assert set(statuses) == {ik.motion.FollowStatus.FOLLOWING}
     position, angle = robot.errors(np.array(q[1:]), points, normals)
     assert position.max() <= 2e-3
     told = np.array([state.position_error for state in states])
@@ -85,7 +85,7 @@ def test_limits_are_kept_whatever_the_targets_do(robot, solver, seed, events):
             q.append(follower(points, normals))
             state = follower.state
             bad = event in ("NaN", "partly", "infinite", "endless", "zero")
-            assert (state.status is ik.FollowStatus.HOLDING) == bad
+            assert (state.status is ik.motion.FollowStatus.HOLDING) == bad
             assert bool(state.reason) == bad
     check_limits(robot, follower, np.array(q))
 
@@ -103,7 +103,7 @@ def test_a_target_that_leaps_is_met_at_rest(robot, solver, seed):
     q = np.array([start] + [follower(grasp) for _ in range(1500)])
     check_limits(robot, follower, q)
     state = follower.state
-    assert state.status is ik.FollowStatus.FOLLOWING
+    assert state.status is ik.motion.FollowStatus.FOLLOWING
     position, angle = robot.errors(q[-1], *grasp.arrays(robot.fingers))
     assert position.max() <= 5e-3
     assert angle.max() <= np.radians(3)
@@ -123,10 +123,10 @@ def test_a_stream_goes_on_after_bad_frames(robot, solver):
         q.append(follower(*target))
         statuses.append(follower.state.status)
     check_limits(robot, follower, np.array(q))
-    bad = [i for i, status in enumerate(statuses) if status is ik.FollowStatus.HOLDING]
+    bad = [i for i, status in enumerate(statuses) if status is ik.motion.FollowStatus.HOLDING]
     assert bad == [*range(300, 330), 400]
-    assert statuses[299] is ik.FollowStatus.FOLLOWING
-    assert set(statuses[500:]) == {ik.FollowStatus.FOLLOWING}
+    assert statuses[299] is ik.motion.FollowStatus.FOLLOWING
+    assert set(statuses[500:]) == {ik.motion.FollowStatus.FOLLOWING}
 
 
 def test_a_long_pause_brings_the_motors_to_rest(robot, solver):
@@ -155,9 +155,9 @@ def test_out_of_reach_and_back(robot, solver):
         states.append(follower.state)
     check_limits(robot, follower, np.array(q))
     statuses = [state.status for state in states]
-    assert ik.FollowStatus.MISSED in statuses[300:500]
+    assert ik.motion.FollowStatus.MISSED in statuses[300:500]
     assert states[400].goal_position_error.max() > 5e-3
-    assert set(statuses[-100:]) == {ik.FollowStatus.FOLLOWING}
+    assert set(statuses[-100:]) == {ik.motion.FollowStatus.FOLLOWING}
 
 
 def test_fingertips_alone_and_a_wrist(robot, solver):
@@ -170,7 +170,7 @@ def test_fingertips_alone_and_a_wrist(robot, solver):
         follower = solver.follow(robot.home, PERIOD)
         for _ in range(800):
             follower(points, palm=palm, palm_weight=(weight, weight))
-        assert follower.state.status is ik.FollowStatus.FOLLOWING
+        assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
         assert np.isnan(follower.state.angle_error).all()
         away[weight] = np.linalg.norm(robot.palm(follower.state.q)[:3, 3] - palm[:3, 3])
     assert away[0.1] < 0.5 * away[0.0]
@@ -188,7 +188,7 @@ def test_another_branch_when_asked(robot, solver):
     q = np.array([follower.state.q] + [follower(grasp) for _ in range(2500)])
     check_limits(robot, follower, q)
     np.testing.assert_allclose(q[-1], other, atol=0.1)
-    assert follower.state.status is ik.FollowStatus.FOLLOWING
+    assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
 
 
 def test_contacts_of_other_kinds(robot, solver):
@@ -203,7 +203,7 @@ def test_contacts_of_other_kinds(robot, solver):
     follower = solver.follow(robot.home, PERIOD)
     for _ in range(800):
         follower(ik.Grasp(contacts))
-    assert follower.state.status is ik.FollowStatus.FOLLOWING
+    assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
     points, normals = robot.contacts(end)
     follower(points, normals)
     assert not np.isnan(follower.state.angle_error).any()

@@ -44,9 +44,9 @@ def test_targets_in_a_table_are_not_followed_there(robot, solver):
         np.testing.assert_allclose(states[i].position_error, position, atol=1e-9)
         np.testing.assert_allclose(states[i].angle_error, angle, atol=1e-6)
     statuses = [state.status for state in states]
-    assert ik.FollowStatus.BLOCKED in statuses
-    assert not {ik.FollowStatus.FOLLOWING} & set(statuses[480:520])
-    assert statuses[-1] is ik.FollowStatus.FOLLOWING
+    assert ik.motion.FollowStatus.BLOCKED in statuses
+    assert not {ik.motion.FollowStatus.FOLLOWING} & set(statuses[480:520])
+    assert statuses[-1] is ik.motion.FollowStatus.FOLLOWING
     steps = np.diff(np.array(q), axis=0)
     assert (np.abs(steps) <= follower.velocity * PERIOD * (1 + 1e-9)).all()
     changes = np.diff(steps, axis=0)

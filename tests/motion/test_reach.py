@@ -32,7 +32,7 @@ def sent(motion):
 
 def check_motion(robot, grasp, found, q0):
     motion, rates = found.motion, rates_of(robot, None, None)
-    assert found.status is ik.ReachStatus.REACHED
+    assert found.status is ik.motion.ReachStatus.REACHED
     np.testing.assert_array_equal(motion.q[0], q0)
     np.testing.assert_allclose(motion.q[-1], found.q, atol=1e-9)
     position, angle = robot.errors(motion.q[-1], *grasp.arrays(robot.fingers))
@@ -155,13 +155,13 @@ def test_what_cannot_be_reached_is_said(robot, grasp):
     away = np.eye(4)
     away[0, 3] = 5.0
     found = ik.Solver(robot).reach(grasp.at(away))
-    assert (found.status, found.motion) == (ik.ReachStatus.NOT_SOLVED, None)
+    assert (found.status, found.motion) == (ik.motion.ReachStatus.NOT_SOLVED, None)
     assert not found.success
     points, _ = grasp.arrays(robot.fingers)
     place = (points.mean(axis=0) + np.array([0.0, 0.0, 0.25])).tolist()
     lid = {"lid": {"kind": "box", "size": [0.6, 0.6, 0.02], "xyz": place}}
     found = ik.Solver(robot, scene=ik.Scene(lid)).reach(grasp, distance=0.3)
-    assert found.status in (ik.ReachStatus.NO_APPROACH, ik.ReachStatus.NOT_SOLVED)
+    assert found.status in (ik.motion.ReachStatus.NO_APPROACH, ik.motion.ReachStatus.NOT_SOLVED)
     assert found.reason
     with pytest.raises(InputError, match="distance: found -1, expected a number of metres >= 0"):
         ik.Solver(robot).reach(grasp, distance=-1)
@@ -192,7 +192,7 @@ def test_the_last_part_alone(robot, grasp):
     middle = robot.palm(found.coming[len(found.coming) // 2])[:3, 3] - 0.1 * np.array([0, 0, 1])
     wall = {"wall": {"kind": "sphere", "radius": 0.09, "xyz": middle.tolist()}}
     blocked = ik.Solver(robot, scene=ik.Scene(wall)).approach(grasp, distance=0.3, limit=1)
-    assert blocked.status in (ik.ReachStatus.NO_APPROACH, ik.ReachStatus.NOT_SOLVED)
+    assert blocked.status in (ik.motion.ReachStatus.NO_APPROACH, ik.motion.ReachStatus.NOT_SOLVED)
     assert blocked.pregrasp is None
     assert blocked.reason
 
@@ -229,7 +229,7 @@ def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
     away[0, 3] = 0.1
     moved = replace(ranked[0], grasp=grasp.at(away))
     missed = solver.reach(moved)
-    assert missed.status is ik.ReachStatus.NOT_SOLVED
+    assert missed.status is ik.motion.ReachStatus.NOT_SOLVED
     assert "does not take its grasp" in missed.reason
     assert solver.approach(moved).reason == missed.reason
     with pytest.raises(InputError, match="grasp: found int, expected a Grasp"):
@@ -285,7 +285,7 @@ def test_the_object_goes_along(robot, grasp, on_table):
         ball = {"ball": {"kind": "sphere", "radius": 0.01, "xyz": place}}
         other = ik.Solver(robot, scene=ik.Scene(ball)).reach(ranked[0], lift=lift)
         assert other.success is free
-        assert free or other.status is ik.ReachStatus.NO_RETREAT
+        assert free or other.status is ik.motion.ReachStatus.NO_RETREAT
         assert free or other.reason == "lifting is not free: cup and ball touch"
     hand = ik.Solver(ik.load_robot("ar10"))
     with pytest.raises(UnsupportedError, match="no arm that moves its palm"):
@@ -304,7 +304,7 @@ def test_what_stands_on_something_may_be_lifted_from_it(robot, grasp, on_table):
 def test_from_posture_to_posture(robot, grasp, on_table):
     solver, ranked = on_table
     found = solver.move(robot.home, ranked[0].q)
-    assert (found.status, found.reason) == (ik.ReachStatus.REACHED, "straight")
+    assert (found.status, found.reason) == (ik.motion.ReachStatus.REACHED, "straight")
     np.testing.assert_array_equal(found.motion.q[[0, -1]], [robot.home, ranked[0].q])
     assert set(found.motion.notes["part"]) == {"going"}
     assert max(found.velocity_share, found.acceleration_share) <= 1
@@ -319,7 +319,7 @@ def test_from_posture_to_posture(robot, grasp, on_table):
     assert there.min() >= -1e-4
     assert found.clearance <= there.min() + 1e-4
     inside = around.move((start + robot.home) / 2, robot.home)
-    assert (inside.status, inside.motion) == (ik.ReachStatus.NO_WAY, None)
+    assert (inside.status, inside.motion) == (ik.motion.ReachStatus.NO_WAY, None)
     assert inside.reason == "the start is not free: bh_base and ball touch"
     with pytest.raises(InputError, match=r"q1: found lwr_joint_1 at 9, expected a number from"):
         solver.move(robot.home, [9.0, *robot.home[1:]])

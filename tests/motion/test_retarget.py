@@ -239,5 +239,5 @@ def test_arm_and_hand_follow_a_person(robot):
         np.testing.assert_allclose(wanted.points, expected, atol=1e-9)
         np.testing.assert_allclose(wanted.palm, palm, atol=1e-9)
         q = follower(wanted.points, palm=wanted.palm, palm_weight=(0.05, 0.05))
-        assert follower.state.status is ik.FollowStatus.FOLLOWING
+        assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
         np.testing.assert_allclose(robot.palm(q)[:3, 3], palm[:3, 3], atol=0.02)

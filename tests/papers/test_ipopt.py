@@ -359,7 +359,7 @@ def test_the_trace(robot, solver, targets):
         np.testing.assert_array_equal(
             np.unique(trace["restart"]), np.arange(outcome.restarts[row] + 1)
         )
-        assert np.all(trace["phase"] == ik.Phase.WHOLE_SYSTEM)
+        assert np.all(trace["phase"] == ik.answers.Phase.WHOLE_SYSTEM)
         assert np.all(trace["status"][:-1] == ik.Status.RUNNING)
         assert trace["status"][-1] == outcome.status[row] == ik.Status.SOLVED
         points, normals = robot.contacts(trace["q"])

@@ -26,7 +26,7 @@ class Stepper:
         )
         self.graph = self.step.graph()
 
-    def state(self, q, phase=ik.Phase.THUMB_REACHING):
+    def state(self, q, phase=ik.answers.Phase.THUMB_REACHING):
         return self.step.state.pack(
             {"q": q, "phase": float(phase), "best": 1e9, "waited": 0.0, "reached": 0.0}
         )
@@ -62,7 +62,7 @@ def test_reaching_starts_from_the_recorded_configuration(robot, stepper, rng):
     q = robot.home
     after, record, status = stepper(stepper.state(q), stepper.parameters(points, normals))
     assert status == ik.Status.RUNNING == record["status"]
-    assert record["phase"] == ik.Phase.THUMB_REACHING
+    assert record["phase"] == ik.answers.Phase.THUMB_REACHING
     np.testing.assert_array_equal(record["q"], q)
     reached_points, reached_normals = robot.contacts(q)
     np.testing.assert_allclose(
@@ -106,7 +106,7 @@ def test_reaching_ends_within_tolerance_without_another_step(robot, stepper):
     q[7] = 0.0  # without spread the contacts' own palm estimate is the palm
     after, record, status = stepper(stepper.state(q), stepper.parameters(*robot.contacts(q)))
     assert record["palm_error"] < 1e-9
-    assert after["phase"] == ik.Phase.HAND_ALIGNMENT
+    assert after["phase"] == ik.answers.Phase.HAND_ALIGNMENT
     assert status == ik.Status.RUNNING
     np.testing.assert_array_equal(after["q"], q)
 
@@ -123,11 +123,11 @@ def test_reaching_gives_up_after_a_while(robot, stepper, waited, reached):
     state[layout.slice("waited")] = waited - 1
     state[layout.slice("reached")] = reached - 1
     after, _, _ = stepper(state, parameters)
-    assert after["phase"] == ik.Phase.THUMB_REACHING
+    assert after["phase"] == ik.answers.Phase.THUMB_REACHING
     state[layout.slice("waited")] = waited
     state[layout.slice("reached")] = reached
     after, _, _ = stepper(state, parameters)
-    assert after["phase"] == ik.Phase.HAND_ALIGNMENT
+    assert after["phase"] == ik.answers.Phase.HAND_ALIGNMENT
     assert after["waited"] == 0
 
 
@@ -137,10 +137,10 @@ def test_alignment_closes_the_fingers_first(robot, stepper, rng):
     q = goal.copy()
     q[[7, 10, 11, 12, 13]] = robot.home[[7, 10, 11, 12, 13]]
     after, record, status = stepper(
-        stepper.state(q, ik.Phase.HAND_ALIGNMENT), stepper.parameters(*robot.contacts(goal))
+        stepper.state(q, ik.answers.Phase.HAND_ALIGNMENT), stepper.parameters(*robot.contacts(goal))
     )
     assert status == ik.Status.SOLVED == record["status"]
-    assert record["phase"] == ik.Phase.HAND_ALIGNMENT
+    assert record["phase"] == ik.answers.Phase.HAND_ALIGNMENT
     np.testing.assert_allclose(record["q"], goal, atol=1e-6)
     np.testing.assert_array_equal(after["q"], record["q"])
     assert record["position_error"].max() < 1e-8
@@ -152,7 +152,7 @@ def test_alignment_records_the_configuration_after_the_fingers(robot, stepper, r
     points, normals = robot.contacts(pinch(robot, rng))
     q = robot.home
     after, record, status = stepper(
-        stepper.state(q, ik.Phase.HAND_ALIGNMENT), stepper.parameters(points, normals)
+        stepper.state(q, ik.answers.Phase.HAND_ALIGNMENT), stepper.parameters(points, normals)
     )
     palm = robot.palm(q)
     local = palm[:3, :3].T @ (points[1:] - palm[:3, 3]).T
@@ -177,7 +177,7 @@ def test_alignment_keeps_the_thumb(robot, stepper, rng):
     q = goal.copy()
     q[:7] += rng.normal(scale=2e-3, size=7)
     before = np.linalg.norm(robot.contacts(q)[0][0] - points[0])
-    state = stepper.state(q, ik.Phase.HAND_ALIGNMENT)
+    state = stepper.state(q, ik.answers.Phase.HAND_ALIGNMENT)
     parameters = stepper.parameters(points, normals)
     parameters[stepper.step.parameters.slice("position_tolerance")] = 1e-9
     after, _, _ = stepper(state, parameters)
@@ -225,7 +225,7 @@ def test_graph_sizes_and_name(robot, stepper):
 def test_other_readings_step_as_well(robot, rng, options):
     other = Stepper(robot, **options)
     points, normals = robot.contacts(pinch(robot, rng))
-    for phase in (ik.Phase.THUMB_REACHING, ik.Phase.HAND_ALIGNMENT):
+    for phase in (ik.answers.Phase.THUMB_REACHING, ik.answers.Phase.HAND_ALIGNMENT):
         after, _, _ = other(other.state(robot.home, phase), other.parameters(points, normals))
         assert np.all(np.isfinite(after["q"]))
 
@@ -543,10 +543,14 @@ def test_phases_and_statuses_of_the_trace(robot, compiled):
     for row, trace in enumerate(outcome.trace):
         assert len(trace) == outcome.iterations[row]
         phases = trace["phase"].astype(int)
-        assert set(phases) <= {ik.Phase.THUMB_REACHING, ik.Phase.HAND_ALIGNMENT}
+        assert set(phases) <= {ik.answers.Phase.THUMB_REACHING, ik.answers.Phase.HAND_ALIGNMENT}
         assert np.all(np.diff(phases) >= 0), "thumb reaching comes first and is not returned to"
-        assert outcome.phases["thumb-reaching"][row] == np.sum(phases == ik.Phase.THUMB_REACHING)
-        assert outcome.phases["hand-alignment"][row] == np.sum(phases == ik.Phase.HAND_ALIGNMENT)
+        assert outcome.phases["thumb-reaching"][row] == np.sum(
+            phases == ik.answers.Phase.THUMB_REACHING
+        )
+        assert outcome.phases["hand-alignment"][row] == np.sum(
+            phases == ik.answers.Phase.HAND_ALIGNMENT
+        )
         assert np.all(trace["status"][:-1] == ik.Status.RUNNING)
         solved = outcome.status[row] == ik.Status.SOLVED
         assert trace["status"][-1] == (ik.Status.SOLVED if solved else ik.Status.RUNNING)
@@ -554,7 +558,7 @@ def test_phases_and_statuses_of_the_trace(robot, compiled):
         if solved:
             np.testing.assert_array_equal(trace["q"][-1], outcome.q[row])
             assert trace["position_error"][-1].max() <= 5e-3
-            before = trace[:-1][phases[:-1] == ik.Phase.HAND_ALIGNMENT]
+            before = trace[:-1][phases[:-1] == ik.answers.Phase.HAND_ALIGNMENT]
             off = before["position_error"].max(axis=1) > 5e-3
             off |= before["angle_error"].max(axis=1) > np.radians(3)
             assert off.all(), "it ends at the first configuration within tolerance"
@@ -622,7 +626,7 @@ def test_labels_make_the_trace_readable(robot, compiled):
     assert form.labels["q"] == robot.actuators
     assert form.labels["limit_mask"] == robot.actuators
     assert form.labels["position_error"] == robot.fingers
-    assert form.labels["phase"][ik.Phase.HAND_ALIGNMENT] == "hand-alignment"
+    assert form.labels["phase"][ik.answers.Phase.HAND_ALIGNMENT] == "hand-alignment"
     assert form.labels["status"][ik.Status.STALLED] == "STALLED"
 
 

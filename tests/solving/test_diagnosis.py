@@ -30,7 +30,7 @@ def cup(robot: ik.ArmHand) -> tuple[Array, Array]:
     return ik.load_grasp("cup").arrays(robot.fingers)
 
 
-def diagnosed(solver: ik.Solver, points: Array, normals: Array) -> ik.Diagnosis:
+def diagnosed(solver: ik.Solver, points: Array, normals: Array) -> ik.answers.Diagnosis:
     """The diagnosis of a target that is not solved; called unreachable only with a proof."""
     batch = solver.solve_batch(points[None], normals[None], diagnose=True)
     (diagnosis,) = batch.diagnoses
@@ -40,7 +40,7 @@ def diagnosed(solver: ik.Solver, points: Array, normals: Array) -> ik.Diagnosis:
     return diagnosis
 
 
-def proved(solver: ik.Solver, points: Array, normals: Array) -> ik.Diagnosis:
+def proved(solver: ik.Solver, points: Array, normals: Array) -> ik.answers.Diagnosis:
     """The diagnosis of a target that is to be called unreachable."""
     diagnosis = diagnosed(solver, points, normals)
     assert diagnosis.established
@@ -87,7 +87,7 @@ def test_contacts_too_far_apart(solver: ik.Solver, cup: tuple[Array, Array]) -> 
     points, normals = cup
     spread = points + 0.25 * np.array([[0, 1, 0], [1, -1, 0], [-1, -1, 0]])
     diagnosis = proved(solver, spread, normals)
-    assert diagnosis.reason is ik.Reason.HAND
+    assert diagnosis.reason is ik.answers.Reason.HAND
     assert diagnosis.hand is not None
     assert not diagnosis.hand.fits
     assert max(c.position_error for c in diagnosis.hand.contacts.values()) > 0.05
@@ -100,7 +100,7 @@ def test_too_far(
     solver: ik.Solver, cup: tuple[Array, Array], shift: Array, distance: float
 ) -> None:
     diagnosis = proved(solver, cup[0] + np.array(shift), cup[1])
-    assert diagnosis.reason is ik.Reason.REACH
+    assert diagnosis.reason is ik.answers.Reason.REACH
     assert diagnosis.reach is not None
     assert diagnosis.reach.farthest == pytest.approx(0.79)
     assert diagnosis.reach.excess == pytest.approx(distance - 0.79, abs=0.8)
@@ -114,7 +114,7 @@ def test_object_in_the_shoulder(
     """The elbow would have to bend farther than it can; lifting its limit proves it."""
     points = cup[0] - cup[0].mean(axis=0) + [0, 0, 0.31]
     diagnosis = proved(solver, points, cup[1])
-    assert diagnosis.reason is ik.Reason.REACH
+    assert diagnosis.reason is ik.answers.Reason.REACH
     assert diagnosis.reach is not None
     assert diagnosis.reach.nearest == pytest.approx(0.395, abs=1e-3)
     assert diagnosis.reach.excess < -0.1
@@ -129,7 +129,7 @@ def test_normal_that_faces_away(
     points, normals = cup
     normals = normals * np.array([[-1], [1], [1]])
     diagnosis = diagnosed(solver, points, normals)
-    assert diagnosis.reason is ik.Reason.HAND
+    assert diagnosis.reason is ik.answers.Reason.HAND
     assert {(item.part, item.finger) for item in diagnosis.freed} >= {
         ("normal", "thumb"),
         ("finger", "thumb"),
@@ -179,7 +179,7 @@ def test_one_limit_blocks(solver: ik.Solver, robot: ik.ArmHand) -> None:
             assert diagnosis is not None
             best = best_of_restarts(robot, points, normals, q)
             assert np.linalg.norm(residual(best, robot, points, normals)) > 1e-2
-            assert diagnosis.reason is not ik.Reason.REACHABLE
+            assert diagnosis.reason is not ik.answers.Reason.REACHABLE
             (relief,) = (item for item in diagnosis.reliefs if item.lifted == name)
             assert list(relief.beyond) == [name]
             assert 0 < abs(relief.beyond[name]) <= np.deg2rad(5.3)
@@ -243,7 +243,7 @@ def test_other_methods_ask_hand_first(robot: ik.ArmHand, cup: tuple[Array, Array
     assert not solution.success
     assert solution.status is not ik.Status.UNREACHABLE
     assert solution.diagnosis is not None
-    assert solution.diagnosis.reason is ik.Reason.REACHABLE
+    assert solution.diagnosis.reason is ik.answers.Reason.REACHABLE
     assert "hand-first solves it" in solution.diagnosis.lines[1]
     far = paper.solve_batch(cup[0][None] + 3.0, cup[1][None], diagnose=True)
     assert far.status_names.tolist() == ["UNREACHABLE"]

@@ -46,7 +46,7 @@ def test_free_finger(robot: ik.ArmHand, cup: tuple[Array, Array], finger: int) -
     (why,) = far.diagnoses
     assert far.status_names.tolist() == ["UNREACHABLE"]
     assert why is not None
-    assert why.reason is ik.Reason.REACH
+    assert why.reason is ik.answers.Reason.REACH
     assert np.isnan(why.nearest[robot.fingers[finger]].position_error)
     assert robot.fingers[finger] not in {item.finger for item in why.freed}
 
@@ -66,7 +66,7 @@ def test_fixed_actuators(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
     (why,) = closed.diagnoses
     assert set(closed.status_names) <= {"UNREACHABLE", "NOT_FOUND"}
     assert why is not None
-    assert why.reason is ik.Reason.HAND
+    assert why.reason is ik.answers.Reason.HAND
     assert why.q[robot.actuators.index("bh_spread")] == pytest.approx(2.5)
     for relief in why.reliefs:
         assert "bh_spread" not in relief.beyond
@@ -83,7 +83,7 @@ def test_arm_without_a_closed_form(bent: ik.ArmHand) -> None:
     wide = points + 0.25 * np.array([[0, 1, 0], [1, -1, 0], [-1, -1, 0]])
     (why,) = diagnosed(solver, wide[None], normals[None]).diagnoses
     assert why is not None
-    assert why.reason is ik.Reason.HAND
+    assert why.reason is ik.answers.Reason.HAND
     assert why.established
 
     # What such an arm can span is not known: too far is seen, but not called by its name.
@@ -92,7 +92,7 @@ def test_arm_without_a_closed_form(bent: ik.ArmHand) -> None:
     assert not far.success[0]
     assert why is not None
     assert why.reach is None
-    assert why.reason is not ik.Reason.HAND
+    assert why.reason is not ik.answers.Reason.HAND
     assert why.enough.position > 1.0
 
 
@@ -107,6 +107,6 @@ def test_a_bad_start_never_makes_it_unreachable(robot: ik.ArmHand) -> None:
     starts = np.tile(robot.home, (count, 1))
     diagnostician = ik.Solver(robot)._engine.diagnostician
     found = diagnostician.diagnose(asked, starts, robot.random(rng, count))
-    assert {diagnosis.reason for diagnosis in found} == {ik.Reason.REACHABLE}
+    assert {diagnosis.reason for diagnosis in found} == {ik.answers.Reason.REACHABLE}
     reached, _ = robot.contacts(np.stack([diagnosis.q for diagnosis in found]))
     assert np.linalg.norm(reached - points, axis=2).max() < 5.01e-3

@@ -408,7 +408,7 @@ def test_what_is_not_proved_is_not_unreachable(
     assert diagnosis is not None
     assert (diagnosis.proof, diagnosis.established) == (None, False)
     assert diagnosis.searches > 2
-    assert diagnosis.lines[0] == f"likely: {ik.Reason.REACH}"
+    assert diagnosis.lines[0] == f"likely: {ik.answers.Reason.REACH}"
     assert any(line.startswith("not proved; no solution from") for line in diagnosis.lines)
 
 

@@ -97,9 +97,9 @@ def test_a_missed_grasp_is_red(robot, grasp) -> None:
 def test_free_fingers_and_normals_are_left_out(robot, solution, grasp) -> None:
     point = grasp.contacts["thumb"].point
     part = ik.Grasp({"thumb": ik.Contact(point)}, name="a point", object="no such thing")
-    free = ik.ContactVerdict(np.nan, np.nan, True, ik.Tolerance())
+    free = ik.answers.ContactVerdict(np.nan, np.nan, True, ik.Tolerance())
     verdicts = dict.fromkeys(robot.fingers, free)
-    verdicts["thumb"] = ik.ContactVerdict(1e-3, np.nan, True, ik.Tolerance())
+    verdicts["thumb"] = ik.answers.ContactVerdict(1e-3, np.nan, True, ik.Tolerance())
     answer = dataclasses.replace(solution, contacts=verdicts)
     text = words(views.draw_solution(robot, answer, part, dpi=40))
     assert "1.00 mm" in text
@@ -112,7 +112,9 @@ def test_a_target_far_away_does_not_shrink_the_close_up(robot, solution, grasp) 
         name: ik.Contact(contact.point + np.array([5.0, 0, 0]), contact.normal)
         for name, contact in grasp.contacts.items()
     }
-    missed = {name: ik.ContactVerdict(5.0, 0.0, False, ik.Tolerance()) for name in robot.fingers}
+    missed = {
+        name: ik.answers.ContactVerdict(5.0, 0.0, False, ik.Tolerance()) for name in robot.fingers
+    }
     far = views.draw_solution(
         robot,
         dataclasses.replace(solution, contacts=missed),

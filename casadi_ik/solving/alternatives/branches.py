@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.solution import ArmBranch
 from casadi_ik.arms.family import SIGNS, ArmFamily, ClosedForm
 from casadi_ik.arms.search import PARAMETERS
 from casadi_ik.arrays import Array
@@ -40,35 +41,6 @@ class StretchParameters:
 
 
 STRETCHES = StretchParameters()
-
-
-@dataclass(frozen=True)
-class ArmBranch:
-    """One way to bend an arm, and how far it may be varied.
-
-    Attributes:
-        shoulder: +1 or -1. Of an arm with a spherical shoulder, elbow and spherical wrist (S-R-S):
-            sign of joint 2 from where axes 1 and 3 are aligned.
-        elbow: +1 or -1; S-R-S: sign of joint 4 from the stretched arm.
-        wrist: +1 or -1; S-R-S: sign of joint 6 from where axes 5 and 7 are aligned.
-        swivel: (start, end) [rad] of an interval of the arm's freedom within limits, start <= end;
-            None for an arm without one. S-R-S: the angle of the elbow about the line from shoulder
-            to wrist, a whole turn if none is out. Other arms of seven joints: the position of the
-            joint that is swept, see `casadi_ik.arms.six_joints`.
-        root: Number of the arm among those of the same signs, at each position of a swept joint:
-            a wrist whose last axis passes by it may have several. 0 of other arms.
-
-    Example:
-        >>> branch = solver.solve_all(grasp, limit=1)[0].branch
-        >>> branch.elbow in (-1, 1), branch.swivel[0] <= branch.swivel[1]
-        (True, True)
-    """
-
-    shoulder: int
-    elbow: int
-    wrist: int
-    swivel: tuple[float, float] | None
-    root: int = 0
 
 
 class ArmBranches:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.answers.solution import Alternative, ArmBranch
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
@@ -21,7 +21,7 @@ from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.questions import CLEARANCE, free_palms, preference
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
-from casadi_ik.solving.alternatives.branches import ArmBranch, ArmBranches
+from casadi_ik.solving.alternatives.branches import ArmBranches
 from casadi_ik.solving.trials import Bounds, Descent, HandMethod, Trials, repeated
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.singular_values import manipulability
@@ -44,38 +44,6 @@ BLOCKED = 1e6
 
 CLOSE = 1e-7
 """Tolerance [m, rad] that hand postures are brought to first, so that equals are seen as equal."""
-
-
-@dataclass(frozen=True, eq=False)
-class Alternative:
-    """One of several solutions of a grasp.
-
-    Attributes:
-        q: (n,) actuator positions [rad or m], within limits unless they are ignored.
-        contacts: Verdict by finger; all are met.
-        posture: Number of the hand posture, the same for all solutions that share it.
-        branch: How the arm is bent and how far it may be varied; None for an arm without a
-            closed form, and for a hand without an arm.
-        swivel: The swivel [rad] of q within `branch.swivel`, or None.
-        margin: Smallest distance of any actuator from its limits as a part of half its range: 1
-            in the middle of the range, 0 at a limit.
-        manipulability: Yoshikawa's measure of the arm [m^3]; 0 for a hand without an arm.
-        distance: Euclidean distance from q0, every actuator as a part of its range.
-
-    Example:
-        >>> first, second = solver.solve_all(grasp, limit=2)
-        >>> first.margin >= second.margin, first.q.shape
-        (True, (14,))
-    """
-
-    q: Array
-    contacts: Mapping[str, ContactVerdict]
-    posture: int
-    branch: ArmBranch | None
-    swivel: float | None
-    margin: float
-    manipulability: float
-    distance: float
 
 
 @dataclass(frozen=True, eq=False)
