@@ -51,6 +51,9 @@ class ArmSearchParameters:
         placement: Trials for an arm far from its limits. Of 20,000 random poses of a Panda 2,427
             need more than the first, 369 more than two, 6 more than all.
         choice: Trials for the arm nearest to a given one.
+        swivels: The same of a family with breakpoints, at which placement finds what these miss.
+            The distance is flat where it is smallest: the last values, 0.8 deg apart, are near
+            enough.
         parts: Of the bounds, each searched by itself for poses that were given up before: what is
             best of all may be short of the limits everywhere, and a stretch where an arm stands
             with several joints at theirs is short. Of 20,000 grasps of a Panda near its limits, at
@@ -71,6 +74,9 @@ class ArmSearchParameters:
     choice: tuple[Level, ...] = (
         *(Level(False, 0.0), Level(False, 1 / 3), Level(False, -1 / 3)),
         *(Level(True, 1 / 2), Level(True, 1 / 12), Level(True, 1 / 72)),
+    )
+    swivels: tuple[Level, ...] = (
+        *(Level(False, 0.0), Level(False, 1 / 2), Level(True, 1 / 2), Level(True, 1 / 12)),
     )
     parts: int = 4
     allowed: float = -1e-9
@@ -225,7 +231,9 @@ class ArmTrials:
 
     @property
     def _levels(self) -> tuple[Level, ...]:
-        return PARAMETERS.choice if self.is_nearest else PARAMETERS.placement
+        if not self.is_nearest:
+            return PARAMETERS.placement
+        return PARAMETERS.swivels if _break_count(self.family) else PARAMETERS.choice
 
     @property
     def _varied(self) -> int:
