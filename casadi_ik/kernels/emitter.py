@@ -603,6 +603,10 @@ class _MXBody:
                 f"for (int i = 0; i < {rows}; ++i) {name}[i+{rows}*j]+={left}*{right};",
             ]
             return made
+        if code == ca.OP_FIND and self._emitter.form.lanes == 1:
+            zeros = f"while (k < {first.size} && EQUAL({x},R(0.0))) ++k;"
+            self._lines.append(f"{{ int k = 0; {zeros} {sum_}=R(k); }}")
+            return made
         each = {
             ca.OP_DOT: f"{sum_}+{x}*{given[-1].at('k')}",
             ca.OP_NORM2: f"{sum_}+real_sq({x})",
