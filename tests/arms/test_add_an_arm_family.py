@@ -18,7 +18,7 @@ SCRIPT = """
 import sys
 import numpy as np
 import casadi_ik as ik
-from casadi_ik.arms.recognise import family_in_words
+from casadi_ik.arms.recognise import (family_in_words)
 
 robot = ik.load_robot(sys.argv[1])
 assert family_in_words(robot.description) == "nearly gimbal", family_in_words(robot.description)

@@ -8,24 +8,23 @@ from capsule_arm import SCENE, write_robot
 from coal_oracle import described, distance, in_scene
 
 import casadi_ik as ik
-from casadi_ik.arm_hand import ArmHand
 from casadi_ik.problem.clearance import SceneCheck, Surroundings
 
 MICROMETRE = 1e-6
 
 
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> ArmHand:
+def robot(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
     return ik.load_robot(write_robot(tmp_path_factory.mktemp("three")))
 
 
-def surroundings(robot: ArmHand, scene: ik.Scene, compiled: bool = True) -> Surroundings:
+def surroundings(robot: ik.ArmHand, scene: ik.Scene, compiled: bool = True) -> Surroundings:
     check = SceneCheck(robot, scene, compiled)
     points, normals = robot.contacts(robot.home)
     return check.around(ik.Solver(robot)._questions.of_arrays(points[None], normals[None], None))
 
 
-def by_coal(robot: ArmHand, q: np.ndarray, names: set[frozenset[str]]) -> np.ndarray:
+def by_coal(robot: ik.ArmHand, q: np.ndarray, names: set[frozenset[str]]) -> np.ndarray:
     """(k, pairs) the smallest signed distance of each pair of names."""
     shapes, scene = described(robot), in_scene()
     links = robot.links(q)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnsupportedError
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +71,9 @@ def test_no_scene_checks_nothing(robot):
     solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
     assert solution.clearance is None
     assert solution.closest is None
-    with pytest.raises(InputError, match="'clearance', which needs a solver with a scene"):
+    with pytest.raises(
+        ik.errors.InputError, match="'clearance', which needs a solver with a scene"
+    ):
         ik.Solver(robot).solve(ik.load_grasp("cup"), prefer="clearance")
 
 
@@ -111,9 +112,9 @@ def test_batches_are_what_single_solves_are(solver, robot):
         points[1:2], normals[1:2], object_pose=poses[1:2]
     )
     np.testing.assert_allclose(one.q[0], batch.q[1], atol=1e-9)
-    with pytest.raises(InputError, match="object_pose: found 2 for 3 targets"):
+    with pytest.raises(ik.errors.InputError, match="object_pose: found 2 for 3 targets"):
         ik.Solver(robot, scene=held).solve_batch(points, normals, object_pose=poses[:2])
-    with pytest.raises(InputError, match="expected a scene that says what is 'grasped'"):
+    with pytest.raises(ik.errors.InputError, match="expected a scene that says what is 'grasped'"):
         solver.solve_batch(points, normals, object_pose=poses)
 
 
@@ -121,7 +122,7 @@ def test_poses_for_other_rows_are_refused(solver):
     """The driver reads as many poses as there are configurations."""
     cup = ik.load_grasp("cup")
     around = solver._engine.around(solver._questions.of_grasps([cup, cup], None))
-    with pytest.raises(InputError, match="2 poses for 3 configurations"):
+    with pytest.raises(ik.errors.InputError, match="2 poses for 3 configurations"):
         around.check(np.tile(solver.robot.home, (3, 1)))
     assert around.check(np.tile(solver.robot.home, (2, 1))).free.shape == (2,)
 
@@ -135,7 +136,7 @@ def test_all_solutions_are_free(solver):
 
 
 def test_what_knows_no_scene_says_so(solver):
-    with pytest.raises(UnsupportedError, match="fast: checks no collisions"):
+    with pytest.raises(ik.errors.UnsupportedError, match="fast: checks no collisions"):
         solver.fast()
 
 

@@ -12,16 +12,13 @@ import yaml
 from capsule_arm import ARM, write_robot
 
 import casadi_ik as ik
-from casadi_ik.arm_hand import ArmHand
+from casadi_ik import robots
 from casadi_ik.collision.model import collision_model
-from casadi_ik.collision.scene import Scene
-from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.files.reading import Frame, convert, frame_matrix
 from casadi_ik.files.units import in_si
 from casadi_ik.importing import capsules, imported
 from casadi_ik.importing.write import collision_lines
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.robots import load_description
 from casadi_ik.robots.collision import Touching, capsules_of
 from casadi_ik.robots.schema import BoxEntry, CapsuleEntry, CollisionEntry, CylinderEntry
 
@@ -81,7 +78,7 @@ fingers:
 
 
 def test_shapes_come_with_the_parts(tmp_path):
-    shapes = load_description(write_robot(tmp_path)).shapes
+    shapes = robots.load_description(write_robot(tmp_path)).shapes
     assert [one.link for one in shapes.capsules if one.covers < 0] == [
         *("l1", "l3", "l3"),
         *("tip1", "tip2"),
@@ -147,8 +144,8 @@ def test_bad_shapes_are_named(tmp_path, place, value, message):
         at = at[key]
     at[place[-1]] = value
     (tmp_path / "three.yaml").write_text(yaml.safe_dump(arm))
-    with pytest.raises(DescriptionError, match=message) as caught:
-        load_description(path)
+    with pytest.raises(ik.errors.DescriptionError, match=message) as caught:
+        robots.load_description(path)
     assert "\n" not in str(caught.value)
     assert "three.yaml" in str(caught.value) or "none.srdf" in str(caught.value)
 
@@ -162,7 +159,7 @@ def test_an_srdf_says_what_may_touch(tmp_path):
         "<robot name='three'><disable_collisions link1='base' link2='l3' reason='Never'/>"
         "<disable_collisions link1='base' link2='elsewhere' reason='Never'/></robot>"
     )
-    excluded = collision_model(load_description(path)).excluded
+    excluded = collision_model(robots.load_description(path)).excluded
     assert ("base", "l3", "three.srdf: Never") in [(*one.links, one.reason) for one in excluded]
 
 
@@ -171,7 +168,9 @@ def test_a_robot_without_shapes_works_but_takes_no_scene(tmp_path):
     arm = {key: value for key, value in ARM.items() if key != "collision"}
     (tmp_path / "three.yaml").write_text(yaml.safe_dump(arm))
     robot = ik.load_robot(path)
-    with pytest.raises(UnsupportedError, match="its arm has no shapes, which a scene needs"):
+    with pytest.raises(
+        ik.errors.UnsupportedError, match="its arm has no shapes, which a scene needs"
+    ):
         ik.Solver(robot, scene=ik.Scene())
 
 
@@ -228,7 +227,7 @@ def test_a_description_reads_simple_shapes_of_its_file(tmp_path: Path) -> None:
     write_hand(tmp_path)
     path = tmp_path / "mine.yaml"
     path.write_text(DESCRIPTION)
-    shapes = load_description(path).shapes
+    shapes = robots.load_description(path).shapes
     assert [(one.link, one.kind, one.size.tolist()) for one in shapes.solids] == [
         ("palm", "box", [0.1, 0.06, 0.02]),
         ("left_1", "cylinder", [0.01, 0.05, 0.0]),
@@ -240,7 +239,7 @@ def test_a_description_reads_simple_shapes_of_its_file(tmp_path: Path) -> None:
     # What the description says of a link goes before its file.
     own = "collision: {links: {palm: [{kind: sphere, radius: 5 cm}]}}\n"
     path.write_text(DESCRIPTION + own)
-    palm = [one for one in load_description(path).shapes.capsules if one.link == "palm"]
+    palm = [one for one in robots.load_description(path).shapes.capsules if one.link == "palm"]
     assert [one.radius for one in palm] == [0.05]
 
 
@@ -249,8 +248,10 @@ def test_meshes_that_nobody_fitted_are_no_shapes(tmp_path: Path, rng) -> None:
     write_hand(tmp_path, '<mesh filename="slab.stl"/>')
     path = tmp_path / "mine.yaml"
     path.write_text(DESCRIPTION)
-    with pytest.raises(UnsupportedError, match="its hand has no shapes, which a scene needs"):
-        collision_model(load_description(path))
+    with pytest.raises(
+        ik.errors.UnsupportedError, match="its hand has no shapes, which a scene needs"
+    ):
+        collision_model(robots.load_description(path))
 
 
 def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
@@ -272,7 +273,7 @@ def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
     assert {one["kind"] for one in fitted} <= {"capsule", "sphere"}
     excess = float(fitted[0]["excess"].removesuffix(" mm"))
     assert 0 < excess < 20
-    description = load_description(out)
+    description = robots.load_description(out)
     # In the link's frame the mesh is turned as the file has it.
     pose = frame_matrix(Frame((0, 0, 0.02), (0.3, 0.2, 0.1)))
     mesh = points @ pose[:3, :3].T + pose[:3, 3]
@@ -286,7 +287,7 @@ def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
     assert sum(one.link == "right_2" for one in description.shapes.capsules) == len(fitted)
     excluded = {frozenset(one.links): one.reason for one in collision_model(description).excluded}
     assert excluded[frozenset(("left_2", "right_2"))] == "hand.srdf: Never"
-    assert SceneCheck(ArmHand(description), Scene(), compiled=False).model.pairs.size
+    assert SceneCheck(ik.ArmHand(description), ik.Scene(), compiled=False).model.pairs.size
 
 
 def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:

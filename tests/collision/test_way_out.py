@@ -9,7 +9,6 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.collision.distances import gaps
-from casadi_ik.errors import DescriptionError
 
 
 @pytest.fixture(scope="module")
@@ -82,5 +81,5 @@ def test_margins_of_single_pairs(robot) -> None:
 )
 def test_bad_margins_are_named(robot, margin, message) -> None:
     box = {"kind": "box", "size": [1, 1, 1], "xyz": [3, 0, 0]}
-    with pytest.raises(DescriptionError, match=message):
+    with pytest.raises(ik.errors.DescriptionError, match=message):
         ik.Solver(robot, scene=ik.Scene({"a": box}, margins=[margin]), compiled=False)

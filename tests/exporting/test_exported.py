@@ -12,7 +12,6 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.cli.main import main
-from casadi_ik.errors import InputError
 from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
 from casadi_ik.exporting.solver import plain
 from casadi_ik.exporting.targets import SceneTargets, stored
@@ -146,7 +145,7 @@ def test_malformed_targets_end_as_in_python(plain_project):
         status, *words = found[row]
         asked = points[row], normals[row], q0[row] if near[row] else None
         if status == "-2":
-            with pytest.raises(InputError):
+            with pytest.raises(ik.errors.InputError):
                 fast(*asked)
             refused += 1
             continue

@@ -13,11 +13,7 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.cli.main import main
 from casadi_ik.exporting.project import c_project, write_folder
-from casadi_ik.exporting.single import (
-    ROUNDING,
-    SinglePrecision,
-    in_single_precision,
-)
+from casadi_ik.exporting.single import ROUNDING, SinglePrecision, in_single_precision
 from casadi_ik.kernels.codegen import driver_text
 
 STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wdouble-promotion", "-Werror")

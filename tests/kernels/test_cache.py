@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import KernelError
 from casadi_ik.kernels import (
     FunctionKernel,
     LoopKernel,
@@ -204,7 +203,7 @@ def test_cache_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
 @needs_compiler
 def test_compile_error_is_named(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CASADI_IK_CFLAGS", "-include does_not_exist.h")
-    with pytest.raises(KernelError, match=r"(?s)exit code 1.*does_not_exist\.h"):
+    with pytest.raises(ik.errors.KernelError, match=r"(?s)exit code 1.*does_not_exist\.h"):
         FunctionKernel(function())
     assert list(directory.iterdir()) == []
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import casadi as ca
 import pytest
 
-from casadi_ik.errors import KernelError
+import casadi_ik as ik
 from casadi_ik.kernels import (
     CacheWarning,
     FunctionKernel,
@@ -298,7 +298,7 @@ def test_a_compiler_that_lies(
     directory: Path, monkeypatch: pytest.MonkeyPatch, what: str, said: str
 ) -> None:
     lie(directory, monkeypatch, what)
-    with pytest.raises(KernelError, match=said) as caught:
+    with pytest.raises(ik.errors.KernelError, match=said) as caught:
         kernel()
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 1000
@@ -314,7 +314,7 @@ def test_a_cc_that_is_no_command(directory: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_flags_that_are_no_words(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CASADI_IK_CFLAGS", '"x')
-    with pytest.raises(KernelError, match="CASADI_IK_CFLAGS='\"x': No closing quotation"):
+    with pytest.raises(ik.errors.KernelError, match="CASADI_IK_CFLAGS='\"x': No closing quotation"):
         kernel()
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import KernelError
 from casadi_ik.kernels import FunctionGraph, FunctionKernel
 from casadi_ik.kernels.function_kernel import MeasureKernel
 
@@ -130,7 +129,7 @@ def test_what_has_no_c_code_is_named() -> None:
     x = ca.MX.sym("x", 3)
     solver = ca.rootfinder("root", "newton", {"x": x, "g": x**2 - 2})
     function = ca.Function("hidden_solver", [x], [solver(x, [])])
-    with pytest.raises(KernelError, match=r"hidden_solver|root"):
+    with pytest.raises(ik.errors.KernelError, match=r"hidden_solver|root"):
         FunctionKernel(function)
 
 

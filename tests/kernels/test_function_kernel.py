@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.errors import InputError, KernelError
+import casadi_ik as ik
 from casadi_ik.kernels import FunctionKernel
 
 from .graphs import needs_compiler, random_expression
@@ -117,18 +117,20 @@ def test_failure_of_the_function_is_an_error() -> None:
     function = ca.Function("positive", [x], [ca.sqrt(x.attachAssert(x > 0, "negative"))])
     kernel = FunctionKernel(function, compiled=False)
     assert kernel(4.0)[0] == 2
-    with pytest.raises(KernelError, match="positive"):
+    with pytest.raises(ik.errors.KernelError, match="positive"):
         kernel([4.0, -1.0])
-    with pytest.raises(KernelError, match=r"positive.* assertion"):
+    with pytest.raises(ik.errors.KernelError, match=r"positive.* assertion"):
         FunctionKernel(function)
 
 
 def test_wrong_inputs_are_named() -> None:
     kernel = FunctionKernel(matrices(ca.SX), compiled=False)
     v, m = np.zeros(3), np.zeros((2, 3))
-    with pytest.raises(InputError, match=r"2 inputs, expected 3 \(a, v, m\)"):
+    with pytest.raises(ik.errors.InputError, match=r"2 inputs, expected 3 \(a, v, m\)"):
         kernel(1, v)
-    with pytest.raises(InputError, match=r"input 'm' has shape \(3, 2\), expected \(2, 3\) or"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"input 'm' has shape \(3, 2\), expected \(2, 3\) or"
+    ):
         kernel(1, v, m.T)
-    with pytest.raises(InputError, match="input 'v' is a batch of 4, another of 2"):
+    with pytest.raises(ik.errors.InputError, match="input 'v' is a batch of 4, another of 2"):
         kernel([1, 2], np.zeros((4, 3)), m)

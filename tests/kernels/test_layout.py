@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casadi_ik.errors import InputError
+import casadi_ik as ik
 from casadi_ik.kernels import Field, Layout, StepGraph
 from casadi_ik.kernels.layout import STORAGE
 
@@ -85,16 +85,16 @@ def test_record_is_packed_widest_first(layout: Layout) -> None:
 
 
 def test_bad_layouts_and_values_are_named() -> None:
-    with pytest.raises(InputError, match="'a' appears twice"):
+    with pytest.raises(ik.errors.InputError, match="'a' appears twice"):
         Layout((Field("a"), Field("a")))
-    with pytest.raises(InputError, match="'f2'"):
+    with pytest.raises(ik.errors.InputError, match="'f2'"):
         Layout((Field("a", (), "f2"),))
     layout = Layout((Field("a"), Field("b", (2,))))
-    with pytest.raises(InputError, match=r"missing \['b'\], unknown \['c'\]"):
+    with pytest.raises(ik.errors.InputError, match=r"missing \['b'\], unknown \['c'\]"):
         layout.pack({"a": 1, "c": 2})
-    with pytest.raises(InputError, match="'b' has 3 numbers, expected 2"):
+    with pytest.raises(ik.errors.InputError, match="'b' has 3 numbers, expected 2"):
         layout.pack({"a": 1, "b": [1, 2, 3]})
-    with pytest.raises(InputError, match="no field 'z'; known: a, b"):
+    with pytest.raises(ik.errors.InputError, match="no field 'z'; known: a, b"):
         layout.slice("z")
 
 
@@ -103,5 +103,5 @@ def test_step_whose_sizes_disagree_is_refused() -> None:
     function = ca.Function("f", [x, ca.SX.sym("p")], [x, x, 0])
     two, one = Layout((Field("x", (2,)),)), Layout((Field("p"),))
     StepGraph("fine", function, two, one, two)
-    with pytest.raises(InputError, match="step graph 'wrong'"):
+    with pytest.raises(ik.errors.InputError, match="step graph 'wrong'"):
         StepGraph("wrong", function, two, one, one)

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.errors import InputError
+import casadi_ik as ik
 from casadi_ik.kernels import LookupKernel
 from casadi_ik.kernels.lookup import LARGEST, STEPS
 
@@ -52,5 +52,5 @@ def test_nothing_known_takes_the_first(compiled, rng):
 def test_no_samples_and_wrong_inputs(compiled, rng):
     lookup = LookupKernel(identity(3), [rng.normal(size=(30, 3))], compiled)
     assert lookup(4, np.zeros((0, 3))).shape == (0, 4)
-    with pytest.raises(InputError, match="expected"):
+    with pytest.raises(ik.errors.InputError, match="expected"):
         lookup(4, np.zeros((2, 2)))

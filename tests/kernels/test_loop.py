@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casadi_ik.errors import InputError, KernelError
+import casadi_ik as ik
 from casadi_ik.kernels import (
     FAILED,
     NON_FINITE,
@@ -243,18 +243,18 @@ def test_step_that_wrongly_claims_c_code_is_named() -> None:
     callback = Callback()
     x, p = ca.MX.sym("x"), ca.MX.sym("p")
     step = step_of("claims", ca.Function("claims", [x, p], [callback(x), x, 0]), COUNT)
-    with pytest.raises(KernelError, match="claims"):
+    with pytest.raises(ik.errors.KernelError, match="claims"):
         LoopKernel(step)
 
 
 def test_wrong_shapes_are_named() -> None:
     kernel = LoopKernel(random_step(), compiled=False)
     states, parameters = starts(3)
-    with pytest.raises(InputError, match=r"states have shape \(4,\), expected \(k, 4\)"):
+    with pytest.raises(ik.errors.InputError, match=r"states have shape \(4,\), expected \(k, 4\)"):
         kernel.run(states[0], parameters[0], 5)
-    with pytest.raises(InputError, match=r"expected \(2,\) or \(3, 2\)"):
+    with pytest.raises(ik.errors.InputError, match=r"expected \(2,\) or \(3, 2\)"):
         kernel.run(states, parameters[:2], 5)
-    with pytest.raises(InputError, match="max_iterations is -1"):
+    with pytest.raises(ik.errors.InputError, match="max_iterations is -1"):
         kernel.run(states, parameters, -1)
 
 

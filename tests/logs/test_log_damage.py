@@ -32,12 +32,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from casadi_ik import errors, logs
 from casadi_ik.logs.chunks import RECORD, RECORD_LIMIT, unpack
-from casadi_ik.logs.container import (
-    MAGIC,
-    read_chunk,
-    read_contents,
-    records,
-)
+from casadi_ik.logs.container import MAGIC, read_chunk, read_contents, records
 from casadi_ik.logs.provenance import METADATA_NAME, signed
 from casadi_ik.logs.writer import CHUNK_SIZE
 

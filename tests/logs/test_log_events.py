@@ -20,7 +20,6 @@ from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.events import event_format
 from casadi_ik.methods.common import coupling_record
 from casadi_ik.problem.jacobian_measures import THRESHOLDS, JacobianMeasures
-from casadi_ik.problem.status import Phase
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 
 STORAGE = {"phase": "u1", "restart": "u4", "limit_mask": "u4", "active_mask": "u4"}
@@ -533,7 +532,7 @@ def test_each_row_with_a_configuration_has_the_values_it_should(robot, log):
         hands = [spread(robot, q, name, columns) for name, columns in fingers.items()]
         assert row["sigma_hand"] == pytest.approx(min(s[-1] for s in hands), rel=1e-3, abs=1e-5)
         assert row["condition_hand"] == pytest.approx(max(s[0] / s[-1] for s in hands), rel=1e-2)
-        if unplaced and row["phase"] in (Phase.CANDIDATE, Phase.HAND_FIT):
+        if unplaced and row["phase"] in (ik.answers.Phase.CANDIDATE, ik.answers.Phase.HAND_FIT):
             assert np.isnan(row["sigma_arm"])
             assert np.isnan(row["condition_arm"])
             continue

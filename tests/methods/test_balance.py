@@ -10,7 +10,6 @@ from casadi_ik.methods.common.contact_fit import BALANCE
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.problems import Problems, target_arrays
-from casadi_ik.problem.status import Phase, Status
 
 TOLERANCE = ik.Tolerance()
 THREE = ("index", "thumb", "middle")
@@ -100,7 +99,7 @@ def test_the_largest_part_falls_until_all_are_met(robot):
     outcome = method.run(asked, np.tile(robot.home, (len(asked), 1)), 0, True)
     seen = 0
     for trace in outcome.trace:
-        stage = trace[trace["phase"] == Phase.BALANCE]
+        stage = trace[trace["phase"] == ik.answers.Phase.BALANCE]
         if not len(stage):
             continue
         seen += 1
@@ -110,7 +109,7 @@ def test_the_largest_part_falls_until_all_are_met(robot):
         ).max(axis=1)
         assert 1 < parts[0] < BALANCE.near
         assert parts.min() > 1
-        assert trace["status"][-1] == Status.SOLVED
+        assert trace["status"][-1] == ik.Status.SOLVED
     assert seen > 5
 
 

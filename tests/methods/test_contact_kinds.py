@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError, InputError, RowError
+from casadi_ik import logs
 from casadi_ik.grasps.grasp import MORE, fault, faulty
-from casadi_ik.logs import one_solve
 from casadi_ik.problem.contacts import CONDITIONS, NAMES, ContactKind, by_kinds, more_arrays, usual
 from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
@@ -155,9 +154,11 @@ def test_a_fingertip_turned_about_its_normal_misses_its_pose(robot):
 def test_the_papers_methods_say_what_they_need(robot, method):
     points, normals, tangents = (frames(robot)[None, :, :3, i] for i in (3, 0, 1))
     solver = ik.Solver(robot, method, finger_step="closed-form", compiled=False)
-    with pytest.raises(RowError, match=r"needs point and normal of every finger.*row 0.*'thumb'"):
+    with pytest.raises(
+        ik.errors.RowError, match=r"needs point and normal of every finger.*row 0.*'thumb'"
+    ):
         solver.solve_batch(points, normals, tangents=tangents)
-    with pytest.raises(RowError, match="needs a contact for every finger"):
+    with pytest.raises(ik.errors.RowError, match="needs a contact for every finger"):
         solver.solve(ik.Grasp({"thumb": ik.Contact(direction=UP)}))
 
 
@@ -206,7 +207,7 @@ def test_a_batch_may_hold_directions_alone(robot, solvers):
     grasp = ik.Grasp({robot.fingers[0]: ik.Contact(direction=directions[1, 0]), **contacts})
     one = solver.solve(grasp)
     np.testing.assert_allclose(one.q, batch.q[1], atol=1e-12)
-    with pytest.raises(RowError, match="directions: row 1, finger 0 has a point too"):
+    with pytest.raises(ik.errors.RowError, match="directions: row 1, finger 0 has a point too"):
         solver.solve_batch(at[..., :3, 3], at[..., :3, 0], directions=directions)
 
 
@@ -219,7 +220,7 @@ def test_rows_of_a_log_belong_to_their_solves(robot, solvers, tmp_path: Path):
     batch = solvers["hand-first"].solve_batch(points, normals, tangents=tangents, log=path)
     log = ik.logs.open(path)
     for i in range(4):
-        solve = one_solve(log, i)
+        solve = logs.one_solve(log, i)
         assert len(solve.rows) == batch.iterations[i]
         np.testing.assert_array_equal(solve.target_points, points[i])
         assert ("tangents" in solve.target_more) == (i % 2 == 1)
@@ -238,7 +239,7 @@ def test_what_was_asked_stands_in_the_log(robot, solvers, tmp_path: Path):
     )
     path = tmp_path / "asked.mcap"
     first = solvers["ipopt"].solve(grasp, log=path)
-    solve = one_solve(ik.logs.open(path))
+    solve = logs.one_solve(ik.logs.open(path))
     asked = {"points": solve.target_points, "normals": solve.target_normals, **solve.target_more}
     for name, one in grasp.contacts.items():
         row = robot.fingers.index(name)
@@ -325,7 +326,7 @@ def test_grasp_files(tmp_path: Path, thumb, expected):
 def test_bad_grasp_files(tmp_path: Path, thumb, message):
     path = tmp_path / "grasp.yaml"
     path.write_text(FILE.format(thumb=thumb))
-    with pytest.raises(DescriptionError, match=message) as caught:
+    with pytest.raises(ik.errors.DescriptionError, match=message) as caught:
         ik.load_grasp(path)
     assert str(path) in str(caught.value)
 
@@ -340,10 +341,12 @@ def test_bad_arrays(robot):
         (np.where(tangents > 0, np.nan, tangents), normals, "expected finite numbers"),
         (0 * tangents, normals, "row 4, finger 0: tangent: .* not zero"),
     ):
-        with pytest.raises(RowError, match=message) as caught:
+        with pytest.raises(ik.errors.RowError, match=message) as caught:
             more_arrays({"tangents": bad}, points, facing, first_row=4)
         assert caught.value.row == 4
-    with pytest.raises(InputError, match=r"tangents: found shape \(1, 3\), expected \(1, 3, 3\)"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"tangents: found shape \(1, 3\), expected \(1, 3, 3\)"
+    ):
         more_arrays({"tangents": tangents[..., 0]}, points, normals)
 
 

@@ -11,7 +11,6 @@ import pytest
 from pinocchio_oracle import PinocchioRobot, verdict
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnknownNameError, UnsupportedError
 from casadi_ik.registry import build_method, method_summary
 
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
@@ -74,7 +73,7 @@ def case(request) -> Case:
     case = Case(robot, method, q, *robot.contacts(q), {})
     try:
         case.solver()
-    except UnsupportedError as error:
+    except ik.errors.UnsupportedError as error:
         if name not in str(error):
             raise
         pytest.skip(str(error))
@@ -278,7 +277,7 @@ def test_a_log_changes_no_number(case, tmp_path):
 
 def test_bad_input_leaves_no_log(case, tmp_path):
     path = tmp_path / "solve.mcap"
-    with pytest.raises(InputError):
+    with pytest.raises(ik.errors.InputError):
         case.solver().solve_batch(case.points, case.normals, q0=[1.0], log=path)
     assert list(tmp_path.iterdir()) == []
 
@@ -299,7 +298,7 @@ def test_bad_input_leaves_no_log(case, tmp_path):
 )
 def test_bad_arguments(case, change, says):
     arguments = {"points": case.points, "normals": case.normals} | change
-    with pytest.raises(InputError, match=says) as caught:
+    with pytest.raises(ik.errors.InputError, match=says) as caught:
         case.solver().solve_batch(**arguments)
     assert "\n" not in str(caught.value)
 
@@ -307,18 +306,20 @@ def test_bad_arguments(case, change, says):
 def test_starts_as_many_as_targets(case):
     q0 = np.tile(case.robot.home, (3, 1))
     with pytest.raises(
-        InputError, match="q0: found 3 rows for 8 targets, expected as many, or one"
+        ik.errors.InputError, match="q0: found 3 rows for 8 targets, expected as many, or one"
     ):
         case.solver().solve_batch(case.points, case.normals, q0=q0)
     q0[1, 2] = np.nan
-    with pytest.raises(InputError, match="q0: holds NaN or infinity"):
+    with pytest.raises(ik.errors.InputError, match="q0: holds NaN or infinity"):
         case.solver().solve_batch(case.points[:3], case.normals[:3], q0=q0)
 
 
 def test_a_grasp_of_another_hand(case):
-    with pytest.raises(InputError, match=r"contacts\.pinky: no such finger; the robot's fingers: "):
+    with pytest.raises(
+        ik.errors.InputError, match=r"contacts\.pinky: no such finger; the robot's fingers: "
+    ):
         case.solver().solve(ik.Grasp({"pinky": ik.Contact([0, 0, 1])}))
-    with pytest.raises(InputError, match="grasp: found str, expected a Grasp"):
+    with pytest.raises(ik.errors.InputError, match="grasp: found str, expected a Grasp"):
         case.solver().solve("cup")
 
 
@@ -336,27 +337,35 @@ def test_parameters_say_everything(case):
 @pytest.mark.parametrize(
     ("arguments", "error", "says"),
     [
-        ({"method": "newton"}, UnknownNameError, "method 'newton' does not exist; methods: "),
-        ({"limits": "maybe"}, InputError, "limits: found 'maybe', expected one of enforce, ignore"),
-        ({"tolerance": 5e-3}, InputError, "tolerance: found 0.005, expected a Tolerance"),
+        (
+            {"method": "newton"},
+            ik.errors.UnknownNameError,
+            "method 'newton' does not exist; methods: ",
+        ),
+        (
+            {"limits": "maybe"},
+            ik.errors.InputError,
+            "limits: found 'maybe', expected one of enforce, ignore",
+        ),
+        ({"tolerance": 5e-3}, ik.errors.InputError, "tolerance: found 0.005, expected a Tolerance"),
         (
             {"method": "enhanced-dls", "options": {"speed": 3}},
-            UnknownNameError,
+            ik.errors.UnknownNameError,
             "option 'speed' does not exist for method 'enhanced-dls'; options: reaching_damping",
         ),
         (
             {"method": "enhanced-dls", "finger_step": "fmincon"},
-            InputError,
+            ik.errors.InputError,
             "finger_step: found 'fmincon', expected one of ipopt, closed-form",
         ),
         (
             {"method": "enhanced-dls", "options": {"chain_damping": "big"}},
-            InputError,
+            ik.errors.InputError,
             "chain_damping: found 'big', expected a number > 0",
         ),
         (
             {"method": "enhanced-dls", "options": {"borrowed": 7}},
-            UnsupportedError,
+            ik.errors.UnsupportedError,
             "cannot borrow 7 arm joints",
         ),
     ],
@@ -369,7 +378,9 @@ def test_bad_solvers(robot, arguments, error, says):
 
 
 def test_a_name_is_no_robot():
-    with pytest.raises(InputError, match="robot: found 'kuka_lwr_barrett', expected what load_rob"):
+    with pytest.raises(
+        ik.errors.InputError, match="robot: found 'kuka_lwr_barrett', expected what load_rob"
+    ):
         ik.Solver("kuka_lwr_barrett")
 
 

@@ -11,11 +11,9 @@ from robot_variants import derived_robot
 from samplers import HARD, near_limits
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.problem.problems import Problems, fixed_array, target_arrays
-from casadi_ik.problem.status import Phase, Status
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 
@@ -91,22 +89,27 @@ def test_traces(robot, method, rng):
     """Stages come in their order, costs never rise, and a rejected step changes nothing."""
     asked = problems(robot, near_limits(robot, rng, 60))
     outcome = method.run(asked, np.tile(robot.home, (60, 1)), 0, True)
-    order = {Phase.CANDIDATE: 0, Phase.HAND_FIT: 1, Phase.ARM_PLACEMENT: 2, Phase.REFINEMENT: 3}
+    order = {
+        ik.answers.Phase.CANDIDATE: 0,
+        ik.answers.Phase.HAND_FIT: 1,
+        ik.answers.Phase.ARM_PLACEMENT: 2,
+        ik.answers.Phase.REFINEMENT: 3,
+    }
     rejected = 0
     for row, trace in enumerate(outcome.trace):
         assert len(trace) == outcome.iterations[row]
-        assert trace["phase"][0] == Phase.CANDIDATE
+        assert trace["phase"][0] == ik.answers.Phase.CANDIDATE
         assert trace["restart"][0] == 0
-        assert trace["status"][-1] == outcome.status[row] == Status.SOLVED
+        assert trace["status"][-1] == outcome.status[row] == ik.Status.SOLVED
         # A round that ends in vain says so, and the next one begins with other candidates.
-        vain = trace["status"][:-1] == Status.STALLED
+        vain = trace["status"][:-1] == ik.Status.STALLED
         assert not trace["status"][:-1][~vain].any()
-        assert (trace["phase"][:-1][vain] == Phase.CANDIDATE).all()
+        assert (trace["phase"][:-1][vain] == ik.answers.Phase.CANDIDATE).all()
         assert (np.diff(trace["restart"].astype(int)) >= 0).all()
         for stage in order:
             assert np.sum(trace["phase"] == stage) == outcome.phases[stage.label][row]
         for one, following in pairwise(trace):
-            if following["phase"] == Phase.CANDIDATE:
+            if following["phase"] == ik.answers.Phase.CANDIDATE:
                 assert one["restart"] != following["restart"] or one["status"]
                 continue
             assert one["restart"] == following["restart"]
@@ -125,7 +128,7 @@ def test_traces(robot, method, rng):
 def test_trace_of_an_exact_fit_shows_errors_falling_to_nothing(robot, method, rng):
     asked = problems(robot, robot.random(rng, 1))
     trace = method.run(asked, robot.home[None], 0, True).trace[0]
-    fit = trace[trace["phase"] == Phase.HAND_FIT]
+    fit = trace[trace["phase"] == ik.answers.Phase.HAND_FIT]
     assert fit["position_error"][0].max() > 1e-3
     assert fit["position_error"][-1].max() < 1e-4
     assert np.isfinite(fit["damping"]).all()
@@ -189,10 +192,14 @@ def test_several_actuators_locked(robot, method, rng):
 def test_locked_actuators_are_checked(robot):
     limits = robot.lower, robot.upper
     assert fixed_array({}, robot.actuators, *limits) is None
-    with pytest.raises(UnknownNameError, match="no actuator 'elbow', expected one of lwr_joint_1"):
+    with pytest.raises(
+        ik.errors.UnknownNameError, match="no actuator 'elbow', expected one of lwr_joint_1"
+    ):
         fixed_array({"elbow": 0.0}, robot.actuators, *limits)
     for value in (9.0, float("nan"), "much", None):
-        with pytest.raises(InputError, match=r"fixed\.bh_spread: found .*from 0 to 3\.14"):
+        with pytest.raises(
+            ik.errors.InputError, match=r"fixed\.bh_spread: found .*from 0 to 3\.14"
+        ):
             fixed_array({"bh_spread": value}, robot.actuators, *limits)
 
 
@@ -244,9 +251,11 @@ def test_optimisation_changes_no_bit(robot, rng, monkeypatch):
 
 
 def test_parameters_are_checked():
-    with pytest.raises(InputError, match="candidates: found 0, expected a whole number >= 1"):
+    with pytest.raises(
+        ik.errors.InputError, match="candidates: found 0, expected a whole number >= 1"
+    ):
         HandFirstParameters(candidates=0)
-    with pytest.raises(InputError, match="table: found 4, expected at least"):
+    with pytest.raises(ik.errors.InputError, match="table: found 4, expected at least"):
         HandFirstParameters(table=4)
     assert dataclasses.asdict(HandFirstParameters())["rounds"] >= 1
 

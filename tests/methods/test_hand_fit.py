@@ -16,12 +16,7 @@ from casadi_ik.methods.common.numeric_arm import (
     pose_step,
 )
 from casadi_ik.methods.common.palm_fit import best_palm, hand_contacts
-from casadi_ik.methods.hand_first.hand_fit import (
-    PalmAndHand,
-    fit_jacobian,
-    fit_residual,
-    reach_row,
-)
+from casadi_ik.methods.hand_first.hand_fit import PalmAndHand, fit_jacobian, fit_residual, reach_row
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.state import HandFirstLayouts
 from casadi_ik.problem.contacts import LENGTH, ContactRows, chord, usual, within_tolerance

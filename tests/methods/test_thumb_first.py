@@ -11,16 +11,14 @@ from robot_variants import derived_robot, thumb_of
 from samplers import shipped_hands
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError
 from casadi_ik.methods.thumb_first.method import ThumbFirstMethod
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
-from casadi_ik.problem.problems import Problems, Tolerance, fixed_array, target_arrays
-from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.problems import Problems, fixed_array, target_arrays
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 
-PAPER = Tolerance()
-EXACT = Tolerance(1e-6, 1e-6)
+PAPER = ik.Tolerance()
+EXACT = ik.Tolerance(1e-6, 1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +81,8 @@ def test_trace_of_a_solve(robot, method, rng):
     rejected = 0
     for row, trace in enumerate(outcome.trace):
         assert len(trace) == outcome.iterations[row]
-        assert trace["phase"][0] == Phase.CANDIDATE
-        assert trace["status"][-1] == outcome.status[row] == Status.SOLVED
+        assert trace["phase"][0] == ik.answers.Phase.CANDIDATE
+        assert trace["status"][-1] == outcome.status[row] == ik.Status.SOLVED
         np.testing.assert_array_equal(trace["q"][-1], outcome.q[row])
         assert trace["position_error"][-1].max() <= 1e-6
         points, _ = robot.contacts(trace["q"])
@@ -92,7 +90,7 @@ def test_trace_of_a_solve(robot, method, rng):
         np.testing.assert_allclose(trace["position_error"], distances, rtol=1e-5, atol=1e-9)
         assert ((trace["q"] >= robot.lower) & (trace["q"] <= robot.upper)).all()
         for before, after in pairwise(trace):
-            if after["phase"] != Phase.HAND_ALIGNMENT:
+            if after["phase"] != ik.answers.Phase.HAND_ALIGNMENT:
                 assert after["restart"] == before["restart"] + 1
                 continue
             assert after["restart"] == before["restart"]
@@ -138,7 +136,7 @@ def test_out_of_reach_the_best_is_kept(robot, method, rng):
     far = Problems(asked.points + np.array([3.0, 0, 0]), asked.normals, PAPER, True)
     batch = solve(robot, method, far)
     assert not batch.success.any()
-    assert (batch.status == Status.STALLED).all()
+    assert (batch.status == ik.Status.STALLED).all()
     assert (batch.restarts == method.options.starts - 1).all()
     assert batch.limits_ok.all()
 
@@ -223,7 +221,7 @@ def test_proxqp_solves_as_well(robot, once, rng):
     ],
 )
 def test_parameters_are_checked(robot, options, says):
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(ik.errors.InputError, match=says):
         ik.Solver(robot, "thumb-first", options=options)
 
 

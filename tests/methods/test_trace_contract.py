@@ -17,10 +17,9 @@ from samplers import (
 from trace_checks import Kept, check_trace
 
 import casadi_ik as ik
+from casadi_ik import logs
 from casadi_ik.answers.recorder import SolveBlock
-from casadi_ik.errors import InputError
 from casadi_ik.kernels.layout import Layout
-from casadi_ik.logs import EventKind, detect_events
 from casadi_ik.problem.trace import (
     ACCEPTED,
     ACTIVE_MASK,
@@ -131,11 +130,11 @@ def test_a_field_of_another_kind_is_refused(robot, blocks, field):
     changed = Layout.record(
         *(dataclasses.replace(f, dtype=other) if f.name == field.name else f for f in layout)
     )
-    with pytest.raises(InputError, match=f"{field.name!r} has dtype {other!r}, expected"):
+    with pytest.raises(ik.errors.InputError, match=f"{field.name!r} has dtype {other!r}, expected"):
         trace_format(changed, robot.description)
     without = Layout(tuple(f for f in layout if f.name != field.name))
     if field.required:
-        with pytest.raises(InputError, match=f"no field {field.name!r}"):
+        with pytest.raises(ik.errors.InputError, match=f"no field {field.name!r}"):
             trace_format(without, robot.description)
     else:
         assert field.name not in trace_format(without, robot.description).labels
@@ -145,10 +144,12 @@ def test_every_kind_of_event_is_produced(blocks):
     """Each kind by some method: names that differ between methods and events would hide one."""
     found = {}
     for method, block in blocks.items():
-        events = detect_events(block.format, block.rows, block.batch.iterations)
-        found[method] = {EventKind(kind) for kind in np.unique(events["kind"])}
+        events = logs.detect_events(block.format, block.rows, block.batch.iterations)
+        found[method] = {logs.EventKind(kind) for kind in np.unique(events["kind"])}
     # Collisions are of a log with a scene: tests/logs/test_log_collisions.py.
-    with_scene = {EventKind.COLLISION_ENTERED, EventKind.COLLISION_LEFT}
-    assert set.union(*found.values()) == set(EventKind) - with_scene
-    assert {EventKind.ACTIVATED, EventKind.RELEASED, EventKind.RESTART} <= found["thumb-first"]
-    assert EventKind.RESTART in found["hand-first"] & found["ipopt"]
+    with_scene = {logs.EventKind.COLLISION_ENTERED, logs.EventKind.COLLISION_LEFT}
+    assert set.union(*found.values()) == set(logs.EventKind) - with_scene
+    assert {logs.EventKind.ACTIVATED, logs.EventKind.RELEASED, logs.EventKind.RESTART} <= found[
+        "thumb-first"
+    ]
+    assert logs.EventKind.RESTART in found["hand-first"] & found["ipopt"]

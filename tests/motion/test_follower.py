@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from samplers import smooth_path
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError
 
 PERIOD = 0.004
 ROUNDING = 1e-9
@@ -212,17 +211,21 @@ def test_contacts_of_other_kinds(robot, solver):
 def test_what_is_refused(robot, solver):
     follower = solver.follow(robot.home, PERIOD)
     points, normals = robot.contacts(robot.home)
-    with pytest.raises(InputError, match=r"points: found shape \(2, 3\), expected \(3, 3\)"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"points: found shape \(2, 3\), expected \(3, 3\)"
+    ):
         follower(points[:2], normals)
-    with pytest.raises(InputError, match="normals: expected an array of numbers"):
+    with pytest.raises(ik.errors.InputError, match="normals: expected an array of numbers"):
         follower(points, [["a"]])
-    with pytest.raises(InputError, match="normals: found beside a grasp"):
+    with pytest.raises(ik.errors.InputError, match="normals: found beside a grasp"):
         follower(ik.load_grasp("cup"), normals)
-    with pytest.raises(InputError, match="period: found 0, expected a number of seconds > 0"):
+    with pytest.raises(
+        ik.errors.InputError, match="period: found 0, expected a number of seconds > 0"
+    ):
         solver.follow(period=0)
-    with pytest.raises(InputError, match="acceleration: found -1, expected a number > 0"):
+    with pytest.raises(ik.errors.InputError, match="acceleration: found -1, expected a number > 0"):
         solver.follow(acceleration=-1)
-    with pytest.raises(InputError, match="velocity: found"):
+    with pytest.raises(ik.errors.InputError, match="velocity: found"):
         solver.follow(velocity=[1.0, 2.0])
-    with pytest.raises(InputError, match="q0: found shape"):
+    with pytest.raises(ik.errors.InputError, match="q0: found shape"):
         solver.follow(np.zeros(3))

@@ -10,7 +10,6 @@ import pytest
 from dense_ways import dense
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.motion.clear import free_way, motor_units
 from casadi_ik.motion.timing import rates_of, shares, timed
 
@@ -163,7 +162,9 @@ def test_what_cannot_be_reached_is_said(robot, grasp):
     found = ik.Solver(robot, scene=ik.Scene(lid)).reach(grasp, distance=0.3)
     assert found.status in (ik.motion.ReachStatus.NO_APPROACH, ik.motion.ReachStatus.NOT_SOLVED)
     assert found.reason
-    with pytest.raises(InputError, match="distance: found -1, expected a number of metres >= 0"):
+    with pytest.raises(
+        ik.errors.InputError, match="distance: found -1, expected a number of metres >= 0"
+    ):
         ik.Solver(robot).reach(grasp, distance=-1)
 
 
@@ -174,7 +175,9 @@ def test_it_is_written_as_a_follower_is(robot, grasp, tmp_path):
     found = np.load(tmp_path / "way.npz")
     np.testing.assert_array_equal(found["q"], motion.q)
     assert found["part"].tolist() == motion.notes["part"].tolist()
-    with pytest.raises(InputError, match=r"found suffix '\.txt', expected one of \.npz, \.csv"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"found suffix '\.txt', expected one of \.npz, \.csv"
+    ):
         motion.write(tmp_path / "way.txt")
     assert len(list(tmp_path.iterdir())) == 3
 
@@ -232,7 +235,7 @@ def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
     assert missed.status is ik.motion.ReachStatus.NOT_SOLVED
     assert "does not take its grasp" in missed.reason
     assert solver.approach(moved).reason == missed.reason
-    with pytest.raises(InputError, match="grasp: found int, expected a Grasp"):
+    with pytest.raises(ik.errors.InputError, match="grasp: found int, expected a Grasp"):
         solver.reach(3)
 
 
@@ -262,7 +265,7 @@ def test_a_direction_that_is_given_or_known(robot, grasp):
     above = robot.palm(one.q) - np.array([[0, 0, 0, 0]] * 2 + [[0, 0, 0, -0.05]] + [[0, 0, 0, 0]])
     before = ik.Grasp(palm=above, posture=motors)
     assert comes(replace(one, grasp=replace(grasp, pregrasp=before))) @ down > 0.999
-    with pytest.raises(InputError, match=r"direction: found .*, expected three numbers"):
+    with pytest.raises(ik.errors.InputError, match=r"direction: found .*, expected three numbers"):
         solver.reach(grasp, direction=[0, 0, 0])
 
 
@@ -288,7 +291,7 @@ def test_the_object_goes_along(robot, grasp, on_table):
         assert free or other.status is ik.motion.ReachStatus.NO_RETREAT
         assert free or other.reason == "lifting is not free: cup and ball touch"
     hand = ik.Solver(ik.load_robot("ar10"))
-    with pytest.raises(UnsupportedError, match="no arm that moves its palm"):
+    with pytest.raises(ik.errors.UnsupportedError, match="no arm that moves its palm"):
         hand.reach(ik.load_grasp("ar10_cup"), lift=0.1)
 
 
@@ -321,5 +324,7 @@ def test_from_posture_to_posture(robot, grasp, on_table):
     inside = around.move((start + robot.home) / 2, robot.home)
     assert (inside.status, inside.motion) == (ik.motion.ReachStatus.NO_WAY, None)
     assert inside.reason == "the start is not free: bh_base and ball touch"
-    with pytest.raises(InputError, match=r"q1: found lwr_joint_1 at 9, expected a number from"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"q1: found lwr_joint_1 at 9, expected a number from"
+    ):
         solver.move(robot.home, [9.0, *robot.home[1:]])

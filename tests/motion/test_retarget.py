@@ -8,8 +8,7 @@ from made_up_hand import hand, like_robot
 from msgspec.structs import replace
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError, InputError
-from casadi_ik.motion.retarget import Retarget, Retargeter, load_retarget, usual_retarget
+from casadi_ik.motion.retarget import Retarget, usual_retarget
 
 TEN_LINES = """\
 robot: kuka_lwr_barrett
@@ -27,7 +26,7 @@ wrist_weight: 0.02
 def test_ten_lines(tmp_path):
     path = tmp_path / "hand.yaml"
     path.write_text(TEN_LINES)
-    config = load_retarget(path)
+    config = ik.motion.load_retarget(path)
     assert config.fingers == {"thumb": 4, "finger_2": 8, "finger_3": 12}
     assert (config.scaling, config.low_pass, config.robot) == (1.6, 0.3, "kuka_lwr_barrett")
     assert config.rpy == pytest.approx((0, 0, np.pi / 2))
@@ -47,14 +46,14 @@ def test_ten_lines(tmp_path):
 def test_a_bad_file_is_refused_by_key(tmp_path, old, new, message):
     path = tmp_path / "hand.yaml"
     path.write_text(TEN_LINES.replace(old, new))
-    with pytest.raises(DescriptionError, match=message) as caught:
-        load_retarget(path)
+    with pytest.raises(ik.errors.DescriptionError, match=message) as caught:
+        ik.motion.load_retarget(path)
     assert str(caught.value).startswith(str(path))
 
 
 def test_a_finger_that_the_robot_has_not(robot):
-    with pytest.raises(InputError, match=r"fingers\.little: no such finger"):
-        Retargeter(Retarget(fingers={"little": 20}), robot)
+    with pytest.raises(ik.errors.InputError, match=r"fingers\.little: no such finger"):
+        ik.motion.Retargeter(Retarget(fingers={"little": 20}), robot)
 
 
 def test_motions_are_scaled_and_turned(robot):
@@ -62,7 +61,7 @@ def test_motions_are_scaled_and_turned(robot):
     config = Retarget(
         fingers={"thumb": 4, "finger_2": 8}, scaling=1.5, travel=2.0, rpy=(0, 0, np.pi / 2)
     )
-    retargeter = Retargeter(config, robot)
+    retargeter = ik.motion.Retargeter(config, robot)
     first = retargeter(hand(0.4, np.zeros(3)))
     second = retargeter(hand(0.4, np.array([0.1, 0.0, 0.0])))
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -87,7 +86,7 @@ def test_without_a_frame_the_first_one_tells_it(robot):
     turn *= np.sign(np.linalg.det(turn))
     frame[[4, 8, 12]] = (points - palm[:3, 3]) @ turn / 1.7 + frame[0]
     config = replace(usual_retarget(robot), scaling=1.7)
-    wanted = Retargeter(config, robot)(frame)
+    wanted = ik.motion.Retargeter(config, robot)(frame)
     np.testing.assert_allclose(wanted.points, points, atol=1e-9)
 
 
@@ -107,7 +106,7 @@ def test_sizes_are_those_of_open_hands(name):
     pinch[4] = pinch[8] + [0.0, 0.0, -0.02]
     ratios = []
     for bend in (0.0, 0.4, 0.9):
-        retargeter = Retargeter(config, robot)
+        retargeter = ik.motion.Retargeter(config, robot)
         retargeter(hand(bend, place))
         person, own = spans(pinch, retargeter(pinch), robot, config)
         ratios.append(own / person)
@@ -117,7 +116,7 @@ def test_sizes_are_those_of_open_hands(name):
     # Where the joints between are not seen, the first frame's fingers are taken to be straight.
     half_seen = hand(0.0, place)
     half_seen[[2, 6, 10, 14, 18]] = np.nan
-    retargeter = Retargeter(config, robot)
+    retargeter = ik.motion.Retargeter(config, robot)
     retargeter(half_seen)
     person, own = spans(pinch, retargeter(pinch), robot, config)
     assert own / person == pytest.approx(ratios[0], rel=0.25)
@@ -133,12 +132,12 @@ def test_of_world_landmarks_the_wrist_stays(robot):
     config = usual_retarget(robot)
     home = robot.palm(robot.home)[:3, 3]
     ways = [(bend, np.array([0.2 * bend, 0.1, 0.5])) for bend in (0.1, 0.5, 0.9)]
-    retargeter = Retargeter(config, robot)
+    retargeter = ik.motion.Retargeter(config, robot)
     for bend, place in ways:
         wanted = retargeter(seen_by_mediapipe(bend, place))
         np.testing.assert_allclose(wanted.palm[:3, 3], home, atol=1e-12)
     assert retargeter.in_hand
-    metric = Retargeter(config, robot)
+    metric = ik.motion.Retargeter(config, robot)
     for bend, place in ways:
         goes = metric(hand(bend, place))
     # The fingers are where they are of a hand whose wrist goes.
@@ -147,7 +146,7 @@ def test_of_world_landmarks_the_wrist_stays(robot):
     assert np.linalg.norm(goes.palm[:3, 3] - home) > 0.1
     assert not metric.in_hand
     # Who says how far the wrist goes is believed.
-    told = Retargeter(replace(config, travel=1.0), robot)
+    told = ik.motion.Retargeter(replace(config, travel=1.0), robot)
     moved = [told(seen_by_mediapipe(*way)).palm[:3, 3] for way in ways]
     assert np.linalg.norm(moved[-1] - moved[0]) > 0.005
 
@@ -156,18 +155,25 @@ def test_of_world_landmarks_the_wrist_stays(robot):
 def test_image_landmarks_are_refused_in_words(robot, size):
     """Parts of the picture's width and height, depths from the wrist; fingers may be beyond it."""
     frame = hand(0.3, np.zeros(3)) * size / 0.09 + [0.4, 0.5, 3e-7]
-    with pytest.raises(InputError, match=r"image landmarks.*expected metres: take its world landm"):
-        Retargeter(usual_retarget(robot), robot)(frame)
+    with pytest.raises(
+        ik.errors.InputError, match=r"image landmarks.*expected metres: take its world landm"
+    ):
+        ik.motion.Retargeter(usual_retarget(robot), robot)(frame)
     pixels = 1800 * (hand(0.3, np.zeros(3)) + 0.2)
-    with pytest.raises(InputError, match=r"a palm 163 m long, expected metres \(pixels, or mm\?\)"):
-        Retargeter(usual_retarget(robot), robot)(pixels)
+    with pytest.raises(
+        ik.errors.InputError, match=r"a palm 163 m long, expected metres \(pixels, or mm\?\)"
+    ):
+        ik.motion.Retargeter(usual_retarget(robot), robot)(pixels)
 
 
 def test_a_left_hand_moves_a_right_robot_hand(robot):
     """Its fingers come out as a right hand's, its wrist goes and turns as it does."""
     config = replace(usual_retarget(robot), rpy=(0.0, 0.0, 0.0))
-    right, left = Retargeter(config, robot), Retargeter(replace(config, mirror=True), robot)
-    plain = Retargeter(config, robot)
+    right, left = (
+        ik.motion.Retargeter(config, robot),
+        ik.motion.Retargeter(replace(config, mirror=True), robot),
+    )
+    plain = ik.motion.Retargeter(config, robot)
     for i, bend in enumerate((0.5, 0.3, 0.7)):
         place, turn = np.array([0.3, 0.1 * i, 0.5 + 0.05 * i]), 0.3 * i
         c, s = np.cos(turn), np.sin(turn)
@@ -190,27 +196,29 @@ def test_smoothing_does_not_depend_on_how_often_it_is_called(robot):
     frames = [hand(0.4, np.array([0.05 * i, 0.0, 0.4])) for i in range(5)]
     found = []
     for cycles in (1, 33, 66):
-        retargeter = Retargeter(config, robot)
+        retargeter = ik.motion.Retargeter(config, robot)
         for frame in frames:
             for _ in range(cycles):
                 wanted = retargeter(frame, elapsed=1 / 30 / cycles)
         found.append(wanted.palm)
     np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-12)
     for bad in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(InputError, match=r"elapsed: found .*, expected seconds above 0"):
+        with pytest.raises(
+            ik.errors.InputError, match=r"elapsed: found .*, expected seconds above 0"
+        ):
             retargeter(frames[0], elapsed=bad)
 
 
 def test_low_pass(robot):
     config = Retarget(fingers={"thumb": 4}, scaling=1.0, rpy=(0.0, 0.0, 0.0), low_pass=0.25)
-    retargeter = Retargeter(config, robot)
+    retargeter = ik.motion.Retargeter(config, robot)
     start = retargeter(hand(0.4, np.zeros(3))).points[0]
     moved = [retargeter(hand(0.4, np.array([0.1, 0, 0]))).points[0] - start for _ in range(3)]
     np.testing.assert_allclose([m[0] for m in moved], 0.1 * (1 - 0.75 ** np.arange(1, 4)))
 
 
 def test_a_frame_with_nan_asks_for_nothing_and_is_forgotten(robot):
-    retargeter = Retargeter(usual_retarget(robot), robot)
+    retargeter = ik.motion.Retargeter(usual_retarget(robot), robot)
     before = retargeter(hand(0.4, np.zeros(3)))
     bad = hand(0.4, np.zeros(3))
     bad[4, 1] = np.nan
@@ -219,7 +227,9 @@ def test_a_frame_with_nan_asks_for_nothing_and_is_forgotten(robot):
     assert np.isnan(wanted.points).all()
     after = retargeter(hand(0.4, np.zeros(3)))
     np.testing.assert_array_equal(after.points, before.points)
-    with pytest.raises(InputError, match=r"keypoints: found shape \(20, 3\), expected \(21, 3\)"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"keypoints: found shape \(20, 3\), expected \(21, 3\)"
+    ):
         retargeter(bad[:20])
 
 
@@ -229,7 +239,7 @@ def test_arm_and_hand_follow_a_person(robot):
     path = robot.home + way
     fingers = {"thumb": 4, "finger_2": 8, "finger_3": 12}
     config = Retarget(fingers=fingers, scaling=1.7, travel=1.7)
-    retargeter = Retargeter(config, robot)
+    retargeter = ik.motion.Retargeter(config, robot)
     follower = ik.Solver(robot).follow(robot.home, 1 / 30)
     points, _ = robot.contacts(path)
     for keypoints, expected, palm in zip(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.motion.track import TUNING
 
 
@@ -122,15 +121,19 @@ def test_a_grasp_out_of_reach_is_come_near_to(robot, solver):
 
 def test_what_is_refused(robot, solver):
     moving = grasps(robot, np.tile(robot.home, (2, 1)))
-    with pytest.raises(InputError, match="grasps: found none, expected at least one"):
+    with pytest.raises(ik.errors.InputError, match="grasps: found none, expected at least one"):
         solver.track([])
-    with pytest.raises(InputError, match="velocity: given without a period, expected both"):
+    with pytest.raises(
+        ik.errors.InputError, match="velocity: given without a period, expected both"
+    ):
         solver.track(moving, velocity=1.0)
-    with pytest.raises(InputError, match="period: found -1, expected a number of seconds > 0"):
+    with pytest.raises(
+        ik.errors.InputError, match="period: found -1, expected a number of seconds > 0"
+    ):
         solver.track(moving, period=-1)
     with pytest.raises(
-        InputError, match=r"velocity: found .*, expected a number > 0, or 14 of them"
+        ik.errors.InputError, match=r"velocity: found .*, expected a number > 0, or 14 of them"
     ):
         solver.track(moving, period=1.0, velocity=[1.0, 2.0])
-    with pytest.raises(UnsupportedError, match="method 'ipopt' gives one solution"):
+    with pytest.raises(ik.errors.UnsupportedError, match="method 'ipopt' gives one solution"):
         ik.Solver(robot, "ipopt").track(moving)

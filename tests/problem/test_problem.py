@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from casadi_ik.errors import InputError
-from casadi_ik.problem.problems import Problems, Tolerance, target_arrays
+import casadi_ik as ik
+from casadi_ik.problem.problems import Problems, target_arrays
 
 
 def arrays(k=2, f=3):
@@ -59,7 +59,7 @@ def spoiled(which, index, value):
     ],
 )
 def test_malformed_targets(points, normals, says):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(ik.errors.InputError) as caught:
         target_arrays(points, normals, 3)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -90,25 +90,27 @@ def test_a_direction_is_a_normal_without_a_point():
     ],
 )
 def test_malformed_directions(directions, says):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(ik.errors.InputError) as caught:
         target_arrays(*arrays(), 3, 4, directions)
     assert says in str(caught.value)
 
 
 @pytest.mark.parametrize("value", [0, -1e-3, float("nan"), float("inf"), "5 mm", None])
 def test_tolerance_is_a_positive_number(value):
-    with pytest.raises(InputError, match=r"tolerance\.position: found .*, expected a number > 0"):
-        Tolerance(position=value)
-    with pytest.raises(InputError, match=r"tolerance\.angle"):
-        Tolerance(angle=value)
+    with pytest.raises(
+        ik.errors.InputError, match=r"tolerance\.position: found .*, expected a number > 0"
+    ):
+        ik.Tolerance(position=value)
+    with pytest.raises(ik.errors.InputError, match=r"tolerance\.angle"):
+        ik.Tolerance(angle=value)
 
 
 def test_default_tolerance_is_the_papers():
-    assert Tolerance() == Tolerance(position=0.005, angle=np.deg2rad(3))
+    assert ik.Tolerance() == ik.Tolerance(position=0.005, angle=np.deg2rad(3))
 
 
 def test_rows_of_a_batch():
-    problems = Problems(*arrays(k=4), Tolerance(), True)
+    problems = Problems(*arrays(k=4), ik.Tolerance(), True)
     part = problems.rows(slice(1, 3))
     assert len(problems) == 4
     assert len(part) == 2
@@ -118,7 +120,7 @@ def test_rows_of_a_batch():
 
 def test_parts_of_a_batch_keep_the_numbers_of_their_targets():
     points = np.zeros((10, 3, 3))
-    problems = Problems(points, points, Tolerance(), True, first_row=100)
+    problems = Problems(points, points, ik.Tolerance(), True, first_row=100)
     assert problems.rows(slice(4, 8)).first_row == 104
     assert problems.rows(slice(4, 8)).rows(slice(1, None)).first_row == 105
     assert problems.rows(slice(-2, None)).first_row == 108

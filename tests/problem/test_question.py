@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import DescriptionError, InputError, UnknownNameError, UnsupportedError
 
 FINE = ik.Tolerance(1e-6, 1e-6)
 COARSE = ik.Tolerance(0.08, 0.5)
@@ -82,7 +81,7 @@ def test_grasp_file_with_tolerances(tmp_path):
     says = (
         r"grasp\.yaml: contacts\.thumb\.tolerance\.position: found -0\.002, expected a number > 0"
     )
-    with pytest.raises(DescriptionError, match=says):
+    with pytest.raises(ik.errors.DescriptionError, match=says):
         ik.load_grasp(path)
 
 
@@ -117,16 +116,26 @@ def test_a_spread_that_does_not_fit_is_found_out(robot):
 def test_what_is_refused(robot):
     solver = ik.Solver(robot)
     asked = grasp(robot, robot.home)
-    with pytest.raises(UnknownNameError, match="fixed: no actuator 'elbow', expected one of lwr_"):
+    with pytest.raises(
+        ik.errors.UnknownNameError, match="fixed: no actuator 'elbow', expected one of lwr_"
+    ):
         solver.solve(asked, fixed={"elbow": 0.0})
-    with pytest.raises(InputError, match=r"fixed\.lwr_joint_1: found 7, expected a number from"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"fixed\.lwr_joint_1: found 7, expected a number from"
+    ):
         solver.solve(asked, fixed={"lwr_joint_1": 7})
     paper = ik.Solver(robot, "enhanced-dls", finger_step="closed-form")
-    with pytest.raises(UnsupportedError, match="'enhanced-dls' cannot keep actuators fixed"):
+    with pytest.raises(
+        ik.errors.UnsupportedError, match="'enhanced-dls' cannot keep actuators fixed"
+    ):
         paper.solve(asked, fixed={"lwr_joint_1": 0.0})
-    with pytest.raises(InputError, match=r"tolerance\.pinky: no such finger; the robot's fingers"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"tolerance\.pinky: no such finger; the robot's fingers"
+    ):
         ik.Solver(robot, tolerance={"pinky": COARSE})
-    with pytest.raises(InputError, match=r"tolerance\.thumb: found 3, expected a Tolerance"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"tolerance\.thumb: found 3, expected a Tolerance"
+    ):
         ik.Solver(robot, tolerance={"thumb": 3})
-    with pytest.raises(InputError, match=r"tolerance: found 0\.1, expected a Tolerance"):
+    with pytest.raises(ik.errors.InputError, match=r"tolerance: found 0\.1, expected a Tolerance"):
         ik.Contact([0, 0, 1], tolerance=0.1)

@@ -8,12 +8,12 @@ from pinocchio_oracle import verdict
 from toy_robots import replace
 
 import casadi_ik as ik
-from casadi_ik.problem.problems import Problems, Tolerance
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.verdict import judge
 
 
 def problems(points, normals, **tolerance):
-    return Problems(points, normals, Tolerance(**tolerance), True)
+    return Problems(points, normals, ik.Tolerance(**tolerance), True)
 
 
 def test_errors_are_pinocchios(robot, oracle, rng):

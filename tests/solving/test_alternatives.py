@@ -7,7 +7,6 @@ import pytest
 from robot_variants import derived_robot
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError, UnsupportedError
 
 APART, DISTINCT = 0.25, 0.05
 """Least differences of answers unless said otherwise, and of hands that are searched."""
@@ -178,14 +177,20 @@ def test_none_where_there_is_none(robot, solver):
 
 def test_what_is_refused(robot, solver):
     asked = grasp(robot, robot.home)
-    with pytest.raises(InputError, match="limit: found 0, expected an integer >= 1"):
+    with pytest.raises(ik.errors.InputError, match="limit: found 0, expected an integer >= 1"):
         solver.solve_all(asked, limit=0)
     for apart in (-0.1, 1.5, float("nan"), "far", True):
-        with pytest.raises(InputError, match=r"apart: found .*, expected a number from 0 to 1"):
+        with pytest.raises(
+            ik.errors.InputError, match=r"apart: found .*, expected a number from 0 to 1"
+        ):
             solver.solve_all(asked, apart=apart)
-    with pytest.raises(InputError, match="prefer: found 'speed', expected one of limits, manip"):
+    with pytest.raises(
+        ik.errors.InputError, match="prefer: found 'speed', expected one of limits, manip"
+    ):
         solver.solve_all(asked, prefer="speed")
-    with pytest.raises(InputError, match=r"q0: found shape \(2, 14\), expected \(14,\)"):
+    with pytest.raises(ik.errors.InputError, match=r"q0: found shape \(2, 14\), expected \(14,\)"):
         solver.solve_all(asked, q0=np.zeros((2, 14)))
-    with pytest.raises(UnsupportedError, match="method 'ipopt' gives one solution; several need"):
+    with pytest.raises(
+        ik.errors.UnsupportedError, match="method 'ipopt' gives one solution; several need"
+    ):
         ik.Solver(robot, "ipopt").solve_all(asked)

@@ -10,7 +10,6 @@ import pytest
 from scipy.optimize import least_squares
 
 import casadi_ik as ik
-from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arrays import Array
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
@@ -270,7 +269,7 @@ def test_nearest_contacts(solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array
 
 
 def test_same_twice(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
-    def once() -> BatchSolution:
+    def once() -> ik.BatchSolution:
         return solver.solve_batch(cup[0][None] + [0.5, 0.2, 0], cup[1][None], diagnose=True)
 
     one, other = once().diagnoses[0], once().diagnoses[0]

@@ -7,7 +7,6 @@ import pytest
 from robot_variants import derived_robot
 
 import casadi_ik as ik
-from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arrays import Array
 from casadi_ik.problem.problems import Problems
 
@@ -26,7 +25,7 @@ def bent(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
 
 def diagnosed(
     solver: ik.Solver, points: Array, normals: Array, **options: dict[str, float]
-) -> BatchSolution:
+) -> ik.BatchSolution:
     return solver.solve_batch(points, normals, diagnose=True, **options)
 
 

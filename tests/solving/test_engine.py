@@ -11,16 +11,9 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.problems import Problems, Tolerance
-from casadi_ik.problem.status import Status
+from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.trace import TraceFormat
-from casadi_ik.solving.batch_parts import (
-    CACHED_BYTES,
-    ENOUGH,
-    FIRST_PART,
-    PART_BYTES,
-    BatchParts,
-)
+from casadi_ik.solving.batch_parts import CACHED_BYTES, ENOUGH, FIRST_PART, PART_BYTES, BatchParts
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 
@@ -32,7 +25,7 @@ class Answering:
 
     name = "answering"
 
-    def __init__(self, status=Status.SOLVED):
+    def __init__(self, status=ik.Status.SOLVED):
         self.status = status
         self.prepared = 0
         self.calls = []
@@ -76,7 +69,7 @@ class Keeping:
 
 def targets(robot, q, enforce=True):
     points, normals = robot.contacts(q)
-    return Problems(points, normals, Tolerance(), enforce)
+    return Problems(points, normals, ik.Tolerance(), enforce)
 
 
 @pytest.mark.parametrize("enforce", [True, False])
@@ -90,7 +83,9 @@ def test_limits_are_part_of_success_where_enforced(robot, enforce):
     assert list(batch.status_names) == ["SOLVED", "STALLED" if enforce else "SOLVED"]
 
 
-@pytest.mark.parametrize("status", [Status.ITERATION_LIMIT, Status.STALLED, Status.INVALID])
+@pytest.mark.parametrize(
+    "status", [ik.Status.ITERATION_LIMIT, ik.Status.STALLED, ik.Status.INVALID]
+)
 def test_the_verdict_outvotes_the_method(robot, status):
     """What meets its contacts is solved; what does not keeps the method's word for it."""
     q = np.tile(robot.home, (2, 1))

@@ -11,7 +11,7 @@ import pytest
 from event_thresholds import Kept
 
 import casadi_ik as ik
-from casadi_ik.logs import EventKind
+from casadi_ik import logs
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_what_a_threshold_catches(kept: Kept) -> None:
     starts = np.cumsum(counts) - counts
     shares = []
     for trial in event_thresholds.trials(kept.blocks[0]):
-        if (trial.kind, trial.subject) != (EventKind.NEAR_SINGULAR, "closed_chain"):
+        if (trial.kind, trial.subject) != (logs.EventKind.NEAR_SINGULAR, "closed_chain"):
             continue
         lowest = np.fmin.reduceat(rows["sigma_closed_chain"], starts)
         found = event_thresholds.caught(kept.blocks, trial)

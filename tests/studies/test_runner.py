@@ -23,7 +23,6 @@ from runner.study import STUDY_FILE, claim, missing, read_results, run
 
 import casadi_ik as ik
 from casadi_ik.batches import backend
-from casadi_ik.errors import InputError
 from casadi_ik.logs import Keep
 
 STUDY = small_study.STUDY
@@ -80,13 +79,13 @@ def scheduler() -> Iterator[str]:
 
 def test_a_dask_cluster_without_workers_is_refused(scheduler, tmp_path, monkeypatch):
     monkeypatch.setattr(backend, "PATIENCE", 1)
-    with pytest.raises(InputError, match="found no worker within 1 s"):
+    with pytest.raises(ik.errors.InputError, match="found no worker within 1 s"):
         run(STUDY, tmp_path, dask=scheduler)
 
 
 def test_no_dask_scheduler_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(backend, "PATIENCE", 1)
-    with pytest.raises(InputError, match="found no scheduler"):
+    with pytest.raises(ik.errors.InputError, match="found no scheduler"):
         run(STUDY, tmp_path, dask="tcp://127.0.0.1:9")
 
 
@@ -113,7 +112,9 @@ def test_a_worker_with_another_version_is_named(monkeypatch):
         def run_on_scheduler(self, function, packages):
             return function(packages)
 
-    with pytest.raises(InputError, match=r"tcp://worker:1 has .*casadi-ik 0\.0\.1.*expected"):
+    with pytest.raises(
+        ik.errors.InputError, match=r"tcp://worker:1 has .*casadi-ik 0\.0\.1.*expected"
+    ):
         backend._check(Client(), "tcp://here:1", backend.PACKAGES)  # type: ignore[arg-type]
 
 
@@ -216,7 +217,7 @@ def test_a_log_per_block_keeps_what_is_asked_for(done, tmp_path):
 )
 def test_different_settings_do_not_mix(done, change, says):
     before = (done / STUDY_FILE).read_bytes()
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(ik.errors.InputError) as caught:
         run(dataclasses.replace(STUDY, **change), done)
     assert says in str(caught.value)
     assert (done / STUDY_FILE).read_bytes() == before
@@ -224,7 +225,7 @@ def test_different_settings_do_not_mix(done, change, says):
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="holds files but no study"):
+    with pytest.raises(ik.errors.InputError, match="holds files but no study"):
         run(STUDY, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 

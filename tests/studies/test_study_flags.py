@@ -14,7 +14,6 @@ import pytest
 import virtual_joint_range
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError
 
 
 def test_the_turns_of_the_virtual_joint(tmp_path: Path) -> None:
@@ -23,7 +22,7 @@ def test_the_turns_of_the_virtual_joint(tmp_path: Path) -> None:
     text = (tmp_path / "virtual_joint_range" / "README.md").read_text()
     assert f"`python studies/virtual_joint_range.py {' '.join(arguments)}`" in text
     assert "in steps of 45 deg" in text
-    with pytest.raises(InputError, match="--steps: found 7, expected an even number"):
+    with pytest.raises(ik.errors.InputError, match="--steps: found 7, expected an even number"):
         virtual_joint_range.main(["--steps", "7"])
 
 
@@ -57,7 +56,9 @@ def test_gains_and_resolution_of_the_sliders(tmp_path: Path) -> None:
 
 def test_parts_of_outliers(tmp_path: Path) -> None:
     for wrong in (["0.3", "0.2"], ["0", "0.2"], ["0.1", "1"]):
-        with pytest.raises(InputError, match=r"--outliers: found .*, expected 0 < FEW < MANY < 1"):
+        with pytest.raises(
+            ik.errors.InputError, match=r"--outliers: found .*, expected 0 < FEW < MANY < 1"
+        ):
             calibration.main(["--outliers", *wrong, "--out", str(tmp_path)])
 
 

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError
-from casadi_ik.robots import FourBar, LeadScrew
+from casadi_ik import robots
 from casadi_ik.symbolic import couplings, mechanisms, screws, se3
 from casadi_ik.symbolic import dual_quaternion as dq
 from casadi_ik.symbolic.couplings import linkage
@@ -207,7 +206,7 @@ def test_eqs_15_16_signs_and_columns(toy):
 def test_relative_chain_leaves_the_arm_out(robot):
     tip = relative_chain(robot.description, "finger_2", "thumb")
     assert not any(name.startswith("lwr") for name in tip.chain.joints)
-    with pytest.raises(InputError, match="found 'thumb' twice"):
+    with pytest.raises(ik.errors.InputError, match="found 'thumb' twice"):
         relative_chain(robot.description, "thumb", "thumb")
 
 
@@ -248,14 +247,14 @@ def test_eq_12_index(ar10, rng):
     q = ca.SX.sym("q", 10)
     motion = tip.at(q)
     bar = joint(ar10, "index_distal").coupling
-    assert isinstance(bar, FourBar)
+    assert isinstance(bar, robots.FourBar)
     f = mechanisms.theta3_rate(bar.phi_0 + motion.joints["index_middle"], linkage(bar, bar))
     s = motion.screws.jacobian
     printed = ca.horzcat(s[:, 0], s[:, 1] + f * s[:, 2])
     rates = []
     for name in tip.drivers:
         screw = joint(ar10, name).coupling
-        assert isinstance(screw, LeadScrew)
+        assert isinstance(screw, robots.LeadScrew)
         slider = q[ar10.actuators.index(screw.of)]
         rates.append(mechanisms.angle_rate(slider, screw.b, screw.c))
     sliders = printed @ ca.diag(ca.vertcat(*rates))
@@ -287,7 +286,7 @@ def test_round_trips_over_the_full_strokes(ar10):
     turned = 0
     for each in ar10.description.movable:
         coupling = each.coupling
-        if isinstance(coupling, LeadScrew):
+        if isinstance(coupling, robots.LeadScrew):
             slider = strokes[:, ar10.actuators.index(coupling.of)]
             theta = ca.DM(coupling.theta_0 + joints[each.name]).T
             back = mechanisms.slider_from_angle(theta, coupling.b, coupling.c)
@@ -311,9 +310,9 @@ def test_ipopt_with_the_linkage_as_a_constraint_finds_the_reduced_answer(finger,
     """The last joint as an unknown tied by the loop's closure, against the joint substituted."""
     names = [f"{finger}_{part}" for part in ("proximal", "middle", "distal")]
     proximal, middle, distal = (joint(ar10, name).coupling for name in names)
-    assert isinstance(distal, FourBar)
-    assert isinstance(middle, LeadScrew)
-    assert isinstance(proximal, LeadScrew)
+    assert isinstance(distal, robots.FourBar)
+    assert isinstance(middle, robots.LeadScrew)
+    assert isinstance(proximal, robots.LeadScrew)
     tip = finger_chain(ar10.description, finger)
     columns = list(tip.actuators)
     lower, upper = ar10.lower[columns], ar10.upper[columns]

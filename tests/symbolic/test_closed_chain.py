@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from robot_variants import thumb_of
 
-from casadi_ik.errors import UnsupportedError
+import casadi_ik as ik
 from casadi_ik.symbolic.closed_chain import VIRTUAL, closed_chain, mobility, pivoted, split
 from casadi_ik.symbolic.kinematics import actuated
 
@@ -67,13 +67,15 @@ def test_the_papers_choice(robot):
 
 
 def test_no_closed_chain_without_an_arm(coupled_robot):
-    with pytest.raises(UnsupportedError, match=r"arm \(0\), thumb \(3\).*at least six joints"):
+    with pytest.raises(
+        ik.errors.UnsupportedError, match=r"arm \(0\), thumb \(3\).*at least six joints"
+    ):
         split(coupled_robot.description)
 
 
 @pytest.mark.parametrize("borrowed", [-1, 7, 8])
 def test_borrowed_joints_are_the_arms(robot, borrowed):
-    with pytest.raises(UnsupportedError, match="cannot borrow"):
+    with pytest.raises(ik.errors.UnsupportedError, match="cannot borrow"):
         split(robot.description, borrowed)
 
 

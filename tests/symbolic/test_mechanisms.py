@@ -9,7 +9,7 @@ from algebra_samples import PROPERTY, central_difference, gradient, graph
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casadi_ik.errors import InputError
+import casadi_ik as ik
 from casadi_ik.symbolic import mechanisms
 from casadi_ik.symbolic.mechanisms import Linkage, angle_from_slider
 
@@ -150,7 +150,7 @@ def test_branch_from_a_known_pose():
     for b, phi in linkages(50, seed=6):
         theta = float(theta3(phi, b, 0))
         assert mechanisms.branch_from_pose(Linkage(*b), phi, theta) == b[4]
-    with pytest.raises(InputError, match="cannot be assembled"):
+    with pytest.raises(ik.errors.InputError, match="cannot be assembled"):
         mechanisms.branch_from_pose(Linkage(1.0, 0.1, 3.0, 0.1), 3.0, 0.0)
 
 

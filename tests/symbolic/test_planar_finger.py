@@ -7,8 +7,8 @@ import pinocchio as pin
 import pytest
 from toy_robots import replace
 
-from casadi_ik.errors import UnsupportedError
-from casadi_ik.robots import load_description
+import casadi_ik as ik
+from casadi_ik import robots
 from casadi_ik.symbolic.planar_finger import planar_finger
 
 
@@ -68,7 +68,7 @@ def test_ratio_and_offset_of_the_spread(own_robot, rng):
         "coupling: {kind: linear, of: bh_spread}",
         "coupling: {kind: linear, of: bh_spread, ratio: -0.5, offset: 0.3}",
     )
-    description = load_description(own_robot)
+    description = robots.load_description(own_robot)
     finger = planar_finger(description, "finger_2")
     assert (finger.ratio, finger.offset) == (-0.5, 0.3)
 
@@ -114,8 +114,8 @@ def test_other_fingers_are_refused_with_the_reason(own_robot, case):
         replace(
             hand, f"{head}[0 deg, 48 deg], velocity: 2 rad/s", f"{head}[0, 48 mm], velocity: 2 m/s"
         )
-    with pytest.raises(UnsupportedError) as caught:
-        planar_finger(load_description(own_robot), "finger_2")
+    with pytest.raises(ik.errors.UnsupportedError) as caught:
+        planar_finger(robots.load_description(own_robot), "finger_2")
     message = str(caught.value)
     assert message.startswith(
         "robot 'kuka_lwr_barrett': finger 'finger_2' is not a planar finger: "
@@ -133,12 +133,16 @@ def test_coupled_flexion_is_refused(own_robot):
     follower = ",\n     coupling: {kind: linear, of: bh_finger_2_proximal, ratio: 0.3333}"
     hand.write_text(text[: at + len(limits)] + follower + text[at + len(limits) :])
     replace(own_robot, "  bh_finger_2_distal: 10 deg\n", "")
-    with pytest.raises(UnsupportedError, match="follows 'bh_finger_2_proximal'; expected its own"):
-        planar_finger(load_description(own_robot), "finger_2")
+    with pytest.raises(
+        ik.errors.UnsupportedError, match="follows 'bh_finger_2_proximal'; expected its own"
+    ):
+        planar_finger(robots.load_description(own_robot), "finger_2")
 
 
 def test_long_and_short_chains_are_refused(coupled_robot):
-    with pytest.raises(UnsupportedError, match=r"it has joints \['left_spread', 'left_1', .*; exp"):
+    with pytest.raises(
+        ik.errors.UnsupportedError, match=r"it has joints \['left_spread', 'left_1', .*; exp"
+    ):
         planar_finger(coupled_robot.description, "left")
-    with pytest.raises(UnsupportedError, match="right_spread follows 'spread'"):
+    with pytest.raises(ik.errors.UnsupportedError, match="right_spread follows 'spread'"):
         planar_finger(coupled_robot.description, "right")

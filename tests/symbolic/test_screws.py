@@ -19,7 +19,7 @@ from algebra_samples import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casadi_ik.errors import UnknownNameError
+import casadi_ik as ik
 from casadi_ik.symbolic import dual_quaternion as dq
 from casadi_ik.symbolic.kinematics import actuated, forward
 from casadi_ik.symbolic.screws import screw_chain_to_contact, screw_chain_to_link
@@ -141,9 +141,9 @@ def test_reference_pose_is_that_of_all_joints_at_zero(robot):
 
 
 def test_unknown_names(robot):
-    with pytest.raises(UnknownNameError, match="no finger 'x'"):
+    with pytest.raises(ik.errors.UnknownNameError, match="no finger 'x'"):
         screw_chain_to_contact(robot.description, "x")
-    with pytest.raises(UnknownNameError, match="no link 'x'"):
+    with pytest.raises(ik.errors.UnknownNameError, match="no link 'x'"):
         screw_chain_to_link(robot.description, "x")
 
 

@@ -12,7 +12,6 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.drawing.drawables import item_of, links_seen
 from casadi_ik.drawing.surfaces import arrow, ball, facing, sharp
-from casadi_ik.errors import DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.kernels.cancellation import stop_if_cancelled
 from casadi_ik.viewing import file_meshes, request_of
@@ -202,10 +201,10 @@ def test_edges_are_sharp_and_round_sides_are_not() -> None:
 
 def test_nothing_is_written_where_pads_are_not_stated(description: Path) -> None:
     text = description.read_text()
-    with pytest.raises(DescriptionError, match=r"fingers\.third"):
+    with pytest.raises(ik.errors.DescriptionError, match=r"fingers\.third"):
         save_pads(description, {"third": LinkPad(np.zeros(3), np.array([1.0, 0.0, 0.0]))})
     assert description.read_text() == text
-    with pytest.raises(DescriptionError, match=r"fingers\.third: not in the description"):
+    with pytest.raises(ik.errors.DescriptionError, match=r"fingers\.third: not in the description"):
         corrected(text, "third", np.zeros(3), np.ones(3))
 
 

@@ -12,7 +12,6 @@ import casadi_ik as ik
 from casadi_ik import palette
 from casadi_ik.drawing.drawables import Drawable, body, contact_marks, target_place
 from casadi_ik.drawing.surfaces import arrow, ball, drum, ring, rod, stretched
-from casadi_ik.errors import InputError, PictureError
 from casadi_ik.views import draw_solution, show
 from casadi_ik.views.stage import Stage, axes_of, close_view, over, whole_view
 
@@ -211,13 +210,13 @@ def test_show_gives_a_plotter_to_export(robot, grasp, tmp_path) -> None:
     plotter.close()
     assert (tmp_path / "robot.gltf").stat().st_size > 100_000
     show(robot, robot.home, window=False).close()
-    with pytest.raises(InputError):
+    with pytest.raises(ik.errors.InputError):
         show(robot, np.zeros(3), window=False)
 
 
 def test_without_opengl_there_is_an_error_and_no_crash(monkeypatch) -> None:
     monkeypatch.setattr("pyvista.Plotter", NoOpenGL)
-    with pytest.raises(PictureError, match="no OpenGL"):
+    with pytest.raises(ik.errors.PictureError, match="no OpenGL"):
         Stage()
 
 
