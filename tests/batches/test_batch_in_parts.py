@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from commands import main
 from dask_processes import scheduler_process, worker_process
 
 import casadi_ik as ik
-from casadi_ik.cli.main import main
 
 ROBOT = ("--robot", "kuka_lwr_barrett")
 COUNT, SIZE = 4000, 100

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import main
 from make_grasp_sets import ROBOTS, TABLES, Written, made
 
 import casadi_ik as ik
-from casadi_ik.cli.main import main
 from casadi_ik.cli.report import reasons
 from casadi_ik.datasets.conventions import load_convention
 from casadi_ik.datasets.postures import HandPoses

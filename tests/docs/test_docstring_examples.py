@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik import registry
-from casadi_ik.public import SUBMODULES
+from casadi_ik import public, registry
 
 WITHOUT = {
     "METHODS",  # a tuple of names
-    *SUBMODULES,  # their names have their own
+    *public.SUBMODULES,  # their names have their own
     "logs.Compression",  # three words
     "logs.detect_events",  # takes what a recorder is given while a batch runs
 }
@@ -38,7 +37,7 @@ PLAIN = {
 def public_names() -> list[str]:
     inside = (
         f"{module}.{name}"
-        for module in SUBMODULES
+        for module in public.SUBMODULES
         if module != "errors"
         for name in getattr(ik, module).__all__
     )

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import main
 
 import casadi_ik as ik
-from casadi_ik.cli.main import main
 from casadi_ik.exporting.project import MARK, c_project, checked_prefix, write_folder
 from casadi_ik.exporting.solver import plain
 from casadi_ik.exporting.targets import SceneTargets, stored

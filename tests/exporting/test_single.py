@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import main
 
 import casadi_ik as ik
-from casadi_ik.cli.main import main
 from casadi_ik.exporting.project import c_project, write_folder
 from casadi_ik.exporting.single import ROUNDING, SinglePrecision, in_single_precision
 from casadi_ik.kernels.codegen import driver_text

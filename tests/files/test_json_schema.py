@@ -12,10 +12,10 @@ from typing import Any
 import jsonschema
 import pytest
 import yaml
+from commands import main
 
 import casadi_ik as ik
 from casadi_ik.cli.lists import FILES, schema_of
-from casadi_ik.cli.main import main
 from casadi_ik.files.reading import convert
 from casadi_ik.files.units import check_units, in_si
 from casadi_ik.robots.load import _imports

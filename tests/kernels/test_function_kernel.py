@@ -1,4 +1,4 @@
-"""Functions on numpy arrays: shapes, batches, threads, the same in C and in the VM."""
+"""Functions called as C: shapes, batches, measures, elementary functions of our own."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from graphs import needs_compiler, random_expression
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import casadi_ik as ik
 from casadi_ik.kernels import FunctionKernel
-
-from .graphs import needs_compiler, random_expression
+from casadi_ik.kernels.function_kernel import MeasureKernel
+from casadi_ik.kernels.graphs import FunctionGraph
 
 BOTH = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
 
@@ -134,3 +137,110 @@ def test_wrong_inputs_are_named() -> None:
         kernel(1, v, m.T)
     with pytest.raises(ik.errors.InputError, match="input 'v' is a batch of 4, another of 2"):
         kernel([1, 2], np.zeros((4, 3)), m)
+
+
+def graph() -> FunctionGraph:
+    x = ca.SX.sym("x", 3)
+    values = ca.vertcat(ca.sin(x[0]), ca.cos(x[0]), x[1] * x[2])
+    return FunctionGraph.of(ca.Function("measured", [x], [values]))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 64, 1003])
+def test_any_number_of_samples(count, compiled):
+    rng = np.random.default_rng(count)
+    x = rng.normal(size=(count, 3)) * [10.0 ** rng.uniform(-8, 4), 1.0, 1.0]
+    found = MeasureKernel(graph(), compiled)(x)
+    expected = np.stack([np.sin(x[:, 0]), np.cos(x[:, 0]), x[:, 1] * x[:, 2]], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+def test_all_quarters_of_a_turn_and_their_edges():
+    angles = np.concatenate([np.arange(-16, 17) * np.pi / 4 + d for d in (-1e-9, 0.0, 1e-9)])
+    x = np.zeros((len(angles), 3))
+    x[:, 0] = angles
+    found = MeasureKernel(graph())(x)
+    np.testing.assert_allclose(found[:, 0], np.sin(angles), rtol=0, atol=4e-16)
+    np.testing.assert_allclose(found[:, 1], np.cos(angles), rtol=0, atol=4e-16)
+
+
+def test_what_is_no_number_is_none():
+    x = np.array([[np.nan, 1.0, 2.0], [np.inf, 1.0, 2.0], [0.5, np.nan, 2.0]])
+    found = MeasureKernel(graph())(x)
+    assert np.isnan(found[:2, :2]).all()
+    assert np.isnan(found[2, 2])
+    assert found[0, 2] == 2.0
+
+
+pytestmark = needs_compiler
+
+OF_ONE = ("sin", "cos", "tan", "asin", "acos", "atan")
+
+
+@pytest.fixture(scope="module")
+def functions() -> tuple[FunctionKernel, MeasureKernel]:
+    x = ca.SX.sym("x", 2)
+    values = [getattr(ca, name)(x[0]) for name in OF_ONE] + [ca.atan2(x[1], x[0])]
+    function = ca.Function("elementary", [x], [ca.vertcat(*values)])
+    return FunctionKernel(function), MeasureKernel(FunctionGraph.of(function))
+
+
+def compare(functions: tuple[FunctionKernel, MeasureKernel], points: np.ndarray) -> None:
+    alone, beside = functions
+    (found,) = alone(points)
+    assert beside(points).tobytes() == found.tobytes()
+    x, y = points.T
+    with np.errstate(all="ignore"):
+        expected = [getattr(np, name.replace("a", "arc", 1) if name[0] == "a" else name)(x)
+                    for name in OF_ONE]  # fmt: skip
+        expected.append(np.arctan2(y, x))
+        # Next to a multiple of pi the last places of a sine are those of pi.
+        off = np.abs(found - np.stack(expected, axis=1)) - 1e-22
+        units = off / np.spacing(np.abs(expected)).T
+    assert (np.isnan(found) == np.isnan(np.stack(expected, axis=1))).all()
+    worst = np.nan_to_num(units).max(axis=0)
+    assert worst[[0, 1, 3, 4, 5, 6]].max() <= 2, worst
+    assert worst[2] <= 16, worst  # a quotient of two
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-8, 1e-3, 1.0, 3.0, 1e3, 4e8, 1e12, 1e300])
+def test_all_sizes(functions: tuple[FunctionKernel, MeasureKernel], scale: float) -> None:
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(20_000, 2)) * scale
+    points[:, 1] *= 10.0 ** rng.uniform(-8, 7, len(points))
+    compare(functions, points)
+
+
+def test_quarters_of_a_turn_and_their_edges(
+    functions: tuple[FunctionKernel, MeasureKernel],
+) -> None:
+    angles = np.concatenate([np.arange(-64, 65) * np.pi / 8 + d for d in (-1e-9, 0.0, 1e-9)])
+    compare(functions, np.stack([angles, 1 + angles], axis=1))
+    edges = np.nextafter([1.0, 1.0, 1.0, -1.0, -1.0, -1.0], [0.0, 1.0, 2.0, 0.0, -1.0, -2.0])
+    compare(functions, np.stack([edges, edges[::-1]], axis=1))
+
+
+def test_signs_of_zero(functions: tuple[FunctionKernel, MeasureKernel]) -> None:
+    zeros = np.array([[x, y] for x in (0.0, -0.0, 2.0, -2.0) for y in (0.0, -0.0)])
+    found = functions[0](zeros)[0][:, -1]
+    np.testing.assert_array_equal(found, np.arctan2(zeros[:, 1], zeros[:, 0]))
+    np.testing.assert_array_equal(np.signbit(found), np.signbit(zeros[:, 1]))
+
+
+def test_one_lane_that_is_large_changes_no_other(
+    functions: tuple[FunctionKernel, MeasureKernel],
+) -> None:
+    points = np.random.default_rng(5).normal(size=(64, 2))
+    points[::5, 0] *= 1e11
+    compare(functions, points)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.floats(allow_subnormal=False), st.floats(-1e6, 1e6, allow_subnormal=False))
+def test_any_number(functions: tuple[FunctionKernel, MeasureKernel], x: float, y: float) -> None:
+    alone, beside = functions
+    points = np.array([[x, y]] * 3)
+    (found,) = alone(points)
+    assert found.tobytes() == beside(points).tobytes()
+    if not np.isnan(x):
+        assert abs(found[0, -1] - np.arctan2(y, x)) <= 1e-15 * 4

@@ -11,7 +11,7 @@ import pytest
 from pinocchio_oracle import PinocchioRobot, verdict
 
 import casadi_ik as ik
-from casadi_ik.registry import build_method, method_summary
+from casadi_ik import registry
 
 PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
 ROBOTS = ik.shipped_names("arm_hands")
@@ -186,7 +186,9 @@ def test_a_batch_is_its_single_solves(case):
 def test_a_batch_goes_side_by_side(case):
     """No line of any method's code is refused by the rewriting, and on one robot it is run."""
     options = {"finger_step": "closed-form"} if case.method.startswith("enhanced") else {}
-    kernel = getattr(build_method(case.method, case.robot.description, options), "kernel", None)
+    kernel = getattr(
+        registry.build_method(case.method, case.robot.description, options), "kernel", None
+    )
     if kernel is None or not kernel.compiled:
         pytest.skip("no compiled loop")
     if case.robot.name != "kuka_lwr_barrett":
@@ -386,5 +388,5 @@ def test_a_name_is_no_robot():
 
 def test_every_method_has_a_summary():
     for method in ik.METHODS:
-        assert "\n" not in method_summary(method)
-        assert len(method_summary(method)) > 20
+        assert "\n" not in registry.method_summary(method)
+        assert len(registry.method_summary(method)) > 20

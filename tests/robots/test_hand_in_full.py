@@ -10,12 +10,13 @@ import pytest
 import yaml
 
 import casadi_ik as ik
-from casadi_ik.files.shipped import models_folder
+
+MODELS = Path(__file__).parents[2] / "models"
 
 
 def in_full(folder: Path, name: str = "kuka_lwr_barrett", **changes: Any) -> Path:
     """A shipped robot with its hand written out; keyword arguments replace the hand's keys."""
-    models = models_folder()
+    models = MODELS
     robot = yaml.safe_load((models / "arm_hands" / f"{name}.yaml").read_text())
     hand = yaml.safe_load((models / "hands" / f"{robot['hand']}.yaml").read_text())
     path = folder / "whole.yaml"

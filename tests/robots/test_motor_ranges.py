@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -9,9 +11,10 @@ import yaml
 from toy_robots import COUPLED_HAND, copy_shipped_robot, write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.files.shipped import models_folder
 from casadi_ik.robots.couplings import FourBar, LeadScrew, Linear
 from casadi_ik.symbolic.couplings import follow
+
+MODELS = Path(__file__).parents[2] / "models"
 
 NARROW = {
     "left_spread": [-0.1, 0.5],
@@ -41,7 +44,7 @@ def narrow(tmp_path):
 def narrow_barrett(folder):
     """The shipped arm with the coupled hand, whose distal joints keep to 8 to 30 deg."""
     path = copy_shipped_robot(folder)
-    models = models_folder()
+    models = MODELS
     hand = yaml.safe_load((models / "hands" / "barrett_bh8_280_coupled.yaml").read_text())
     for joint in hand["joints"]:
         if joint["name"].endswith("distal"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import yaml
 
 import casadi_ik as ik
 from casadi_ik import robots
-from casadi_ik.files.shipped import models_folder
+
+MODELS = Path(__file__).parents[2] / "models"
 
 DEG = np.pi / 180
 
@@ -172,7 +174,7 @@ def test_one_motor_spreads_two_fingers_mirrored(robot):
 
 @pytest.mark.parametrize("kind", ["arms", "hands"])
 def test_every_number_has_a_source(kind):
-    for path in (models_folder() / kind).glob("*.yaml"):
+    for path in (MODELS / kind).glob("*.yaml"):
         text = yaml.safe_load(path.read_text())
         entries = [*text["joints"], *text.get("fingers", {}).values()]
         entries += [text[key] for key in ("tip", "palm") if key in text]

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import main
 
 import casadi_ik as ik
 from casadi_ik import viewing
-from casadi_ik.cli.main import main
 from casadi_ik.cli.report import as_json
 from casadi_ik.cli.table import parse
 from casadi_ik.cli.view import opened
