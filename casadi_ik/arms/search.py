@@ -188,6 +188,12 @@ class ArmTrials:
         return self.trials
 
     @property
+    def closer(self) -> int | None:
+        """The first trial around the best so far; None if nothing is varied."""
+        closer = (i for i, level in enumerate(self._levels) if level.around)
+        return next(closer) if self._varied else None
+
+    @property
     def is_nearest(self) -> bool:
         """Whether arms near to a given one are wanted."""
         return isinstance(self.score, Nearest)

@@ -94,8 +94,8 @@ def test_every_public_name_is_on_a_page_of_the_reference() -> None:
     for page in (ROOT / "docs" / "reference").glob("*.md"):
         for names in re.findall(r"^<!-- here: api (.*) -->$", page.read_text(), re.MULTILINE):
             shown += names.split()
-    public = set(ik.__all__) - set(public.SUBMODULES)
+    names = set(ik.__all__) - set(public.SUBMODULES)
     for module in set(public.SUBMODULES) - {"errors"}:
-        public |= {f"{module}.{name}" for name in getattr(ik, module).__all__}
-    public -= {"CasadiIKError"}  # with the other errors, by their module
-    assert sorted(name for name in shown if not name.startswith("errors.")) == sorted(public)
+        names |= {f"{module}.{name}" for name in getattr(ik, module).__all__}
+    names -= {"CasadiIKError"}  # with the other errors, by their module
+    assert sorted(name for name in shown if not name.startswith("errors.")) == sorted(names)

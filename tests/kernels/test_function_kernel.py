@@ -8,7 +8,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from graphs import needs_compiler, random_expression
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,6 +15,8 @@ import casadi_ik as ik
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.function_kernel import MeasureKernel
 from casadi_ik.kernels.graphs import FunctionGraph
+
+from .graphs import needs_compiler, random_expression
 
 BOTH = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
 

@@ -7,13 +7,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from graphs import needs_compiler
 from hypothesis import given
 from hypothesis import strategies as st
 
 import casadi_ik as ik
 from casadi_ik.kernels import Field, Layout, LoopKernel, StepGraph
 from casadi_ik.kernels.layout import STORAGE, store_rows
+
+from .graphs import needs_compiler
 
 shapes = st.one_of(
     st.just(()), st.tuples(st.integers(1, 4)), st.tuples(st.integers(1, 3), st.integers(1, 4))

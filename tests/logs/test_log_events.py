@@ -18,7 +18,7 @@ import casadi_ik as ik
 from casadi_ik import errors, logs
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.events import event_format
-from casadi_ik.methods.common import coupling_record
+from casadi_ik.methods.common import limits as coupling_record
 from casadi_ik.problem.jacobian_measures import THRESHOLDS, JacobianMeasures
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 

@@ -150,12 +150,16 @@ class ThumbFirstStep(ThumbFirstLayouts):
         origin: Expr = ca.MX.sym("origin", 3)
         columns, first = list(self.robot.arm_actuators), ca.MX(0)
         here, lower, upper = (ca.MX.sym(name, len(columns)) for name in ("here", "lower", "upper"))
-        palm, best = Pose(rotation, origin), (here, first)
+        palm, bounds = Pose(rotation, origin), (lower, upper)
         ranges = (self.robot.upper - self.robot.lower)[columns]
         inputs, cases = [rotation, origin, here, lower, upper], []
         for score in (Nearest.by_ranges(ranges), Farthest()):
             search = ArmTrials(family, score)
-            arm, *_ = search.trial(palm, (lower, upper), first, best, first, here)
+            arm, value, swivel = search.trial(palm, bounds, first, (here, first), first, here)
+            if search.is_nearest and search.closer is not None:
+                around = ca.MX(search.closer)
+                other, better, _ = search.trial(palm, bounds, around, (arm, swivel), first, here)
+                arm = ca.if_else(better > value, other, arm)
             cases.append(ca.Function("near_or_far", inputs, [arm]))
         return ca.Function.if_else("arm_start", *cases)
 
