@@ -353,7 +353,8 @@ class _Writer:
                 self._put(node, node.value)
 
     def _put(self, node: _Node, value: str) -> None:
-        self._lines.append(f"const {'mask' if node.mask else 'real'} {node.name}={value};")
+        # Not const: clang would look for a constant's value through all that it is made of.
+        self._lines.append(f"{'mask' if node.mask else 'real'} {node.name}={value};")
         node.written = True
 
     def _call(self, number: int) -> None:
