@@ -130,7 +130,8 @@ def test_ctrl_c_while_modules_are_imported() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.meta_path.insert(0, Finder())
     sys.argv = ["casadi-ik", "grasps"]
-        sys.exit(main())
+    from casadi_ik.cli.main import main
+    sys.exit(main())
     """
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, capture_output=True, text=True, check=False)

@@ -18,7 +18,7 @@ HERE = Path(__file__).parent
 
 OF_THE_COMPILER = (
     "bit_for_bit or last_places or finite or equals_vm or row_major or comes_back or threads "
-    "or lookup or elementary"
+    "or lookup or number"
 )
 """Of the kernels' tests those whose outcome may be another with another compiler: arithmetic, the
 order of numbers, vectors, locks. What C says in any case is said once."""
@@ -54,7 +54,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def test_the_kernel_tests_pass(environment: dict[str, str]) -> None:
-    files = ("test_loop.py", "test_function_kernel.py", "test_lookup.py", "test_elementary.py")
+    files = ("test_loop.py", "test_function_kernel.py", "test_lookup.py")
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0"]
     done = subprocess.run(
         [
