@@ -1,5 +1,6 @@
 """MCAP logs: every iteration into a file, and back."""
 
+from casadi_ik.logs.cdr import RecordedMotion, read_motion
 from casadi_ik.logs.compare import matched, side_by_side
 from casadi_ik.logs.detect import detect_events
 from casadi_ik.logs.events import EventKind, EventRules
@@ -25,6 +26,7 @@ __all__ = [
     "McapRecorder",
     "MethodRows",
     "OneSolve",
+    "RecordedMotion",
     "Table",
     "detect_events",
     "explain",
@@ -33,5 +35,6 @@ __all__ = [
     "merge_logs",
     "one_solve",
     "open",
+    "read_motion",
     "side_by_side",
 ]

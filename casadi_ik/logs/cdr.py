@@ -1,14 +1,21 @@
-"""ROS 2 messages as bytes: plain CDR, little endian."""
+"""ROS 2 messages as bytes (plain CDR, little endian), and recorded motions read from them."""
 
 from __future__ import annotations
 
+import os
+import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.logs.chunks import CDR_HEADER
+from casadi_ik.errors import LogError
+from casadi_ik.logs.chunks import CDR_HEADER, MESSAGE
+from casadi_ik.logs.container import read_chunk, read_contents, reading
 
 Stamp = tuple[int, int]
 """Seconds and nanoseconds: a time, or a duration."""
@@ -89,3 +96,115 @@ def cdr(values: Iterable[Value]) -> bytes:
                 data = text.encode() + b"\0"
                 out += bytes(-len(out) % 4) + struct.pack("<I", len(data)) + data
     return bytes(out)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedMotion:
+    """A motion out of a file: what `reach` and `follow` write, and `ik.motion.Motion.write`.
+
+    Attributes:
+        robot: Name of the robot, as its URDF in the file has it.
+        actuators: Names of the n actuators.
+        times: (k,) from the start [s].
+        q: (k, n) [rad or m].
+
+    Example:
+        >>> times, q = np.array([0.0, 0.1]), np.stack([robot.home, robot.home])
+        >>> ik.motion.Motion(robot, times, q, 0 * q, 0 * q).write("still.mcap")
+        >>> recorded = ik.logs.read_motion("still.mcap")
+        >>> recorded.robot, recorded.q.shape
+        ('kuka_lwr_barrett', (2, 14))
+    """
+
+    robot: str
+    actuators: tuple[str, ...]
+    times: Array
+    q: Array
+
+    def ordered(self, actuators: Sequence[str]) -> Array:
+        """The positions (k, n) of a robot's actuators, in its order.
+
+        Raises:
+            LogError: The motion is of other actuators.
+        """
+        if sorted(self.actuators) != sorted(actuators):
+            raise LogError(
+                f"a motion of {', '.join(self.actuators)}; the robot has {', '.join(actuators)}"
+            )
+        return self.q[:, [self.actuators.index(name) for name in actuators]]
+
+
+def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
+    """Read a motion from an MCAP file; the contacts follow from `ArmHand.contacts`.
+
+    Raises:
+        LogError: The file is missing, damaged, no MCAP file, or holds no motion.
+
+    Example:
+        >>> times, q = np.array([0.0, 0.1]), np.stack([robot.home, robot.home])
+        >>> ik.motion.Motion(robot, times, q, 0 * q, 0 * q).write("still.mcap")
+        >>> motion = ik.logs.read_motion("still.mcap")
+        >>> points, normals = robot.contacts(motion.ordered(robot.actuators))
+    """
+    with reading(Path(path)) as stream:
+        contents = read_contents(Path(path))
+        topics = {channel.id: channel.topic for channel in contents.summary.channels.values()}
+        found: dict[str, bytes] = {}
+        wanted = "/robot_description", "/joint_trajectory"
+        for index in contents.chunks:
+            chunk = read_chunk(stream, index)
+            for run in chunk.runs:
+                if topics.get(run.channel) in wanted:
+                    start = run.start + MESSAGE.itemsize
+                    found[topics[run.channel]] = chunk.data[start : run.start + run.size]
+        if len(found) < len(wanted):
+            raise LogError(f"no motion: found {', '.join(topics.values()) or 'no topic'}")
+        try:
+            description, trajectory = (_Reader(found[topic]) for topic in wanted)
+            robot = re.search(r'<robot\s[^>]*?name="([^"<]*)"', description.text())
+            trajectory.place = 8
+            trajectory.text()
+            actuators = tuple(trajectory.text() for _ in range(trajectory.number("<I")))
+            times, q = [], []
+            for _ in range(trajectory.number("<I")):
+                q.append(trajectory.numbers())
+                for _ in range(3):
+                    trajectory.numbers()
+                times.append(trajectory.number("<i") + 1e-9 * trajectory.number("<I"))
+            motion = RecordedMotion(
+                robot[1] if robot else "", actuators, np.array(times), np.array(q)
+            )
+        except (struct.error, ValueError) as error:
+            raise LogError(f"the motion is damaged: {error}") from error
+        shape = len(times), len(actuators)
+        if not times or motion.q.shape != shape or not np.isfinite(motion.q).all():
+            raise LogError(f"the motion is damaged: expected {shape} finite positions")
+        return motion
+
+
+class _Reader:
+    """Values of a message, one after the other; the inverse of `cdr`."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.place = data, 0
+
+    def number(self, kind: str) -> Any:
+        """A number of four bytes."""
+        self.place += -self.place % 4
+        (value,) = struct.unpack_from(kind, self.data, self.place)
+        self.place += 4
+        return value
+
+    def text(self) -> str:
+        """A text, its end mark left out."""
+        length = self.number("<I")
+        self.place += length
+        return self.data[self.place - length : self.place - 1].decode()
+
+    def numbers(self) -> Array:
+        """A sequence of float64."""
+        count = self.number("<I")
+        self.place += -self.place % 8 if count else 0
+        values = np.frombuffer(self.data, "<f8", count, self.place)
+        self.place += 8 * count
+        return values

@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import CompressionType, IndexType, Writer
 
+import casadi_ik as ik
 from casadi_ik import errors, logs
 
 Write = Callable[..., Path]
@@ -477,3 +478,31 @@ def test_only_the_beginning_of_a_file(tmp_path: Path) -> None:
         (tmp_path / f"{i}.mcap").write_bytes(data)
     with pytest.raises(errors.LogError, match=r"0\.mcap: nothing in it is whole, nor in 2 others"):
         logs.open(tmp_path)
+
+
+def test_a_motion_is_read_back_or_refused(tmp_path: Path) -> None:
+    robot, path = ik.load_robot("kuka_lwr_barrett"), tmp_path / "way.mcap"
+    rng = np.random.default_rng(0)
+    times, q = 0.1 * np.arange(5), robot.random(rng, 5)
+    ik.motion.Motion(robot, times, q, 0 * q, 0 * q).write(path)
+    found = logs.read_motion(path)
+    assert (found.robot, found.actuators) == (robot.name, robot.actuators)
+    np.testing.assert_allclose(found.times, times, atol=1e-9)
+    np.testing.assert_array_equal(found.q, q)
+    np.testing.assert_array_equal(found.ordered(robot.actuators[::-1]), q[:, ::-1])
+    with pytest.raises(errors.LogError, match="a motion of lwr_joint_1, "):
+        found.ordered(("elbow",))
+    whole, refused = path.read_bytes(), 0
+    for i in range(100):
+        data = bytearray(whole[: rng.integers(len(whole)) if i % 2 else None])
+        data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        path.write_bytes(data)
+        try:
+            np.testing.assert_array_equal(logs.read_motion(path).q, q)
+        except errors.LogError as error:
+            refused += str(error).startswith(f"{path}: ")
+    assert refused > 90
+    solved = tmp_path / "log.mcap"
+    ik.Solver(robot).solve(ik.load_grasp("cup"), log=solved)
+    with pytest.raises(errors.LogError, match=r"log\.mcap: no motion: found /ik/hand-first"):
+        logs.read_motion(solved)
