@@ -95,14 +95,14 @@ def check_installed(cluster: str | None) -> None:
     except ImportError as error:
         raise UnsupportedError(
             "batches in parts (--resume, --part-size, --dask, Parquet, folders) need joblib: "
-            "pip install casadi-ik[cluster]"
+            "pip install 'casadi-ik[cluster]'"
         ) from error
     if cluster is None:
         return
     try:
         import dask.distributed  # noqa: F401 - makes its loggers
     except ImportError as error:
-        raise UnsupportedError("--dask: needs Dask: pip install casadi-ik[cluster]") from error
+        raise UnsupportedError("--dask: needs Dask: pip install 'casadi-ik[cluster]'") from error
 
 
 def _client(address: str) -> Client:

@@ -51,9 +51,9 @@ def solve(said: Said) -> Answer:
     a grasp file:
       robot: kuka_lwr_barrett
       contacts:   # point [m], outward pad normal, in the robot's base frame
-        thumb:    {point: [0.52, 0.10, 0.60], normal: [0.0, -0.94, 0.34]}
-        finger_2: {point: [0.55, 0.02, 0.60], normal: [0.0, 0.94, 0.34]}
-        finger_3: {point: [0.49, 0.02, 0.60], normal: [0.0, 0.94, 0.34]}
+        thumb:    {point: [-0.83, 0.15, 0.41], normal: [0.48, -0.88, 0]}
+        finger_2: {point: [-0.84, 0.11, 0.435], normal: [0.72, 0.70, 0]}
+        finger_3: {point: [-0.84, 0.11, 0.385], normal: [0.72, 0.70, 0]}
 
     exit codes: 0 solved, 1 not solved (the report says why), 2 bad input
     """

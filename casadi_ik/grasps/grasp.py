@@ -286,12 +286,12 @@ class Grasp:
     Example:
         >>> pinch = ik.Grasp(
         ...     {
-        ...         "thumb": ik.Contact([-0.70, 0.05, 0.42], [-0.42, -0.91, 0.0]),
-        ...         "finger_2": ik.Contact([-0.70, -0.01, 0.45], [-0.42, 0.91, 0.0]),
+        ...         "thumb": ik.Contact([-0.83, 0.15, 0.41], [0.48, -0.88, 0.0]),
+        ...         "finger_2": ik.Contact([-0.84, 0.11, 0.435], [0.72, 0.70, 0.0]),
         ...     }
         ... )
-        >>> sorted(pinch.contacts)
-        ['finger_2', 'thumb']
+        >>> solver.solve(pinch).success
+        True
     """
 
     contacts: Mapping[str, Contact] = field(default_factory=dict)

@@ -46,7 +46,7 @@ try:
     from foxglove import messages as fox
 except ImportError as error:
     raise MissingExtraError(
-        "viewer files need foxglove-sdk, which is not installed: pip install casadi-ik[viewer]"
+        "viewer files need foxglove-sdk, which is not installed: pip install 'casadi-ik[viewer]'"
     ) from error
 
 ITERATION = 10_000_000

@@ -207,7 +207,7 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
         from toppra.simplepath import SimplePath
     except ImportError as error:
         raise MissingExtraError(
-            "timing needs toppra, which is not installed: pip install casadi-ik[motion]"
+            "timing needs toppra, which is not installed: pip install 'casadi-ik[motion]'"
         ) from error
     tuning = TimingTuning()
     lengths = np.abs(np.diff(path, axis=0)).sum(axis=0)

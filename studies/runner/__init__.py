@@ -10,5 +10,5 @@ from casadi_ik.errors import MissingExtraError
 for _name in ("joblib", "markdown_it", "matplotlib", "polars"):
     if find_spec(_name) is None:
         raise MissingExtraError(
-            f"studies need {_name}, which is not installed: pip install casadi-ik[studies]"
+            f"studies need {_name}, which is not installed: pip install 'casadi-ik[studies]'"
         )

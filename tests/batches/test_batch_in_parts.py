@@ -263,7 +263,7 @@ def test_an_extra_that_is_missing_leaves_nothing(
     for out in (tmp_path / "out.npz", tmp_path / "out"):
         assert main(["batch", str(path), *ROBOT, "--resume", "--out", str(out)]) == 2
         error = capsys.readouterr().err
-        assert f"pip install casadi-ik[{said}]" in error
+        assert f"pip install 'casadi-ik[{said}]'" in error
         assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == [path]
 

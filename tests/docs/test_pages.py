@@ -1,10 +1,15 @@
-"""What the pages tell people to type and to write: commands that exist, files that are accepted."""
+"""What the pages show people to type and to run: it exists, is accepted, is solved, runs."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import io
 import re
 import shlex
+import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +20,37 @@ import yaml
 import casadi_ik as ik
 from casadi_ik import public
 from casadi_ik.cli.lists import schema_of
+from casadi_ik.cli.main import main
 from casadi_ik.cli.table import COMMANDS, GROUPS, load
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^    (casadi-ik .*)$", re.MULTILINE)
+FILE_NAME = re.compile(r"# (\w+\.yaml)\b")
+"""First line of a block of YAML that is meant to be saved."""
+
+WITH_OUTPUT = re.compile(r"^```python\n((?:(?!```).)*)^```\n\n```text\n(.*?)^```", re.M | re.S)
+"""A block of Python, and what it prints."""
+
+NOT_PASTED = {"add_a_coupling", "add_a_shape", "add_an_arm_family", "your_robot"}
+"""Their Python belongs into modules of the package, for which each has a test of its own; that of
+`your_robot` stands between commands and is run with them."""
+
+GRASP = re.compile(r"^( *)contacts:.*\n(?:\1 +\w+: +\{point.*\n)+", re.MULTILINE)
+"""A grasp in a docstring."""
+
+STEP = re.compile(
+    r"^```python\n(?P<python>.*?)^```|^```sh\n.*?^```|^```.*?^```|^    casadi-ik [^\n]*$",
+    re.M | re.S,
+)
+"""What a reader does next on a page."""
+
+INPUT = re.compile(r"\.(urdf|xml|xacro|npz|npy|pt|parquet|mcap|yaml|json|csv)$|/$")
+"""Names of files that a command reads."""
+
+NOT_RUN = ("view", "follow", "completion")
+"""Commands that serve until they are stopped, or need a recording of a hand."""
 
 
 def commands(text: str) -> Iterator[str]:
@@ -57,11 +87,45 @@ def yaml_blocks(text: str) -> Iterator[Any]:
 def kind_of(data: Any) -> str:
     """Which file it is, as far as it is a whole one."""
     keys = set(data) if isinstance(data, dict) else set()
-    if "contacts" in keys:
-        return "grasp"
-    if "solids" in keys:
-        return "scene"
+    for key, kind in (("candidates", "candidates"), ("contacts", "grasp"), ("solids", "scene")):
+        if key in keys:
+            return kind
     return "robot" if {"name", "hand"} <= keys else ""
+
+
+def python_blocks(page: Path) -> list[str]:
+    text = page.read_text(encoding="utf-8")
+    return [body for language, body in BLOCK.findall(text) if language == "python"]
+
+
+def printed(block: str, names: dict[str, Any]) -> str:
+    """What a block prints."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        exec(compile(block, "page", "exec"), names)
+    return out.getvalue()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where a page's lines are run."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    sys.modules.pop("make_grasp_sets", None)
+    return tmp_path
+
+
+def save_files(page: Path, folder: Path) -> None:
+    """Blocks of YAML whose first line is their file's name, and the sets that a tool makes."""
+    for language, body in BLOCK.findall(page.read_text(encoding="utf-8")):
+        name = FILE_NAME.match(body)
+        if language == "yaml" and name:
+            (folder / name[1]).write_text(body, encoding="utf-8")
+    if "make_grasp_sets" in page.read_text():
+        sets = importlib.import_module("make_grasp_sets")
+        (folder / "sets").mkdir()
+        for name in ("getagrip_allegro", "dexgraspnet_shadow"):
+            sets.made(name, folder / "sets")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
@@ -78,8 +142,8 @@ def test_files_are_accepted() -> None:
                 errors = list(jsonschema.Draft7Validator(schema_of(kind)).iter_errors(data))
                 assert not errors, f"{page.name}: {errors[0].message}"
                 seen.append(kind)
-    assert len(seen) >= 6
-    assert set(seen) == {"grasp", "scene", "robot"}
+    assert len(seen) >= 7
+    assert set(seen) == {"grasp", "scene", "robot", "candidates"}
 
 
 def test_faults_are_seen() -> None:
@@ -87,6 +151,102 @@ def test_faults_are_seen() -> None:
     assert fault("casadi-ik solved cup") == "no command 'solved'"
     assert fault("casadi-ik log why cup.mcap --scene table") == "no option --scene"
     assert sum(1 for page in PAGES for _ in commands(page.read_text())) > 40
+
+
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if python_blocks(page) and page.stem not in NOT_PASTED],
+    ids=lambda path: path.stem,
+)
+def test_python_runs_when_pasted(page: Path, folder: Path) -> None:
+    """Every block alone, or after the page's first one."""
+    save_files(page, folder)
+    first, *others = python_blocks(page)
+    known: dict[str, Any] = {}
+    outputs = {first: printed(first, known)}
+    for block in others:
+        outputs[block] = printed(block, dict(known))
+    for block, text in WITH_OUTPUT.findall(page.read_text(encoding="utf-8")):
+        assert outputs[block] == text
+
+
+def grasps_shown() -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every grasp in YAML on a page, in a docstring or in a help text, and where it stands."""
+    for page in PAGES:
+        for data in yaml_blocks(page.read_text()):
+            kind = kind_of(data)
+            for one in data["candidates"] if kind == "candidates" else [data] * (kind == "grasp"):
+                yield page.name, {"robot": data["robot"]} | one
+    for source in sorted((ROOT / "casadi_ik").rglob("*.py")):
+        for found in GRASP.finditer(source.read_text(encoding="utf-8")):
+            if "..." not in found[0]:
+                yield source.name, {"robot": "kuka_lwr_barrett"} | yaml.safe_load(found[0])
+
+
+def test_every_grasp_shown_is_solved(tmp_path: Path) -> None:
+    shown = list(grasps_shown())
+    assert len(shown) >= 6
+    for where, data in shown:
+        path = tmp_path / "shown.yaml"
+        path.write_text(yaml.safe_dump(data), encoding="utf-8")
+        grasp = ik.load_grasp(path)
+        solution = ik.Solver(ik.load_robot(grasp.robot)).solve(grasp)
+        assert solution.success, f"{where}: {solution.status.name}"
+
+
+def without_pictures(words: list[str]) -> list[str]:
+    """Arguments without what is drawn: tests/views draws."""
+    kept = list(words)
+    for name in ("--picture", "--picture-dark", "--animation"):
+        if name in kept:
+            del kept[kept.index(name) : kept.index(name) + 2]
+    return kept
+
+
+def missing(words: list[str]) -> bool:
+    """Whether a command reads what a reader has to bring along."""
+    given = [
+        word
+        for before, word in pairwise(["", *words])
+        if not before.startswith("--out") and before != "--log"
+    ]
+    return any(word.isupper() or (INPUT.search(word) and not Path(word).exists()) for word in given)
+
+
+def gone_through(page: Path, folder: Path) -> list[str]:
+    """A page done from top to bottom; the commands that were run."""
+    save_files(page, folder)
+    text, names, done = page.read_text(encoding="utf-8"), {}, []
+    for found in STEP.finditer(text):
+        if found["python"]:
+            printed(found["python"], names)
+        for line in commands(found[0]):
+            words = without_pictures(shlex.split(line, comments=True)[1:])
+            if words[0] in NOT_RUN or missing(words) or words == ["import", "my_robot.yaml"]:
+                continue
+            unsolved = re.match(
+                r"\n*```text\n(UNREACHABLE|NOT_FOUND|COLLISION)", text[found.end() :]
+            )
+            assert main(words) == (1 if unsolved else 0), line
+            done.append(line)
+    return done
+
+
+@pytest.mark.parametrize(
+    ("page", "count"),
+    [
+        ("README", 4),
+        ("first_grasp", 6),
+        ("your_robot", 3),
+        ("choosing", 2),
+        ("motion", 1),
+        ("logs", 9),
+    ],
+)
+def test_pages_are_gone_through(page: str, count: int, folder: Path) -> None:
+    """Commands, Python and files in the order of the page, as one reader does it."""
+    path = next(one for one in PAGES if one.stem == page)
+    assert len(gone_through(path, folder)) >= count
 
 
 def test_every_public_name_is_on_a_page_of_the_reference() -> None:

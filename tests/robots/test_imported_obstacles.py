@@ -189,7 +189,7 @@ def test_formats_whose_reader_is_missing_name_the_extra(tmp_path, module, name):
         "except ImportError as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert f"pip install casadi-ik[{module}]" in done.stdout, done
+    assert f"pip install 'casadi-ik[{module}]'" in done.stdout, done
 
 
 def test_pinocchio_says_nothing_of_its_own(tmp_path, capfd):

@@ -30,7 +30,7 @@ def confined(what: str, path: Path) -> bytes:
     """
     if find_spec(what) is None:
         noun = "has xacro macros" if what == MACROS else "is MJCF"
-        raise MissingExtraError(f"{path}: {noun}; to read it: pip install casadi-ik[{what}]")
+        raise MissingExtraError(f"{path}: {noun}; to read it: pip install 'casadi-ik[{what}]'")
     seconds, doing = limit(LIMITS.reader_seconds), "expand" if what == MACROS else "read"
     limits = (seconds, limit(LIMITS.reader_memory), limit(LIMITS.reader_output))
     # Not the script's folder, whose modules are called as some of others are.
