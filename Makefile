@@ -32,7 +32,7 @@ $(VENV)/python.stamp:
 	touch $@
 
 $(VENV)/demo.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt
-	$(INSTALL) -e ".[plots]"
+	$(INSTALL) -e ".[plots,reference]"
 	touch $@
 
 $(VENV)/dev.stamp: $(VENV)/python.stamp pyproject.toml constraints.txt

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from casadi_ik.public import *  # noqa: F403
 
+__version__ = "0.1.0"
+
 
 def __getattr__(name: str) -> Any:
     """Import the public names when the first of them is used (PEP 562).

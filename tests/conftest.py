@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
 from hypothesis import settings
-from pinocchio_oracle import PinocchioRobot
 from toy_robots import copy_shipped_robot, write_coupled_robot
 
 import casadi_ik as ik
+
+if TYPE_CHECKING:
+    from pinocchio_oracle import PinocchioRobot
+
+REFERENCE = re.compile(r"^ *(?:import|from) (?:pinocchio|coal)(?:_oracle)?\b", re.MULTILINE)
+"""A test module that asks other libraries for a second opinion: the extra `reference`."""
 
 # Half the time of the tests was the compiler's. Without optimisation it takes 0.4 of that, and not
 # a bit of a result is another (`test_optimisation_changes_no_bit`, of kernels and of hand-first).
@@ -25,6 +33,18 @@ os.environ.setdefault("CASADI_IK_CFLAGS", "-O0")
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
+
+
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    """Leave out modules that compare with pinocchio and coal where these are not installed."""
+    if collection_path.suffix != ".py" or find_spec("pinocchio") is not None:
+        return None
+    return True if REFERENCE.search(collection_path.read_text(encoding="utf-8")) else None
+
+
+def pytest_report_header() -> str:
+    """Say what is left out."""
+    return "" if find_spec("pinocchio") else "no pinocchio: comparisons with it are left out"
 
 
 @pytest.fixture(scope="session")
@@ -42,12 +62,18 @@ def coupled_robot(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
 @pytest.fixture(scope="session")
 def oracle(robot: ik.ArmHand) -> PinocchioRobot:
     """The shipped robot as pinocchio reads it from the written URDF."""
+    pytest.importorskip("pinocchio")
+    from pinocchio_oracle import PinocchioRobot
+
     return PinocchioRobot(robot)
 
 
 @pytest.fixture(scope="session")
 def coupled_oracle(coupled_robot: ik.ArmHand) -> PinocchioRobot:
     """The coupled robot as pinocchio reads it from the written URDF."""
+    pytest.importorskip("pinocchio")
+    from pinocchio_oracle import PinocchioRobot
+
     return PinocchioRobot(coupled_robot)
 
 

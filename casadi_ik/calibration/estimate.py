@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import proxsuite
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
@@ -379,6 +378,8 @@ def _sizes(errors: Array, turned: NDArray[np.bool_]) -> Array:
 
 def _in_box(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
     """Minimiser of x' H x / 2 + g' x within bounds."""
+    import proxsuite
+
     n = len(gradient)
     result = proxsuite.proxqp.dense.solve(
         hessian, gradient, None, None, np.eye(n), lower, upper, eps_abs=1e-10

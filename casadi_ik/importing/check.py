@@ -140,7 +140,7 @@ def _pinocchio() -> Any:
     except ImportError as error:
         raise MissingExtraError(
             "URDF files are checked by pinocchio, which is not installed (there is none for "
-            "Windows): pip install pin"
+            "Windows): pip install 'casadi-ik[reference]'"
         ) from error
     return module
 

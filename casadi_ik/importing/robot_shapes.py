@@ -9,13 +9,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import between_segments
-from casadi_ik.importing.capsules import FIT, fitted
+from casadi_ik.importing.capsules import FIT, Rows, fitted
 from casadi_ik.importing.posture import Jointed, Postures
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.robots.collision import Touching, capsules_of
@@ -117,7 +118,7 @@ def _verdict(
         return []
     looked, always = hit[: SAMPLING.looked_at], len(hit) == SAMPLING.samples
     said = f"their shapes touch in {len(hit)} of {SAMPLING.samples} random configurations, seed 0, "
-    if not meshes.known:
+    if not meshes.known(*links):
         return [Touching(links, said + "their meshes were not looked at")] if always else []
     if not any(meshes.touch(poses[row], *links) for row in looked.tolist()):
         return [Touching(links, said + "their meshes in none")]
@@ -154,40 +155,112 @@ def _segments(
     return np.concatenate([middle + origins, half], axis=2)
 
 
+class TriangleTree:
+    """Triangles in a balanced tree of boxes, to find whether two meshes meet.
+
+    Level k has 2^k boxes along the axes of the mesh's frame; the last level has one for each
+    triangle, of which some are there twice to fill it.
+    """
+
+    def __init__(self, triangles: Array) -> None:
+        """Sort triangles (t, 3, 3) [m] into boxes."""
+        depth = max(len(triangles) - 1, 0).bit_length()
+        order = np.resize(np.arange(len(triangles)), 2**depth)[None]
+        middles = triangles.mean(axis=1)
+        while order.shape[1] > 1:  # halve each box along its longest side
+            inside = middles[order]
+            longest = np.ptp(inside, axis=1).argmax(axis=1)
+            along = np.take_along_axis(inside, longest[:, None, None], axis=2)[:, :, 0]
+            order = np.take_along_axis(order, along.argsort(axis=1), axis=1)
+            order = order.reshape(2 * len(order), -1)
+        self.triangles = triangles[order[:, 0]]
+        low, high = self.triangles.min(axis=1), self.triangles.max(axis=1)
+        self.levels = [((low + high) / 2, (high - low) / 2)]
+        for _ in range(depth):
+            low = low.reshape(-1, 2, 3).min(axis=1)
+            high = high.reshape(-1, 2, 3).max(axis=1)
+            self.levels.insert(0, ((low + high) / 2, (high - low) / 2))
+
+    def meets(self, other: TriangleTree, pose: Array) -> bool:
+        """Whether a triangle of one crosses one of another mesh, whose frame has a (4, 4) pose."""
+        waiting = [(0, 0, np.zeros(1, np.intp), np.zeros(1, np.intp))]
+        ends = len(self.levels) - 1, len(other.levels) - 1
+        while waiting:
+            level, its, rows, columns = waiting.pop()
+            if len(rows) > PAIRS_AT_ONCE:  # the rest later: a meeting found ends it all
+                waiting.append((level, its, rows[PAIRS_AT_ONCE:], columns[PAIRS_AT_ONCE:]))
+                rows, columns = rows[:PAIRS_AT_ONCE], columns[:PAIRS_AT_ONCE]
+            near = self._near(level, rows, other.levels[its], columns, pose)
+            rows, columns = rows[near], columns[near]
+            if (level, its) == ends:
+                theirs = other.triangles[columns] @ pose[:3, :3].T + pose[:3, 3]
+                if _crossing(self.triangles[rows], theirs).any():
+                    return True
+            elif len(rows):
+                if level < ends[0]:
+                    rows, columns = np.r_[2 * rows, 2 * rows + 1], np.r_[columns, columns]
+                if its < ends[1]:
+                    rows, columns = np.r_[rows, rows], np.r_[2 * columns, 2 * columns + 1]
+                waiting.append((min(level + 1, ends[0]), min(its + 1, ends[1]), rows, columns))
+        return False
+
+    def _near(
+        self, level: int, rows: Rows, theirs: tuple[Array, Array], columns: Rows, pose: Array
+    ) -> NDArray[np.bool_]:
+        """Whether the boxes of some pairs overlap along the axes of either frame."""
+        (middle, half), (at, reach) = self.levels[level], theirs
+        turn = pose[:3, :3]
+        apart = at[columns] @ turn.T + pose[:3, 3] - middle[rows]
+        ours = np.abs(apart) <= half[rows] + reach[columns] @ np.abs(turn).T
+        other = np.abs(apart @ turn) <= reach[columns] + half[rows] @ np.abs(turn)
+        return ours.all(axis=1) & other.all(axis=1)
+
+
+PAIRS_AT_ONCE = 256
+"""Pairs of boxes that are looked at in one piece."""
+
+
+def _crossing(first: Array, second: Array) -> NDArray[np.bool_]:
+    """Whether an edge of one of two triangles (k, 3, 3) goes through the other (Moeller-Trumbore).
+
+    Triangles in one plane do not cross.
+    """
+    found = np.zeros(len(first), bool)
+    for one, other in ((first, second), (second, first)):
+        corner = other[:, 0]
+        side, edge = other[:, 1] - corner, other[:, 2] - corner
+        for i in range(3):
+            along, start = one[:, (i + 1) % 3] - one[:, i], one[:, i] - corner
+            normal, turned = np.cross(along, edge), np.cross(start, side)
+            scale = (side * normal).sum(axis=1)
+            with np.errstate(all="ignore"):
+                u = (start * normal).sum(axis=1) / scale
+                v = (along * turned).sum(axis=1) / scale
+                t = (edge * turned).sum(axis=1) / scale
+                found |= (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
+    return found
+
+
 class _Meshes:
-    """Meshes of links, made when they are asked for."""
+    """Meshes of links, sorted when they are asked for."""
 
     def __init__(self, surfaces: Mapping[str, Surface]) -> None:
         self._surfaces = surfaces
-        self._made: dict[str, Any] = {}
-        try:
-            import coal
-        except ImportError:  # it comes with pinocchio, of which there is none for Windows
-            self._coal: Any = None
-        else:
-            self._coal = coal
+        self._made: dict[str, TriangleTree] = {}
 
-    @property
-    def known(self) -> bool:
-        """Whether there is coal, which tells."""
-        return self._coal is not None
+    def known(self, *links: str) -> bool:
+        """Whether there are triangles of all of them: of too fine a mesh only points are kept."""
+        return all(len(self._surfaces[link].triangles) for link in links)
 
     def touch(self, pose: Mapping[str, Array], one: str, other: str) -> bool:
         """Whether the meshes of two links meet."""
-        coal = self._coal
-        request, result = coal.CollisionRequest(), coal.CollisionResult()
-        places = [coal.Transform3s(pose[x][:3, :3], pose[x][:3, 3]) for x in (one, other)]
-        first, second = self._mesh(one), self._mesh(other)
-        return bool(coal.collide(first, places[0], second, places[1], request, result))
+        between = np.linalg.inv(pose[one]) @ pose[other]
+        return self._mesh(one).meets(self._mesh(other), between)
 
-    def _mesh(self, link: str) -> Any:
+    def _mesh(self, link: str) -> TriangleTree:
         if link not in self._made:
-            surface, model = self._surfaces[link], self._coal.BVHModelOBBRSS()
-            model.beginModel(len(surface.triangles), len(surface.points))
-            model.addVertices(np.asarray(surface.points, dtype=float))
-            model.addTriangles(np.asarray(surface.triangles))
-            model.endModel()
-            self._made[link] = model
+            surface = self._surfaces[link]
+            self._made[link] = TriangleTree(surface.points[surface.triangles])
         return self._made[link]
 
 

@@ -105,6 +105,7 @@ def test_macros_that_grow_without_end(
 
 
 def test_macros_are_expanded_where_they_are_asked_for(run: Command, tmp_path: Path) -> None:
+    pytest.importorskip("pinocchio")
     path, out = robot(tmp_path / "hand.urdf", place="${0.05 * 2}"), tmp_path / "mine.yaml"
     head = '<xacro:property name="unused" value="1"/>'
     assert "import it with --xacro" in run("import", robot(path, head), "--out", out).error
@@ -129,6 +130,7 @@ def test_what_robots_are_written_with_is_expanded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Command, lead: str
 ) -> None:
     """Properties, arguments, conditions, yaml of the folder, and packages, wherever they are."""
+    pytest.importorskip("pinocchio")
     own = tmp_path / "robots" / "hand" / "urdf"
     own.mkdir(parents=True)
     (own / "sizes.yaml").write_text("hand: {long: 0.05, angle: !degrees 90}\n")
@@ -192,6 +194,7 @@ NUMBERS = {
 
 @pytest.mark.parametrize("case", NUMBERS)
 def test_numbers_and_encodings_of_urdf(run: Command, tmp_path: Path, case: str) -> None:
+    pytest.importorskip("pinocchio")
     path = robot(tmp_path / "x.urdf")
     old, new, says = NUMBERS[case]
     assert old in path.read_text()

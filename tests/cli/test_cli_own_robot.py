@@ -64,6 +64,7 @@ def arm(folder: Path) -> Path:
 
 
 def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.Generator) -> None:
+    pytest.importorskip("pinocchio")
     arm(tmp_path)
     hand(tmp_path)
     done = run_process("import", "arm.urdf", "hand.urdf", "--out", "mine.yaml", "--check")
@@ -242,6 +243,7 @@ def gripper(folder: Path) -> Path:
 def test_a_relative_file_finds_its_meshes_and_a_propeller_is_no_thumb(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    pytest.importorskip("pinocchio")
     (tmp_path / "jaws" / "meshes").mkdir(parents=True)
     trimesh.creation.box((0.05, 0.01, 0.02)).export(tmp_path / "jaws" / "meshes" / "jaw.stl")
     gripper(tmp_path / "jaws").rename(tmp_path / "jaws" / "robot.urdf")

@@ -192,7 +192,7 @@ def test_formats_whose_reader_is_missing_name_the_extra(tmp_path, module, name):
     assert f"pip install 'casadi-ik[{module}]'" in done.stdout, done
 
 
-def test_pinocchio_says_nothing_of_its_own(tmp_path, capfd):
+def test_a_robot_without_a_name_is_read_in_silence(tmp_path, capfd):
     path = hand(tmp_path)
     path.write_text(path.read_text().replace('<robot name="hand">', '<robot name="">'))
     ik.load_robot(describe(tmp_path, "hand: {file: hand.urdf}"))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from imported_files import FINGERS, arm, describe, hand, joint, link, urdf
 
 import casadi_ik as ik
 from casadi_ik.importing.check import largest_difference
-from casadi_ik.importing.robot_shapes import robot_shapes
+from casadi_ik.importing.robot_shapes import TriangleTree, robot_shapes
 from casadi_ik.robots.robot_files.read import read_tree
 
 MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"
@@ -26,6 +27,7 @@ def both(tmp_path, arm_text="", hand_text="", more=MOUNT, hand_changes=(), joint
 
 
 def check(robot, path, rng, locked=None, beside=None, carried=None):
+    pytest.importorskip("pinocchio")
     q = robot.random(rng, 5)
     trees = [None if one is None else read_tree(one) for one in (path, beside, carried)]
     assert largest_difference(robot, trees[0], q, locked, *trees[1:]) < 1e-12
@@ -70,6 +72,37 @@ def test_a_link_beyond_the_tip_may_be_called_like_one_of_the_hand(tmp_path, rng)
     check(robot, hand_path, rng, beside=path)
     shapes, _, _ = robot_shapes(robot.description, (read_tree(path), read_tree(hand_path)))
     assert "left_tip" not in shapes
+
+
+def test_meshes_meet_where_coal_says_so(rng):
+    coal = pytest.importorskip("coal")
+    bodies = [
+        trimesh.creation.icosphere(3, 1.0),
+        trimesh.creation.torus(1, 0.2),
+        trimesh.creation.box((1, 2, 0.1)),
+        trimesh.creation.annulus(0.5, 0.6, 2.0),
+        trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False),
+    ]
+    trees, models = [], []
+    for body in bodies:
+        trees.append(TriangleTree(np.asarray(body.triangles, dtype=float)))
+        models.append(coal.BVHModelOBBRSS())
+        models[-1].beginModel(len(body.faces), len(body.vertices))
+        models[-1].addVertices(np.asarray(body.vertices))
+        models[-1].addTriangles(np.asarray(body.faces))
+        models[-1].endModel()
+    found = []
+    for one, other in rng.integers(len(bodies), size=(200, 2)):
+        pose = trimesh.transformations.random_rotation_matrix(rng.random(3))
+        pose[:3, 3] = rng.normal(0, 0.8, 3)
+        theirs = coal.collide(
+            models[one], coal.Transform3s(),
+            models[other], coal.Transform3s(pose[:3, :3], pose[:3, 3]),
+            coal.CollisionRequest(), coal.CollisionResult(),
+        )  # fmt: skip
+        found.append(trees[one].meets(trees[other], pose))
+        assert found[-1] == bool(theirs)
+    assert 40 < sum(found) < 160
 
 
 def test_one_file_with_its_palm(tmp_path, rng):

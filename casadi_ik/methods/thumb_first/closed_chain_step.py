@@ -19,7 +19,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from proxsuite import proxqp as backend
 
 from casadi_ik.problem.contacts import LENGTH, PLACE, ContactRows, tip_vectors
 from casadi_ik.robots.description import RobotDescription
@@ -102,6 +101,8 @@ class ProxqpNode(ca.Callback):
 
     def eval(self, arg: Any) -> list[Any]:
         """Solve one program; with contradicting equations the nearest that can be solved."""
+        from proxsuite import proxqp as backend
+
         H, g, A, b, lower, upper = (np.array(x) for x in arg)
         program = backend.dense.QP(len(g), len(b), 0, True)
         program.settings.eps_abs = ACCURACY

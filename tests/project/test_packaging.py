@@ -1,0 +1,39 @@
+"""What is installed, and what it imports."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import casadi_ik as ik
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+ON_DEMAND = "pinocchio coal matplotlib pyvista polars mujoco scipy proxsuite trimesh collada rich"
+"""What the public names do not import."""
+
+
+def test_version_is_said_once():
+    assert PROJECT["dynamic"] == ["version"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == ik.__version__
+
+
+def test_the_core_asks_for_no_second_opinion():
+    names = [line.split(">")[0].split(";")[0] for line in PROJECT["dependencies"]]
+    assert not {"pin", "matplotlib", "pyvista", "polars"} & set(names)
+    assert any(line.startswith("pin>") for line in PROJECT["optional-dependencies"]["reference"])
+
+
+@pytest.mark.parametrize(
+    "program", ["import casadi_ik", "import casadi_ik as ik; ik.Solver; ik.load_robot('ar10')"]
+)
+def test_what_is_imported(program):
+    more = f"; import sys; print(*(x for x in {ON_DEMAND!r}.split() if x in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program + more], capture_output=True, text=True)
+    assert (done.stdout.strip(), done.stderr, done.returncode) == ("", "", 0)
