@@ -23,8 +23,8 @@ from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.writer import recorder_of
 from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.problem.clearance import Clearances, SceneCheck
-from casadi_ik.problem.problems import LIMITS, Problems, Tolerance
-from casadi_ik.problem.questions import Questions, hand_postures, tolerances_by_finger
+from casadi_ik.problem.request import Request, hand_postures, tolerances_by_finger
+from casadi_ik.problem.targets import LIMITS, TargetBatch, Tolerance
 from casadi_ik.registry import METHODS, build_method, with_finger_step
 from casadi_ik.solving.alternatives.finder import APART
 from casadi_ik.solving.choose import Judgement, choose
@@ -99,7 +99,7 @@ class Solver(MovingSolver):
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
         self.limits = limits
         self.options = with_finger_step(method, options or {}, finger_step)
-        self._questions = Questions(robot, self.tolerances, limits == "enforce")
+        self._request = Request(robot, self.tolerances, limits == "enforce")
         self.scene = scene
         check = None if scene is None else SceneCheck(robot, scene, compiled)
         built = build_method(method, robot.description, self.options, compiled)
@@ -167,14 +167,14 @@ class Solver(MovingSolver):
             >>> print(round(held.q[2], 6))
             0.2
         """
-        problems = self._questions.of_grasps(
+        targets = self._request.of_grasps(
             [grasp], fixed, self._engine.preference(prefer, q0 is not None)
         )
         if log is None:
-            return self._engine.solve_one(problems, Run(q0, seed, diagnose=diagnose))
+            return self._engine.solve_one(targets, Run(q0, seed, diagnose=diagnose))
         with recorder_of(self, log, seed) as recorder:
             run = Run(q0, seed, recorder=recorder, diagnose=diagnose)
-            return self._engine.solve(problems, run).solution(0)
+            return self._engine.solve(targets, run).solution(0)
 
     def solve_batch(
         self,
@@ -225,13 +225,13 @@ class Solver(MovingSolver):
             >>> batch.q.shape, bool(batch.success.all())
             ((1000, 14), True)
         """
-        held = self._questions.held(fixed)
+        held = self._request.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
-        problems = self._questions.of_arrays(points, normals, held, more=more, prefer=preferred)
+        targets = self._request.of_arrays(points, normals, held, more=more, prefer=preferred)
         if object_pose is not None:
-            problems = problems.holding(grasped_in(self.scene), object_pose)
+            targets = targets.holding(grasped_in(self.scene), object_pose)
         with recorder_of(self, log, seed, keep, compression) as recorder:
-            return self._engine.solve(problems, Run(q0, seed, jobs, recorder, diagnose))
+            return self._engine.solve(targets, Run(q0, seed, jobs, recorder, diagnose))
 
     def solve_blocks(
         self,
@@ -275,11 +275,11 @@ class Solver(MovingSolver):
             >>> [int(block.solution.success.sum()) for block in solver.solve_blocks(blocks)]
             [500, 500, 500]
         """
-        held = self._questions.held(fixed)
+        held = self._request.held(fixed)
         preferred = self._engine.preference(prefer, q0 is not None)
 
-        def ask(block: Mapping[str, ArrayLike], first_row: int) -> Problems:
-            return self._questions.of_named(block, held, first_row, preferred)
+        def ask(block: Mapping[str, ArrayLike], first_row: int) -> TargetBatch:
+            return self._request.of_named(block, held, first_row, preferred)
 
         with recorder_of(self, log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
@@ -303,8 +303,8 @@ class Solver(MovingSolver):
             'Stepper'
         """
         preferred = self._engine.preference(None, q0 is not None)
-        problems = self._questions.of_grasps([grasp], None, preferred)
-        return self._engine.kinds_of(problems).method.stepper(problems, self._questions.start(q0))
+        targets = self._request.of_grasps([grasp], None, preferred)
+        return self._engine.kinds_of(targets).method.stepper(targets, self._request.start(q0))
 
     def fast(self) -> FastSolver:
         """Solve for loops that cannot wait: see `FastSolver`.
@@ -319,7 +319,7 @@ class Solver(MovingSolver):
             >>> ik.Status(status).name
             'SOLVED'
         """
-        return FastSolver(self._engine, self._questions)
+        return FastSolver(self._engine, self._request)
 
     def solve_all(
         self,
@@ -360,10 +360,10 @@ class Solver(MovingSolver):
             >>> len(several), several[0].manipulability >= several[1].manipulability
             (4, True)
         """
-        problems = self._questions.of_grasps([grasp], fixed)
-        finder = self._engine.kinds_of(problems).finder
-        start, around = self._questions.start(q0), self._engine.around(problems)
-        return finder.find(problems, start, seed, limit, prefer, apart, around)
+        targets = self._request.of_grasps([grasp], fixed)
+        finder = self._engine.kinds_of(targets).finder
+        start, query = self._request.start(q0), self._engine.collision_query(targets)
+        return finder.find(targets, start, seed, limit, prefer, apart, query)
 
     def solve_palms(
         self,
@@ -407,10 +407,10 @@ class Solver(MovingSolver):
         poses = checked_pose(palms, "palms")
         if poses.ndim != 3:
             raise InputError(f"palms: found shape {poses.shape}, expected (k, 4, 4)")
-        hands = hand_postures(self._questions.robot, postures, len(poses))
+        hands = hand_postures(self._request.robot, postures, len(poses))
         preferred = self._engine.preference(prefer, q0 is not None)
-        problems = self._questions.of_palms(poses, hands, fixed, preferred)
-        return self._engine.solve(problems, Run(q0, seed, jobs, None, diagnose))
+        targets = self._request.of_palms(poses, hands, fixed, preferred)
+        return self._engine.solve(targets, Run(q0, seed, jobs, None, diagnose))
 
     def choose(
         self,
@@ -461,7 +461,7 @@ class Solver(MovingSolver):
         """
         return choose(
             self._engine,
-            self._questions,
+            self._request,
             grasps,
             object_pose,
             q0,
@@ -519,6 +519,6 @@ class Solver(MovingSolver):
             >>> bool(among.check(solution.q, grasp).distance[0] > 0)
             True
         """
-        problems = self._questions.of_grasps([grasp], None)
-        around = self._engine.around(problems)
-        return around and around.check(np.atleast_2d(self.robot.configuration(q)))
+        targets = self._request.of_grasps([grasp], None)
+        query = self._engine.collision_query(targets)
+        return query and query.check(np.atleast_2d(self.robot.configuration(q)))

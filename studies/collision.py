@@ -47,7 +47,7 @@ from runner.report import (
 from samplers import grasps_of
 
 import casadi_ik as ik
-from casadi_ik.problem.clearance import SceneCheck, Surroundings
+from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+shadow")
 CLUTTER = (0, 3, 8)
@@ -114,7 +114,7 @@ class Part:
 
 
 @cache
-def the_check() -> tuple[ik.ArmHand, Surroundings, CoalOracle]:
+def the_check() -> tuple[ik.ArmHand, CollisionQuery, CoalOracle]:
     """The robot, what it is checked against, and the same by coal; made once in a process."""
     robot = ik.load_robot(ROBOT)
     (grasp,) = grasps_of(robot, *robot.contacts(robot.home[None]))

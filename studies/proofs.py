@@ -42,7 +42,7 @@ from samplers import corners, near_limits, random_hands, singular_arms
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.proofs.prove import Prover
 
 ROBOTS = (*SHIPPED_AND_MADE, "ur5e+shadow")
@@ -143,7 +143,7 @@ def reachable(part: Part, case: tuple[str, float, float, bool]) -> dict[str, Any
         turning = [a.unit == "rad" for a in robot.description.actuators]
         q[:, turning] = rng.uniform(-7, 7, (len(q), sum(turning)))
     targets = moved(robot.contacts(q), rng, share * tolerance, share * 10 * tolerance)
-    problems = Problems(*targets, ik.Tolerance(tolerance, 10 * tolerance), limits)
+    problems = TargetBatch(*targets, ik.Tolerance(tolerance, 10 * tolerance), limits)
     prover = Prover(robot.description)
     places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
     proofs = prover.prove(problems, prover.space.of(places, problems))
@@ -163,7 +163,7 @@ def clearly_impossible(part: Part) -> dict[str, Any]:
     found: dict[str, Any] = {"count": len(rows), "ms": [], "hand": 0, "arm": 0}
     if not len(rows):
         return found
-    prover, problems = Prover(robot.description), Problems(points, normals, usual, True)
+    prover, problems = Prover(robot.description), TargetBatch(points, normals, usual, True)
     prover.prove(problems.rows(rows[:1]))
     proofs = prover.prove(problems.rows(rows))
     for row, proof in zip(rows, proofs, strict=True):

@@ -9,7 +9,7 @@ from enum import StrEnum
 from functools import cached_property
 
 from casadi_ik.arrays import Array
-from casadi_ik.problem.problems import Tolerance
+from casadi_ik.problem.targets import Tolerance
 from casadi_ik.problem.verdict import ContactVerdict, PalmVerdict
 from casadi_ik.proofs.proof import Proof
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arrays import Array
-from casadi_ik.problem.clearance import Surroundings
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.clearance import CollisionQuery
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import TraceFormat
 
 
@@ -26,25 +26,25 @@ class SolveBlock:
     Attributes:
         format: How the rows are to be read.
         first: Number of the first solve; solves are unique per method in one log.
-        problems: The targets.
+        targets: The targets.
         starts: Where each solve began, (k, n).
         seed: Of the random numbers.
         batch: The answers; it names method, robot and fingers.
         rows: The iterations of all solves, one solve after the other, (sum of
             `BatchSolution.iterations`,) of the format's layout.
         started: When each solve began, (k,) [ns since the Unix epoch].
-        around: What they were checked against; None: nothing.
+        query: What they were checked against; None: nothing.
     """
 
     format: TraceFormat
     first: int
-    problems: Problems
+    targets: TargetBatch
     starts: Array
     seed: int
     batch: BatchSolution
     rows: NDArray[Any]
     started: NDArray[np.int64]
-    around: Surroundings | None = None
+    query: CollisionQuery | None = None
 
     def __len__(self) -> int:
         return len(self.batch)

@@ -26,7 +26,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.batches.backend import backend
 from casadi_ik.batches.targets import Part, Source
 from casadi_ik.errors import CasadiIKError, InputError
-from casadi_ik.files.writing import tidy, written_whole
+from casadi_ik.files.writing import remove_stale, written_whole
 from casadi_ik.grasps.pose import moved
 from casadi_ik.problem.status import Status
 
@@ -161,7 +161,7 @@ class BatchFolder:
             raise InputError(f"{self.path}: holds files but no {MANIFEST}, expected a new folder")
         for folder in filter(None, (self.path, self.logs)):
             folder.mkdir(parents=True, exist_ok=True)
-            tidy(folder, ".part-*")
+            remove_stale(folder, ".part-*")
         if not path.exists():
             with written_whole(path) as part:
                 part.write_text(json.dumps(mine, indent=1) + "\n", encoding="utf-8")

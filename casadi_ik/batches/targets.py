@@ -19,7 +19,7 @@ from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.limits import RAISED, limit
 from casadi_ik.files.npz import UNREADABLE
 from casadi_ik.problem.contacts import NAMES
-from casadi_ik.problem.problems import DIRECTIONS
+from casadi_ik.problem.targets import DIRECTIONS
 
 if TYPE_CHECKING:
     import polars

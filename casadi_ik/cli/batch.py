@@ -31,7 +31,7 @@ from casadi_ik.cli.outputs import check_outputs, folder_of, say, write_output, w
 from casadi_ik.cli.report import counted, duration, fields, files, headline
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.files.shipped import resolve
-from casadi_ik.files.writing import tidy
+from casadi_ik.files.writing import remove_stale
 from casadi_ik.grasps.pose import moved
 from casadi_ik.logs.provenance import plain
 
@@ -452,7 +452,7 @@ def _growing_npz(path: Path) -> Iterator[_GrowingNpz]:
         OutputError: It cannot be written; nothing is left behind.
     """
     with writing(path, "--out"):
-        tidy(folder_of(path), ".batch-*", 2)
+        remove_stale(folder_of(path), ".batch-*", 2)
         temporary = TemporaryDirectory(prefix=f".batch-{os.getpid()}-", dir=folder_of(path))
     with temporary as folder:
         arrays = _GrowingNpz(path, Path(folder))

@@ -23,7 +23,7 @@ from casadi_ik.files.shipped import resolve, resolve_robot
 from casadi_ik.grasps import Grasp, Tolerance, load_grasp
 from casadi_ik.logs import Log
 from casadi_ik.logs.solve import check_robot
-from casadi_ik.problem.problems import fixed_array
+from casadi_ik.problem.targets import fixed_array
 from casadi_ik.registry import METHODS
 
 

@@ -26,7 +26,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, MissingExtraError
 from casadi_ik.grasps import Grasp, load_object
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.questions import Questions, tolerances_by_finger
+from casadi_ik.problem.request import Request, tolerances_by_finger
 
 
 @command(
@@ -85,14 +85,14 @@ def _penetration(robot: ArmHand, grasp: Grasp, solution: Solution) -> str:
     shapes = robot.description.shapes.capsules
     if not (solution.success and grasp.object and grasp.object_pose is not None and shapes):
         return ""
-    questions = Questions(robot, tolerances_by_finger(None, robot.fingers), True)
+    request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
     try:
         check = SceneCheck(robot, Scene(), compiled=False)
-        around = check.around(questions.of_grasps([grasp], None))
+        query = check.collision_query(request.of_grasps([grasp], None))
     except CasadiIKError:  # a robot or an object without shapes
         return ""
-    mine = np.array([grasp.object in names for names in around.table.names], dtype=bool)
-    clear = around.only(mine).check(solution.q[None])
+    mine = np.array([grasp.object in names for names in query.table.names], dtype=bool)
+    clear = query.only(mine).check(solution.q[None])
     pair = clear.pair(0)
     if clear.free[0] or pair is None:
         return ""

@@ -32,7 +32,7 @@ from casadi_ik.grasps.load import load_grasp_files
 from casadi_ik.grasps.objects import is_mesh
 from casadi_ik.grasps.pose import rotations_of
 from casadi_ik.problem.contacts import NAMES
-from casadi_ik.problem.problems import DIRECTIONS
+from casadi_ik.problem.targets import DIRECTIONS
 
 Invalid = Literal["error", "drop", "clip"]
 """What becomes of a row that the hand cannot take."""

@@ -15,7 +15,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.kernels.codegen import number
 from casadi_ik.methods.common.contact_fit import FIT
-from casadi_ik.problem.problems import Tolerance
+from casadi_ik.problem.targets import Tolerance
 
 TOKEN = re.compile(
     r"""

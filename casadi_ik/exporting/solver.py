@@ -44,8 +44,8 @@ from casadi_ik.motion.inputs import FADING, contact_weights
 from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
 from casadi_ik.motion.timing import RUN_UP, own_velocities
 from casadi_ik.problem.contacts import usual
-from casadi_ik.problem.problems import Problems, Tolerance
-from casadi_ik.problem.questions import BEYOND, touched
+from casadi_ik.problem.request import BEYOND, touched
+from casadi_ik.problem.targets import TargetBatch, Tolerance
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
 MARKS = ("PALM_CALLS", "PALM", "PALM_WASM", "PALM_JS", "PALM_DTS")
@@ -346,7 +346,7 @@ class SolverSources:
         if self.single is not None:
             less = self.single.tolerance
             allowed = Tolerance(allowed.position - less.position, allowed.angle - less.angle)
-        found = self.method.terms(Problems(none, none, allowed, True)).copy()
+        found = self.method.terms(TargetBatch(none, none, allowed, True)).copy()
         found[layout.slice("lower")], found[layout.slice("upper")] = self._bounds
         return found
 

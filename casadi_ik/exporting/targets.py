@@ -19,7 +19,7 @@ from casadi_ik.exporting.single import in_single_precision
 from casadi_ik.grasps.load import load_grasp, shipped_grasps
 from casadi_ik.kernels.codegen import number, numbers
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.request import Request
 from casadi_ik.problem.status import Status
 from casadi_ik.registry import build_method
 from casadi_ik.solving.alternatives.free import resolve_at_once
@@ -211,15 +211,15 @@ class SceneTargets:
         self, points: Array, normals: Array, q: Array, q0: list[float] | None
     ) -> tuple[Array, float] | None:
         """An answer that touches nothing, beside a given one, and its clearance [m]."""
-        engine, questions = self._engine, Questions(self.solver.robot, self.solver.tolerances, True)
+        engine, request = self._engine, Request(self.solver.robot, self.solver.tolerances, True)
         prefer = "limits" if q0 is None else "q0"
-        problems = questions.of_arrays(points, normals, None, prefer=prefer)
-        around = engine.around(problems)
-        assert around is not None
-        clear = around.check(q[None])
+        targets = request.of_arrays(points, normals, None, prefer=prefer)
+        query = engine.collision_query(targets)
+        assert query is not None
+        clear = query.check(q[None])
         if not clear.free[0]:
             found = resolve_at_once(
-                engine.finder, problems, around, q, questions.start(q0), others=True
+                engine.finder, targets, query, q, request.start(q0), others=True
             )
             if found is None:
                 return None

@@ -17,7 +17,7 @@ from pathlib import Path
 HOUR, DAY = 3600.0, 86400.0
 
 
-def tidy(folder: Path, pattern: str, word: int | None = None) -> None:
+def remove_stale(folder: Path, pattern: str, word: int | None = None) -> None:
     """Remove files and folders that a process made and cannot have use for any more.
 
     That is so if the process is gone and nothing was written for an hour: it could run on another
@@ -79,7 +79,7 @@ def written_whole(path: Path) -> Iterator[Path]:
     """
     target = target_of(path)
     part = part_of(target)
-    tidy(target.parent, f".{glob.escape(target.stem)}.*.part{glob.escape(target.suffix)}")
+    remove_stale(target.parent, f".{glob.escape(target.stem)}.*.part{glob.escape(target.suffix)}")
     try:
         yield part
         part.replace(target)

@@ -35,7 +35,7 @@ from pathlib import Path
 
 import casadi as ca
 
-from casadi_ik.files.writing import tidy
+from casadi_ik.files.writing import remove_stale
 from casadi_ik.kernels.cancellation import ForkSafeLock, interrupt_afterwards
 from casadi_ik.kernels.codegen import library_source
 from casadi_ik.kernels.compiler import (
@@ -399,8 +399,8 @@ def _built(
     announce(stem.rpartition("-")[0], len(source))
     for place in chain(places, _temporary(places)):
         try:
-            tidy(place, "build-*", 1)
-            tidy(place, ".*.part", -2)
+            remove_stale(place, "build-*", 1)
+            remove_stale(place, ".*.part", -2)
             library = _compiled(place, stem, source, compiler, symbol)
             break
         except (OSError, UnloadableError) as error:

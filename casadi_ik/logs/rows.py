@@ -13,7 +13,7 @@ from casadi_ik.kernels.layout import Field, Layout, opaque
 from casadi_ik.logs.detect import as_matrix, words_of
 from casadi_ik.logs.events import EventKind, jacobian_names, measured_jacobians
 from casadi_ik.problem.contacts import NAMES
-from casadi_ik.problem.questions import NO_PREFERENCE, PREFERENCES
+from casadi_ik.problem.request import NO_PREFERENCE, PREFERENCES
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.trace import CLEARANCE, TraceFormat
 
@@ -53,11 +53,11 @@ def measured_format(form: TraceFormat, checked: bool = False) -> TraceFormat:
 
 def measured_rows(block: SolveBlock) -> NDArray[Any]:
     """Rows (m,) of a block as rows of its `measured_format`."""
-    form, rows, around = block.format, block.rows, block.around
-    added = _added(form, around is not None)
+    form, rows, query = block.format, block.rows, block.query
+    added = _added(form, query is not None)
     if not added:
         return rows
-    dtype = measured_format(form, around is not None).layout.dtype
+    dtype = measured_format(form, query is not None).layout.dtype
     wide = np.empty(len(rows), dtype)
     # The new fields stand together, behind the others of their width: three pieces of bytes.
     places: Any = dtype.fields
@@ -68,10 +68,10 @@ def measured_rows(block: SolveBlock) -> NDArray[Any]:
     for first in range(0, len(rows), 2048):
         part = np.ascontiguousarray(rows[first : first + 2048])
         values = [] if form.measures is None else [form.measures(part)]
-        if around is not None:
-            there = around.rows(solve[first : first + 2048])
-            room = there.check(np.ascontiguousarray(part["q"])).room
-            values.append((room + around.margin).astype(np.float32)[:, None])
+        if query is not None:
+            there = query.rows(solve[first : first + 2048])
+            surplus = there.check(np.ascontiguousarray(part["q"])).surplus
+            values.append((surplus + query.margin).astype(np.float32)[:, None])
         measured = np.ascontiguousarray(np.concatenate(values, axis=1), np.float32)
         source, target = (
             array.view(np.uint8).reshape(len(part), -1)
@@ -159,7 +159,7 @@ def solve_format(block: SolveBlock) -> TraceFormat:
         "prefer": (NO_PREFERENCE, *PREFERENCES),
     }
     if checked:
-        pairs = () if block.around is None else block.around.table.names
+        pairs = () if block.query is None else block.query.table.names
         known = list(dict.fromkeys(name for pair in pairs for name in pair))
         # Codes of one byte; the last stands for what is not among them.
         labels |= dict.fromkeys(PAIR, ("none", *known[:254], "other"))
@@ -174,24 +174,24 @@ def solve_rows(block: SolveBlock, events: NDArray[np.int64], form: TraceFormat) 
         events: (k, kinds) events by kind.
         form: Of `solve_format`.
     """
-    batch, problems, layout = block.batch, block.problems, form.layout
+    batch, targets, layout = block.batch, block.targets, form.layout
     rows = _common(block, layout)
     rows["started"] = block.started * 1e-9
     rows["solve_id"] = block.first + np.arange(len(block))
     rows["status"] = batch.status % len(STATUSES)
     rows["phase_iterations"] = np.stack(list(batch.phases.values()), axis=1)
     rows["events"] = events
-    rows["target_points"], rows["target_normals"] = problems.points, problems.normals
-    for name, vectors in problems.more.items():
+    rows["target_points"], rows["target_normals"] = targets.points, targets.normals
+    for name, vectors in targets.more.items():
         rows[f"target_{name}"] = vectors
     rows["start"] = block.starts
-    if problems.fixed is not None:
-        held = ~np.isnan(problems.fixed)
-        rows["start"] = np.where(held, problems.fixed, block.starts)
+    if targets.fixed is not None:
+        held = ~np.isnan(targets.fixed)
+        rows["start"] = np.where(held, targets.fixed, block.starts)
         padded = np.pad(held, (0, -len(held) % 32))
         rows["fixed_mask"] = words_of(padded[None]).reshape(rows["fixed_mask"].shape[1:])
     for name in ("position_tolerance", "angle_tolerance"):
-        rows[name] = getattr(problems, name)
+        rows[name] = getattr(targets, name)
     for name in (
         *("time", "q", "position_error", "angle_error", "iterations", "restarts"),
         *("success", "limits_ok", "ok"),
@@ -215,8 +215,8 @@ def _common(block: SolveBlock, layout: Layout) -> NDArray[Any]:
     for name in NAMES:
         one[f"target_{name}"] = np.nan
     one["seed"] = block.seed
-    one["limits_enforced"] = block.problems.enforce_limits
-    one["prefer"] = (NO_PREFERENCE, *PREFERENCES).index(block.problems.prefer)
+    one["limits_enforced"] = block.targets.enforce_limits
+    one["prefer"] = (NO_PREFERENCE, *PREFERENCES).index(block.targets.prefer)
     rows = np.empty(len(block), layout.dtype)
     rows.view(opaque(one).dtype)[:] = opaque(one)
     return rows

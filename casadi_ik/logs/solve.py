@@ -20,8 +20,8 @@ from casadi_ik.logs.events import Happening
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.tables import MethodRows, Table, element_name, happening, label_of
 from casadi_ik.problem.contacts import NAMES
-from casadi_ik.problem.problems import Tolerance
-from casadi_ik.problem.questions import NO_PREFERENCE
+from casadi_ik.problem.request import NO_PREFERENCE
+from casadi_ik.problem.targets import Tolerance
 
 
 @dataclass(frozen=True)

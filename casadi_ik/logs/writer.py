@@ -192,8 +192,8 @@ class McapRecorder:
         method = self._method(block)
         block = replace(block, format=method.form, rows=measured_rows(block))
         counts, rules = block.batch.iterations, self._rules
-        if block.around is not None:
-            rules = replace(rules, clearance=block.around.margin)
+        if block.query is not None:
+            rules = replace(rules, clearance=block.query.margin)
         events = detect_events(block.format, block.rows, counts, rules)
         kinds = len(EventKind)
         cell = events["solve_id"].astype(np.int64) * kinds + events["kind"]
@@ -255,7 +255,7 @@ class McapRecorder:
             same = known.given.layout == block.format.layout and known.given.labels == (
                 block.format.labels
             )
-            same &= (block.around is not None) == (CLEARANCE in known.form.layout.names)
+            same &= (block.query is not None) == (CLEARANCE in known.form.layout.names)
             if not same or known.fingers != block.fingers:
                 raise LogError(f"{where}: layout or labels differ from the method's earlier solves")
         try:
@@ -268,7 +268,7 @@ class McapRecorder:
         known = self._methods.get(block.method)
         if known is not None:
             return known
-        form = measured_format(block.format, block.around is not None)
+        form = measured_format(block.format, block.query is not None)
         solve = solve_format(replace(block, format=form))
         formats = {"iteration": form, "solve": solve, "event": event_format(form)}
         texts = [schema_text(each.layout, each.labels) for each in formats.values()]

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
-from casadi_ik.problem.clearance import ROUNDING, Clearances, Surroundings
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.clearance import ROUNDING, Clearances, CollisionQuery
+from casadi_ik.problem.targets import TargetBatch
 
 
 def stopping_way(moved: Array, change: Array) -> Array:
@@ -69,15 +69,15 @@ class Between:
     Attributes:
         free: (k - 1,) whether they touch nothing.
         worst: (k - 1, n) the posture with least room that was looked at on each.
-        room: (k - 1,) its room [m]; no posture on a free way has less by more than what it moves
-            to the next that was looked at.
+        surplus: (k - 1,) clearance beyond the margin [m]; no posture on a free way has less by more
+            than what it moves to the next that was looked at.
         distance: (k - 1,) its clearance, see `Clearances` [m].
         pairs: (k - 1,) number of its pair, see `Clearances`.
     """
 
     free: Bools
     worst: Array
-    room: Array
+    surplus: Array
     distance: Array
     pairs: NDArray[np.int64]
 
@@ -99,7 +99,7 @@ class _Postures:
     found: Array
 
     @property
-    def room(self) -> Array:
+    def surplus(self) -> Array:
         return self.found[:, 0]
 
     def rows(self, rows: NDArray[np.intp] | slice) -> _Postures:
@@ -119,8 +119,8 @@ class _Postures:
 class _Looking:
     """What is looked at, in surroundings whose solids may move with the postures."""
 
-    def __init__(self, around: Surroundings) -> None:
-        self._around, table = around, around.table
+    def __init__(self, query: CollisionQuery) -> None:
+        self._query, table = query, query.table
         reach = np.array([solid.reach for solid in table.solids])
         # What is unbounded (a half-space) may move, too, but no scene turns it under a robot.
         self._own = np.where(np.isfinite(reach), reach, 0.0)[: table.own]
@@ -130,12 +130,12 @@ class _Looking:
     def at(self, q: Array, poses: Array, together: int = 4096) -> _Postures:
         """Postures (m, n) with solids at (m, s, 12), so many checked at once."""
         parts = [slice(i, i + together) for i in range(0, len(q), together)]
-        around, found, places = self._around, list[Array](), list[Array]()
+        query, found, places = self._query, list[Array](), list[Array]()
         for part in parts:
-            here = Surroundings(around.kernel, around.table, poses[part], around.margin)
+            here = CollisionQuery(query.kernel, query.table, poses[part], query.margin)
             seen = here.check(q[part])
-            found.append(np.stack([seen.room, seen.distance, seen.pairs.astype(float)], axis=1))
-            places.append(around.kernel.placed(q[part])[0])
+            found.append(np.stack([seen.surplus, seen.distance, seen.pairs.astype(float)], axis=1))
+            places.append(query.kernel.placed(q[part])[0])
         return _Postures(q, poses, np.concatenate(places), np.concatenate(found))
 
     def motion(self, one: _Postures, other: _Postures) -> Array:
@@ -164,42 +164,42 @@ class _Looking:
         return self.at((one.q + other.q) / 2, _half_way(one.poses, other.poses))
 
 
-def between(around: Surroundings, q: Array, least: bool = False) -> Between:
+def between(query: CollisionQuery, q: Array, least: bool = False) -> Between:
     """What is on the straight ways from each of k postures to the next.
 
     Args:
-        around: What must not be touched, the same for all, or at each posture.
+        query: What must not be touched, the same for all, or at each posture.
         q: (k, n).
         least: Whether the least room of all is looked for, too: where all is free it is nowhere
-            less than the smallest of `Between.room` by more than `RESOLUTION`.
+            less than the smallest of `Between.surplus` by more than `RESOLUTION`.
     """
     count, n = max(len(q) - 1, 0), q.shape[1]
-    poses = around.poses
+    poses = query.poses
     if poses.ndim == 2 or len(poses) != len(q):
         poses = np.broadcast_to(
             poses.reshape(-1, *poses.shape[-2:])[:1], (len(q), *poses.shape[-2:])
         )
-    looking = _Looking(around)
+    looking = _Looking(query)
     free, found = np.ones(count, dtype=bool), np.full((count, 3), np.inf)
     found[:, 2] = -1
-    room, worst = found[:, 0], np.empty((count, n))
+    surplus, worst = found[:, 0], np.empty((count, n))
     every = looking.at(q, np.ascontiguousarray(poses))
     way = np.arange(count)
     one, other = every.rows(slice(0, count)), every.rows(slice(1, count + 1))
 
     def seen(some: _Postures, whose: NDArray[np.intp]) -> None:
-        order = np.argsort(-some.room, kind="stable")
-        less = order[some.room[order] < room[whose[order]]]
+        order = np.argsort(-some.surplus, kind="stable")
+        less = order[some.surplus[order] < surplus[whose[order]]]
         # Behind each other the least comes last, and is what stays.
         found[whose[less]], worst[whose[less]] = some.found[less], some.q[less]
-        free[whose[~(some.room >= -ROUNDING)]] = False
+        free[whose[~(some.surplus >= -ROUNDING)]] = False
 
     seen(one, way)
     seen(other, way)
     while len(way):
         motion = looking.motion(one, other)
-        floor = max(float(room.min()) - RESOLUTION, 0.0) if least else 0.0
-        near = one.room + other.room < motion + 2 * floor
+        floor = max(float(surplus.min()) - RESOLUTION, 0.0) if least else 0.0
+        near = one.surplus + other.surplus < motion + 2 * floor
         kept = near & (motion > 2 * RESOLUTION) & free[way]
         rows = np.flatnonzero(kept)
         if not len(rows):
@@ -209,14 +209,14 @@ def between(around: Surroundings, q: Array, least: bool = False) -> Between:
         seen(middle, way)
         one, other = _Postures.joined(one, middle), _Postures.joined(middle, other)
         way = np.concatenate([way, way])
-    return Between(free, worst, room, found[:, 1], found[:, 2].astype(np.int64))
+    return Between(free, worst, surplus, found[:, 1], found[:, 2].astype(np.int64))
 
 
-def least_clearance(around: Surroundings, q: Array) -> tuple[float, str]:
+def least_clearance(query: CollisionQuery, q: Array) -> tuple[float, str]:
     """The least clearance on the straight ways from each of k postures to the next.
 
     Args:
-        around: As for `between`.
+        query: As for `between`.
         q: (k, n).
 
     Returns:
@@ -225,11 +225,11 @@ def least_clearance(around: Surroundings, q: Array) -> tuple[float, str]:
     """
     if len(q) < 2:
         q = np.concatenate([q, q])
-    ways = between(around, q, least=True)
+    ways = between(query, q, least=True)
     clearance = float(ways.distance.min())
     if ways.free.all():
         return clearance, ""
-    pair = around.table.names[ways.pairs[int(ways.room.argmin())]]
+    pair = query.table.names[ways.pairs[int(ways.surplus.argmin())]]
     return clearance, f"{pair[0]} and {pair[1]} touch"
 
 
@@ -258,7 +258,7 @@ def free_way(
     robot: ArmHand,
     start: Array,
     end: Array,
-    around: Surroundings | None,
+    query: CollisionQuery | None,
     seed: int,
     limit: float = 5.0,
 ) -> tuple[Array | None, str]:
@@ -268,7 +268,7 @@ def free_way(
         robot: The robot.
         start: (n,).
         end: (n,).
-        around: What must not be touched; None: nothing is checked.
+        query: What must not be touched; None: nothing is checked.
         seed: Of the planner.
         limit: Time that it has [s].
 
@@ -276,10 +276,10 @@ def free_way(
         The corners, None if no way was found; and how it was found, or why not.
     """
     units, straight = motor_units(robot), np.stack([start, end])
-    if around is None or between(around, straight).free.all():
+    if query is None or between(query, straight).free.all():
         return straight, "straight"
     for posture, name in ((start, "start"), (end, "pre-grasp")):
-        found = around.check(posture[None])
+        found = query.check(posture[None])
         if not found.free[0]:
             return None, f"the {name} is not free: {' and '.join(found.pair(0) or ())} touch"
     try:
@@ -297,7 +297,7 @@ def free_way(
     space.setBounds(bounds)
     setup = geometric.SimpleSetup(space)
     setup.setStateValidityChecker(
-        lambda state: bool(around.free(units * _numbers(state, n)[None])[0])
+        lambda state: bool(query.free(units * _numbers(state, n)[None])[0])
     )
     states: list[Any] = []
     for posture in (start, end):
@@ -318,7 +318,7 @@ def free_way(
         found_way = setup.getSolutionPath().getStates()
         corners = units * np.array([_numbers(state, n) for state in found_way])
         corners[0], corners[-1] = start, end
-        if between(around, corners).free.all():
+        if between(query, corners).free.all():
             return corners, "OMPL, RRT-Connect"
     return None, "the ways that OMPL found are not free between the postures it looked at"
 
@@ -353,20 +353,20 @@ class Guard:
         self._check, self._plan = plan.check, plan
         fingers = len(plan.robot.fingers)
         anywhere = np.zeros((1, fingers, 3))
-        self._around = self._at(plan.questions.of_arrays(anywhere, anywhere + 1.0, None))
+        self._query = self._at(plan.request.of_arrays(anywhere, anywhere + 1.0, None))
         self._n = len(plan.robot.actuators)
         self._change = plan.rates.steps(plan.period)[1]
 
-    def surround(self, problem: Problems) -> None:
+    def surround(self, problem: TargetBatch) -> None:
         """Mind one target: which fingers touch, and where the object is."""
-        self._around = self._at(problem)
+        self._query = self._at(problem)
 
-    def _at(self, problem: Problems) -> Surroundings:
-        return self._check.around(problem).rows(np.zeros(1, dtype=np.intp))
+    def _at(self, problem: TargetBatch) -> CollisionQuery:
+        return self._check.collision_query(problem).rows(np.zeros(1, dtype=np.intp))
 
     def clearance(self, q: Array) -> Clearances:
         """Of a configuration (n,)."""
-        return self._around.check(q[None])
+        return self._query.check(q[None])
 
     def step(self, asked: FollowerInputs) -> tuple[Array, bool]:
         """One step of the graph, or less of it.
@@ -399,23 +399,23 @@ class Guard:
 
     def _can_rest(self, q: Array, moved: Array) -> bool:
         path = stopping_path(q, moved, self._change, self.places)
-        return bool(self._around.free(path).all())
+        return bool(self._query.free(path).all())
 
     def _gets_free(self, q: Array, moved: Array) -> bool:
         """Whether a robot that is too near already gets away."""
-        room = self._around.check(np.stack([q, q + moved])).room
-        return bool(room[0] < 0 and room[1] > room[0])
+        surplus = self._query.check(np.stack([q, q + moved])).surplus
+        return bool(surplus[0] < 0 and surplus[1] > surplus[0])
 
     def _keep_away(self, asked: FollowerInputs, goal: Array) -> None:
-        around = self._around
+        query = self._query
         rooms, slopes = asked.views["rooms"], asked.views["slopes"]
         rooms[...] = 0.0
-        most = around.margin + self.near
-        least, _ = around.kernel.least(goal[None], around.poses, around.table, most)
+        most = query.margin + self.near
+        least, _ = query.kernel.least(goal[None], query.poses, query.table, most)
         if least[0] >= most:
             return
         nudged = goal + np.concatenate([np.zeros((1, self._n)), self.nudge * np.eye(self._n)])
-        every = around.kernel.every(nudged, around.poses, around.table)
+        every = query.kernel.every(nudged, query.poses, query.table)
         nearest = np.argsort(every[0])[: len(rooms)]
         count = len(nearest)
         rooms[:count] = np.maximum(most - every[0, nearest], 0.0)

@@ -120,7 +120,7 @@ class Follower:
         robot = plan.robot
         self._n, self._shape = len(robot.actuators), (len(robot.fingers), 3)
         self._usual = usual(self._shape[0])
-        self._tolerances = self._own = tuple(plan.questions.tolerances.values())
+        self._tolerances = self._own = tuple(plan.request.tolerances.values())
         self._all_asked: dict[Kinds, FollowerInputs] = {}
         self._posture = plan.posture
         self._guard = None if plan.check is None else Guard(plan)
@@ -190,7 +190,7 @@ class Follower:
             asked.lead_to(goal)
 
     def _inside(self, q: ArrayLike) -> Array:
-        return np.clip(self._plan.questions.start(q), *self._plan.bounds)
+        return np.clip(self._plan.request.start(q), *self._plan.bounds)
 
     def __call__(
         self,
@@ -271,7 +271,7 @@ class Follower:
     def _ask_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
         if normals is not None:
             raise InputError("normals: found beside a grasp, expected them in it")
-        problem = self._plan.questions.of_grasps([grasp], None)
+        problem = self._plan.request.of_grasps([grasp], None)
         ((kinds, _, _),) = by_kinds(problem)
         if kinds != self._asked.cycle.kinds:
             self._take_up(kinds)

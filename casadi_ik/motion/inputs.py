@@ -17,8 +17,8 @@ from casadi_ik.motion.cycle import Cycle
 from casadi_ik.motion.timing import Rates
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.contacts import LENGTH, Kinds
-from casadi_ik.problem.problems import Problems, Tolerance
-from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.request import Request
+from casadi_ik.problem.targets import TargetBatch, Tolerance
 from casadi_ik.problem.verdict import deviations
 
 FADING = 0.05
@@ -30,7 +30,7 @@ class FollowPlan:
     """What a follower keeps to all the time.
 
     Attributes:
-        questions: Robot and tolerances.
+        request: Robot and tolerances.
         check: The scene about the robot; None: collisions are not checked.
         compiled: Whether in compiled code.
         q0: (n,) where the robot is [rad or m].
@@ -42,7 +42,7 @@ class FollowPlan:
         pull: See `Cycle`.
     """
 
-    questions: Questions
+    request: Request
     check: SceneCheck | None
     compiled: bool
     q0: Array
@@ -56,7 +56,7 @@ class FollowPlan:
     @property
     def robot(self) -> ArmHand:
         """The robot."""
-        return self.questions.robot
+        return self.request.robot
 
     @property
     def habits(self) -> dict[str, float]:
@@ -100,7 +100,7 @@ class FollowerInputs:
         fastest, change = plan.rates.steps(plan.period)
         self._fill(lower=plan.bounds[0], upper=plan.bounds[1], posture=plan.posture)
         self._fill(fastest=fastest, change=change)
-        tolerances = tuple(plan.questions.tolerances.values())
+        tolerances = tuple(plan.request.tolerances.values())
         self._usual, self._tolerances = contact_weights(tolerances), tolerance_rows(tolerances)
         self._fill(**plan.habits)
         self._told = self.run.record
@@ -159,7 +159,7 @@ class FollowerInputs:
         self._fill(weights=known * self._usual, **self._tolerances)
         return ""
 
-    def ask_problem(self, problem: Problems) -> None:
+    def ask_problem(self, problem: TargetBatch) -> None:
         """Ask for one target of the graph's kinds, checked before."""
         self._mode = ""
         rows = contact_rows(self.cycle, problem)
@@ -189,7 +189,7 @@ class FollowerInputs:
         }
         points, normals = asked("points", weights[:, 0] > 0), asked("normals", weights[:, 1] > 0)
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-        problem = Problems(points, normals, Tolerance(), enforce_limits=True, more=more)
+        problem = TargetBatch(points, normals, Tolerance(), enforce_limits=True, more=more)
         position, angle, _ = deviations(robot, problem, q[None])
         return position[0], angle[0]
 
@@ -218,22 +218,22 @@ def tolerance_rows(tolerances: tuple[Tolerance, ...]) -> dict[str, Array]:
     }
 
 
-def contact_rows(cycle: Cycle, problems: Problems) -> dict[str, Array]:
+def contact_rows(cycle: Cycle, targets: TargetBatch) -> dict[str, Array]:
     """Targets as the parameters of a cycle's contacts.
 
     Args:
         cycle: The graph.
-        problems: k targets of its kinds.
+        targets: k targets of its kinds.
 
     Returns:
         By field (k, ...): vectors, with zeros where free, and weights.
     """
-    known = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
+    known = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
     values: dict[str, Array] = {
-        f"{name}s": np.nan_to_num(problems.vectors(f"{name}s")) for name in cycle.contacts.data
+        f"{name}s": np.nan_to_num(targets.vectors(f"{name}s")) for name in cycle.contacts.data
     }
     values["normals"] = np.where(known[1][..., None], values["normals"], ANY)
-    return values | {"weights": np.stack(known, axis=2) * contact_weights(problems.tolerances)}
+    return values | {"weights": np.stack(known, axis=2) * contact_weights(targets.tolerances)}
 
 
 def fault(points: Array, normals: Array) -> str:

@@ -31,8 +31,8 @@ from casadi_ik.motion.reach import (
 from casadi_ik.motion.timing import Rates, a_direction, length, rates_of, seconds, unbounded
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.problem.contacts import by_kinds
-from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import Questions
+from casadi_ik.problem.request import Request
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import LIMIT_SLACK, judge
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
@@ -57,7 +57,7 @@ class MovingSolver:
 
     robot: ArmHand
     _engine: Engine
-    _questions: Questions
+    _request: Request
 
     def follow(
         self,
@@ -88,9 +88,9 @@ class MovingSolver:
             >>> follower(grasp).shape, follower.state.status.name
             ((14,), 'FOLLOWING')
         """
-        start = self._questions.start(q0)
+        start = self._request.start(q0)
         rates = rates_of(self.robot, velocity, acceleration)
-        comfortable = start if posture is None else self._questions.start(posture)
+        comfortable = start if posture is None else self._request.start(posture)
         return Follower(
             self._plan(
                 start,
@@ -144,21 +144,21 @@ class MovingSolver:
         if period is None and velocity is not None:
             raise InputError("velocity: given without a period, expected both")
         # A palm that is given counts as the contacts that it leads to.
-        problems = replace(self._questions.of_grasps(grasps, fixed), palms=None)
-        if problems.fixed is not None and problems.fixed.ndim > 1:
-            problems = replace(problems, fixed=self._questions.held(fixed))
-        engine, start = self._engine.kinds_of(problems), self._questions.start(q0)
+        targets = replace(self._request.of_grasps(grasps, fixed), palms=None)
+        if targets.fixed is not None and targets.fixed.ndim > 1:
+            targets = replace(targets, fixed=self._request.held(fixed))
+        engine, start = self._engine.kinds_of(targets), self._request.start(q0)
         _ = engine.finder
-        ((kinds, _, _),) = by_kinds(problems.rows(slice(0, 1)))
+        ((kinds, _, _),) = by_kinds(targets.rows(slice(0, 1)))
         travel = None
         if period is not None:
             travel = rates_of(self.robot, velocity, None).steps(seconds("period", period))[0]
-        bounds, rates = self._bounds(problems), unbounded(self.robot)
+        bounds, rates = self._bounds(targets), unbounded(self.robot)
         tracker = PathTracker(
             self._plan(start, bounds, 1.0, rates, start, math.inf, PATH_PULL), kinds
         )
         prefer = "limits" if q0 is None else "q0"
-        return track(engine, problems, start, prefer, tracker, travel, seed)
+        return track(engine, targets, start, prefer, tracker, travel, seed)
 
     def reach(
         self,
@@ -215,7 +215,7 @@ class MovingSolver:
             >>> bool((found.motion.q == best.solution.q).all(axis=1).any())
             True
         """
-        start = self._questions.start(q0)
+        start = self._request.start(q0)
         onward = length("lift", lift), length("retreat", retreat)
         if any(onward) and not self.robot.description.arm_actuators:
             raise UnsupportedError(f"lift: {self.robot.name!r} has no arm that moves its palm")
@@ -260,7 +260,7 @@ class MovingSolver:
             >>> found.success, bool((found.motion.q[-1] == solution.q).all())
             (True, True)
         """
-        ends = self._questions.start(q0), self._questions.start(q1, "q1")
+        ends = self._request.start(q0), self._request.start(q1, "q1")
         lower, upper = self._bounds(None)
         for name, q in zip(("q0", "q1"), ends, strict=True):
             off = np.maximum(lower - q, q - upper)
@@ -271,10 +271,10 @@ class MovingSolver:
                     f"{lower[i]:g} to {upper[i]:g}"
                 )
         pace = Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
-        around, check = None, self._engine.check
+        query, check = None, self._engine.check
         if check is not None:
-            around = check.around(self._anything(np.nan)).rows(np.zeros(1, dtype=np.intp))
-        return move(self.robot, ends, around, pace, seed)
+            query = check.collision_query(self._anything(np.nan)).rows(np.zeros(1, dtype=np.intp))
+        return move(self.robot, ends, query, pace, seed)
 
     def approach(
         self,
@@ -310,7 +310,7 @@ class MovingSolver:
             >>> found.success, found.pregrasp.shape
             (True, (14,))
         """
-        start = self._questions.start(q0)
+        start = self._request.start(q0)
         last = self._last_part(grasp, start, opening, distance, direction)
         return approach(last, *self._solutions(grasp, last.problem, start, seed, limit))
 
@@ -324,7 +324,7 @@ class MovingSolver:
     ) -> ApproachPlan:
         """What the last part of the way to a grasp keeps to."""
         asked: Any = grasp if isinstance(grasp, Grasp) else getattr(grasp, "grasp", grasp)
-        problem = self._questions.of_grasps([asked], None)
+        problem = self._request.of_grasps([asked], None)
         before = asked.pregrasp and asked.pregrasp.palm
         return ApproachPlan(
             self._plan(
@@ -338,11 +338,11 @@ class MovingSolver:
         )
 
     def _solutions(
-        self, grasp: Grasp | Chosen, problem: Problems, start: Array, seed: int, limit: int
+        self, grasp: Grasp | Chosen, problem: TargetBatch, start: Array, seed: int, limit: int
     ) -> tuple[list[Array], str]:
         """Solutions (n,) of a grasp, nearest first, or that which was chosen; why there is none."""
         if not isinstance(grasp, Grasp):
-            q = self._questions.start(grasp.q, "q")
+            q = self._request.start(grasp.q, "q")
             verdict = judge(self.robot, problem, q[None])
             if verdict.solved(problem.enforce_limits)[0]:
                 return [q], ""
@@ -350,7 +350,7 @@ class MovingSolver:
             return [], f"the posture that was chosen does not take its grasp ({off} off, or limits)"
         engine = self._engine.kinds_of(problem)
         found = engine.finder.find(
-            problem, start, seed, limit, "q0", apart=0.05, around=engine.around(problem)
+            problem, start, seed, limit, "q0", apart=0.05, query=engine.collision_query(problem)
         )
         # A solve looks further for an answer that is free than a list of all does.
         best = engine.solve(replace(problem, prefer="q0"), Run(start, seed))
@@ -369,7 +369,7 @@ class MovingSolver:
     ) -> FollowPlan:
         engine = self._engine
         return FollowPlan(
-            self._questions,
+            self._request,
             engine.check,
             engine.compiled,
             q0,
@@ -381,14 +381,14 @@ class MovingSolver:
             pull,
         )
 
-    def _bounds(self, problems: Problems | None) -> tuple[Array, Array]:
+    def _bounds(self, targets: TargetBatch | None) -> tuple[Array, Array]:
         """(n,) lower and upper."""
-        if problems is None:
-            problems = self._anything(0.0)
-        return problems.bounds(self.robot.description, UNBOUNDED)
+        if targets is None:
+            targets = self._anything(0.0)
+        return targets.bounds(self.robot.description, UNBOUNDED)
 
-    def _anything(self, place: float) -> Problems:
+    def _anything(self, place: float) -> TargetBatch:
         """A target with all contacts at a place, or none if that is NaN."""
         anywhere = np.zeros((1, len(self.robot.fingers), 3))
-        found = self._questions.of_arrays(anywhere, anywhere + 1.0, None)
+        found = self._request.of_arrays(anywhere, anywhere + 1.0, None)
         return replace(found, points=anywhere + place)

@@ -21,9 +21,9 @@ from casadi_ik.motion.clear import free_way, least_clearance
 from casadi_ik.motion.inputs import ANY, FollowerInputs, FollowPlan
 from casadi_ik.motion.motion import Motion
 from casadi_ik.motion.timing import Rates, shares, timed
-from casadi_ik.problem.clearance import SceneCheck, Surroundings
+from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 from casadi_ik.problem.contacts import usual
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Closer:
 
     def find(
         self,
-        problem: Problems,
+        problem: TargetBatch,
         q: Array,
         opening: float,
         distance: float,
@@ -201,7 +201,7 @@ class ApproachPlan:
     """
 
     plan: FollowPlan
-    problem: Problems
+    problem: TargetBatch
     opening: float
     distance: float
     direction: Array | None = None
@@ -235,8 +235,8 @@ class Tried:
     q: Array
     last: LastPart | None
     reason: str
-    open_handed: Surroundings | None
-    holding: Surroundings | None
+    open_handed: CollisionQuery | None
+    holding: CollisionQuery | None
 
 
 def approaches(asked: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Tried]:
@@ -274,31 +274,31 @@ def approach(asked: ApproachPlan, solutions: Sequence[Array], why: str) -> Appro
     return Approach(ReachStatus.NO_APPROACH, reason, None, None, None, None, count)
 
 
-def _surroundings(asked: ApproachPlan) -> tuple[Surroundings | None, Surroundings | None]:
+def _surroundings(asked: ApproachPlan) -> tuple[CollisionQuery | None, CollisionQuery | None]:
     """What is checked while the hand closes, and before: then fingers touch no object either."""
     check, problem = asked.plan.check, asked.problem
     if check is None:
         return None, None
     one = np.zeros(1, dtype=np.intp)
     untouched = replace(problem, points=np.full_like(problem.points, np.nan))
-    return check.around(problem).rows(one), check.around(untouched).rows(one)
+    return check.collision_query(problem).rows(one), check.collision_query(untouched).rows(one)
 
 
 def _blocked(
     last: LastPart | None,
-    holding: Surroundings | None,
-    open_handed: Surroundings | None,
+    holding: CollisionQuery | None,
+    open_handed: CollisionQuery | None,
 ) -> str:
     """Why the last part cannot be gone; "": it can."""
     if last is None:
         return "the arm cannot follow the straight way back"
-    for name, postures, around in (
+    for name, postures, query in (
         ("the approach", last.coming, open_handed),
         ("the closing", last.closing, holding),
     ):
-        if around is None or len(postures) < 2:
+        if query is None or len(postures) < 2:
             continue
-        _, touching = least_clearance(around, postures)
+        _, touching = least_clearance(query, postures)
         if touching:
             return f"{name} is not free: {touching}"
     return ""
@@ -316,7 +316,7 @@ class Carried:
     step = 1e-3
     giving = 1e-3
 
-    def __init__(self, check: SceneCheck, problem: Problems, q: Array) -> None:
+    def __init__(self, check: SceneCheck, problem: TargetBatch, q: Array) -> None:
         """Take the object.
 
         Args:
@@ -333,16 +333,16 @@ class Carried:
 
     def blocked(self, q: Array) -> str:
         """What is in the way from each of k postures (k, n) straight to the next; "": nothing."""
-        around = self._around(q)
-        return least_clearance(around, q)[1] or self._comes_near(q)
+        query = self._query_at(q)
+        return least_clearance(query, q)[1] or self._comes_near(q)
 
-    def _around(self, q: Array) -> Surroundings:
+    def _query_at(self, q: Array) -> CollisionQuery:
         every = self._problem.rows(np.zeros(len(q), dtype=np.intp))
         if self._in_palm is None:
-            return self._check.around(every).rows(np.zeros(1, dtype=np.intp))
+            return self._check.collision_query(every).rows(np.zeros(1, dtype=np.intp))
         poses = self._robot.palm(q) @ self._in_palm
         held = replace(every, object=self._name, object_pose=poses)
-        return self._check.around(held, carried=True)
+        return self._check.collision_query(held, carried=True)
 
     def _comes_near(self, q: Array) -> str:
         """What in the scene the object comes too near to, as far as it is not there already."""
@@ -487,22 +487,22 @@ def reach(asked: ReachPlan, q0: Array, solutions: Sequence[Array], why: str) -> 
 
 
 def move(
-    robot: ArmHand, ends: tuple[Array, Array], around: Surroundings | None, pace: Pace, seed: int
+    robot: ArmHand, ends: tuple[Array, Array], query: CollisionQuery | None, pace: Pace, seed: int
 ) -> Reach:
     """The way from one posture (n,) to another.
 
     Args:
         robot: The robot.
         ends: Where it is, and where it is to be.
-        around: What must not be touched; None: nothing is checked.
+        query: What must not be touched; None: nothing is checked.
         pace: How fast it is.
         seed: Of a planner.
     """
-    corners, how = free_way(robot, *ends, around, seed)
+    corners, how = free_way(robot, *ends, query, seed)
     if corners is None:
         return _none(ReachStatus.NO_WAY, how)
     motion = _in_time(robot, [(GOING, np.stack(pair)) for pair in pairwise(corners)], pace)
-    clearance, reason = (None, "") if around is None else least_clearance(around, motion.q)
+    clearance, reason = (None, "") if query is None else least_clearance(query, motion.q)
     if reason:
         return _none(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
     return _reached(how, motion, ends[1], clearance, 1, pace)

@@ -13,14 +13,14 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.motion.clear import OBSTACLES, Guard, between
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan, contact_rows, tolerance_rows
-from casadi_ik.problem.clearance import Surroundings
+from casadi_ik.problem.clearance import CollisionQuery
 from casadi_ik.problem.contacts import Kinds
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import judge
 from casadi_ik.solving.engine import Engine
 
 
-def contacts_between(problems: Problems, i: int, count: int) -> Problems:
+def contacts_between(targets: TargetBatch, i: int, count: int) -> TargetBatch:
     """Contacts on the way from grasp i - 1 to grasp i, the last of them grasp i itself."""
     share = np.linspace(0, 1, count + 1)[1:, None, None]
 
@@ -33,15 +33,15 @@ def contacts_between(problems: Problems, i: int, count: int) -> Problems:
         way = mixed(values)
         return way / np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-12)
 
-    normals, more = turned(problems.normals), {}
-    for name, values in problems.more.items():
+    normals, more = turned(targets.normals), {}
+    for name, values in targets.more.items():
         way = turned(values)
         if name == "tangents":
             way -= normals * np.sum(normals * way, axis=2, keepdims=True)
             way /= np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-12)
         more[name] = way
-    points = mixed(problems.points)
-    return replace(problems, points=points, normals=normals, more=more, object_pose=None)
+    points = mixed(targets.points)
+    return replace(targets, points=points, normals=normals, more=more, object_pose=None)
 
 
 @dataclass(frozen=True)
@@ -88,19 +88,19 @@ class PathTracker:
         """The state of rest at a posture (n,)."""
         return self._asked.state_at(q)
 
-    def walk(self, state: Array, problems: Problems) -> Array:
+    def walk(self, state: Array, targets: TargetBatch) -> Array:
         """Follow targets, TUNING.cycles` each.
 
         Args:
             state: Where it begins.
-            problems: k targets.
+            targets: k targets.
 
         Returns:
             (k, ...) the states after them (`Cycle.state`): where the motors are comes first, their
             last step second, the goal third.
         """
         asked, guard = self._asked, self._guard
-        rows = self._rows(problems)
+        rows = self._rows(targets)
         if guard is None:
             return asked.run.run(state, np.repeat(rows, TUNING.cycles, axis=0))[0][
                 TUNING.cycles - 1 :: TUNING.cycles
@@ -109,21 +109,21 @@ class PathTracker:
         found = np.empty((len(rows), len(state)))
         for i, row in enumerate(rows):
             asked.run.parameters[:] = row
-            guard.surround(problems.rows(slice(i, i + 1)))
+            guard.surround(targets.rows(slice(i, i + 1)))
             for _ in range(TUNING.cycles):
                 guard.step(asked)
             found[i] = asked.run.state
         return found
 
-    def _rows(self, problems: Problems) -> Array:
+    def _rows(self, targets: TargetBatch) -> Array:
         """(k, ...) parameters of the cycles."""
         asked = self._asked
         # What does not belong to a target stands in the memory already.
-        every = np.repeat(asked.run.parameters[None], len(problems), axis=0)
+        every = np.repeat(asked.run.parameters[None], len(targets), axis=0)
         layout = asked.cycle.parameters
-        for name, values in contact_rows(asked.cycle, problems).items():
-            every[:, layout.slice(name)] = values.reshape(len(problems), -1)
-        for name, each in tolerance_rows(problems.tolerances).items():
+        for name, values in contact_rows(asked.cycle, targets).items():
+            every[:, layout.slice(name)] = values.reshape(len(targets), -1)
+        for name, each in tolerance_rows(targets.tolerances).items():
             every[:, layout.slice(name)] = each
         return every
 
@@ -158,17 +158,17 @@ class Path:
 
     Attributes:
         engine: Hand-first on the robot.
-        problems: The grasps in order, all of the same kinds.
+        targets: The grasps in order, all of the same kinds.
         seed: Of the starts of arms without a closed form.
         tracker: Makes the cycles.
-        around: What must not be touched; None: nothing is checked.
+        query: What must not be touched; None: nothing is checked.
     """
 
     engine: Engine
-    problems: Problems
+    targets: TargetBatch
     seed: int
     tracker: PathTracker
-    around: Surroundings | None
+    query: CollisionQuery | None
     _reachable: dict[int, bool] = field(default_factory=dict)
 
     @property
@@ -178,14 +178,14 @@ class Path:
 
     def follow(self, start: Array) -> tuple[Array, list[Jump]]:
         """Configurations (k, n) that begin with `start`, and the jumps between them."""
-        count, n = len(self.problems), self.tracker.n
+        count, n = len(self.targets), self.tracker.n
         first = self.tracker.at(start)
         states = np.empty((count, len(first)))
         states[0] = first
         jumps: list[Jump] = []
         i = 1
         while i < count:
-            block = self.problems.rows(slice(i, min(i + TUNING.block, count)))
+            block = self.targets.rows(slice(i, min(i + TUNING.block, count)))
             states[i : i + len(block)] = self.tracker.walk(states[i - 1], block)
             broken = self._broken(i, states[i - 1 : i + len(block), 2 * n : 3 * n])
             if broken is None:
@@ -216,7 +216,7 @@ class Path:
         """Which grasps can be solved, wherever the robot is."""
         new = [row for row in rows.tolist() if row not in self._reachable]
         if new:
-            asked = self.problems.rows(np.array(new))
+            asked = self.targets.rows(np.array(new))
             starts = np.tile(self.engine.robot.home, (len(new), 1))
             q = self.engine.method.run(asked, starts, self.seed, trace=False).q
             self._reachable |= zip(new, self._meets(np.array(new), q).tolist(), strict=True)
@@ -234,7 +234,7 @@ class Path:
                 if not self._reach(rows)[0]:
                     return direct, None
                 found = self.engine.finder.find(
-                    row, here, self.seed, 1, "q0", around=self._around(rows)
+                    row, here, self.seed, 1, "q0", query=self._query_at(rows)
                 )
                 if not found:
                     return direct, None
@@ -252,23 +252,23 @@ class Path:
             The goal reached, and the one before some motor leapt, if one did.
         """
         n = self.tracker.n
-        way = contacts_between(self.problems, i, TUNING.substeps)
+        way = contacts_between(self.targets, i, TUNING.substeps)
         states = self.tracker.walk(before, way)
         goals = np.concatenate([before[None, 2 * n : 3 * n], states[:, 2 * n : 3 * n]])
         leaps = np.flatnonzero(self._parts(np.diff(goals, axis=0)) > TUNING.leap)
         return goals[-1], goals[leaps[0]] if len(leaps) else None
 
     def _meets(self, rows: NDArray[np.intp], q: Array) -> NDArray[np.bool_]:
-        problems = self.problems.rows(rows)
-        solved = judge(self.engine.robot, problems, q).solved(problems.enforce_limits)
-        around = self._around(rows)
-        return solved if around is None else solved & around.free(q)
+        targets = self.targets.rows(rows)
+        solved = judge(self.engine.robot, targets, q).solved(targets.enforce_limits)
+        query = self._query_at(rows)
+        return solved if query is None else solved & query.free(q)
 
-    def _around(self, rows: NDArray[np.intp]) -> Surroundings | None:
-        return None if self.around is None else self.around.rows(rows)
+    def _query_at(self, rows: NDArray[np.intp]) -> CollisionQuery | None:
+        return None if self.query is None else self.query.rows(rows)
 
-    def _row(self, i: int) -> Problems:
-        return self.problems.rows(slice(i, i + 1))
+    def _row(self, i: int) -> TargetBatch:
+        return self.targets.rows(slice(i, i + 1))
 
     def _parts(self, change: Array) -> Array:
         """(...) the farthest that a motor moves, as a part of its range."""
@@ -321,7 +321,7 @@ class Track:
 
 def track(
     engine: Engine,
-    problems: Problems,
+    targets: TargetBatch,
     q0: Array,
     prefer: str,
     tracker: PathTracker,
@@ -335,7 +335,7 @@ def track(
 
     Args:
         engine: Hand-first on the robot, for the kinds of the grasps.
-        problems: The grasps in order.
+        targets: The grasps in order.
         q0: (n,) where the robot is.
         prefer: How the solutions of the first grasp are ranked, see `PREFERENCES`.
         tracker: Goes along them.
@@ -347,16 +347,16 @@ def track(
         UnsupportedError: The method is not hand-first.
     """
     begin = time.perf_counter()
-    around = engine.around(problems)
-    path = Path(engine, problems, seed, tracker, around)
+    query = engine.collision_query(targets)
+    path = Path(engine, targets, seed, tracker, query)
     best: tuple[Array, list[Jump]] | None = None
     least = (np.inf, np.inf)
-    for start in _starts(engine, problems, q0, prefer, seed, around):
+    for start in _starts(engine, targets, q0, prefer, seed, query):
         q, jumps = path.follow(start)
-        missed = int((~_solved(engine.robot, problems, q, around)).sum())
-        if around is not None and not missed:
+        missed = int((~_solved(engine.robot, targets, q, query)).sum())
+        if query is not None and not missed:
             # A way between two postures that touches something counts as one missed.
-            missed += int((~_free_between(around, q, jumps)).sum()) - len(jumps)
+            missed += int((~_free_between(query, q, jumps)).sum()) - len(jumps)
         if (missed, len(jumps)) < least:
             best, least = (q, jumps), (missed, len(jumps))
         if least[1] == 0 and (least[0] == 0 or least[0] <= path.unreachable):
@@ -365,20 +365,20 @@ def track(
     q, jumps = best
     if travel is not None:
         q = _run_after(q, travel)
-    verdict = judge(engine.robot, problems, q)
+    verdict = judge(engine.robot, targets, q)
     return Track(
         q=q,
-        success=_solved(engine.robot, problems, q, around),
+        success=_solved(engine.robot, targets, q, query),
         position_error=verdict.position_error,
         angle_error=verdict.angle_error,
         jumps=tuple(jumps),
-        clearance=None if around is None else around.check(q).distance,
-        free_between=None if around is None else _free_between(around, q, jumps),
+        clearance=None if query is None else query.check(q).distance,
+        free_between=None if query is None else _free_between(query, q, jumps),
         time=time.perf_counter() - begin,
     )
 
 
-def _free_between(around: Surroundings, q: Array, jumps: Sequence[Jump]) -> Bools:
+def _free_between(query: CollisionQuery, q: Array, jumps: Sequence[Jump]) -> Bools:
     """(k - 1,) of postures (k, n) whether the ways between them are free; jumps are no ways."""
     reached = np.array([jump.index for jump in jumps], dtype=np.intp)
     free = np.ones(max(len(q) - 1, 0), dtype=bool)
@@ -387,27 +387,27 @@ def _free_between(around: Surroundings, q: Array, jumps: Sequence[Jump]) -> Bool
     first = 0
     for end in ends.tolist():
         rows = np.arange(first, end)
-        free[first : end - 1] = between(around.rows(rows), q[rows]).free
+        free[first : end - 1] = between(query.rows(rows), q[rows]).free
         first = end
     return free
 
 
 def _starts(
     engine: Engine,
-    problems: Problems,
+    targets: TargetBatch,
     q0: Array,
     prefer: str,
     seed: int,
-    around: Surroundings | None,
+    query: CollisionQuery | None,
 ) -> Iterator[Array]:
     """Postures that the motion may begin with, the one that a solve gives first: it is quick."""
-    first = problems.rows(slice(0, 1))
-    here = None if around is None else around.rows(np.zeros(1, dtype=np.intp))
+    first = targets.rows(slice(0, 1))
+    here = None if query is None else query.rows(np.zeros(1, dtype=np.intp))
     q = engine.method.run(replace(first, prefer=prefer), q0[None], seed, trace=False).q
     solved = bool(_solved(engine.robot, first, q, here)[0])
     if solved:
         yield q[0]
-    found = engine.finder.find(first, q0, seed, TUNING.starts, prefer, apart=0, around=here)
+    found = engine.finder.find(first, q0, seed, TUNING.starts, prefer, apart=0, query=here)
     yield from (alternative.q for alternative in found)
     if not (found or solved):
         # Not to be solved: the nearest there is.
@@ -426,7 +426,7 @@ def _run_after(path: Array, travel: Array) -> Array:
 
 
 def _solved(
-    robot: ArmHand, problems: Problems, q: Array, around: Surroundings | None
+    robot: ArmHand, targets: TargetBatch, q: Array, query: CollisionQuery | None
 ) -> NDArray[np.bool_]:
-    solved = judge(robot, problems, q).solved(problems.enforce_limits)
-    return solved if around is None else solved & around.free(q)
+    solved = judge(robot, targets, q).solved(targets.enforce_limits)
+    return solved if query is None else solved & query.free(q)

@@ -31,8 +31,8 @@ from casadi_ik.kernels.loop import Stepper
 from casadi_ik.problem.contacts import Kinds, usual
 from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import (
     ANGLE_ERROR,
     COST,
@@ -559,38 +559,38 @@ class IpoptMethod:
         """The parameter record as a plain mapping."""
         return dataclasses.asdict(self.options)
 
-    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+    def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
         """Not to be had.
 
         Raises:
             UnsupportedError: Always.
         """
-        del problems, q0
+        del targets, q0
         raise UnsupportedError(
             f"method {self.name!r} cannot be stepped by hand: Ipopt runs its iterations itself and "
             "only reports them; a log holds them all"
         )
 
-    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+    def run(self, targets: TargetBatch, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch; see `Method.run`.
 
         The random numbers of a target are those of the seed and the target's number in the whole
         batch.
         """
-        robot, count = self._robot, len(problems)
+        robot, count = self._robot, len(targets)
         q = np.zeros((count, len(robot.actuators)))
         status, iterations, restarts = (np.zeros(count, dtype=np.int64) for _ in range(3))
         elapsed = np.zeros(count)
         traces = [np.zeros(0, self.record.dtype)]
-        targets = self._targets(problems)
-        starts = np.clip(q0, robot.lower, robot.upper) if problems.enforce_limits else q0
+        goals = self._goals(targets)
+        starts = np.clip(q0, robot.lower, robot.upper) if targets.enforce_limits else q0
         for row in range(count):
             begin = time.perf_counter()
-            sequence = np.random.SeedSequence([seed, problems.number(row)])
-            runs = self._runs(starts[row], targets[row], problems, np.random.default_rng(sequence))
+            sequence = np.random.SeedSequence([seed, targets.number(row)])
+            runs = self._runs(starts[row], goals[row], targets, np.random.default_rng(sequence))
             best = min(runs, key=lambda run: run.cost)
             q[row] = best.q
-            status[row] = _ending(best, problems, self.program.contacts)
+            status[row] = _ending(best, targets, self.program.contacts)
             iterations[row] = sum(len(run.path) for run in runs)
             restarts[row] = len(runs) - 1
             if trace:
@@ -607,31 +607,31 @@ class IpoptMethod:
         )
 
     def _runs(
-        self, start: Array, targets: Array, problems: Problems, rng: np.random.Generator
+        self, start: Array, goals: Array, targets: TargetBatch, rng: np.random.Generator
     ) -> list[NlpRun]:
         """One run after the other, until the contacts are met or the starts are used up."""
         robot, runs = self._robot, []
-        lower, upper = problems.bounds(robot, np.inf)
+        lower, upper = targets.bounds(robot, np.inf)
         for _ in range(self.options.restarts + 1):
-            runs.append(self.program.solve(start, targets, lower, upper))
-            if _ending(runs[-1], problems, self.program.contacts) is Status.SOLVED:
+            runs.append(self.program.solve(start, goals, lower, upper))
+            if _ending(runs[-1], targets, self.program.contacts) is Status.SOLVED:
                 break
             start = rng.uniform(robot.lower, robot.upper)
         return runs
 
-    def _targets(self, problems: Problems) -> Array:
+    def _goals(self, targets: TargetBatch) -> Array:
         """(k, ...) parameters of the program; what is free is zero."""
-        layout, count = self.program.parameters, len(problems)
-        counts = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
+        layout, count = self.program.parameters, len(targets)
+        counts = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
         values = {
-            item.name: np.nan_to_num(problems.vectors(item.name))
+            item.name: np.nan_to_num(targets.vectors(item.name))
             for item in layout
             if item.name != "weights"
         } | {"weights": np.stack(counts, axis=2)}
-        targets = np.zeros((count, layout.size))
+        goals = np.zeros((count, layout.size))
         for item in layout:
-            targets[:, layout.slice(item.name)] = values[item.name].reshape(count, item.size)
-        return targets
+            goals[:, layout.slice(item.name)] = values[item.name].reshape(count, item.size)
+        return goals
 
     def _trace(self, runs: list[NlpRun], status: Status) -> NDArray[Any]:
         rows = np.zeros(sum(len(run.path) for run in runs), dtype=self.record.dtype)
@@ -657,9 +657,9 @@ def _step_sizes(path: Array) -> Array:
     return np.append(np.abs(np.diff(path, axis=0)).max(axis=1), np.nan)
 
 
-def _ending(run: NlpRun, problems: Problems, contacts: NlpContacts) -> Status:
+def _ending(run: NlpRun, targets: TargetBatch, contacts: NlpContacts) -> Status:
     """How a run ended: solved if every contact is within tolerance, whatever Ipopt thinks."""
     distances, angles = contacts.errors(run.residual[None])
-    met = np.all(distances <= problems.position_tolerance)
-    met = met and np.all(angles <= problems.angle_tolerance)
+    met = np.all(distances <= targets.position_tolerance)
+    met = met and np.all(angles <= targets.angle_tolerance)
     return Status.SOLVED if met and run.inside else run.status

@@ -24,8 +24,8 @@ from casadi_ik.kernels.loop import Stepper
 from casadi_ik.logs import McapRecorder
 from casadi_ik.methods.common.limits import coupling_jacobian
 from casadi_ik.papers.screw_tasks import ScrewControlStep, ScrewTask
-from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.targets import TargetBatch, Tolerance
 from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic import dual_quaternion as dq
@@ -325,7 +325,7 @@ class ScrewControl:
                 self._step.record, labels, coupling_jacobian(self.robot.description)
             ),
             first=0,
-            problems=Problems(free, free, Tolerance(), enforce_limits=True),
+            targets=TargetBatch(free, free, Tolerance(), enforce_limits=True),
             starts=trajectory.q[:1],
             seed=0,
             batch=batch,

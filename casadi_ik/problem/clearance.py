@@ -18,7 +18,7 @@ from casadi_ik.collision.model import CollisionModel, check_base, collision_mode
 from casadi_ik.collision.scene import Item, Scene
 from casadi_ik.collision.solids import Solid, capsule
 from casadi_ik.kernels.clearance_kernel import ClearanceKernel
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.robots.collision import Touching
 
 ROUNDING = 1e-9
@@ -38,14 +38,14 @@ class Clearances:
         free: (k,) whether every pair is as far apart as it has to be.
         pairs: (k,) number of that pair in `names`, -1: none.
         names: What pairs are called.
-        room: (k,) what the distance has to spare beyond what is asked of its pair [m].
+        surplus: (k,) what the distance has to spare beyond what is asked of its pair [m].
     """
 
     distance: Array
     free: NDArray[np.bool_]
     pairs: NDArray[np.int64]
     names: tuple[Pair, ...]
-    room: Array
+    surplus: Array
 
     def pair(self, row: int) -> Pair | None:
         """The nearest pair of a configuration."""
@@ -54,7 +54,7 @@ class Clearances:
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class CollisionQuery:
     """What k targets are checked against.
 
     Attributes:
@@ -69,49 +69,49 @@ class Surroundings:
     poses: Array
     margin: float
 
-    def rows(self, rows: NDArray[np.intp]) -> Surroundings:
+    def rows(self, rows: NDArray[np.intp]) -> CollisionQuery:
         """Those of some targets, which may be there several times."""
         if self.poses.ndim == 2:
             return self
         if len(self.poses) == 1:
-            return Surroundings(self.kernel, self.table, self.poses[0], self.margin)
-        return Surroundings(self.kernel, self.table, self.poses[rows], self.margin)
+            return CollisionQuery(self.kernel, self.table, self.poses[0], self.margin)
+        return CollisionQuery(self.kernel, self.table, self.poses[rows], self.margin)
 
-    def only(self, pairs: NDArray[np.bool_]) -> Surroundings:
+    def only(self, pairs: NDArray[np.bool_]) -> CollisionQuery:
         """With some of the pairs."""
-        return Surroundings(self.kernel, self.table.only(pairs), self.poses, self.margin)
+        return CollisionQuery(self.kernel, self.table.only(pairs), self.poses, self.margin)
 
-    def parted(self, links: frozenset[str]) -> tuple[Surroundings, Surroundings]:
+    def parted(self, links: frozenset[str]) -> tuple[CollisionQuery, CollisionQuery]:
         """With the pairs alone that one of some links is in, and with all others."""
         within, others = self.table.parted(links)
         return (
-            Surroundings(self.kernel, within, self.poses, self.margin),
-            Surroundings(self.kernel, others, self.poses, self.margin),
+            CollisionQuery(self.kernel, within, self.poses, self.margin),
+            CollisionQuery(self.kernel, others, self.poses, self.margin),
         )
 
     @property
-    def held(self) -> Surroundings:
+    def held(self) -> CollisionQuery:
         """With the pairs alone that the hand and its palm's pose decide."""
-        return Surroundings(self.kernel, self.table.held, self.poses, self.margin)
+        return CollisionQuery(self.kernel, self.table.held, self.poses, self.margin)
 
     @property
-    def robot_alone(self) -> Surroundings:
+    def robot_alone(self) -> CollisionQuery:
         """With the pairs alone of the robot with itself."""
-        return Surroundings(self.kernel, self.table.of_robot, self.poses, self.margin)
+        return CollisionQuery(self.kernel, self.table.of_robot, self.poses, self.margin)
 
     @property
-    def scene_alone(self) -> Surroundings:
+    def scene_alone(self) -> CollisionQuery:
         """With the pairs alone of the robot with what stands about it."""
-        return Surroundings(self.kernel, self.table.of_scene, self.poses, self.margin)
+        return CollisionQuery(self.kernel, self.table.of_scene, self.poses, self.margin)
 
     def check(self, q: Array) -> Clearances:
         """Clearances of configurations (k, n)."""
-        room, pairs = self.kernel.least(q, self.poses, self.table)
+        surplus, pairs = self.kernel.least(q, self.poses, self.table)
         margins = np.append(self.table.margins, self.margin)[pairs]
         unknown = ~np.isfinite(q).all(axis=1)
-        room = np.where(unknown, np.nan, room - self.margin)
-        free = room >= -ROUNDING
-        return Clearances(room + margins, free, pairs, self.table.names, room)
+        surplus = np.where(unknown, np.nan, surplus - self.margin)
+        free = surplus >= -ROUNDING
+        return Clearances(surplus + margins, free, pairs, self.table.names, surplus)
 
     def free(self, q: Array) -> NDArray[np.bool_]:
         """(k,) whether configurations (k, n) are free; quicker than `check`."""
@@ -203,30 +203,30 @@ class SceneCheck:
             for finger in self.robot.description.fingers
         }
 
-    def around(self, problems: Problems, carried: bool = False) -> Surroundings:
+    def collision_query(self, targets: TargetBatch, carried: bool = False) -> CollisionQuery:
         """What targets are checked against.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             carried: Whether the hand carries what it grasps.
 
         Raises:
             UnknownNameError: They grasp an object that there is not.
         """
-        scene, name = self.scene, problems.object or self.scene.grasped
-        pose = problems.object_pose
+        scene, name = self.scene, targets.object or self.scene.grasped
+        pose = targets.object_pose
         if name is not None and name not in scene.items and pose is not None:
             scene = self._holding(name, pose[0])
         elif name != scene.grasped and name in scene.items:
             scene = self._holding(name, scene.items[name].pose)
-        fingers = ~np.isnan(problems.points[..., 0]).all(axis=0)
+        fingers = ~np.isnan(targets.points[..., 0]).all(axis=0)
         named = [
             name for name, on in zip(self.robot.fingers, np.atleast_1d(fingers), strict=True) if on
         ]
         touched = frozenset().union(*(self.bodies_of_fingers[name] for name in named))
         table, items = self._table(scene, touched, carried)
         moved = name if pose is not None else None
-        return Surroundings(self.kernel, table, table.poses(items, moved, pose), scene.margin)
+        return CollisionQuery(self.kernel, table, table.poses(items, moved, pose), scene.margin)
 
     def _holding(self, name: str, pose: Array) -> Scene:
         """The scene with an object that is grasped, wherever it was first: its pose goes aside."""

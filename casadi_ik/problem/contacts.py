@@ -29,7 +29,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.grasps.grasp import MORE, fault, faulty, squared, unit_vectors
 from casadi_ik.kernels.layout import Field
-from casadi_ik.problem.problems import DIRECTIONS, Problems
+from casadi_ik.problem.targets import DIRECTIONS, TargetBatch
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.kinematics import ActuatedKinematics, Kinematics
 from casadi_ik.symbolic.se3 import angle_between, log_so3, normal_error, perpendicular, skew
@@ -500,7 +500,7 @@ def _problem(vectors: Mapping[str, Array]) -> str:
     return fault(units) or "malformed"
 
 
-def by_kinds(problems: Problems) -> Iterator[tuple[Kinds, NDArray[np.intp] | None, Problems]]:
+def by_kinds(targets: TargetBatch) -> Iterator[tuple[Kinds, NDArray[np.intp] | None, TargetBatch]]:
     """Targets sorted by the kinds of their contacts: what one kernel solves.
 
     The kinds of a target are its own, whatever else is in the batch. If a finger has a tangent,
@@ -510,12 +510,12 @@ def by_kinds(problems: Problems) -> Iterator[tuple[Kinds, NDArray[np.intp] | Non
     Yields:
         Kinds, rows (None: all, as they are) and the targets in these rows.
     """
-    f = problems.points.shape[1]
-    if not problems.more:
-        yield usual(f), None, problems
+    f = targets.points.shape[1]
+    if not targets.more:
+        yield usual(f), None, targets
         return
-    names = list(problems.more)
-    given = np.stack([~np.isnan(problems.more[name][..., 0]) for name in names], axis=2)
+    names = list(targets.more)
+    given = np.stack([~np.isnan(targets.more[name][..., 0]) for name in names], axis=2)
     if "tangents" in names:
         turned = given[..., names.index("tangents")]
         turned[:] = turned.any(axis=1, keepdims=True)
@@ -529,11 +529,11 @@ def by_kinds(problems: Problems) -> Iterator[tuple[Kinds, NDArray[np.intp] | Non
             for row in of_fingers
         )
         if len(firsts) == 1:
-            yield kinds, None, problems
+            yield kinds, None, targets
             return
         rows = np.flatnonzero(which == i)
-        picked = np.array([problems.number(row) for row in rows.tolist()])
-        yield kinds, rows, replace(problems.rows(rows), picked=picked)
+        picked = np.array([targets.number(row) for row in rows.tolist()])
+        yield kinds, rows, replace(targets.rows(rows), picked=picked)
 
 
 def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
@@ -547,13 +547,13 @@ def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
     )
 
 
-def target_values(problems: Problems) -> dict[str, Array]:
+def target_values(targets: TargetBatch) -> dict[str, Array]:
     """Values of `target_fields` for a batch: targets (k, f, 3), tolerances (f,)."""
     return {
-        "points": problems.points,
-        "normals": problems.normals,
-        "position_tolerance": problems.position_tolerance,
-        "angle_tolerance": problems.angle_tolerance,
+        "points": targets.points,
+        "normals": targets.normals,
+        "position_tolerance": targets.position_tolerance,
+        "angle_tolerance": targets.angle_tolerance,
     }
 
 
@@ -570,7 +570,7 @@ class Target:
         return {"point": self.point, "normal": self.normal}
 
 
-def targets(robot: RobotDescription, parameters: dict[str, ca.SX]) -> dict[str, Target]:
+def goal_contacts(robot: RobotDescription, parameters: dict[str, ca.SX]) -> dict[str, Target]:
     """The targets by finger name, base frame."""
     return {
         name: Target(parameters["points"][i, :].T, parameters["normals"][i, :].T)

@@ -13,7 +13,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.kernels.layout import split_rows
 from casadi_ik.kernels.loop import Stepper
 from casadi_ik.problem.contacts import Kinds
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import TraceFormat
 
 
@@ -133,11 +133,11 @@ class Method(Protocol):
         """
         ...
 
-    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+    def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
         """Solve one target by hand, one iteration at a time.
 
         Args:
-            problems: One target.
+            targets: One target.
             q0: (n,) configuration to start from.
 
         Raises:
@@ -146,11 +146,11 @@ class Method(Protocol):
         """
         ...
 
-    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+    def run(self, targets: TargetBatch, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch of targets of its kinds.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             q0: (k, n) configurations to start from.
             seed: Of all random numbers; row i of a batch gets the same numbers in any batch.
             trace: Whether to keep every iteration.
@@ -166,8 +166,8 @@ class PreferringMethod(Protocol):
     """A method that can prefer one of several solutions.
 
     Attributes:
-        preferences: Those of `PREFERENCES` it knows: "q0" it follows itself where `Problems` say
-            so, "limits" is what it does else.
+        preferences: Those of `PREFERENCES` it knows: "q0" it follows itself where a `TargetBatch`
+            says so, "limits" is what it does else.
     """
 
     preferences: tuple[str, ...]
@@ -177,11 +177,11 @@ class PreferringMethod(Protocol):
 class QuickMethod(Protocol):
     """A method with a shorter way to the same answer for one target."""
 
-    def quick(self, problems: Problems, q0: Array) -> Quick | None:
+    def quick(self, targets: TargetBatch, q0: Array) -> Quick | None:
         """What `run` would find; None: ask `run`.
 
         Args:
-            problems: One target.
+            targets: One target.
             q0: (n,) configuration to start from.
         """
         ...

@@ -16,7 +16,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.grasps import Tolerance
 from casadi_ik.made import made
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 
 LIMIT_SLACK = 1e-9
 """Rounding allowed at a limit [rad or m]: a coupling's arithmetic may end a hair beyond it."""
@@ -112,80 +112,80 @@ class SolvedVerdict:
     limits_ok: bool
 
 
-def judge(robot: ArmHand, problems: Problems, q: Array) -> Verdict:
+def judge(robot: ArmHand, targets: TargetBatch, q: Array) -> Verdict:
     """Compare configurations with their targets.
 
     Args:
         robot: The robot.
-        problems: k targets, or one that all configurations are compared with.
+        targets: k targets, or one that all configurations are compared with.
         q: (k, n) configurations.
     """
-    points, normals = problems.points, problems.normals
-    if len(problems) == 1:
+    points, normals = targets.points, targets.normals
+    if len(targets) == 1:
         points, normals = points[0], normals[0]
-    position, angle, beyond = deviations(robot, problems, q)
+    position, angle, beyond = deviations(robot, targets, q)
     slack = 1 + TOLERANCE_SLACK
-    placed = position <= problems.position_tolerance * slack
-    faced = angle <= problems.angle_tolerance * slack
+    placed = position <= targets.position_tolerance * slack
+    faced = angle <= targets.angle_tolerance * slack
     ok = placed & faced
     if not ok.all():
         # Free is what the target leaves out; an error that is NaN for another reason is no success.
         ok = (placed | np.isnan(points[..., 0])) & (faced | np.isnan(normals[..., 0]))
-    return Verdict(position, angle, ok, beyond <= LIMIT_SLACK, judge_palms(robot, problems, q))
+    return Verdict(position, angle, ok, beyond <= LIMIT_SLACK, judge_palms(robot, targets, q))
 
 
-def judge_palms(robot: ArmHand, problems: Problems, q: Array) -> PalmVerdicts | None:
+def judge_palms(robot: ArmHand, targets: TargetBatch, q: Array) -> PalmVerdicts | None:
     """Compare palms with where they have to be; None where contacts alone decide.
 
     Args:
         robot: The robot.
-        problems: k targets, or one that all configurations are compared with. A palm counts as
+        targets: k targets, or one that all configurations are compared with. A palm counts as
             reached within the largest tolerance of the fingers.
         q: (k, n) configurations; NaN gives NaN.
     """
-    if problems.palms is None:
+    if targets.palms is None:
         return None
     found = np.full((len(q), 4, 4), np.nan)
     finite = np.isfinite(q).all(axis=1)
     if finite.any():
         found[finite] = robot.palm(q[finite])
-    wanted = problems.palms
+    wanted = targets.palms
     position = np.linalg.norm(found[:, :3, 3] - wanted[:, :3, 3], axis=1)
     angle = _turn(found[:, :3, :3], np.broadcast_to(wanted[:, :3, :3], (len(q), 3, 3)))
-    most, slack = problems.largest_tolerance, 1 + TOLERANCE_SLACK
+    most, slack = targets.largest_tolerance, 1 + TOLERANCE_SLACK
     ok = (position <= most.position * slack) & (angle <= most.angle * slack)
     return PalmVerdicts(position, angle, ok)
 
 
-def judge_one(robot: ArmHand, problems: Problems, q: Array) -> SolvedVerdict | None:
+def judge_one(robot: ArmHand, targets: TargetBatch, q: Array) -> SolvedVerdict | None:
     """The verdict on one configuration if everything asked is there and met; None: ask `judge`.
 
     Args:
         robot: The robot.
-        problems: One target.
+        targets: One target.
         q: (n,).
     """
-    position, angle, beyond = deviations(robot, problems, q)
-    return judge_errors(problems, position.tolist(), angle.tolist(), float(beyond))
+    position, angle, beyond = deviations(robot, targets, q)
+    return judge_errors(targets, position.tolist(), angle.tolist(), float(beyond))
 
 
 def judge_errors(
-    problems: Problems, position: list[float], angle: list[float], beyond: float
+    targets: TargetBatch, position: list[float], angle: list[float], beyond: float
 ) -> SolvedVerdict | None:
     """`judge_one` from what was measured.
 
     Args:
-        problems: One target.
+        targets: One target.
         position: Distances by finger [m].
         angle: Angles by finger [rad].
         beyond: By how much the worst actuator or joint is beyond its limits [rad or m].
     """
     limits_ok = beyond <= LIMIT_SLACK
-    if problems.enforce_limits and not limits_ok:
+    if targets.enforce_limits and not limits_ok:
         return None
     contacts = []
     slack = 1 + TOLERANCE_SLACK
-    errors = zip(position, angle, problems.tolerances, strict=True)
+    errors = zip(position, angle, targets.tolerances, strict=True)
     for distance, turn, tolerance in errors:
         if not (distance <= tolerance.position * slack and turn <= tolerance.angle * slack):
             return None
@@ -201,12 +201,12 @@ def judge_errors(
     return SolvedVerdict(contacts, limits_ok)
 
 
-def deviations(robot: ArmHand, problems: Problems, q: Array) -> tuple[Array, Array, Array]:
+def deviations(robot: ArmHand, targets: TargetBatch, q: Array) -> tuple[Array, Array, Array]:
     """How far configurations are from their targets and beyond their limits.
 
     Args:
         robot: The robot.
-        problems: k targets, or one for all.
+        targets: k targets, or one for all.
         q: (k, n) or (n,); NaN gives NaN.
 
     Returns:
@@ -214,16 +214,16 @@ def deviations(robot: ArmHand, problems: Problems, q: Array) -> tuple[Array, Arr
         the normals, or between the whole frames where there is a tangent; NaN where free; (k,) or
         () by how much the worst actuator or joint is beyond its limits [rad or m].
     """
-    points, normals = problems.points, problems.normals
-    if len(problems) == 1:
+    points, normals = targets.points, targets.normals
+    if len(targets) == 1:
         points, normals = points[0], normals[0]
     position, angle, beyond = robot.deviations(q, points, normals)
-    if not problems.more:
+    if not targets.more:
         return position, angle, beyond
     frames = robot.frames_at(q)
     off = frames[..., :3, 3] - points
-    for name, array in problems.more.items():
-        vectors = array[0] if len(problems) == 1 else array
+    for name, array in targets.more.items():
+        vectors = array[0] if len(targets) == 1 else array
         given = np.broadcast_to(~np.isnan(vectors[..., 0]), position.shape)
         if name == "lines":
             position = np.where(given, np.linalg.norm(np.cross(vectors, off), axis=-1), position)

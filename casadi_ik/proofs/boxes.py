@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.proofs.premises import OUTWARDS, motor_box
 from casadi_ik.robots.description import Finger, RobotDescription
 from casadi_ik.symbolic.couplings import Interval, joint_intervals
@@ -78,24 +78,24 @@ class HandSpace:
         found = joint_intervals(self.robot, given)
         return {name: found[name] for name in self.robot.finger_joints}
 
-    def of(self, places: Mapping[str, Array], problems: Problems) -> Array:
+    def of(self, places: Mapping[str, Array], targets: TargetBatch) -> Array:
         """(k, h) coordinates of joint and motor positions, turned by whole periods into the box.
 
         Args:
             places: (k,) by name of the joint or motor [rad or m].
-            problems: Whose limits count.
+            targets: Whose limits count.
         """
-        lower, upper = self.box(problems)
+        lower, upper = self.box(targets)
         found = np.stack([places[name] for name in self.coordinates], axis=1)
         turns = np.floor((found - lower) / (upper - lower))
         turns[(found >= lower) & (found <= upper)] = 0
         return found - turns * (upper - lower)
 
-    def box(self, problems: Problems) -> tuple[Array, Array]:
+    def box(self, targets: TargetBatch) -> tuple[Array, Array]:
         """(h,) ends of the coordinates within all that the problems let the hand do."""
-        ends = motor_box(self.robot, problems)
+        ends = motor_box(self.robot, targets)
         low, high = (np.array(part).ravel() for part in self._of_motors(ends[0], ends[1]))
-        if problems.enforce_limits:
+        if targets.enforce_limits:
             # The limits of a coupled joint may be narrower than those of its motor.
             for joint in self.robot.movable:
                 if joint.name in self.coordinates:

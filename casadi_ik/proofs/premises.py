@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.arms.family import Sphere
 from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.arrays import Array
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 from casadi_ik.robots.description import Joint, RobotDescription
 from casadi_ik.robots.poses import link_poses
@@ -36,26 +36,26 @@ NO_CONE = -2.0
 """The cosine of a cone that excludes nothing."""
 
 
-def motor_ends(robot: RobotDescription, problems: Problems) -> tuple[Array, Array]:
+def motor_ends(robot: RobotDescription, targets: TargetBatch) -> tuple[Array, Array]:
     """(n,) lower and upper ends of all motors, as the verdict has them: each by itself.
 
     `RobotDescription.lower` leaves out what is of no use to a method; a proof must not.
     """
-    lower, upper = robot.strokes if problems.enforce_limits else robot.mechanical
-    if problems.fixed is None:
+    lower, upper = robot.strokes if targets.enforce_limits else robot.mechanical
+    if targets.fixed is None:
         return lower, upper
-    free = np.isnan(problems.fixed)
-    return np.where(free, lower, problems.fixed), np.where(free, upper, problems.fixed)
+    free = np.isnan(targets.fixed)
+    return np.where(free, lower, targets.fixed), np.where(free, upper, targets.fixed)
 
 
-def motor_box(robot: RobotDescription, problems: Problems) -> Array:
+def motor_box(robot: RobotDescription, targets: TargetBatch) -> Array:
     """(2, h) lower and upper ends of `robot.finger_motors`.
 
     Limits where they are enforced; where they are ignored what the mechanisms can do, and else all
     turns until everything repeats. A motor whose motion never repeats is `ENDLESS`.
     """
     names = robot.finger_motors
-    lower, upper = motor_ends(robot, problems)
+    lower, upper = motor_ends(robot, targets)
     columns = [robot.actuator_index(name) for name in names]
     ends = np.stack([lower[columns] - OUTWARDS, upper[columns] + OUTWARDS])
     for i in np.flatnonzero(np.isinf(ends).any(axis=0)):
@@ -63,10 +63,10 @@ def motor_box(robot: RobotDescription, problems: Problems) -> Array:
     return ends
 
 
-def joint_limits(robot: RobotDescription, problems: Problems) -> tuple[Array, Array]:
+def joint_limits(robot: RobotDescription, targets: TargetBatch) -> tuple[Array, Array]:
     """(m,) lower and upper limits of `robot.finger_joints`; infinite where limits are ignored."""
     rows = [robot.joint_names.index(name) for name in robot.finger_joints]
-    if not problems.enforce_limits:
+    if not targets.enforce_limits:
         return np.full(len(rows), -np.inf), np.full(len(rows), np.inf)
     return robot.joint_lower[rows] - OUTWARDS, robot.joint_upper[rows] + OUTWARDS
 
@@ -134,22 +134,22 @@ class ArmSpan:
     between: tuple[Joint, ...]
     robot: RobotDescription
 
-    def span(self, problems: Problems) -> tuple[float, float]:
+    def span(self, targets: TargetBatch) -> tuple[float, float]:
         """Smallest and largest distance [m] within limits, or without where they are ignored."""
         if len(self.between) == 1 and self.between[0].type == "revolute":
-            near, far = self._one_joint(self.between[0], problems)
+            near, far = self._one_joint(self.between[0], targets)
         else:
-            near, far = 0.0, self._length(problems)
+            near, far = 0.0, self._length(targets)
         return near - MEETING, far + MEETING
 
-    def _one_joint(self, joint: Joint, problems: Problems) -> tuple[float, float]:
+    def _one_joint(self, joint: Joint, targets: TargetBatch) -> tuple[float, float]:
         """The squared distance is a + b cos(theta) + c sin(theta)."""
         samples = np.array([0.0, np.pi / 2, np.pi])
         wrists = self._palm({joint.name: samples}) @ np.append(self.wrist, 1.0)
         squares = ((wrists[:, :3] - self.shoulder) ** 2).sum(axis=1)
         a = (squares[0] + squares[2]) / 2
         b, c = squares[0] - a, squares[1] - a
-        lower, upper = self._range(joint, problems)
+        lower, upper = self._range(joint, targets)
         angles = [lower, upper]
         if upper - lower >= 2 * np.pi:
             angles = [0.0]
@@ -162,7 +162,7 @@ class ArmSpan:
         near, far = np.sqrt(np.maximum([values.min(), values.max()], 0.0))
         return float(near), float(far)
 
-    def _length(self, problems: Problems) -> float:
+    def _length(self, targets: TargetBatch) -> float:
         """The arm drawn straight: no pose is longer."""
         poses = link_poses(self.robot.root, self.robot.joints, {})
         points = [self.shoulder, *(poses[joint.child][:3, 3] for joint in self.between)]
@@ -170,17 +170,17 @@ class ArmSpan:
         long = sum(np.linalg.norm(b - a) for a, b in pairwise(points))
         for joint in self.between:
             if joint.type == "prismatic":
-                long += np.abs(self._range(joint, problems)).max()
+                long += np.abs(self._range(joint, targets)).max()
         return float(long)
 
-    def _range(self, joint: Joint, problems: Problems) -> tuple[float, float]:
+    def _range(self, joint: Joint, targets: TargetBatch) -> tuple[float, float]:
         """Ends of a joint: its own limits, and those of its motor where it is one."""
         lower, upper = -np.inf, np.inf
-        if problems.enforce_limits:
+        if targets.enforce_limits:
             lower, upper = joint.lower - OUTWARDS, joint.upper + OUTWARDS
         if joint.name in self.robot.actuator_names:
             i = self.robot.actuator_index(joint.name)
-            ends = motor_ends(self.robot, problems)
+            ends = motor_ends(self.robot, targets)
             lower = max(lower, ends[0][i] - OUTWARDS)
             upper = min(upper, ends[1][i] + OUTWARDS)
         return float(lower), float(upper)
@@ -225,22 +225,22 @@ def _common(joints: tuple[Joint, ...], lines: list[tuple[Array, Array]]) -> tupl
     return point, count
 
 
-def palms_in_span(arm: ArmSpan | None, problems: Problems) -> NDArray[np.bool_] | None:
+def palms_in_span(arm: ArmSpan | None, targets: TargetBatch) -> NDArray[np.bool_] | None:
     """(k,) whether palms that are given have the wrist within the arm's span, tolerances aside.
 
     Args:
         arm: The span; None: nothing is known.
-        problems: k targets with palms, of one arm.
+        targets: k targets with palms, of one arm.
     """
-    if arm is None or problems.palms is None:
+    if arm is None or targets.palms is None:
         return None
-    fixed = problems.fixed
-    one = problems if fixed is None or fixed.ndim == 1 else replace(problems, fixed=fixed[0])
+    fixed = targets.fixed
+    one = targets if fixed is None or fixed.ndim == 1 else replace(targets, fixed=fixed[0])
     near, far = arm.span(one)
-    allowed = problems.largest_tolerance
+    allowed = targets.largest_tolerance
     turned = 2 * np.sin(min(allowed.angle, np.pi) / 2) * np.linalg.norm(arm.wrist)
     loose = (1 + TOLERANCE_SLACK) * (allowed.position + turned) + MEETING
-    wrist = problems.palms[:, :3, :3] @ arm.wrist + problems.palms[:, :3, 3]
+    wrist = targets.palms[:, :3, :3] @ arm.wrist + targets.palms[:, :3, 3]
     away = np.linalg.norm(wrist - arm.shoulder, axis=1)
     return (away >= near - loose) & (away <= far + loose)
 
@@ -270,9 +270,9 @@ class ArmCones:
     lengths: tuple[float, float]
     offsets: tuple[float, float]
 
-    def cosines(self, problems: Problems) -> Array:
+    def cosines(self, targets: TargetBatch) -> Array:
         """(2,) of the half angles of the cones, `NO_CONE` where all directions are inside."""
-        lower, upper = motor_ends(self.robot, problems)
+        lower, upper = motor_ends(self.robot, targets)
         found = []
         for joint, offset in zip((1, 5), self.offsets, strict=True):
             i = self.robot.arm_actuators[joint]

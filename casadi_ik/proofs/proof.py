@@ -18,7 +18,7 @@ from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arms.recognise import srs_arm
 from casadi_ik.arrays import Array, Bools
 from casadi_ik.grasps import Tolerance
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.proofs.numeric_bounds import (
     Balls,
     angle_of,
@@ -94,7 +94,7 @@ class Proof:
     quantities: tuple[Quantity, ...]
     boxes: int
     tolerance: tuple[Tolerance, ...]
-    target: Problems = field(repr=False)
+    target: TargetBatch = field(repr=False)
     seal: str = field(default="", repr=False)
 
     def sealed(self) -> Proof:
@@ -128,7 +128,7 @@ class Proof:
             return ("proved: the palm has the wrist where the arm does not reach",)
         return (f"proved: {self.kind}",)
 
-    def check(self, robot: ArmHand, target: Problems | None = None) -> bool:
+    def check(self, robot: ArmHand, target: TargetBatch | None = None) -> bool:
         """Prove it again by other means: whether the proof holds and says what it said.
 
         The seal is compared, every quantity computed anew from the robot's description, and the
@@ -142,7 +142,7 @@ class Proof:
         return self.seal == self._seal() and _holds(self, robot.description, target)
 
 
-def _holds(proof: Proof, robot: RobotDescription, target: Problems | None) -> bool:
+def _holds(proof: Proof, robot: RobotDescription, target: TargetBatch | None) -> bool:
     """Whether a proof is about a target, states it rightly, and can be proved again."""
     about = proof.target
     if len(about) != 1 or (target is not None and not _same(about, target)):
@@ -168,7 +168,7 @@ def _holds(proof: Proof, robot: RobotDescription, target: Problems | None) -> bo
 
 
 def _quantities(
-    robot: RobotDescription, asked: Problems, fingers: list[int]
+    robot: RobotDescription, asked: TargetBatch, fingers: list[int]
 ) -> tuple[Quantity, ...]:
     """What the fingers' contacts keep, found anew."""
     invariants = rigid_invariants(robot, asked)
@@ -176,7 +176,7 @@ def _quantities(
     return quantities_of(invariants, values[0], give[0], fingers)
 
 
-def _same(one: Problems, other: Problems) -> bool:
+def _same(one: TargetBatch, other: TargetBatch) -> bool:
     arrays = ((one.points, other.points), (one.normals, other.normals))
     fixed = [np.zeros(0) if item.fixed is None else item.fixed for item in (one, other)]
     return (
@@ -191,7 +191,7 @@ class _Search:
     """Divides the hand's box until every part is refuted."""
 
     def __init__(
-        self, robot: RobotDescription, asked: Problems, fingers: list[int], kind: str
+        self, robot: RobotDescription, asked: TargetBatch, fingers: list[int], kind: str
     ) -> None:
         self.robot, self.asked, self.fingers, self.kind = robot, asked, fingers, kind
         self.motors = robot.finger_motors

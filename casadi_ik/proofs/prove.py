@@ -12,7 +12,7 @@ import numpy as np
 from casadi_ik.arrays import Array, Bools, Counts, Rows
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.problem.contacts import CONDITIONS, PLACE
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.proofs.box_tests import BoxTest
 from casadi_ik.proofs.boxes import HandSpace
 from casadi_ik.proofs.premises import (
@@ -89,11 +89,11 @@ class _Stated:
     """What targets ask of a robot's quantities, and proofs with their numbers."""
 
     def __init__(
-        self, robot: RobotDescription, kept: tuple[RigidInvariant, ...], problems: Problems
+        self, robot: RobotDescription, kept: tuple[RigidInvariant, ...], targets: TargetBatch
     ) -> None:
-        self._robot, self._kept, self._problems = robot, kept, problems
+        self._robot, self._kept, self._problems = robot, kept, targets
         self._fixed = arm_span(robot) is None
-        self._asked, self._give = asked_values(robot, kept, problems)
+        self._asked, self._give = asked_values(robot, kept, targets)
 
     def decided(self, known: Bools) -> list[Proof | None]:
         """Proofs where a quantity decides by itself.
@@ -140,36 +140,36 @@ class Prover:
         self._known: dict[tuple[bool, bytes], tuple[RigidInvariant, ...]] = {}
 
     def prove(
-        self, problems: Problems, holding: Array | None = None, most: Counts | None = None
+        self, targets: TargetBatch, holding: Array | None = None, most: Counts | None = None
     ) -> list[Proof | None]:
         """Proofs of k targets, None where none was found.
 
         No proof says nothing: neither that a target can be reached nor that it cannot.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             holding: (k, h) coordinates of hands (`HandSpace`) that reach them. Only boxes that
                 hold these are looked at: what comes out as proved would be proved wrongly, and
                 whatever would be proved wrongly comes out, in a fraction of the time.
             most: (k,) boxes of a target after which it is given up, if not before.
         """
         found: list[Proof | None] = []
-        for start in range(0, len(problems), EFFORT.together):
+        for start in range(0, len(targets), EFFORT.together):
             some = slice(start, start + EFFORT.together)
             known = None if holding is None else holding[some]
-            bound = np.full(len(problems), EFFORT.most)[some] if most is None else most[some]
-            found += self._together(problems.rows(some), known, bound)
+            bound = np.full(len(targets), EFFORT.most)[some] if most is None else most[some]
+            found += self._together(targets.rows(some), known, bound)
         return found
 
     def _together(
-        self, problems: Problems, holding: Array | None, bound: Counts
+        self, targets: TargetBatch, holding: Array | None, bound: Counts
     ) -> list[Proof | None]:
-        known = ~np.isnan(problems.points[:, :, 0])
-        for name in SLIDING & problems.more.keys():
+        known = ~np.isnan(targets.points[:, :, 0])
+        for name in SLIDING & targets.more.keys():
             # Anywhere on a line or a plane: the point itself need not be reached.
-            known &= np.isnan(problems.more[name][..., 0])
-        known &= ~np.array(endless_fingers(self._robot, motor_box(self._robot, problems)))
-        stated = _Stated(self._robot, self._kept(problems), problems)
+            known &= np.isnan(targets.more[name][..., 0])
+        known &= ~np.array(endless_fingers(self._robot, motor_box(self._robot, targets)))
+        stated = _Stated(self._robot, self._kept(targets), targets)
         proofs = stated.decided(known)
         for group, most in self._groups():
             chosen = np.zeros(known.shape[1], dtype=bool)
@@ -181,7 +181,7 @@ class Prover:
                 continue
             kept = None if holding is None else holding[rows]
             boxes = np.minimum(most, bound[rows])
-            result = self._search(problems.rows(rows), asked[rows], boxes, kept)
+            result = self._search(targets.rows(rows), asked[rows], boxes, kept)
             for place in np.flatnonzero(result.proved).tolist():
                 row = int(rows[place])
                 kind = ProofKind.REACH if result.reach[place] else ProofKind.HAND
@@ -200,14 +200,14 @@ class Prover:
         subsets = [(list(some), EFFORT.some) for some in combinations(fingers, EFFORT.subset)]
         return [(fingers, EFFORT.first), *subsets, (fingers, EFFORT.most)]
 
-    def _kept(self, problems: Problems) -> tuple[RigidInvariant, ...]:
+    def _kept(self, targets: TargetBatch) -> tuple[RigidInvariant, ...]:
         """The robot's quantities; bounds are found once for limits and locked motors."""
-        fixed = b"" if problems.fixed is None else problems.fixed.tobytes()
-        key = problems.enforce_limits, fixed
+        fixed = b"" if targets.fixed is None else targets.fixed.tobytes()
+        key = targets.enforce_limits, fixed
         if key not in self._known:
             if len(self._known) >= 16:
                 self._known.clear()
-            self._known[key] = rigid_invariants(self._robot, problems)
+            self._known[key] = rigid_invariants(self._robot, targets)
         return self._known[key]
 
     @cached_property
@@ -223,31 +223,31 @@ class Prover:
         return cones if same and np.allclose(cones.wrist, self._arm.wrist, 0, 1e-9) else None
 
     def _search(
-        self, problems: Problems, fingers: Bools, most: Counts, holding: Array | None
+        self, targets: TargetBatch, fingers: Bools, most: Counts, holding: Array | None
     ) -> _Found:
         """Divide the boxes of k targets, some of them a level deeper in each pass.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             fingers: (k, f) which contacts count.
             most: (k,) boxes of a target after which it is given up.
             holding: (k, h) see `prove`.
         """
-        count = len(problems)
-        points = np.where(fingers[..., None], problems.points, 0.0)
-        faced = fingers & ~np.isnan(problems.normals[:, :, 0])
-        normals = np.where(faced[..., None], problems.normals, 0.0)
+        count = len(targets)
+        points = np.where(fingers[..., None], targets.points, 0.0)
+        faced = fingers & ~np.isnan(targets.normals[:, :, 0])
+        normals = np.where(faced[..., None], targets.normals, 0.0)
         asked = np.stack([fingers, faced], axis=2).astype(float)
-        tolerance = np.stack([problems.position_tolerance, problems.angle_tolerance], axis=1)
-        finest = max(1e-9, EFFORT.part * float(problems.position_tolerance.min()))
+        tolerance = np.stack([targets.position_tolerance, targets.angle_tolerance], axis=1)
+        finest = max(1e-9, EFFORT.part * float(targets.position_tolerance.min()))
         # A kernel's column is a vector: of a hand with one motor there is no second dimension.
         size, ends = self._test.input_shapes[0], self._test.input_shapes[2]
-        limits = [np.reshape(end, ends) for end in joint_limits(self._robot, problems)]
+        limits = [np.reshape(end, ends) for end in joint_limits(self._robot, targets)]
         arm = np.zeros(2), np.full(2, NO_CONE)
         if self._arm is not None:
-            cosines = arm[1] if self._cones is None else self._cones.cosines(problems)
-            arm = np.array(self._arm.span(problems)), cosines
-        lower, upper = (np.tile(end, (count, 1)) for end in self.space.box(problems))
+            cosines = arm[1] if self._cones is None else self._cones.cosines(targets)
+            arm = np.array(self._arm.span(targets)), cosines
+        lower, upper = (np.tile(end, (count, 1)) for end in self.space.box(targets))
         waiting: list[Boxes] = [(np.arange(count), lower, upper)]
         boxes = np.zeros(count, dtype=np.int64)
         given_up, reach = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from casadi_ik.arrays import Array
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.proofs.numeric_bounds import Balls, angle_of, contact_balls, halved
 from casadi_ik.proofs.premises import arm_span, endless_fingers, joint_limits, motor_box
 from casadi_ik.robots.description import RobotDescription
@@ -85,26 +85,26 @@ class Quantity:
         )
 
 
-def rigid_invariants(robot: RobotDescription, problems: Problems) -> tuple[RigidInvariant, ...]:
+def rigid_invariants(robot: RobotDescription, targets: TargetBatch) -> tuple[RigidInvariant, ...]:
     """All quantities of a robot under the limits and locked motors of some problems.
 
     Takes some tenths of a second.
     """
-    return tuple(_invariants(_Hand(robot, problems)))
+    return tuple(_invariants(_Hand(robot, targets)))
 
 
 def asked_values(
-    robot: RobotDescription, invariants: tuple[RigidInvariant, ...], problems: Problems
+    robot: RobotDescription, invariants: tuple[RigidInvariant, ...], targets: TargetBatch
 ) -> tuple[Array, Array]:
     """What k targets ask of the quantities, and by how much the tolerances let it differ.
 
     Returns:
         Two arrays (k, m), NaN where a target does not ask for it.
     """
-    position, angle = problems.position_tolerance, problems.angle_tolerance
-    points, normals = problems.points, problems.normals
+    position, angle = targets.position_tolerance, targets.angle_tolerance
+    points, normals = targets.points, targets.normals
     span = arm_span(robot)
-    asked = np.full((len(problems), len(invariants)), np.nan)
+    asked = np.full((len(targets), len(invariants)), np.nan)
     give = np.full_like(asked, np.nan)
     for column, item in enumerate(invariants):
         first, last = points[:, item.fingers[0]], points[:, item.fingers[-1]]
@@ -145,14 +145,14 @@ def quantities_of(
 class _Hand:
     """All postures of a hand, and balls that hold its contacts."""
 
-    def __init__(self, robot: RobotDescription, problems: Problems) -> None:
+    def __init__(self, robot: RobotDescription, targets: TargetBatch) -> None:
         self.robot = robot
         self.motors = robot.finger_motors
-        self.ends = motor_box(robot, problems)
-        self.limits = joint_limits(robot, problems)
+        self.ends = motor_box(robot, targets)
+        self.limits = joint_limits(robot, targets)
         self.endless = endless_fingers(robot, self.ends)
         self.arm = arm_span(robot)
-        self.span = (0.0, 0.0) if self.arm is None else self.arm.span(problems)
+        self.span = (0.0, 0.0) if self.arm is None else self.arm.span(targets)
 
     def largest(
         self,

@@ -16,10 +16,10 @@ from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.kernels.cancellation import cancellable, stop_if_cancelled
-from casadi_ik.problem.clearance import Surroundings
+from casadi_ik.problem.clearance import CollisionQuery
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.problem.verdict import judge
 
@@ -29,20 +29,20 @@ class SolvedPart:
     """A part of a batch, solved.
 
     Attributes:
-        problems: Its targets.
+        targets: Its targets.
         starts: (k, n) where they were begun.
         started: When it was begun, since the Unix epoch [ns].
         outcome: What the method came to.
         batch: The same, judged.
-        around: What the answers were checked against; None: nothing.
+        query: What the answers were checked against; None: nothing.
     """
 
-    problems: Problems
+    targets: TargetBatch
     starts: Array
     started: int
     outcome: Outcome
     batch: BatchSolution
-    around: Surroundings | None = None
+    query: CollisionQuery | None = None
 
     def record(self, recorder: Recorder, form: TraceFormat, seed: int) -> None:
         """Hand it on with its iterations, if they were kept."""
@@ -52,14 +52,14 @@ class SolvedPart:
         before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
         block = SolveBlock(
             format=form,
-            first=self.problems.first_row,
-            problems=self.problems,
+            first=self.targets.first_row,
+            targets=self.targets,
             starts=self.starts,
             seed=seed,
             batch=batch,
             rows=self.outcome.rows,
             started=self.started + (before * 1e9).astype(np.int64),
-            around=self.around,
+            query=self.query,
         )
         recorder.record(block)
 
@@ -67,22 +67,22 @@ class SolvedPart:
 def judged(
     robot: ArmHand,
     method: str,
-    problems: Problems,
+    targets: TargetBatch,
     outcome: Outcome,
-    around: Surroundings | None = None,
+    query: CollisionQuery | None = None,
 ) -> BatchSolution:
     """An outcome with the verdict on it, which has the last word on what is solved.
 
     Args:
         robot: The robot.
         method: Name of the method.
-        problems: The targets.
+        targets: The targets.
         outcome: What the method came to.
-        around: What the answers must not touch; None: nothing is checked.
+        query: What the answers must not touch; None: nothing is checked.
     """
-    verdict = judge(robot, problems, outcome.q)
-    success, palm = verdict.solved(problems.enforce_limits), verdict.palm
-    clear = None if around is None else around.check(outcome.q)
+    verdict = judge(robot, targets, outcome.q)
+    success, palm = verdict.solved(targets.enforce_limits), verdict.palm
+    clear = None if query is None else query.check(outcome.q)
     touching = None if clear is None else success & ~clear.free
     if clear is not None:
         success = success & clear.free
@@ -105,7 +105,7 @@ def judged(
         ok=verdict.ok,
         limits_ok=verdict.limits_ok,
         phases=outcome.phases,
-        tolerances=problems.tolerances,
+        tolerances=targets.tolerances,
         fingers=robot.fingers,
         method=method,
         robot=robot.name,

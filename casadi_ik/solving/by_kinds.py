@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 from casadi_ik.arrays import Array
 from casadi_ik.problem.contacts import Kinds, by_kinds
 from casadi_ik.problem.method import Method, Outcome
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 
 T = TypeVar("T")
 
@@ -32,19 +32,19 @@ class PerKinds(Generic[T]):
 
 
 def run(
-    method: Callable[[Kinds], Method], problems: Problems, starts: Array, seed: int, trace: bool
+    method: Callable[[Kinds], Method], targets: TargetBatch, starts: Array, seed: int, trace: bool
 ) -> Outcome:
     """Solve a batch; see `Method.run`.
 
     Args:
         method: Gives the method for some kinds.
-        problems: k targets.
+        targets: k targets.
         starts: (k, n).
         seed: Of all random numbers.
         trace: Whether to keep every iteration.
     """
     groups, outcomes = [], []
-    for kinds, rows, some in by_kinds(problems):
+    for kinds, rows, some in by_kinds(targets):
         if rows is None:
             return method(kinds).run(some, starts, seed, trace)
         groups.append(rows)

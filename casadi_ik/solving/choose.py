@@ -22,12 +22,12 @@ from casadi_ik.arrays import Array, Bools
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import inverse, moved, one_pose
-from casadi_ik.problem.clearance import ROUNDING, Surroundings
+from casadi_ik.problem.clearance import ROUNDING, CollisionQuery
 from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import CLEARANCE, Questions, free_palms
+from casadi_ik.problem.request import CLEARANCE, Request, free_palms
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import (
     APART,
@@ -121,7 +121,7 @@ class Answers:
 
 def choose(
     engine: Engine,
-    questions: Questions,
+    request: Request,
     grasps: Sequence[Grasp],
     object_pose: ArrayLike | None = None,
     q0: ArrayLike | None = None,
@@ -141,7 +141,7 @@ def choose(
     begin = time.perf_counter()
     limit = _count(limit, "limit")
     most = None if per_candidate is None else _count(per_candidate, "per_candidate")
-    apart, start = checked_distance(apart), questions.start(q0)
+    apart, start = checked_distance(apart), request.start(q0)
     word = "own" if callable(prefer) else engine.preference(prefer, q0 is not None)
     pose = None if object_pose is None else one_pose(object_pose, "object_pose")
 
@@ -149,7 +149,7 @@ def choose(
         grasp = grasps[number]
         return grasp if pose is None else grasp.in_object_frame().at(pose)
 
-    asked = list(_asked(questions, grasps, pose, fixed))
+    asked = list(_asked(request, grasps, pose, fixed))
     wanted: Preference = _own(prefer, engine.robot) if callable(prefer) else word
     parts: list[tuple[NDArray[np.intp], Answers]] = []
 
@@ -164,7 +164,7 @@ def choose(
             found = answers_of(
                 engine.kinds_of(mine).finder,
                 mine,
-                engine.around(mine),
+                engine.collision_query(mine),
                 start if near else engine.robot.home,
                 start,
                 wanted,
@@ -223,11 +223,11 @@ def _own(prefer: Callable[[ArmHand, Array], ArrayLike], robot: ArmHand) -> Calla
 
 
 def _asked(
-    questions: Questions,
+    request: Request,
     grasps: Sequence[Grasp],
     pose: Array | None,
     fixed: Mapping[str, float] | None,
-) -> Iterator[tuple[NDArray[np.intp], Problems]]:
+) -> Iterator[tuple[NDArray[np.intp], TargetBatch]]:
     """Candidates with the same fingers, tolerances, kinds and object, in the base frame."""
     if not len(grasps):
         raise InputError("grasps: found none, expected at least one")
@@ -241,17 +241,17 @@ def _asked(
     for numbers in groups.values():
         some = [grasps[number] for number in numbers]
         rows = np.array(numbers, dtype=np.intp)
-        problems = _placed(questions.of_grasps(some, fixed), some, pose)
-        for _, of_kinds, alike in by_kinds(problems):
+        targets = _placed(request.of_grasps(some, fixed), some, pose)
+        for _, of_kinds, alike in by_kinds(targets):
             yield (rows if of_kinds is None else rows[of_kinds]), alike
 
 
-def _placed(problems: Problems, grasps: Sequence[Grasp], pose: Array | None) -> Problems:
+def _placed(targets: TargetBatch, grasps: Sequence[Grasp], pose: Array | None) -> TargetBatch:
     """Targets moved as a whole with the object they are on, see `Grasp.at`."""
     if pose is None:
-        return problems
+        return targets
     places = [grasp.object_pose for grasp in grasps if grasp.object_pose is not None]
-    arrays = {"points": problems.points, "normals": problems.normals, **problems.more}
+    arrays = {"points": targets.points, "normals": targets.normals, **targets.more}
     for name, array in arrays.items() if places else ():
         # Seen from the object first.
         stack = np.stack(places)
@@ -261,11 +261,11 @@ def _placed(problems: Problems, grasps: Sequence[Grasp], pose: Array | None) -> 
     points, normals = arrays.pop("points"), arrays.pop("normals")
     named = grasps[0].object
     at = np.broadcast_to(pose, (len(grasps), 4, 4)) if named or places else None
-    palms = problems.palms
+    palms = targets.palms
     if palms is not None:
         palms = pose @ (np.stack([inverse(place) for place in places]) @ palms if places else palms)
     return replace(
-        problems, points=points, normals=normals, more=arrays, object_pose=at, palms=palms
+        targets, points=points, normals=normals, more=arrays, object_pose=at, palms=palms
     )
 
 
@@ -275,7 +275,7 @@ class _Ranked:
     def __init__(
         self,
         engine: Engine,
-        asked: Sequence[tuple[NDArray[np.intp], Problems]],
+        asked: Sequence[tuple[NDArray[np.intp], TargetBatch]],
         answers: Answers,
         apart: float,
         placed: Callable[[int], Grasp],
@@ -294,8 +294,8 @@ class _Ranked:
 
         def others(rows: NDArray[np.intp], row: int, places: NDArray[np.intp]) -> NDArray[np.intp]:
             off = np.abs(parts[rows] - parts[row]).max(axis=1)
-            room = places[answers.owner[rows]] > 0
-            return rows[(off >= self.apart) & (off > 0) & room]
+            vacant = places[answers.owner[rows]] > 0
+            return rows[(off >= self.apart) & (off > 0) & vacant]
 
         while len(left) and len(found) < limit:
             chosen, rest, free = list[int](), left, places.copy()
@@ -319,25 +319,25 @@ class _Ranked:
         """Answers with the verdict on them, which has the last word."""
         found: dict[int, Solution] = {}
         owner = self.answers.owner[rows]
-        for numbers, problems in self.asked:
+        for numbers, targets in self.asked:
             mine = rows[np.isin(owner, numbers)]
             if not len(mine):
                 continue
-            some = problems.rows(np.searchsorted(numbers, self.answers.owner[mine]))
+            some = targets.rows(np.searchsorted(numbers, self.answers.owner[mine]))
             none = np.zeros(len(mine), dtype=np.int64)
             status = np.full(len(mine), int(Status.SOLVED), dtype=np.int64)
             q = self.answers.q[mine]
             outcome = Outcome(q, status, none, none, np.zeros(len(mine)), {})
-            around, method = self.engine.around(some), self.engine.method.name
-            batch = judged(self.engine.robot, method, some, outcome, around)
+            query, method = self.engine.collision_query(some), self.engine.method.name
+            batch = judged(self.engine.robot, method, some, outcome, query)
             found |= {int(row): batch.solution(i) for i, row in enumerate(mine.tolist())}
         return found
 
 
 def answers_of(
     finder: AlternativeFinder,
-    problems: Problems,
-    around: Surroundings | None,
+    targets: TargetBatch,
+    query: CollisionQuery | None,
     begin: Array,
     start: Array,
     prefer: Preference,
@@ -349,8 +349,8 @@ def answers_of(
 
     Args:
         finder: Of the robot, for the kinds of their contacts.
-        problems: The candidates.
-        around: What answers must not touch; None: nothing is checked.
+        targets: The candidates.
+        query: What answers must not touch; None: nothing is checked.
         begin: (n,) where hands are looked for from.
         start: (n,) where the robot is; with `prefer` it says which arms are better.
         prefer: What is preferred.
@@ -359,12 +359,12 @@ def answers_of(
         look: Which hands are looked at.
     """
     parts = []
-    for first in range(0, len(problems), PARAMETERS.together):
-        rows = np.arange(first, min(first + PARAMETERS.together, len(problems)))
-        nearby = None if around is None else around.rows(rows)
-        part = _Part(finder, problems.rows(rows), nearby, begin, start, prefer, limit)
+    for first in range(0, len(targets), PARAMETERS.together):
+        rows = np.arange(first, min(first + PARAMETERS.together, len(targets)))
+        nearby = None if query is None else query.rows(rows)
+        part = _Part(finder, targets.rows(rows), nearby, begin, start, prefer, limit)
         parts.append((rows, part.run(seed, look)))
-    return Answers.joined(parts, len(problems))
+    return Answers.joined(parts, len(targets))
 
 
 class _Part:
@@ -373,18 +373,18 @@ class _Part:
     def __init__(
         self,
         finder: AlternativeFinder,
-        problems: Problems,
-        around: Surroundings | None,
+        targets: TargetBatch,
+        query: CollisionQuery | None,
         begin: Array,
         start: Array,
         prefer: Preference,
         limit: int,
     ) -> None:
-        self.finder, self.problems, self.around = finder, problems, around
+        self.finder, self.targets, self.query = finder, targets, query
         self.prefer, self.limit, self.trials = prefer, limit, finder.trials
-        self.begin, self.starts = (np.tile(q, (len(problems), 1)) for q in (begin, start))
-        self.limits = self.trials.limits(problems)
-        fixed = np.full(len(begin), np.nan) if problems.fixed is None else problems.fixed
+        self.begin, self.starts = (np.tile(q, (len(targets), 1)) for q in (begin, start))
+        self.limits = self.trials.limits(targets)
+        fixed = np.full(len(begin), np.nan) if targets.fixed is None else targets.fixed
         # What is given has no part in what is better.
         self.columns = np.flatnonzero(np.isnan(np.atleast_2d(fixed)).any(axis=0)).tolist()
 
@@ -392,12 +392,12 @@ class _Part:
         """Their answers."""
         method = self.trials.method
         rounds = PARAMETERS.rounds if look is Look.THOROUGH else 1
-        outcome = method.run(self.problems, self.begin, seed, False, rounds)
-        good = self.trials.solved(self.problems, outcome.q, self.problems.enforce_limits)
+        outcome = method.run(self.targets, self.begin, seed, False, rounds)
+        good = self.trials.solved(self.targets, outcome.q, self.targets.enforce_limits)
         rows = np.flatnonzero(good)
         hands = outcome.q[rows], rows
         q, owner, pairs = self._answers(*(hands if look is Look.OWN else self._hands(*hands)))
-        if look is Look.THOROUGH and self.around is not None:
+        if look is Look.THOROUGH and self.query is not None:
             left = rows[~np.isin(rows, owner)]
             more, whose = self._further(outcome.q, left, seed)
             q, owner = np.concatenate([q, more]), np.concatenate([owner, whose])
@@ -416,13 +416,13 @@ class _Part:
             q: (m, n) first answers.
             rows: (m,) the candidates that have them.
         """
-        if not len(rows) or self.problems.palms is not None:
+        if not len(rows) or self.targets.palms is not None:
             return q, rows  # a hand that is given has no other posture
-        some = self.problems.rows(rows)
+        some = self.targets.rows(rows)
         postures = self.trials.method.postures(some, 0)
         count, n = postures.shape[1], q.shape[1]
         owner = np.repeat(rows, count)
-        asked = self.problems.rows(owner)
+        asked = self.targets.rows(owner)
         starts = self.limits.of(owner).clip(self.begin[owner])
         flat = postures.reshape(len(owner), postures.shape[2])
         turns = np.tile(np.arange(count), len(rows))
@@ -440,69 +440,69 @@ class _Part:
         self, q: Array, owner: NDArray[np.intp]
     ) -> tuple[Array, NDArray[np.intp], dict[int, tuple[str, str]]]:
         """The preferred free arm of every branch of hands; and what is in the way of the others."""
-        arms, around = self.finder.arm_search, self.around
-        room = np.full(len(q), np.inf)
+        arms, query = self.finder.arm_search, self.query
+        surplus = np.full(len(q), np.inf)
         if not len(q):
             return q, owner, {}
-        if around is not None:
-            nearby = around.rows(owner)
-            room = (nearby if arms is None else nearby.held).check(q).room
-        kept = np.flatnonzero(room >= -ROUNDING)
-        found, targets = q[kept], owner[kept]
+        if query is not None:
+            nearby = query.rows(owner)
+            surplus = (nearby if arms is None else nearby.held).check(q).surplus
+        kept = np.flatnonzero(surplus >= -ROUNDING)
+        found, whose = q[kept], owner[kept]
         if arms is not None:
-            found, hand = self._arms(found, targets, room[kept])
-            targets = targets[hand]
-        if around is None:
-            return found, targets, {}
-        left = np.flatnonzero(~np.isin(owner, targets))
+            found, hand = self._arms(found, whose, surplus[kept])
+            whose = whose[hand]
+        if query is None:
+            return found, whose, {}
+        left = np.flatnonzero(~np.isin(owner, whose))
         # The last word has the hand with most room.
-        left = left[np.argsort(room[left], kind="stable")]
-        clear = around.rows(owner[left]).check(q[left])
+        left = left[np.argsort(surplus[left], kind="stable")]
+        clear = query.rows(owner[left]).check(q[left])
         named = ((row, clear.pair(i)) for i, row in enumerate(owner[left].tolist()))
-        return found, targets, {row: pair for row, pair in named if pair is not None}
+        return found, whose, {row: pair for row, pair in named if pair is not None}
 
     def _arms(
-        self, q: Array, owner: NDArray[np.intp], room: Array
+        self, q: Array, owner: NDArray[np.intp], surplus: Array
     ) -> tuple[Array, NDArray[np.intp]]:
         """Free arms of hands, and whose hand it is; closer where the best of them are."""
-        found, hand = self._preferred(q, owner, room, False)
+        found, hand = self._preferred(q, owner, surplus, False)
         score = self._score(found, owner[hand])
         best = np.argsort(-score, kind="stable")[: PARAMETERS.closer * self.limit]
         again = np.unique(hand[best])
-        more, mine = self._preferred(q[again], owner[again], room[again], True)
+        more, mine = self._preferred(q[again], owner[again], surplus[again], True)
         others = ~np.isin(hand, again)
         return np.concatenate([found[others], more]), np.concatenate([hand[others], again[mine]])
 
     def _preferred(
-        self, q: Array, owner: NDArray[np.intp], room: Array, closer: bool
+        self, q: Array, owner: NDArray[np.intp], surplus: Array, closer: bool
     ) -> tuple[Array, NDArray[np.intp]]:
         arms = self.finder.arm_search
         assert arms is not None
-        around = None if self.around is None else self.around.rows(owner)
+        query = None if self.query is None else self.query.rows(owner)
         bounds = self.limits.first.lower, self.limits.first.upper
         starts = self.starts[owner]
-        found = arms.choose(q, starts, bounds, self.prefer, around, room, True, closer)
-        if around is None or self.prefer != CLEARANCE:
+        found = arms.choose(q, starts, bounds, self.prefer, query, surplus, True, closer)
+        if query is None or self.prefer != CLEARANCE:
             return found.q, found.owner
-        free = around.rows(found.owner).free(found.q)
+        free = query.rows(found.owner).free(found.q)
         return found.q[free], found.owner[free]
 
     def _further(
         self, q: Array, rows: NDArray[np.intp], seed: int
     ) -> tuple[Array, NDArray[np.intp]]:
         """What a single grasp would get."""
-        assert self.around is not None
+        assert self.query is not None
         if not len(rows):
             return q[rows], rows
-        around = self.around.rows(rows)
-        some = self.problems.rows(rows)
-        found = free_answers(self.finder, some, around, q[rows], self.begin[rows], seed)
+        query = self.query.rows(rows)
+        some = self.targets.rows(rows)
+        found = free_answers(self.finder, some, query, q[rows], self.begin[rows], seed)
         return found.q[found.free], rows[found.free]
 
     def _score(self, q: Array, owner: NDArray[np.intp]) -> Array:
         if not len(q):
             return np.zeros(0)
-        room = np.zeros(len(q))
-        if self.prefer == CLEARANCE and self.around is not None:
-            room = self.around.rows(owner).check(q).room
-        return self.finder.score(q, self.starts[owner], self.prefer, self.columns, room)
+        surplus = np.zeros(len(q))
+        if self.prefer == CLEARANCE and self.query is not None:
+            surplus = self.query.rows(owner).check(q).surplus
+        return self.finder.score(q, self.starts[owner], self.prefer, self.columns, surplus)

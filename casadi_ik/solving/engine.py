@@ -21,12 +21,12 @@ from casadi_ik.files.in_background import InBackground
 from casadi_ik.made import made
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.problem.clearance import SceneCheck, Surroundings
+from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 from casadi_ik.problem.contacts import Kinds, by_kinds, usual
 from casadi_ik.problem.method import Method, Outcome, PreferringMethod, Quick, QuickMethod
-from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import CLEARANCE, NO_PREFERENCE, preference
+from casadi_ik.problem.request import CLEARANCE, NO_PREFERENCE, preference
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import judge_errors, judge_one
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.alternatives.free import (
@@ -109,13 +109,13 @@ class Engine:
         method = self.method
         return method.preferences if isinstance(method, PreferringMethod) else ()
 
-    def kinds_of(self, problems: Problems) -> Engine:
+    def kinds_of(self, targets: TargetBatch) -> Engine:
         """The engine for targets that are all of the same kinds.
 
         Raises:
             InputError: They are of several.
         """
-        engines = {self.of_kinds(kinds) for kinds, _, _ in by_kinds(problems)}
+        engines = {self.of_kinds(kinds) for kinds, _, _ in by_kinds(targets)}
         if len(engines) > 1:
             raise InputError("grasps: found contacts of several kinds, expected the same in all")
         return engines.pop()
@@ -135,9 +135,9 @@ class Engine:
         vars(other).update(check=check, _others=type(self)._others.func(other))
         return other
 
-    def around(self, problems: Problems) -> Surroundings | None:
+    def collision_query(self, targets: TargetBatch) -> CollisionQuery | None:
         """What targets are checked against; None: nothing."""
-        return None if self.check is None else self.check.around(problems)
+        return None if self.check is None else self.check.collision_query(targets)
 
     def preference(self, prefer: str | None, started: bool) -> str:
         """What is preferred, see `preference`.
@@ -161,51 +161,51 @@ class Engine:
             f"q0; found {prefer!r}"
         )
 
-    def solve_one(self, problems: Problems, run: Run) -> Solution:
+    def solve_one(self, targets: TargetBatch, run: Run) -> Solution:
         """Solve one target, by the shortest way that the method has.
 
         Args:
-            problems: One target.
+            targets: One target.
             run: How to solve it.
 
         Raises:
             InputError: Bad q0, or a target the method cannot take.
         """
-        if problems.more:
-            ((kinds, _, _),) = by_kinds(problems)
+        if targets.more:
+            ((kinds, _, _),) = by_kinds(targets)
             if (other := self.of_kinds(kinds)) is not self:
-                return other.solve_one(problems, run)
+                return other.solve_one(targets, run)
         method, start, known = self._quick, run.start(self.robot), None
-        plain = problems.palms is None and problems.prefer not in RANKED and start.ndim == 1
+        plain = targets.palms is None and targets.prefer not in RANKED and start.ndim == 1
         if method is not None and plain and run.recorder is None:
             self.method.prepare()
             begin = time.perf_counter()
-            found = method.quick(problems, start)
+            found = method.quick(targets, start)
             if found is not None:
-                solution = self._solved(problems, found, start, begin)
+                solution = self._solved(targets, found, start, begin)
                 if solution is not None:
                     return solution
                 known = found.outcome(time.perf_counter() - begin)
-        return self.solve(problems, run, known).solution(0)
+        return self.solve(targets, run, known).solution(0)
 
     def _solved(
-        self, problems: Problems, found: Quick, start: Array, begin: float
+        self, targets: TargetBatch, found: Quick, start: Array, begin: float
     ) -> Solution | None:
         """A single answer with its verdict, begun at a time of the clock, if it is a solution."""
         if found.status != Status.SOLVED:
             return None
         robot, seconds = self.robot, time.perf_counter() - begin
         if found.errors is None:
-            verdict = judge_one(robot, problems, found.q)
+            verdict = judge_one(robot, targets, found.q)
         else:
-            verdict = judge_errors(problems, *found.errors)
+            verdict = judge_errors(targets, *found.errors)
         if verdict is None:
             return None
         q, distance, closest = found.q, None, None
-        if (around := self.around(problems)) is not None:
-            clear = around.check(q[None])
+        if (query := self.collision_query(targets)) is not None:
+            clear = query.check(q[None])
             if not clear.free[0]:
-                if (other := resolve_at_once(self.finder, problems, around, q, start)) is None:
+                if (other := resolve_at_once(self.finder, targets, query, q, start)) is None:
                     return None
                 q, verdict, clear = other
                 seconds = time.perf_counter() - begin
@@ -228,28 +228,28 @@ class Engine:
             closest=closest,
         )
 
-    def solve(self, problems: Problems, run: Run, known: Outcome | None = None) -> BatchSolution:
+    def solve(self, targets: TargetBatch, run: Run, known: Outcome | None = None) -> BatchSolution:
         """Solve a batch of k targets.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             run: How to solve them.
             known: What the method came to, if it was asked before.
 
         Raises:
             InputError: Bad q0, or targets the method cannot take.
         """
-        if problems.palms is not None:
+        if targets.palms is not None:
             _ = self._several  # no other method keeps every target's hand where it is
-        starts, recorder = run.starts(self.robot, len(problems)), run.recorder
+        starts, recorder = run.starts(self.robot, len(targets)), run.recorder
         # Built before the clock and the threads start: no work of a solve, nor for several at once.
-        for kinds, _, _ in by_kinds(problems):
+        for kinds, _, _ in by_kinds(targets):
             self.of_kinds(kinds).method.prepare()
         if recorder is not None and (measures := self.method.trace_format.measures) is not None:
             measures.prepare()
         batches = []
         with InBackground() as background:
-            for part in self._parts(problems, starts, run, known):
+            for part in self._parts(targets, starts, run, known):
                 if recorder is not None:
                     form = self.method.trace_format
                     background.do(partial(part.record, recorder, form, run.seed))
@@ -257,7 +257,7 @@ class Engine:
         return BatchSolution.joined(batches)
 
     def _parts(
-        self, problems: Problems, starts: Array, run: Run, known: Outcome | None
+        self, targets: TargetBatch, starts: Array, run: Run, known: Outcome | None
     ) -> Iterator[SolvedPart]:
         """Parts of the batch in order, solved, judged and diagnosed side by side."""
         trace, jobs, diagnose = run.recorder is not None, run.jobs, run.diagnose
@@ -265,41 +265,41 @@ class Engine:
         def method(kinds: Kinds) -> Method:
             return self.of_kinds(kinds).method
 
-        def finder_of(some: Problems) -> AlternativeFinder:
+        def finder_of(some: TargetBatch) -> AlternativeFinder:
             return self.kinds_of(some).finder
 
         def solve(rows: slice) -> SolvedPart:
-            started, asked = time.time_ns(), problems.rows(rows)
+            started, asked = time.time_ns(), targets.rows(rows)
             outcome = known or run_by_kinds(method, asked, starts[rows], run.seed, trace)
             if outcome.rows is not None:
                 parts.learn(len(outcome.q), outcome.rows.nbytes)
-            around = self.around(asked)
-            if around is None and problems.prefer == MANIPULABILITY:
+            query = self.collision_query(asked)
+            if query is None and targets.prefer == MANIPULABILITY:
                 outcome = self._most_manipulable(asked, starts[rows], run.seed, outcome)
-            batch = judged(self.robot, self.method.name, asked, outcome, around)
-            if around is not None and self._own_hands is not None:
+            batch = judged(self.robot, self.method.name, asked, outcome, query)
+            if query is not None and self._own_hands is not None:
                 q0, seed = starts[rows], run.seed
                 batch = resolve_collisions(
-                    finder_of, asked, around, q0, seed, outcome, batch, diagnose
+                    finder_of, asked, query, q0, seed, outcome, batch, diagnose
                 )
                 outcome = replace(outcome, q=batch.q, time=batch.time)
             if diagnose:
                 batch = self._diagnosed(asked, starts[rows], outcome, batch)
-                if self.check is not None and len(problems) == 1:
+                if self.check is not None and len(targets) == 1:
                     batch = with_way_out(self.solve, self.check, asked, starts[0], run.seed, batch)
-            return SolvedPart(asked, starts[rows], started, outcome, batch, around)
+            return SolvedPart(asked, starts[rows], started, outcome, batch, query)
 
         if diagnose:
-            for kinds, _, _ in by_kinds(problems):
+            for kinds, _, _ in by_kinds(targets):
                 _ = self.of_kinds(kinds).diagnostician
-        if problems.prefer == MANIPULABILITY or self.check is not None:
-            for kinds, _, _ in by_kinds(problems):
+        if targets.prefer == MANIPULABILITY or self.check is not None:
+            for kinds, _, _ in by_kinds(targets):
                 if self._own_hands is not None:
                     _ = self.of_kinds(kinds).finder
         if jobs == 1 and not trace:
-            yield solve(slice(0, len(problems)))
+            yield solve(slice(0, len(targets)))
             return
-        parts = BatchParts(len(problems), jobs, trace)
+        parts = BatchParts(len(targets), jobs, trace)
         if jobs == 1:
             yield from map(solve, parts)
             return
@@ -313,13 +313,13 @@ class Engine:
                 yield ahead.popleft().result()
 
     def _most_manipulable(
-        self, problems: Problems, starts: Array, seed: int, outcome: Outcome
+        self, targets: TargetBatch, starts: Array, seed: int, outcome: Outcome
     ) -> Outcome:
         """Every hand where it is, held by the arm of the best measure."""
         begin, q = time.perf_counter(), outcome.q.copy()
         rows = np.flatnonzero(outcome.status == Status.SOLVED)
         for row in rows:
-            one = problems.rows(slice(row, row + 1))
+            one = targets.rows(slice(row, row + 1))
             finder = self.kinds_of(one).finder
             q[row] = finder.best_arm(one, q[row], starts[row], seed, MANIPULABILITY)
         seconds = outcome.time.copy()
@@ -327,7 +327,7 @@ class Engine:
         return replace(outcome, q=q, time=seconds)
 
     def _diagnosed(
-        self, problems: Problems, starts: Array, outcome: Outcome, batch: BatchSolution
+        self, targets: TargetBatch, starts: Array, outcome: Outcome, batch: BatchSolution
     ) -> BatchSolution:
         """Find the reasons; a solution found by hand-first's own diagnosis is the answer."""
         if batch.success.all():
@@ -337,7 +337,7 @@ class Engine:
         rows = np.flatnonzero(~batch.success & (batch.status != Status.COLLISION))
         if not len(rows):
             return replace(batch, diagnoses=(None,) * len(batch))
-        unbiased = replace(problems.rows(rows), prefer="limits")
+        unbiased = replace(targets.rows(rows), prefer="limits")
         found: dict[int, Diagnosis] = {}
         for kinds, of_kinds, some in by_kinds(unbiased):
             chosen = rows if of_kinds is None else rows[of_kinds]
@@ -348,10 +348,10 @@ class Engine:
             if own and why.reason is Reason.REACHABLE:
                 q[row] = why.q
                 seconds[row] += why.time
-        reports, around = batch.collisions, self.around(problems)
+        reports, query = batch.collisions, self.collision_query(targets)
         ended = replace(outcome, q=q, time=seconds)
         batch = replace(
-            judged(self.robot, self.method.name, problems, ended, around), collisions=reports
+            judged(self.robot, self.method.name, targets, ended, query), collisions=reports
         )
         diagnoses = tuple(
             None if solved else found.get(row) for row, solved in enumerate(batch.success)

@@ -11,9 +11,9 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.grasps.grasp import real_array
 from casadi_ik.methods.hand_first.driver import Searches
-from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import Questions, preference
+from casadi_ik.problem.request import Request, preference
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 
@@ -28,7 +28,7 @@ class FastMethod(Protocol):
         """That memory; None where there is no compiler."""
         ...
 
-    def terms(self, problems: Problems) -> Array:
+    def terms(self, targets: TargetBatch) -> Array:
         """What targets of the same tolerances and limits have in common."""
         ...
 
@@ -48,7 +48,7 @@ class FastSolver:
         angle_error: (f,) [rad], likewise.
     """
 
-    def __init__(self, engine: Engine, questions: Questions) -> None:
+    def __init__(self, engine: Engine, request: Request) -> None:
         """Compile what is not compiled yet, and lay the arrays out.
 
         Raises:
@@ -59,12 +59,12 @@ class FastSolver:
         method = engine.method
         if not isinstance(method, FastMethod):
             raise UnsupportedError(f"fast: expected method 'hand-first', found {method.name!r}")
-        self._engine, self._questions = engine, questions
+        self._engine, self._request = engine, request
         robot = engine.robot
         f, n = len(robot.fingers), len(robot.actuators)
         self._home, self._shapes = robot.home, ((f, 3), (f, 3), (n,))
         self.position_error, self.angle_error = np.full(f, np.nan), np.full(f, np.nan)
-        self._one = one = method.alone(questions.enforce_limits)
+        self._one = one = method.alone(request.enforce_limits)
         if one is None:
             return
         self._points, self._normals, self._here = one.points, one.normals, one.here
@@ -72,7 +72,7 @@ class FastSolver:
         self.position_error, self.angle_error = one.position_error, one.angle_error
         # Tolerances and limits are the same for all targets.
         any_contact = np.zeros((1, *self._shapes[0])), np.ones((1, *self._shapes[0]))
-        self._terms[...] = method.terms(questions.of_arrays(*any_contact, None))
+        self._terms[...] = method.terms(request.of_arrays(*any_contact, None))
 
     def __call__(
         self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None = None
@@ -117,12 +117,12 @@ class FastSolver:
         Raises:
             InputError: Wrong shapes or numbers.
         """
-        questions = self._questions
+        request = self._request
         prefer = preference(None, q0 is not None)
         one: Any = [points], [normals]
-        problems = questions.of_arrays(one[0], one[1], None, prefer=prefer)
-        start = questions.start(q0)
-        solution = self._engine.solve(problems, Run(start)).solution(0)
+        targets = request.of_arrays(one[0], one[1], None, prefer=prefer)
+        start = request.start(q0)
+        solution = self._engine.solve(targets, Run(start)).solution(0)
         verdicts = solution.contacts.values()
         self.position_error[...] = [verdict.position_error for verdict in verdicts]
         self.angle_error[...] = [verdict.angle_error for verdict in verdicts]

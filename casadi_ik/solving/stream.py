@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.errors import InputError, RowError
 from casadi_ik.grasps import Tolerance
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 
@@ -49,7 +49,7 @@ class Stream:
     """
 
     engine: Engine
-    ask: Callable[[Mapping[str, np.ndarray], int], Problems]
+    ask: Callable[[Mapping[str, np.ndarray], int], TargetBatch]
     tolerances: tuple[Tolerance, ...]
     run: Run
 

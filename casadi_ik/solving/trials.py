@@ -19,8 +19,8 @@ from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import deviations, judge
 
 NEVER = 1e-12
@@ -52,12 +52,12 @@ class HandMethod(Protocol):
         """See `Method.prepare`."""
         ...
 
-    def postures(self, problems: Problems, number: int) -> Array:
+    def postures(self, targets: TargetBatch, number: int) -> Array:
         """Hand postures (k, candidates, hand) that a round begins from."""
         ...
 
     def rows(
-        self, problems: Problems, q0: Array, postures: Array, begun: bool = False
+        self, targets: TargetBatch, q0: Array, postures: Array, begun: bool = False
     ) -> tuple[Array, Array]:
         """States and parameters of the loop for hand postures that are given."""
         ...
@@ -67,7 +67,7 @@ class HandMethod(Protocol):
         ...
 
     def run(
-        self, problems: Problems, q0: Array, seed: int, trace: bool, rounds: int | None = None
+        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None = None
     ) -> Outcome:
         """See `Method.run`; so many rounds of each search at most."""
         ...
@@ -103,7 +103,7 @@ class Bounds:
 
 
 @dataclass(frozen=True, eq=False)
-class Trials:
+class Subproblems:
     """The loop of the hand-first method, asked in other ways.
 
     Attributes:
@@ -124,15 +124,15 @@ class Trials:
         """Layout of the loop's parameters."""
         return self.method.step.layouts.parameters
 
-    def limits(self, problems: Problems) -> Bounds:
-        """The bounds that solutions have to keep, (n,) or (k, n), see `Problems.bounds`."""
-        return Bounds(*problems.bounds(self.robot.description, UNBOUNDED))
+    def limits(self, targets: TargetBatch) -> Bounds:
+        """The bounds that solutions have to keep, (n,) or (k, n), see `TargetBatch.bounds`."""
+        return Bounds(*targets.bounds(self.robot.description, UNBOUNDED))
 
-    def search(self, problems: Problems, start: Array, bounds: Bounds) -> Array:
+    def search(self, targets: TargetBatch, start: Array, bounds: Bounds) -> Array:
         """The first round of hand-first for each of k targets.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             start: (n,).
             bounds: (k, n).
 
@@ -140,30 +140,30 @@ class Trials:
             (k, n) configurations.
         """
         starts = bounds.clip(start)
-        postures = self.method.postures(problems, 0)
-        states, parameters = self.method.rows(problems, starts, postures)
+        postures = self.method.postures(targets, 0)
+        states, parameters = self.method.rows(targets, starts, postures)
         self.set_bounds(parameters, bounds)
         return self.run(states, parameters)
 
     def posture_rows(
-        self, problems: Problems, start: Array, postures: Array, turns: ArrayLike = 0.0
+        self, targets: TargetBatch, start: Array, postures: Array, turns: ArrayLike = 0.0
     ) -> tuple[Array, Array]:
         """Rows of the loop that know a single hand posture each.
 
         Args:
-            problems: k targets.
+            targets: k targets.
             start: (k, n).
             postures: (k, hand).
             turns: (k,) numbers, another palm for each where contacts leave the palm free.
         """
-        states, parameters = self.method.rows(problems, start, postures[:, None], begun=True)
+        states, parameters = self.method.rows(targets, start, postures[:, None], begun=True)
         states[:, self.state.slice("candidate")] = self.method.options.candidates - 1
         states[:, self.state.slice("turn").start] = turns
         return states, parameters
 
-    def solved(self, problems: Problems, q: Array, limits: bool) -> NDArray[np.bool_]:
+    def solved(self, targets: TargetBatch, q: Array, limits: bool) -> NDArray[np.bool_]:
         """(k,) whether configurations meet their targets, and if asked the robot's limits."""
-        return judge(self.robot, problems, q).solved(limits)
+        return judge(self.robot, targets, q).solved(limits)
 
     def set_bounds(self, parameters: Array, bounds: Bounds) -> None:
         """Put bounds into rows of parameters."""
@@ -180,27 +180,27 @@ class Trials:
         return self.method.run_rows(states, parameters).states[:, self.state.slice("q")]
 
 
-class Descent:
+class LocalRefinement:
     """Refinement of the whole arm-hand from given configurations.
 
     Attributes:
         trials: The loop.
-        problems: k targets.
+        targets: k targets.
     """
 
-    def __init__(self, trials: Trials, problems: Problems) -> None:
+    def __init__(self, trials: Subproblems, targets: TargetBatch) -> None:
         """Lay out a row per target, for any number of runs."""
         self.trials = trials
-        self.problems = problems
-        self._states, self._parameters = refinement_rows(trials, problems)
+        self.targets = targets
+        self._states, self._parameters = refinement_rows(trials, targets)
 
     def run(
-        self, targets: Rows, q: Array, bounds: Bounds | None = None, weights: Array | None = None
+        self, owner: Rows, q: Array, bounds: Bounds | None = None, weights: Array | None = None
     ) -> Array:
         """Refine.
 
         Args:
-            targets: (m,) number of the target of each row.
+            owner: (m,) number of the target of each row.
             q: (m, n) starts.
             bounds: (n,) or (m, n); None keeps to the limits.
             weights: (m, f, 2) of points and normals; None counts all alike. With weights the loop
@@ -210,8 +210,8 @@ class Descent:
             (m, n) configurations.
         """
         trials = self.trials
-        states, parameters = self._states[targets], self._parameters[targets]
-        bounds = bounds or trials.limits(self.problems).of(targets)
+        states, parameters = self._states[owner], self._parameters[owner]
+        bounds = bounds or trials.limits(self.targets).of(owner)
         start = bounds.clip(q)
         states[:, trials.state.slice("q")] = start
         states[:, trials.state.slice("best_q")] = start
@@ -221,44 +221,44 @@ class Descent:
             trials.set_tolerance(parameters, NEVER)
         return trials.run(states, parameters)
 
-    def misses(self, targets: Rows, q: Array) -> Array:
+    def misses(self, owner: Rows, q: Array) -> Array:
         """(m, f, 2) lengths of the residuals of points [0.1 m] and normals; 0 where free."""
-        position, angle, _ = deviations(self.trials.robot, self.problems.rows(targets), q)
+        position, angle, _ = deviations(self.trials.robot, self.targets.rows(owner), q)
         return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
 
 
-def refinement_rows(trials: Trials, problems: Problems) -> tuple[Array, Array]:
+def refinement_rows(trials: Subproblems, targets: TargetBatch) -> tuple[Array, Array]:
     """States and parameters of the loop that begin with the refinement of the whole arm-hand."""
-    count, hand = len(problems), len(trials.robot.description.hand_actuators)
+    count, hand = len(targets), len(trials.robot.description.hand_actuators)
     home = np.tile(trials.robot.home, (count, 1))
-    states, parameters = trials.posture_rows(problems, home, np.zeros((count, hand)))
+    states, parameters = trials.posture_rows(targets, home, np.zeros((count, hand)))
     for name, value in ({"phase": Phase.REFINEMENT} | fresh_fit()).items():
         states[:, trials.state.slice(name)] = value
     return states, parameters
 
 
-def repeated(problems: Problems, count: int) -> Problems:
+def repeated(targets: TargetBatch, count: int) -> TargetBatch:
     """One target, several times."""
-    return problems.rows(np.zeros(count, dtype=np.intp))
+    return targets.rows(np.zeros(count, dtype=np.intp))
 
 
-def allowed(problems: Problems) -> Array:
-    """(k, f, 2) the residuals that the tolerances allow, as `Descent.misses`; 0 where free."""
-    known = [~np.isnan(problems.points[..., 0]), ~np.isnan(problems.normals[..., 0])]
-    tolerated = [problems.position_tolerance / LENGTH, 2 * np.sin(problems.angle_tolerance / 2)]
+def allowed(targets: TargetBatch) -> Array:
+    """(k, f, 2) the residuals that the tolerances allow, see `LocalRefinement.misses`; 0: free."""
+    known = [~np.isnan(targets.points[..., 0]), ~np.isnan(targets.normals[..., 0])]
+    tolerated = [targets.position_tolerance / LENGTH, 2 * np.sin(targets.angle_tolerance / 2)]
     return np.stack(known, axis=2) * np.stack(tolerated, axis=1)
 
 
-def smallest(targets: Rows, values: Array, most: int) -> Rows:
+def smallest(owner: Rows, values: Array, most: int) -> Rows:
     """Rows with the smallest values of each target that differ, target by target, best first.
 
     Args:
-        targets: (m,) number of the target of each row.
+        owner: (m,) number of the target of each row.
         values: (m,) >= 0.
         most: How many rows of a target at most.
     """
-    order = np.lexsort((values, targets))
-    owner, value = targets[order], values[order]
+    order = np.lexsort((values, owner))
+    owner, value = owner[order], values[order]
     fresh = np.ones(len(order), dtype=bool)
     fresh[1:] = (owner[1:] != owner[:-1]) | (value[1:] > value[:-1] * ALIKE)
     order, owner = order[fresh], owner[fresh]

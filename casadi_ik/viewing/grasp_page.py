@@ -24,8 +24,8 @@ from casadi_ik.errors import CasadiIKError
 from casadi_ik.grasps import Grasp, Tolerance
 from casadi_ik.grasps.load import grasp_data
 from casadi_ik.importing.surfaces import Surface
-from casadi_ik.problem.problems import LIMITS
-from casadi_ik.problem.questions import CLEARANCE, PREFERENCES
+from casadi_ik.problem.request import CLEARANCE, PREFERENCES
+from casadi_ik.problem.targets import LIMITS
 from casadi_ik.registry import METHODS
 from casadi_ik.viewing.drawn import (
     OBJECT,

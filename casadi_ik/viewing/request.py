@@ -21,7 +21,7 @@ from casadi_ik.errors import CasadiIKError, UnsupportedError
 from casadi_ik.grasps import Contact, Grasp, Tolerance
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.problem.clearance import Closest, closest_points
-from casadi_ik.problem.questions import CLEARANCE, Questions, tolerances_by_finger
+from casadi_ik.problem.request import CLEARANCE, Request, tolerances_by_finger
 from casadi_ik.problem.status import Status
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.registry import METHODS
@@ -324,14 +324,14 @@ class Answerer:
         """How a configuration meets what is asked."""
         tolerances = tolerances_by_finger(asked.settings.tolerance, self.robot.fingers)
         enforced = asked.settings.limits == "enforce"
-        problems = Questions(self.robot, tolerances, enforced).of_grasps([asked.grasp], None)
-        verdict = judge(self.robot, problems, q[None])
+        targets = Request(self.robot, tolerances, enforced).of_grasps([asked.grasp], None)
+        verdict = judge(self.robot, targets, q[None])
         contacts = {
             finger: ContactVerdict(
                 float(verdict.position_error[0, i]),
                 float(verdict.angle_error[0, i]),
                 bool(verdict.ok[0, i]),
-                problems.tolerances[i],
+                targets.tolerances[i],
             )
             for i, finger in enumerate(self.robot.fingers)
         }

@@ -22,7 +22,7 @@ from casadi_ik.files.writing import written_whole
 from casadi_ik.logs import Table
 from casadi_ik.logs.detect import bits_of
 from casadi_ik.logs.events import EVENT_COLORS
-from casadi_ik.problem.problems import Tolerance
+from casadi_ik.problem.targets import Tolerance
 
 DPI = 160
 """Dots per inch of a picture unless said."""

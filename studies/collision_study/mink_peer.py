@@ -17,7 +17,7 @@ from peers import Mink, starts_of
 import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.collision.solids import Kind
-from casadi_ik.problem.clearance import SceneCheck, Surroundings
+from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 from collision_study.oracles import with_shapes
 from collision_study.search import Piece, grasps_at, surroundings
 
@@ -34,7 +34,7 @@ DETECTION = 0.05
 class MinkAmong(Mink):
     """mink, with what stands about the robot."""
 
-    def __init__(self, robot: ik.ArmHand, around: Surroundings) -> None:
+    def __init__(self, robot: ik.ArmHand, around: CollisionQuery) -> None:
         """Build the model of one target."""
         self._around = around
         super().__init__(robot, 1e-2)
@@ -45,7 +45,7 @@ class MinkAmong(Mink):
         with_shapes(spec, robot, self._around)
         return spec
 
-    def _limits_of(self, around: Surroundings) -> list[Any]:
+    def _limits_of(self, around: CollisionQuery) -> list[Any]:
         """A limit for all pairs that may overlap equally much."""
         table, found = around.table, []
         for offset in np.unique(table.offsets):
@@ -90,7 +90,7 @@ def solve_peer(piece: Piece, targets: int) -> dict[str, Any]:
 
 
 def _solved(
-    peer: MinkAmong, robot: ik.ArmHand, grasp: ik.Grasp, around: Surroundings
+    peer: MinkAmong, robot: ik.ArmHand, grasp: ik.Grasp, around: CollisionQuery
 ) -> tuple[bool, int]:
     """Whether an answer was found, and how many starts it took."""
     points, normals = grasp.arrays(robot.fingers)
@@ -106,7 +106,7 @@ def _from(
     robot: ik.ArmHand,
     points: Array,
     normals: Array,
-    around: Surroundings,
+    around: CollisionQuery,
     q: Array,
 ) -> bool:
     tolerance, costs = ik.Tolerance(), list[float]()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import casadi_ik as ik
 from casadi_ik.arrays import Array
 from casadi_ik.collision.solids import Kind
-from casadi_ik.problem.clearance import Surroundings
+from casadi_ik.problem.clearance import CollisionQuery
 
 coal: Any = import_module("coal")
 mujoco: Any = import_module("mujoco")
@@ -28,7 +28,7 @@ def rotation_to(axis: Array) -> Array:
 class CoalOracle:
     """pinocchio's kinematics with coal's distances."""
 
-    def __init__(self, robot: ik.ArmHand, around: Surroundings) -> None:
+    def __init__(self, robot: ik.ArmHand, around: CollisionQuery) -> None:
         """Build the geometry model: the table's pairs, shape by shape."""
         self._model = pinocchio.buildModelFromXML(robot.urdf())
         self._data = self._model.createData()
@@ -136,7 +136,7 @@ class CoalOracle:
 
 
 def with_shapes(
-    spec: Any, robot: ik.ArmHand, around: Surroundings, covers: bool = True
+    spec: Any, robot: ik.ArmHand, around: CollisionQuery, covers: bool = True
 ) -> dict[int, str]:
     """Put our shapes into a MuJoCo specification instead of its own, geom "g0", "g1" and so on.
 
@@ -187,7 +187,7 @@ def with_shapes(
 class MuJoCoOracle:
     """MuJoCo's kinematics and collisions."""
 
-    def __init__(self, robot: ik.ArmHand, around: Surroundings) -> None:
+    def __init__(self, robot: ik.ArmHand, around: CollisionQuery) -> None:
         """Read the robot's URDF and put the shapes in."""
         self._robot, table = robot, around.table
         compiler = '<compiler fusestatic="false" boundmass="0.01" boundinertia="0.001"/>'

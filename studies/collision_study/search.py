@@ -12,8 +12,8 @@ import numpy as np
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.problem.clearance import SceneCheck, Surroundings
-from casadi_ik.problem.questions import Questions, tolerances_by_finger
+from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
+from casadi_ik.problem.request import Request, tolerances_by_finger
 from collision_study.oracles import CoalOracle
 
 TABLE = {"kind": "box", "size": [3, 3, 0.04], "xyz": [0, 0, -0.02]}
@@ -161,17 +161,17 @@ def _timed(solver: ik.Solver, points: Array, normals: Array, poses: Array | None
     return (time.process_time() - begin) / len(points)
 
 
-def surroundings(check: SceneCheck, robot: ik.ArmHand, grasp: ik.Grasp) -> Surroundings:
+def surroundings(check: SceneCheck, robot: ik.ArmHand, grasp: ik.Grasp) -> CollisionQuery:
     """What a grasp is checked against."""
-    questions = Questions(robot, tolerances_by_finger(None, robot.fingers), True)
-    return check.around(questions.of_grasps([grasp], None))
+    request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
+    return check.collision_query(request.of_grasps([grasp], None))
 
 
 def dense(
     robot: ik.ArmHand,
     points: Array,
     normals: Array,
-    around: Surroundings,
+    around: CollisionQuery,
     count: int,
     rng: np.random.Generator,
 ) -> bool:
@@ -182,7 +182,7 @@ def dense(
         both = (np.tile(one, (some, 1, 1)) for one in (points, normals))
         found = blind.solve_batch(*both, q0=robot.random(rng, some), prefer="q0")
         q = found.q[found.success]
-        if len(q) and (around.rows(np.zeros(len(q), np.intp)).check(q).room >= SAFE).any():
+        if len(q) and (around.rows(np.zeros(len(q), np.intp)).check(q).surplus >= SAFE).any():
             return True
     return False
 
@@ -202,8 +202,8 @@ def _grasps(robot: ik.ArmHand) -> list[tuple[ik.Grasp, dict[str, Any]]]:
     radii = np.linalg.norm(points - poses[:, None, :3, 3], axis=2).min(axis=1) - SAFE
     point = {"kind": "sphere", "radius": SAFE}
     check = SceneCheck(robot, ik.Scene({BALL: point}, grasped=BALL))
-    questions = Questions(robot, tolerances_by_finger(None, robot.fingers), True)
-    around = check.around(questions.of_arrays(points, normals, None).holding(BALL, poses))
+    request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
+    around = check.collision_query(request.of_arrays(points, normals, None).holding(BALL, poses))
     of_ball = np.array([BALL in names for names in around.table.names])
     clear = around.only(~of_ball).free(q) & (radii > SMALLEST)
     clear &= around.only(of_ball).check(q).distance + SAFE > radii

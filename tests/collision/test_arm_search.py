@@ -7,8 +7,8 @@ import pytest
 
 import casadi_ik as ik
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import PREFERENCES
+from casadi_ik.problem.request import PREFERENCES
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.solving.alternatives.arm_search import ArmSearch
 from casadi_ik.solving.alternatives.free import (
     Deduplicator,
@@ -34,8 +34,8 @@ def hands(robot, solver):
     """Hands in reach, where the arms stand, and what they are checked against."""
     rng = np.random.default_rng(5)
     q = robot.random(rng, 60)
-    around = solver._engine.around(solver._questions.of_arrays(*robot.contacts(q), None))
-    room = around.held.check(q).room
+    around = solver._engine.collision_query(solver._request.of_arrays(*robot.contacts(q), None))
+    room = around.held.check(q).surplus
     kept = np.flatnonzero(room >= 0)
     return q[kept], robot.random(rng, len(kept)), around.rows(kept), room[kept]
 
@@ -62,7 +62,7 @@ def chosen(search, robot, hands, prefer, branches=False, **words):
 
 def scores(search, hands, found, prefer):
     if prefer == "clearance":
-        return np.minimum(hands[2].rows(found.owner).check(found.q).room, hands[3][found.owner])
+        return np.minimum(hands[2].rows(found.owner).check(found.q).surplus, hands[3][found.owner])
     return search.scores(found.q, hands[1][found.owner], prefer)
 
 
@@ -134,7 +134,7 @@ def test_pairs_are_those_of_the_hand_or_of_the_arm(search, robot, hands):
         assert not {first, second} & {f"lwr_link_{i}" for i in range(1, 6)}
     # With the hand where it is, the first do not change while the arm does.
     found = chosen(search, robot, hands, "q0")
-    one = hands[2].rows(found.owner).held.check(found.q).room
+    one = hands[2].rows(found.owner).held.check(found.q).surplus
     np.testing.assert_allclose(one, hands[3][found.owner], atol=1e-8)
 
 
@@ -197,10 +197,10 @@ def test_only_motors_of_unconstrained_fingers_move_and_only_for_more_room():
     motor = robot.actuators.index("shadow_rfj3")
     for given in (None, fixed):
         fixed[motor] = 0.0
-        problems = Problems(points, normals, ik.Tolerance(), True, fixed=given)
-        around = SceneCheck(robot, ik.Scene({})).around(problems).held
+        problems = TargetBatch(points, normals, ik.Tolerance(), True, fixed=given)
+        around = SceneCheck(robot, ik.Scene({})).collision_query(problems).held
         moved = UnconstrainedFingers(robot, problems).aside(q, np.arange(120), around)
-        before, after = around.check(q).room, around.check(moved).room
+        before, after = around.check(q).surplus, around.check(moved).surplus
         changed = (moved != q).any(axis=1)
         assert changed[:90].sum() > 5
         assert not changed[90:].any()

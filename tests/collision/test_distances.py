@@ -8,7 +8,7 @@ from capsule_arm import SCENE, write_robot
 from coal_oracle import described, distance, in_scene
 
 import casadi_ik as ik
-from casadi_ik.problem.clearance import SceneCheck, Surroundings
+from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
 
 MICROMETRE = 1e-6
 
@@ -18,10 +18,12 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
     return ik.load_robot(write_robot(tmp_path_factory.mktemp("three")))
 
 
-def surroundings(robot: ik.ArmHand, scene: ik.Scene, compiled: bool = True) -> Surroundings:
+def surroundings(robot: ik.ArmHand, scene: ik.Scene, compiled: bool = True) -> CollisionQuery:
     check = SceneCheck(robot, scene, compiled)
     points, normals = robot.contacts(robot.home)
-    return check.around(ik.Solver(robot)._questions.of_arrays(points[None], normals[None], None))
+    return check.collision_query(
+        ik.Solver(robot)._request.of_arrays(points[None], normals[None], None)
+    )
 
 
 def by_coal(robot: ik.ArmHand, q: np.ndarray, names: set[frozenset[str]]) -> np.ndarray:

@@ -40,8 +40,8 @@ def test_the_choice_finds_what_contacts_alone_miss(solver, robot):
     blind = ik.Solver(robot)
     touching = 0
     for grasp in grasps:
-        problems = solver._questions.of_grasps([grasp], None)
-        around = solver._engine.around(problems)
+        problems = solver._request.of_grasps([grasp], None)
+        around = solver._engine.collision_query(problems)
         touching += not around.check(blind.solve(grasp).q[None]).free[0]
     assert touching >= 3
 
@@ -79,7 +79,7 @@ def test_no_scene_checks_nothing(robot):
 
 def test_what_is_grasped_may_be_touched_by_the_fingers_alone(solver):
     cup = ik.load_grasp("cup")
-    around = solver._engine.around(solver._questions.of_grasps([cup], None))
+    around = solver._engine.collision_query(solver._request.of_grasps([cup], None))
     of_cup = {names[0] for names in around.table.names if names[1] == "cup"}
     assert "bh_base" in of_cup
     assert "bh_thumb_link_2" in of_cup
@@ -121,7 +121,7 @@ def test_batches_are_what_single_solves_are(solver, robot):
 def test_poses_for_other_rows_are_refused(solver):
     """The driver reads as many poses as there are configurations."""
     cup = ik.load_grasp("cup")
-    around = solver._engine.around(solver._questions.of_grasps([cup, cup], None))
+    around = solver._engine.collision_query(solver._request.of_grasps([cup, cup], None))
     with pytest.raises(ik.errors.InputError, match="2 poses for 3 configurations"):
         around.check(np.tile(solver.robot.home, (3, 1)))
     assert around.check(np.tile(solver.robot.home, (2, 1))).free.shape == (2,)
@@ -131,7 +131,7 @@ def test_all_solutions_are_free(solver):
     cup = ik.load_grasp("cup")
     found = solver.solve_all(cup, limit=4)
     assert found
-    around = solver._engine.around(solver._questions.of_grasps([cup], None))
+    around = solver._engine.collision_query(solver._request.of_grasps([cup], None))
     assert around.free(np.stack([one.q for one in found])).all()
 
 

@@ -192,8 +192,8 @@ def test_shipped_robots_stand_free_at_home(name):
     robot = ik.load_robot(name)
     check = SceneCheck(robot, ik.Scene(), compiled=False)
     points, normals = robot.contacts(robot.home)
-    asked = ik.Solver(robot, compiled=False)._questions.of_arrays(points[None], normals[None], None)
-    found = check.around(asked).check(robot.home[None])
+    asked = ik.Solver(robot, compiled=False)._request.of_arrays(points[None], normals[None], None)
+    found = check.collision_query(asked).check(robot.home[None])
     assert found.free[0], found.pair(0)
     assert all(one.reason for one in check.model.excluded)
 

@@ -63,11 +63,13 @@ def test_margins_of_single_pairs(robot) -> None:
     for margins, kept in (((), 0.03), (less, 0.002)):
         scene = ik.Scene({"post": post}, margin=0.01, margins=margins)
         solver = ik.Solver(robot, scene=scene, compiled=False)
-        around = solver._engine.around(solver._questions.of_grasps([ik.load_grasp("cup")], None))
+        around = solver._engine.collision_query(
+            solver._request.of_grasps([ik.load_grasp("cup")], None)
+        )
         of_pair = np.array([set(names) == {"lwr_link_6", "post"} for names in around.table.names])
         found = around.only(of_pair).check(robot.home[None])
         clearances.append(float(found.distance[0]))
-        assert found.room[0] == pytest.approx(found.distance[0] - kept)
+        assert found.surplus[0] == pytest.approx(found.distance[0] - kept)
     assert clearances[0] == pytest.approx(clearances[1])
 
 

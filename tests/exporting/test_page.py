@@ -142,8 +142,8 @@ def an_obstacle_is_kept_clear_of(page: Page, robot: ik.ArmHand) -> None:
         box = {"kind": "box", "size": post["size"], "xyz": post["pose"][9:]}
         scene = ik.Scene({"apple": ball, "post": box}, grasped="apple")
         solver, points = ik.Solver(robot, scene=scene), asked(page)[None]
-        problems = solver._questions.of_arrays(points, np.full_like(points, np.nan), None)
-        around = solver._engine.around(problems)
+        problems = solver._request.of_arrays(points, np.full_like(points, np.nan), None)
+        around = solver._engine.collision_query(problems)
         assert around is not None
         q = np.array(page.evaluate("[...casadiIk.now.answer.q]"))
         clear = around.check(q[None])

@@ -10,8 +10,8 @@ from casadi_ik.answers.recorder import SolveBlock
 from casadi_ik.answers.solution import BatchSolution
 from casadi_ik.cli.main import main
 from casadi_ik.kernels.layout import Field, Layout
-from casadi_ik.problem.problems import Problems, Tolerance
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.targets import TargetBatch, Tolerance
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat
 
 __all__ = ["Field", "Layout", "RecordedJacobian", "SolveBlock", "TraceFormat", "changed", "main"]
@@ -97,7 +97,7 @@ def make_block(
     return SolveBlock(
         format=form,
         first=first,
-        problems=Problems(rng.normal(size=(k, 3, 3)), normals, Tolerance(), True),
+        targets=TargetBatch(rng.normal(size=(k, 3, 3)), normals, Tolerance(), True),
         starts=rng.normal(size=(k, 14)),
         seed=7,
         batch=batch,

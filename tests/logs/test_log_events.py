@@ -393,15 +393,15 @@ def test_a_log_with_a_scene(robot, tmp_path: Path) -> None:
     named = [(record["closest_first"], record["closest_second"]) for record in solves.records()]
     assert named == list(batch.closest)
     # Every iteration's is that of its q with its own object's pose.
-    around = solver._engine.around(
-        solver._questions.of_arrays(points, normals, None).holding("cup", poses)
+    around = solver._engine.collision_query(
+        solver._request.of_arrays(points, normals, None).holding("cup", poses)
     )
     expected = around.rows(rows.solve_id).check(np.ascontiguousarray(rows.rows["q"]))
     np.testing.assert_allclose(
-        rows.rows["clearance"], expected.room + scene.margin, atol=1e-6, equal_nan=True
+        rows.rows["clearance"], expected.surplus + scene.margin, atol=1e-6, equal_nan=True
     )
     kinds = {record["kind"] for record in log.events().records()}
-    touching = np.flatnonzero(expected.room < -1e-6)
+    touching = np.flatnonzero(expected.surplus < -1e-6)
     assert ("COLLISION_ENTERED" in kinds) == bool(len(touching))
     first = logs.one_solve(log, 0)
     assert first.clearance == pytest.approx(batch.clearance[0])

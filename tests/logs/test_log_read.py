@@ -201,7 +201,7 @@ def test_frames(write: Write, tmp_path: Path) -> None:
     solves = log.solves().frame()
     assert solves["status"].to_list() == ["SOLVED", "STALLED", "STALLED"]
     np.testing.assert_array_equal(
-        solves["target_points.finger_2.y"][:2], block.problems.points[:, 1, 1]
+        solves["target_points.finger_2.y"][:2], block.targets.points[:, 1, 1]
     )
     assert solves["phase_iterations.hand alignment"].to_list() == [13, 1, 1]
     events = log.events().frame()

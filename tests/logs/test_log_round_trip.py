@@ -29,7 +29,7 @@ from casadi_ik.logs.events import event_format
 from casadi_ik.logs.format import KINDS, topic
 from casadi_ik.logs.rows import solve_format
 from casadi_ik.logs.writer import CHUNK_SIZE
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 
 Write = Callable[..., Path]
 
@@ -53,8 +53,8 @@ def assert_solves(table: logs.Table, block: SolveBlock) -> None:
         np.testing.assert_array_equal(rows[name], getattr(batch, name), err_msg=name)
     for name in ("success", "ok", "limits_ok"):
         np.testing.assert_array_equal(rows[name] > 0, getattr(batch, name), err_msg=name)
-    np.testing.assert_array_equal(rows["target_points"], block.problems.points)
-    np.testing.assert_array_equal(rows["target_normals"], block.problems.normals)
+    np.testing.assert_array_equal(rows["target_points"], block.targets.points)
+    np.testing.assert_array_equal(rows["target_normals"], block.targets.normals)
     phases = np.stack(list(batch.phases.values()), axis=1)
     np.testing.assert_array_equal(rows["phase_iterations"], phases)
     np.testing.assert_allclose(rows["started"], block.started * 1e-9, rtol=1e-15)
@@ -395,12 +395,12 @@ def test_held_actuators_beyond_one_word(write: Callable[..., Path]) -> None:
     block = make_block(3)
     held = np.full(40, np.nan)
     held[[1, 33]] = 0.5, -0.25
-    points, normals = block.problems.points, block.problems.normals
+    points, normals = block.targets.points, block.targets.normals
     wide = changed(
         block,
         q=np.zeros((1, 40)),
         starts=np.ones((1, 40)),
-        problems=Problems(points, normals, ik.Tolerance(), enforce_limits=False, fixed=held),
+        targets=TargetBatch(points, normals, ik.Tolerance(), enforce_limits=False, fixed=held),
     )
     assert solve_format(wide).layout.dtype["fixed_mask"].shape == (2,)
     solve = logs.one_solve(logs.open(write(wide)))

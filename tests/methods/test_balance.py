@@ -12,7 +12,7 @@ from casadi_ik.methods.common.bounded_step import Bounded, clip, damped_step, el
 from casadi_ik.methods.common.contact_fit import BALANCE
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.problem.problems import Problems, target_arrays
+from casadi_ik.problem.targets import TargetBatch, target_arrays
 
 M, N, FIRST = 9, 7, 3
 
@@ -264,7 +264,7 @@ def test_alone_in_a_batch_and_in_blocks_the_answer_is_the_same(robot):
 def test_the_largest_part_falls_until_all_are_met(robot):
     method = HandFirstMethod(robot.description, HandFirstParameters())
     targets = target_arrays(*displaced(robot, np.random.default_rng(1), 1000, 0.98), 3)
-    asked = Problems(*targets, TOLERANCE, True)
+    asked = TargetBatch(*targets, TOLERANCE, True)
     outcome = method.run(asked, np.tile(robot.home, (len(asked), 1)), 0, True)
     seen = 0
     for trace in outcome.trace:

@@ -14,7 +14,7 @@ import casadi_ik as ik
 from casadi_ik import logs
 from casadi_ik.grasps.grasp import MORE, fault, faulty
 from casadi_ik.problem.contacts import CONDITIONS, NAMES, ContactKind, by_kinds, more_arrays, usual
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import judge
 from casadi_ik.proofs.prove import Prover
 
@@ -138,7 +138,7 @@ def test_a_fingertip_turned_about_its_normal_misses_its_pose(robot):
     points, normals, tangents = at[:, :3, 3], at[:, :3, 0], at[:, :3, 1]
     turned = np.cos(0.3) * tangents + np.sin(0.3) * np.cross(normals, tangents)
     for asked_for, expected in ((tangents, 0.0), (turned, 0.3)):
-        asked = Problems(
+        asked = TargetBatch(
             points[None],
             normals[None],
             TIGHT,
@@ -384,7 +384,7 @@ def test_every_target_is_in_one_group_of_its_kinds(free, line):
         array[free[..., i]] = np.nan
         if not np.isnan(array).all():
             more[name] = array
-    asked = Problems(points, points, TIGHT, enforce_limits=True, first_row=10, more=more)
+    asked = TargetBatch(points, points, TIGHT, enforce_limits=True, first_row=10, more=more)
     seen = []
     for kinds, rows, some in by_kinds(asked):
         rows = np.arange(5) if rows is None else rows
@@ -410,8 +410,8 @@ def test_the_tables_agree():
     assert ContactKind() == ContactKind("point", "normal")
 
 
-def _plain() -> Problems:
-    return Problems(np.zeros((2, 3, 3)), np.zeros((2, 3, 3)), TIGHT, enforce_limits=True)
+def _plain() -> TargetBatch:
+    return TargetBatch(np.zeros((2, 3, 3)), np.zeros((2, 3, 3)), TIGHT, enforce_limits=True)
 
 
 def test_no_proof_counts_a_contact_that_may_slide(robot):
@@ -422,7 +422,7 @@ def test_no_proof_counts_a_contact_that_may_slide(robot):
     planes = np.full((1, 3, 3), np.nan)
     planes[0, 0] = UP
     prover = Prover(robot.description, compiled=False)
-    asked = Problems(points, normals, TIGHT, enforce_limits=True)
+    asked = TargetBatch(points, normals, TIGHT, enforce_limits=True)
     assert prover.prove(asked)[0] is not None
-    slides = Problems(points, normals, TIGHT, enforce_limits=True, more={"planes": planes})
+    slides = TargetBatch(points, normals, TIGHT, enforce_limits=True, more={"planes": planes})
     assert prover.prove(slides)[0] is None

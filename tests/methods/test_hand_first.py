@@ -13,7 +13,7 @@ from samplers import HARD, near_limits
 import casadi_ik as ik
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
-from casadi_ik.problem.problems import Problems, fixed_array, target_arrays
+from casadi_ik.problem.targets import TargetBatch, fixed_array, target_arrays
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 
@@ -29,7 +29,7 @@ def method(robot):
 def problems(robot, q, tolerance=EXACT, enforce=True, fixed=None):
     points, normals = robot.contacts(q)
     targets = target_arrays(points, normals, len(robot.fingers))
-    return Problems(*targets, tolerance, enforce, fixed=fixed)
+    return TargetBatch(*targets, tolerance, enforce, fixed=fixed)
 
 
 def solve(robot, method, asked):
@@ -141,7 +141,7 @@ def test_out_of_reach_the_contacts_come_near(robot, method, rng):
     points, normals = robot.contacts(q)
     away = points.mean(axis=1, keepdims=True)
     points = points + 2.0 * away / np.linalg.norm(away, axis=2, keepdims=True)
-    asked = Problems(*target_arrays(points, normals, 3), EXACT, True)
+    asked = TargetBatch(*target_arrays(points, normals, 3), EXACT, True)
     batch = solve(robot, method, asked)
     assert not batch.success.any()
     assert np.isfinite(batch.q).all()
@@ -163,7 +163,7 @@ def test_partial_grasps(robot, method, rng, free, tolerance):
     else:
         points[:, :2] = normals[:, :2] = np.nan
     targets = target_arrays(points, normals, 3)
-    batch = solve(robot, method, Problems(*targets, TOLERANCES[tolerance], True))
+    batch = solve(robot, method, TargetBatch(*targets, TOLERANCES[tolerance], True))
     assert batch.success.all()
     assert batch.limits_ok.all()
 
@@ -266,7 +266,7 @@ def test_the_trace_leaves_open_what_is_free(robot, rng, name):
     normals[:, 1] = np.nan
     points[:, 2] = normals[:, 2] = np.nan
     method = ik.Solver(robot, name)._engine.method
-    asked = Problems(*target_arrays(points, normals, 3), ik.Tolerance(), True)
+    asked = TargetBatch(*target_arrays(points, normals, 3), ik.Tolerance(), True)
     (rows,) = method.run(asked, robot.home[None], 0, True).trace
     measured = rows[np.isfinite(rows["position_error"][:, 0])]
     assert len(measured)

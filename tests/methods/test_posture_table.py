@@ -12,7 +12,7 @@ from casadi_ik.methods.common.posture_table import PostureTable, contact_shape, 
 from casadi_ik.methods.hand_first.method import HandFirstMethod
 from casadi_ik.methods.hand_first.parameters import HandFirstParameters
 from casadi_ik.methods.hand_first.seeds import Seeds, each_finger
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.symbolic.even_spread import evenly
 
 HAND = tuple(range(7, 14))
@@ -258,7 +258,7 @@ def test_so_many_rounds_and_no_more(rng):
     hand = ik.load_robot("kuka_lwr_barrett")
     points, normals = hand.contacts(hand.random(rng, 4))
     points += 0.02 * rng.normal(size=points.shape)
-    problems = Problems(points, normals, ik.Tolerance(), True)
+    problems = TargetBatch(points, normals, ik.Tolerance(), True)
     tried = HandFirstMethod(hand.description, HandFirstParameters())
     start = np.tile(hand.home, (4, 1))
     every = [(trace, rounds) for trace in (False, True) for rounds in (1, 3)]

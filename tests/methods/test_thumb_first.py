@@ -13,7 +13,7 @@ from samplers import shipped_hands
 import casadi_ik as ik
 from casadi_ik.methods.thumb_first.method import ThumbFirstMethod
 from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
-from casadi_ik.problem.problems import Problems, fixed_array, target_arrays
+from casadi_ik.problem.targets import TargetBatch, fixed_array, target_arrays
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.run import Run
 
@@ -31,9 +31,9 @@ def once(robot) -> ThumbFirstMethod:
     return ThumbFirstMethod(robot.description, ThumbFirstParameters(starts=1))
 
 
-def problems(robot, q, tolerance=PAPER, enforce=True, fixed=None) -> Problems:
+def problems(robot, q, tolerance=PAPER, enforce=True, fixed=None) -> TargetBatch:
     points, normals = target_arrays(*robot.contacts(q), len(robot.fingers))
-    return Problems(points, normals, tolerance, enforce, fixed=fixed)
+    return TargetBatch(points, normals, tolerance, enforce, fixed=fixed)
 
 
 def solve(robot, method, asked) -> ik.BatchSolution:
@@ -133,7 +133,7 @@ def test_contacts_that_contradict_each_other_a_little_are_balanced(robot, rng):
 
 def test_out_of_reach_the_best_is_kept(robot, method, rng):
     asked = problems(robot, robot.random(rng, 10))
-    far = Problems(asked.points + np.array([3.0, 0, 0]), asked.normals, PAPER, True)
+    far = TargetBatch(asked.points + np.array([3.0, 0, 0]), asked.normals, PAPER, True)
     batch = solve(robot, method, far)
     assert not batch.success.any()
     assert (batch.status == ik.Status.STALLED).all()
@@ -155,7 +155,7 @@ def test_partial_grasps(robot, method, rng, free):
         points[:, thumb] = normals[:, thumb] = np.nan
     else:
         normals[:] = np.nan
-    asked = Problems(*target_arrays(points, normals, 3), PAPER, True)
+    asked = TargetBatch(*target_arrays(points, normals, 3), PAPER, True)
     batch = solve(robot, method, asked)
     assert batch.success.mean() >= 0.93
     assert batch.limits_ok.all()

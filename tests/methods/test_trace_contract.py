@@ -71,10 +71,10 @@ def joined(blocks: list[SolveBlock]) -> SolveBlock:
     """Blocks of one method as one."""
     return dataclasses.replace(
         blocks[0],
-        problems=dataclasses.replace(
-            blocks[0].problems,
-            points=np.concatenate([block.problems.points for block in blocks]),
-            normals=np.concatenate([block.problems.normals for block in blocks]),
+        targets=dataclasses.replace(
+            blocks[0].targets,
+            points=np.concatenate([block.targets.points for block in blocks]),
+            normals=np.concatenate([block.targets.normals for block in blocks]),
         ),
         starts=np.concatenate([block.starts for block in blocks]),
         batch=ik.BatchSolution.joined([block.batch for block in blocks]),

@@ -135,7 +135,7 @@ def _check_errors(robot: ik.ArmHand, block: SolveBlock, promise: Promise) -> Non
     assert wanted.any()
     rows, of_solve = block.rows[wanted], _of_solve(block)[wanted]
     points, normals = robot.contacts(rows[Q.name].astype(float))
-    goal = block.problems.points[of_solve], block.problems.normals[of_solve]
+    goal = block.targets.points[of_solve], block.targets.normals[of_solve]
     distance = np.linalg.norm(points - goal[0], axis=2)
     turned = np.linalg.norm(np.cross(normals, goal[1]), axis=2)
     angle = np.arctan2(turned, np.sum(normals * goal[1], axis=2))

@@ -19,8 +19,8 @@ def solver(robot) -> ik.Solver:
 
 
 def clearances(solver, q):
-    problems = solver._questions.of_arrays(*solver.robot.contacts(q[:1]), None)
-    around = solver._engine.around(problems)
+    problems = solver._request.of_arrays(*solver.robot.contacts(q[:1]), None)
+    around = solver._engine.collision_query(problems)
     assert around is not None
     return around.check(q)
 
@@ -66,7 +66,7 @@ def test_leaping_targets_never_make_it_touch_anything(robot, solver, seed):
 
 def clearances_around(solver):
     grasp = ik.Grasp(dict.fromkeys(solver.robot.fingers[:1], ik.Contact([0, 0, 0], [0, 0, 1])))
-    around = solver._engine.around(solver._questions.of_grasps([grasp], None))
+    around = solver._engine.collision_query(solver._request.of_grasps([grasp], None))
     return around.rows(np.zeros(1, dtype=np.intp))
 
 
@@ -92,7 +92,7 @@ def test_a_path_keeps_clear(robot, solver):
     # Between the postures, too, as far as that is looked into.
     assert track.free_between is not None
     assert track.free_between.all()
-    assert clearances(solver, dense(track.q, motor_units(robot))).room.min() >= -RESOLUTION
+    assert clearances(solver, dense(track.q, motor_units(robot))).surplus.min() >= -RESOLUTION
 
 
 def test_what_stands_between_two_free_postures_is_seen(robot):
@@ -106,14 +106,14 @@ def test_what_stands_between_two_free_postures_is_seen(robot):
     assert around.free(way).all()
     found = between(around, way)
     assert found.free.tolist() == [False, True]
-    assert found.room[0] < 0
+    assert found.surplus[0] < 0
     assert not around.free(found.worst[:1])[0]
     held = ik.Scene({"ball": {"kind": "sphere", "radius": 0.02, "xyz": [x, y, z]}}, grasped="ball")
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[x, y - 0.5, z], [x, y + 0.5, z]]
     carrying = ik.Solver(robot, scene=held)
-    problems = carrying._questions.of_arrays(*robot.contacts(way[:2]), None)
-    moving = carrying._engine.around(problems.holding("ball", poses))
+    problems = carrying._request.of_arrays(*robot.contacts(way[:2]), None)
+    moving = carrying._engine.collision_query(problems.holding("ball", poses))
     standing = np.tile(robot.home, (2, 1))
     assert moving.free(standing).all()
     assert not between(moving, standing).free[0]

@@ -128,8 +128,8 @@ def test_around_what_is_in_the_way(robot):
     place = robot.palm(ways.mean(axis=0))[:3, 3]
     solids = {"ball": {"kind": "sphere", "radius": 0.05, "xyz": place.tolist()}}
     solver = ik.Solver(robot, scene=ik.Scene(solids))
-    problem = solver._questions.of_arrays(*robot.contacts(ways[1:]), None)
-    around = solver._engine.around(problem).rows(np.zeros(1, dtype=int))
+    problem = solver._request.of_arrays(*robot.contacts(ways[1:]), None)
+    around = solver._engine.collision_query(problem).rows(np.zeros(1, dtype=int))
     assert not around.free(dense(ways, motor_units(robot))).all()
     corners, how = free_way(robot, *ways, around, seed=0)
     assert "OMPL" in how
@@ -143,8 +143,8 @@ def test_all_of_it_is_free(robot, grasp):
     solver = ik.Solver(robot, scene=ik.load_scene("table"))
     found = solver.reach(grasp)
     part = check_motion(robot, grasp, found, robot.home)
-    problem = solver._questions.of_grasps([grasp], None)
-    around = solver._engine.around(problem).rows(np.zeros(1, dtype=int))
+    problem = solver._request.of_grasps([grasp], None)
+    around = solver._engine.collision_query(problem).rows(np.zeros(1, dtype=int))
     looked_at = dense(found.motion.q[part != "closing"], motor_units(robot))
     assert around.free(looked_at).all()
     assert found.clearance >= 0

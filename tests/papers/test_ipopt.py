@@ -11,7 +11,7 @@ import casadi_ik as ik
 from casadi_ik.methods.common.contact_fit import whole_residual
 from casadi_ik.papers.ipopt import EXACT, LENGTH, IpoptParameters, WholeNlp, limited_joints
 from casadi_ik.problem.contacts import ContactRows, usual
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 
 
 class Program:
@@ -332,7 +332,7 @@ def test_limits_are_never_left(robot, tmp_path, targets):
 
 def test_a_row_draws_the_same_numbers_in_any_part_of_the_batch(robot, solver, targets):
     method = solver._engine.method
-    problems = Problems(*targets, ik.Tolerance(), True)
+    problems = TargetBatch(*targets, ik.Tolerance(), True)
     q0 = np.tile(robot.home, (10, 1))
     whole = method.run(problems, q0, 3, False)
     again = np.flatnonzero(whole.restarts > 0)
@@ -350,7 +350,7 @@ def test_a_row_draws_the_same_numbers_in_any_part_of_the_batch(robot, solver, ta
 
 def test_the_trace(robot, solver, targets):
     method = solver._engine.method
-    problems = Problems(*targets, ik.Tolerance(), True)
+    problems = TargetBatch(*targets, ik.Tolerance(), True)
     outcome = method.run(problems, np.tile(robot.home, (10, 1)), 0, True)
     assert outcome.restarts.max() >= 1
     for row, trace in enumerate(outcome.trace):

@@ -13,7 +13,7 @@ from casadi_ik.papers.qiu.enhanced import EnhancedStep
 from casadi_ik.papers.qiu.finger_step import finger_step_function
 from casadi_ik.papers.qiu.method import EnhancedMethod
 from casadi_ik.papers.qiu.parameters import QiuParameters
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.symbolic.planar_finger import planar_finger
 
 
@@ -32,7 +32,7 @@ class Stepper:
         )
 
     def parameters(self, points, normals, enforce_limits=False):
-        problems = Problems(points[None], normals[None], ik.Tolerance(), enforce_limits)
+        problems = TargetBatch(points[None], normals[None], ik.Tolerance(), enforce_limits)
         values = self.step.parameter_values(problems)
         return self.step.parameters.pack_rows(values, 1)[0]
 
@@ -470,7 +470,7 @@ def method(robot, compiled=True, **options):
 
 
 def run(built, robot, points, normals, enforce=False, q0=None):
-    problems = Problems(points, normals, ik.Tolerance(), enforce)
+    problems = TargetBatch(points, normals, ik.Tolerance(), enforce)
     start = np.tile(robot.home if q0 is None else q0, (len(points), 1))
     return built.run(problems, start, 0, True)
 
@@ -614,7 +614,7 @@ def test_budget(robot):
 
 def test_no_trace_unless_asked(robot, compiled):
     points, normals = pinch_targets(robot, 1)
-    problems = Problems(points[:2], normals[:2], ik.Tolerance(), False)
+    problems = TargetBatch(points[:2], normals[:2], ik.Tolerance(), False)
     outcome = compiled.run(problems, np.tile(robot.home, (2, 1)), 0, False)
     assert outcome.trace == ()
     np.testing.assert_array_equal(outcome.q, run(compiled, robot, points[:2], normals[:2]).q)

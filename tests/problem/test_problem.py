@@ -8,7 +8,7 @@ from pinocchio_oracle import verdict
 from toy_robots import replace
 
 import casadi_ik as ik
-from casadi_ik.problem.problems import Problems, target_arrays
+from casadi_ik.problem.targets import TargetBatch, target_arrays
 from casadi_ik.problem.verdict import judge
 
 
@@ -113,7 +113,7 @@ def test_default_tolerance_is_the_papers():
 
 
 def test_rows_of_a_batch():
-    problems = Problems(*arrays(k=4), ik.Tolerance(), True)
+    problems = TargetBatch(*arrays(k=4), ik.Tolerance(), True)
     part = problems.rows(slice(1, 3))
     assert len(problems) == 4
     assert len(part) == 2
@@ -123,7 +123,7 @@ def test_rows_of_a_batch():
 
 def test_parts_of_a_batch_keep_the_numbers_of_their_targets():
     points = np.zeros((10, 3, 3))
-    problems = Problems(points, points, ik.Tolerance(), True, first_row=100)
+    problems = TargetBatch(points, points, ik.Tolerance(), True, first_row=100)
     assert problems.rows(slice(4, 8)).first_row == 104
     assert problems.rows(slice(4, 8)).rows(slice(1, None)).first_row == 105
     assert problems.rows(slice(-2, None)).first_row == 108
@@ -133,7 +133,7 @@ def test_parts_of_a_batch_keep_the_numbers_of_their_targets():
 
 
 def problems(points, normals, **tolerance):
-    return Problems(points, normals, ik.Tolerance(**tolerance), True)
+    return TargetBatch(points, normals, ik.Tolerance(**tolerance), True)
 
 
 def test_errors_are_pinocchios(robot, oracle, rng):

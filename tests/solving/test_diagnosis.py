@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
@@ -437,7 +437,7 @@ def test_a_bad_start_never_makes_it_unreachable(robot: ik.ArmHand) -> None:
     q = robot.random(rng, count)
     q = np.where(rng.random(q.shape) < 0.4, robot.lower, q)
     points, normals = robot.contacts(q)
-    asked = Problems(points, normals, ik.Tolerance(), True)
+    asked = TargetBatch(points, normals, ik.Tolerance(), True)
     starts = np.tile(robot.home, (count, 1))
     diagnostician = ik.Solver(robot)._engine.diagnostician
     found = diagnostician.diagnose(asked, starts, robot.random(rng, count))

@@ -11,7 +11,7 @@ import pytest
 import casadi_ik as ik
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import TraceFormat
 from casadi_ik.solving.batch_parts import CACHED_BYTES, ENOUGH, FIRST_PART, PART_BYTES, BatchParts
 from casadi_ik.solving.engine import Engine
@@ -69,7 +69,7 @@ class Keeping:
 
 def targets(robot, q, enforce=True):
     points, normals = robot.contacts(q)
-    return Problems(points, normals, ik.Tolerance(), enforce)
+    return TargetBatch(points, normals, ik.Tolerance(), enforce)
 
 
 @pytest.mark.parametrize("enforce", [True, False])
@@ -131,7 +131,7 @@ def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
         assert block.format.labels == {"row": ("a",)}
         np.testing.assert_array_equal(np.diff(block.started), 500_000_000)
         np.testing.assert_array_equal(block.batch.q, batch.q[rows])
-        np.testing.assert_array_equal(block.problems.points, problems.points[rows])
+        np.testing.assert_array_equal(block.targets.points, problems.points[rows])
         np.testing.assert_array_equal(block.rows["row"], np.arange(rows.start, rows.stop))
 
 

@@ -17,7 +17,7 @@ from toy_robots import write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.proofs.box_tests import Seen, pair_rows
 from casadi_ik.proofs.boxes import box_contacts
 from casadi_ik.proofs.premises import arm_cones
@@ -35,8 +35,8 @@ BLIND = [[0, 100, 48, 78, 48, 48, 48], [0, 90, 48, 78, 46, 60, 31], [4, 94, 48, 
 ROBOTS = ["kuka_lwr_barrett", "kuka_lwr_barrett_coupled", "ar10", "baxter_ar10"]
 
 
-def asked(targets: tuple[Array, Array], position: float, angle: float, limits: bool) -> Problems:
-    return Problems(*targets, ik.Tolerance(position, angle), limits)
+def asked(targets: tuple[Array, Array], position: float, angle: float, limits: bool) -> TargetBatch:
+    return TargetBatch(*targets, ik.Tolerance(position, angle), limits)
 
 
 def moved(targets: tuple[Array, Array], rng: np.random.Generator, metres: float, angle: float):
@@ -49,7 +49,7 @@ def moved(targets: tuple[Array, Array], rng: np.random.Generator, metres: float,
     return points, normals * np.cos(angle) + turn * np.sin(angle)
 
 
-def wrongly(robot: ik.ArmHand, prover: Prover, q: Array, problems: Problems) -> int:
+def wrongly(robot: ik.ArmHand, prover: Prover, q: Array, problems: TargetBatch) -> int:
     """How many proofs would refute a box of hands that holds the hand of q."""
     places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
     proofs = prover.prove(problems, prover.space.of(places, problems))
@@ -419,7 +419,7 @@ def test_what_is_missed_by_little_gets_few_boxes(
     solver, boxes = ik.Solver(robot), []
     prove = solver._engine.diagnostician._prover.prove
 
-    def noted(problems: Problems, most: Array) -> list[Proof | None]:
+    def noted(problems: TargetBatch, most: Array) -> list[Proof | None]:
         boxes.extend(most.tolist())
         return prove(problems, most=most)
 

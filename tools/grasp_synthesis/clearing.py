@@ -9,8 +9,8 @@ import numpy as np
 
 import casadi_ik as ik
 from casadi_ik.arrays import Array
-from casadi_ik.problem.clearance import SceneCheck, Surroundings
-from casadi_ik.problem.questions import Questions, tolerances_by_finger
+from casadi_ik.problem.clearance import CollisionQuery, SceneCheck
+from casadi_ik.problem.request import Request, tolerances_by_finger
 from grasp_synthesis.fingertip_pinch import TipPinch
 
 MARGIN = 0.5e-3  # [m] that everything is apart at least
@@ -19,7 +19,7 @@ IDLE = 400  # random postures of the fingers that do not touch, behind the usual
 
 def surroundings(
     check: SceneCheck, item: str, touching: Iterable[str], pinch: TipPinch, q: Array
-) -> Surroundings:
+) -> CollisionQuery:
     """What a pinch held by q (n,) must not touch."""
     robot = check.robot
     points, normals = robot.contacts(q)
@@ -30,8 +30,8 @@ def surroundings(
         object=item,
         object_pose=pose,
     )
-    questions = Questions(robot, tolerances_by_finger(None, robot.fingers), True)
-    return check.around(questions.of_grasps([grasp], None)).rows(np.zeros(1, dtype=np.intp))
+    request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
+    return check.collision_query(request.of_grasps([grasp], None)).rows(np.zeros(1, dtype=np.intp))
 
 
 def cleared(

@@ -7,7 +7,7 @@ import numpy as np
 
 from casadi_ik.arrays import Array
 from casadi_ik.kernels.layout import Field
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import WORD, RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.symbolic.couplings import has_toggle, toggle_margins
@@ -20,9 +20,9 @@ def kept_within(robot: RobotDescription, q: Expr, enforce: Expr) -> Expr:
     return ca.if_else(enforce > 0, ca.fmin(ca.fmax(q, lower), upper), q)
 
 
-def starts_within(robot: RobotDescription, problems: Problems, q0: Array) -> Array:
+def starts_within(robot: RobotDescription, targets: TargetBatch, q0: Array) -> Array:
     """Starts (k, n), moved into the limits where the targets enforce them."""
-    return np.clip(q0, robot.lower, robot.upper) if problems.enforce_limits else q0
+    return np.clip(q0, robot.lower, robot.upper) if targets.enforce_limits else q0
 
 
 def limit_mask(robot: RobotDescription, q: Expr) -> Expr:

@@ -18,8 +18,8 @@ from casadi_ik.kernels.loop import Stepper
 from casadi_ik.problem.contacts import Kinds
 from casadi_ik.problem.jacobian_measures import JacobianMeasures
 from casadi_ik.problem.method import Method, Outcome
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import RecordedJacobian, TraceFormat, trace_format
 from casadi_ik.robots.description import RobotDescription
 
@@ -78,11 +78,11 @@ class LoopedMethod(ABC):
         """The whole iteration."""
 
     @abstractmethod
-    def begin(self, problems: Problems, q0: Array) -> Start:
+    def begin(self, targets: TargetBatch, q0: Array) -> Start:
         """Where the solves of a batch begin; `Layout.pack_rows` lays it out.
 
         Args:
-            problems: k targets.
+            targets: k targets.
             q0: (k, n) configurations to start from.
         """
 
@@ -142,18 +142,18 @@ class LoopedMethod(ABC):
         del kinds
         return self
 
-    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+    def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
         """One target, one iteration at a time; see `Method.stepper`."""
-        self._check(problems)
-        states, parameters = self.begin(problems, q0[None])
+        self._check(targets)
+        states, parameters = self.begin(targets, q0[None])
         return Stepper(self.kernel, states[0], parameters[0])
 
-    def run(self, problems: Problems, q0: Array, seed: int, trace: bool) -> Outcome:
+    def run(self, targets: TargetBatch, q0: Array, seed: int, trace: bool) -> Outcome:
         """Solve a batch; see `Method.run`. No random numbers are drawn."""
         del seed
-        self._check(problems)
+        self._check(targets)
         begun = time.perf_counter()
-        states, parameters = self.begin(problems, q0)
+        states, parameters = self.begin(targets, q0)
         result = self.kernel.run(states, parameters, self.max_iterations, trace)
         # What is done for all solves at once counts for each of them alike.
         outside = max(time.perf_counter() - begun - result.time.sum(), 0.0)
@@ -164,29 +164,29 @@ class LoopedMethod(ABC):
             status=Status.from_loop(result.status),
             iterations=result.iterations,
             restarts=self.restarts(result.states),
-            time=result.time + outside / max(len(problems), 1),
+            time=result.time + outside / max(len(targets), 1),
             phases={phase.label: spent for phase, spent in counts.items()},
             rows=result.rows,
         )
 
-    def _check(self, problems: Problems) -> None:
-        if problems.fixed is not None and not self.takes_fixed_actuators:
+    def _check(self, targets: TargetBatch) -> None:
+        if targets.fixed is not None and not self.takes_fixed_actuators:
             raise UnsupportedError(f"method {self.name!r} cannot keep actuators fixed")
         if self.takes_free_contacts:
             return
-        for name, array in problems.more.items():
+        for name, array in targets.more.items():
             given = np.argwhere(~np.isnan(array[..., 0]))
             if len(given):
-                row, finger = problems.number(int(given[0, 0])), given[0, 1]
+                row, finger = targets.number(int(given[0, 0])), given[0, 1]
                 raise RowError(
                     f"method {self.name!r} needs point and normal of every finger and knows no "
                     f"{name}; row {row} has one for {self.robot.finger_names[finger]!r}",
                     row,
                 )
-        for name, array in (("contact", problems.points), ("normal", problems.normals)):
+        for name, array in (("contact", targets.points), ("normal", targets.normals)):
             free = np.argwhere(np.isnan(array[..., 0]))
             if len(free):
-                row, finger = problems.number(int(free[0, 0])), free[0, 1]
+                row, finger = targets.number(int(free[0, 0])), free[0, 1]
                 raise RowError(
                     f"method {self.name!r} needs a {name} for every finger; row {row} has none for "
                     f"{self.robot.finger_names[finger]!r}",

@@ -40,8 +40,8 @@ from casadi_ik.methods.hand_first.state import (
 )
 from casadi_ik.problem.contacts import LENGTH
 from casadi_ik.problem.method import Outcome, Quick
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 from casadi_ik.symbolic.even_spread import even_steps
 
@@ -372,19 +372,19 @@ class Searches:
         )
         self._beyond = ctypes.c_double.from_address(base + offsets["beyond"][1])
 
-    def ask(self, problems: Problems, row: int, here: Array, given: Array) -> None:
+    def ask(self, targets: TargetBatch, row: int, here: Array, given: Array) -> None:
         """Put one of k targets in.
 
         Args:
-            problems: k targets.
+            targets: k targets.
             row: Which of them.
             here: (n,) where the robot is.
             given: Its terms.
         """
-        self.points[...], self.normals[...] = problems.points[row], problems.normals[row]
+        self.points[...], self.normals[...] = targets.points[row], targets.normals[row]
         self.here[...], self.terms[...] = here, given
         for vectors, name in zip(self.more, self.plan.layouts.contacts.data[2:], strict=True):
-            vectors[...] = problems.vectors(f"{name}s")[row]
+            vectors[...] = targets.vectors(f"{name}s")[row]
 
     def __call__(self, rounds: int) -> int | None:
         """Search for the target that stands in the arrays.
@@ -452,7 +452,7 @@ class Searches:
 
     def batch(
         self,
-        problems: Problems,
+        targets: TargetBatch,
         q0: Array,
         given: Array,
         rounds: NDArray[np.int64],
@@ -461,17 +461,17 @@ class Searches:
         """Search for k targets, some of them at a time.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             q0: (k, n) where the robot is.
             given: Their terms, (t,) or (k, t).
             rounds: (k,) at most.
             trace: Whether to keep every iteration.
         """
-        plan, count = self.plan, len(problems)
+        plan, count = self.plan, len(targets)
         data = plan.layouts.contacts.data
-        more = [problems.vectors(f"{name}s") for name in data[2:]]
+        more = [targets.vectors(f"{name}s") for name in data[2:]]
         asked = [
-            *map(np.ascontiguousarray, (problems.points, problems.normals)),
+            *map(np.ascontiguousarray, (targets.points, targets.normals)),
             np.stack(more, axis=1) if more else np.zeros(1),
             *map(np.ascontiguousarray, (q0, given)),
             rounds,

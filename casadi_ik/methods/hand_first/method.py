@@ -25,9 +25,9 @@ from casadi_ik.methods.hand_first.state import CARRIED, STAGES, beginning
 from casadi_ik.methods.hand_first.step import HandFirstStep
 from casadi_ik.problem.contacts import Kinds, usual
 from casadi_ik.problem.method import Outcome, Quick
-from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import PREFERENCES
+from casadi_ik.problem.request import PREFERENCES
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.proofs.premises import ArmSpan, arm_span, palms_in_span
 from casadi_ik.robots.description import RobotDescription
@@ -113,32 +113,32 @@ class HandFirstMethod(LoopedMethod):
         return self.options.all_rounds(self.robot)
 
     def run(
-        self, problems: Problems, q0: Array, seed: int, trace: bool, rounds: int | None = None
+        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None = None
     ) -> Outcome:
         """Solve a batch; see `Method.run`. No random numbers are drawn.
 
         `rounds` are so many of each search at most instead of all.
         """
         del seed
-        self._check(problems)
+        self._check(targets)
         if not self.kernel.compiled:
-            return self._run_from_tables(problems, q0, trace, rounds)
-        most = np.full(len(problems), self._rounds_for(problems))
+            return self._run_from_tables(targets, q0, trace, rounds)
+        most = np.full(len(targets), self._rounds_for(targets))
         if rounds is not None:
             most = np.minimum(most, rounds)
-        reachable = None if problems.palms is None else palms_in_span(self._span, problems)
+        reachable = None if targets.palms is None else palms_in_span(self._span, targets)
         if reachable is not None:
             most[~reachable] = 0  # a first round leads near what the arm cannot reach
-        with self._searches.lent(problems.enforce_limits, len(problems)) as searches:
-            return searches.batch(problems, q0, self.terms(problems), most, trace)
+        with self._searches.lent(targets.enforce_limits, len(targets)) as searches:
+            return searches.batch(targets, q0, self.terms(targets), most, trace)
 
-    def quick(self, problems: Problems, q0: Array) -> Quick | None:
+    def quick(self, targets: TargetBatch, q0: Array) -> Quick | None:
         """The answer to one target; see `QuickMethod.quick`."""
         if not self.kernel.compiled:
             return None
-        with self._searches.lent(problems.enforce_limits) as search:
-            search.ask(problems, 0, q0, self.terms(problems))
-            status = search(self._rounds_for(problems))
+        with self._searches.lent(targets.enforce_limits) as search:
+            search.ask(targets, 0, q0, self.terms(targets))
+            status = search(self._rounds_for(targets))
             return None if status is None else search.answer(status)
 
     def alone(self, enforce_limits: bool) -> Searches | None:
@@ -146,13 +146,13 @@ class HandFirstMethod(LoopedMethod):
         self.prepare()
         return Searches(self.plan(enforce_limits), 1) if self.kernel.compiled else None
 
-    def stepper(self, problems: Problems, q0: Array) -> Stepper:
+    def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
         """One target, one iteration at a time; see `Method.stepper`."""
-        self._check(problems)
-        search, rounds = self.alone(problems.enforce_limits), self._rounds_for(problems)
+        self._check(targets)
+        search, rounds = self.alone(targets.enforce_limits), self._rounds_for(targets)
         if search is None:
-            return super().stepper(problems, q0)
-        search.ask(problems, 0, q0, self.terms(problems).reshape(-1))
+            return super().stepper(targets, q0)
+        search.ask(targets, 0, q0, self.terms(targets).reshape(-1))
 
         def following(status: int, state: Array) -> Start | None:
             search.state[...] = state
@@ -163,47 +163,47 @@ class HandFirstMethod(LoopedMethod):
         search.decide(UNBEGUN, rounds)
         return Stepper(self.kernel, search.state, search.parameters, following)
 
-    def postures(self, problems: Problems, number: int) -> Array:
+    def postures(self, targets: TargetBatch, number: int) -> Array:
         """Candidates (k, candidates, hand) of a round whose postures look like the targets.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             number: The round, below `options.rounds`.
         """
-        count, terms = self.options.candidates, self.terms(problems)
+        count, terms = self.options.candidates, self.terms(targets)
         if not number or not self.kernel.compiled:
             table, most = self.seeds.table, (number + 1) * count
-            return table.nearest(problems.points, problems.normals, most)[:, -count:]
-        every = np.broadcast_to(terms, (len(problems), terms.shape[-1]))
+            return table.nearest(targets.points, targets.normals, most)[:, -count:]
+        every = np.broadcast_to(terms, (len(targets), terms.shape[-1]))
         here = np.zeros(len(self.robot.actuators))
-        with self._searches.lent(problems.enforce_limits) as search:
-            found = np.empty((len(problems), *search.postures.shape))
-            for row in range(len(problems)):
-                search.ask(problems, row, here, every[row])
+        with self._searches.lent(targets.enforce_limits) as search:
+            found = np.empty((len(targets), *search.postures.shape))
+            for row in range(len(targets)):
+                search.ask(targets, row, here, every[row])
                 found[row] = search.hands(number)
         return found
 
-    def begin(self, problems: Problems, q0: Array, number: int = 0) -> Start:
+    def begin(self, targets: TargetBatch, q0: Array, number: int = 0) -> Start:
         """A round from a table; where what is near q0 is wanted, its own hand comes first."""
-        postures = self.postures(problems, number)
-        nearest = problems.prefer == NEAREST and not number
+        postures = self.postures(targets, number)
+        nearest = targets.prefer == NEAREST and not number
         if nearest and self.robot.arm_actuators and postures.shape[1] > 1:
-            own = np.clip(q0, *problems.bounds(self.robot, UNBOUNDED))[:, None]
+            own = np.clip(q0, *targets.bounds(self.robot, UNBOUNDED))[:, None]
             own = own[:, :, list(self.robot.hand_actuators)]
             postures = np.concatenate([own, postures[:, :-1]], axis=1)
-        return self.rows(problems, q0, postures, begun=number > 0)
+        return self.rows(targets, q0, postures, begun=number > 0)
 
     def _run_from_tables(
-        self, problems: Problems, q0: Array, trace: bool, rounds: int | None
+        self, targets: TargetBatch, q0: Array, trace: bool, rounds: int | None
     ) -> Outcome:
         """Solve a batch in the virtual machine: the next nearest hands for what is left over."""
-        layout, count = self.step.layouts.state, len(problems)
+        layout, count = self.step.layouts.state, len(targets)
         status, iterations = np.zeros((2, count), dtype=np.int64)
         states, seconds = np.zeros((count, layout.size)), np.zeros(count)
         traces: list[list[NDArray[Any]]] = [[] for _ in range(count)]
-        searches = [problems]
-        if problems.prefer == NEAREST:
-            searches.append(replace(problems, prefer="limits"))
+        searches = [targets]
+        if targets.prefer == NEAREST:
+            searches.append(replace(targets, prefer="limits"))
         most = min(self.rounds, self.options.rounds, rounds or self.rounds)
         for asked, number in product(searches, range(most)):
             left = np.flatnonzero(status != Status.SOLVED)
@@ -231,10 +231,10 @@ class HandFirstMethod(LoopedMethod):
             rows=np.concatenate([none, *chain.from_iterable(traces)]) if trace else None,
         )
 
-    def _rounds_for(self, problems: Problems) -> int:
+    def _rounds_for(self, targets: TargetBatch) -> int:
         """So many; of hands that are given none from anywhere but what every target gets."""
         every = self.rounds
-        return every if problems.palms is None else min(every, self.options.first_rugged)
+        return every if targets.palms is None else min(every, self.options.first_rugged)
 
     @cached_property
     def _span(self) -> ArmSpan | None:
@@ -256,12 +256,12 @@ class HandFirstMethod(LoopedMethod):
         return earlier + np.clip(candidate, 0, self.options.candidates - 1)
 
     def rows(
-        self, problems: Problems, q0: Array, postures: Array, begun: bool = False
+        self, targets: TargetBatch, q0: Array, postures: Array, begun: bool = False
     ) -> tuple[Array, Array]:
         """States and parameters of the loop, to be changed before `run_rows`.
 
         Args:
-            problems: k targets.
+            targets: k targets.
             q0: (k, n).
             postures: (k, candidates, hand) hand postures to start from, or (k, 1, hand). Motors
                 that move free fingers only stay as in q0.
@@ -271,11 +271,11 @@ class HandFirstMethod(LoopedMethod):
             (k, ...) states and parameters.
         """
         hand = len(self.robot.hand_actuators)
-        tried = np.broadcast_to(postures, (len(problems), self.options.candidates, hand))
-        vectors = (problems.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
+        tried = np.broadcast_to(postures, (len(targets), self.options.candidates, hand))
+        vectors = (targets.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
         # A kernel's column is a vector: of a hand with one motor there is no second dimension.
-        tried = tried.reshape(len(problems), *self.first.input_shapes[-1])
-        asked = *vectors, q0, self.terms(problems), tried
+        tried = tried.reshape(len(targets), *self.first.input_shapes[-1])
+        asked = *vectors, q0, self.terms(targets), tried
         states, parameters = self.first(*asked)
         if begun:
             layout = self.step.layouts.state
@@ -287,24 +287,24 @@ class HandFirstMethod(LoopedMethod):
         """Run the compiled loop on rows as made by `rows`."""
         return self.kernel.run(states, parameters, self.max_iterations, trace)
 
-    def terms(self, problems: Problems) -> Array:
+    def terms(self, targets: TargetBatch) -> Array:
         """What `beginning` calls terms; kept, since making them costs as much as a solve."""
-        if problems.fixed is not None:
-            return self._terms_of(problems)
-        asked = problems.tolerances, problems.enforce_limits, problems.prefer
+        if targets.fixed is not None:
+            return self._terms_of(targets)
+        asked = targets.tolerances, targets.enforce_limits, targets.prefer
         kept = self._kept
         if kept is None or kept[0] != asked:
-            self._kept = kept = asked, self._terms_of(problems)
+            self._kept = kept = asked, self._terms_of(targets)
         return kept[1]
 
-    def _terms_of(self, problems: Problems) -> Array:
-        bounds = problems.bounds(self.robot, UNBOUNDED)
-        nearest = np.array([float(problems.prefer == NEAREST)])
-        every = problems.position_tolerance, problems.angle_tolerance, *bounds, nearest
+    def _terms_of(self, targets: TargetBatch) -> Array:
+        bounds = targets.bounds(self.robot, UNBOUNDED)
+        nearest = np.array([float(targets.prefer == NEAREST)])
+        every = targets.position_tolerance, targets.angle_tolerance, *bounds, nearest
         if bounds[0].ndim == 1:
             return np.concatenate(every)
         # Each target has bounds of its own.
-        rows = (np.broadcast_to(part, (len(problems), part.shape[-1])) for part in every)
+        rows = (np.broadcast_to(part, (len(targets), part.shape[-1])) for part in every)
         return np.concatenate(list(rows), axis=1)
 
     @cached_property

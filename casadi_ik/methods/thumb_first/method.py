@@ -17,8 +17,8 @@ from casadi_ik.methods.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.methods.thumb_first.state import STAGES
 from casadi_ik.methods.thumb_first.step import ThumbFirstStep
 from casadi_ik.problem.contacts import Kinds, target_values, usual
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.robots.description import RobotDescription
 
 UNBOUNDED = 1e3
@@ -81,21 +81,21 @@ class ThumbFirstMethod(LoopedMethod):
         """Build and compile the loop, and fill the table."""
         _ = self.kernel, self.table
 
-    def begin(self, problems: Problems, q0: Array) -> Start:
+    def begin(self, targets: TargetBatch, q0: Array) -> Start:
         """Start where the robot is, if its nearest is wanted, and from estimates of the palm."""
-        count, step, most = len(problems), self.step, self.options.starts
-        lower, upper = problems.bounds(self.robot, UNBOUNDED)
+        count, step, most = len(targets), self.step, self.options.starts
+        lower, upper = targets.bounds(self.robot, UNBOUNDED)
         hand = list(self.robot.hand_actuators)
         here = np.clip(q0, lower, upper)
-        nearest = problems.prefer == NEAREST
-        found = self._hands(problems, here[:, hand], nearest, most)[:, :most]
+        nearest = targets.prefer == NEAREST
+        found = self._hands(targets, here[:, hand], nearest, most)[:, :most]
         postures = np.zeros((count, most, len(hand)))
         postures[:, : found.shape[1]] = found
-        known = [~np.isnan(array[..., 0]) for array in (problems.points, problems.normals)]
+        known = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
         values = {
-            **target_values(problems),
+            **target_values(targets),
             **{
-                f"{name}s": np.nan_to_num(problems.vectors(f"{name}s"))
+                f"{name}s": np.nan_to_num(targets.vectors(f"{name}s"))
                 for name in self.step.contacts.data
             },
             "weights": np.stack(known, axis=2),
@@ -120,23 +120,23 @@ class ThumbFirstMethod(LoopedMethod):
         }
         return step.state.pack_rows(first, count), parameters
 
-    def _hands(self, problems: Problems, own: Array, nearest: bool, count: int) -> Array:
+    def _hands(self, targets: TargetBatch, own: Array, nearest: bool, count: int) -> Array:
         """Hands (k, c, hand) to begin with: of those that look alike, the nearest is first.
 
         Args:
-            problems: k targets.
+            targets: k targets.
             own: (k, hand) the robot's own.
             nearest: Whether what is near to that is wanted, not what is near to its home.
             count: How many of the table.
         """
-        targets = problems.points, problems.normals
+        wanted = targets.points, targets.normals
         home = np.tile(self._home, (len(own), 1))
         if not nearest:
-            return self.table.nearest(*targets, count, home)
-        found = self.table.nearest(*targets, 1, own)
+            return self.table.nearest(*wanted, count, home)
+        found = self.table.nearest(*wanted, 1, own)
         if count > 1:
             # What is near was a dead end: from here on as if nothing was preferred.
-            found = np.concatenate([found, self.table.nearest(*targets, count, home)], axis=1)
+            found = np.concatenate([found, self.table.nearest(*wanted, count, home)], axis=1)
         # A hand without an arm has begun there already.
         if not self.robot.arm_actuators:
             return found

@@ -29,13 +29,13 @@ from casadi_ik.papers.qiu.tasks import (
 )
 from casadi_ik.problem.contacts import (
     contact_errors,
+    goal_contacts,
     target_fields,
     target_values,
-    targets,
     within_tolerance,
 )
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import (
     ANGLE_ERROR,
     LIMIT_MASK,
@@ -143,13 +143,13 @@ class EnhancedLayouts:
             "closed_chain": RecordedJacobian(passive, singular=0.01, condition=1e5),
         }
 
-    def parameter_values(self, problems: Problems) -> dict[str, float | list[float] | Array]:
+    def parameter_values(self, targets: TargetBatch) -> dict[str, float | list[float] | Array]:
         """Values of all parameter fields for a batch."""
         options = self.options
         named = (name for name in self.parameters.names if hasattr(options, name))
         return {
-            **target_values(problems),
-            "enforce_limits": float(problems.enforce_limits),
+            **target_values(targets),
+            "enforce_limits": float(targets.enforce_limits),
             "weights": [
                 options.virtual_weight if column == VIRTUAL else options.joint_weight
                 for column in self.chain.active
@@ -236,7 +236,9 @@ class EnhancedStep(EnhancedLayouts):
         """Targets of the fingers but the thumb, seen from the palm: what eq. (5) works with."""
         state, parameters, s, p = self._inputs()
         palm = actuated(self.robot, s["q"]).kinematics.palm
-        goals = [goal for name, goal in targets(self.robot, p).items() if name != self.robot.thumb]
+        goals = [
+            goal for name, goal in goal_contacts(self.robot, p).items() if name != self.robot.thumb
+        ]
         points = ca.horzcat(*(palm.inverse_apply(goal.point) for goal in goals))
         normals = ca.horzcat(*(palm.rotation.T @ goal.normal for goal in goals))
         return ca.Function("palm_view", [state, parameters], [points, normals])
@@ -244,7 +246,7 @@ class EnhancedStep(EnhancedLayouts):
     def _reach(self) -> ca.Function:
         """One iteration of thumb reaching (section II-B)."""
         state, parameters, s, p = self._inputs()
-        robot, body, goals = self.robot, actuated(self.robot, s["q"]), targets(self.robot, p)
+        robot, body, goals = self.robot, actuated(self.robot, s["q"]), goal_contacts(self.robot, p)
         columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
         palm = palm_orientation_task(
             body, palm_orientation(robot, goals), columns, self.options.palm_error == "euler"
@@ -297,7 +299,7 @@ class EnhancedStep(EnhancedLayouts):
         """One iteration of hand alignment (section II-C), after the fingers' own step."""
         state, parameters, s, p = self._inputs()
         closed = ca.SX.sym("closed", len(self.robot.actuators))
-        robot, body, goals = self.robot, actuated(self.robot, closed), targets(self.robot, p)
+        robot, body, goals = self.robot, actuated(self.robot, closed), goal_contacts(self.robot, p)
         positions, angles = contact_errors(body.kinematics, goals, robot.finger_names)
         solved = within_tolerance(positions, angles, p["position_tolerance"], p["angle_tolerance"])
 

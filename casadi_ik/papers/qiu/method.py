@@ -12,8 +12,8 @@ from casadi_ik.methods.common.looped_method import LoopedMethod, Start
 from casadi_ik.papers.qiu.enhanced import EnhancedStep
 from casadi_ik.papers.qiu.original import OriginalStep
 from casadi_ik.papers.qiu.parameters import OriginalParameters, QiuParameters
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import RecordedJacobian
 from casadi_ik.robots.description import RobotDescription
 
@@ -33,12 +33,12 @@ class _QiuMethod(LoopedMethod, Generic[Step]):
         """The whole iteration."""
         return self.step.graph()
 
-    def begin(self, problems: Problems, q0: Array) -> Start:
+    def begin(self, targets: TargetBatch, q0: Array) -> Start:
         """Start at q0, moved into limits that are enforced."""
-        step, count = self.step, len(problems)
-        first = step.first_state(starts_within(self.robot, problems, q0))
+        step, count = self.step, len(targets)
+        first = step.first_state(starts_within(self.robot, targets, q0))
         states = step.state.pack_rows(first, count)
-        return states, step.parameters.pack_rows(step.parameter_values(problems), count)
+        return states, step.parameters.pack_rows(step.parameter_values(targets), count)
 
 
 class EnhancedMethod(_QiuMethod[EnhancedStep]):

@@ -23,13 +23,13 @@ from casadi_ik.papers.qiu.tasks import (
 )
 from casadi_ik.problem.contacts import (
     contact_errors,
+    goal_contacts,
     target_fields,
     target_values,
-    targets,
     within_tolerance,
 )
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase, Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.trace import (
     ANGLE_ERROR,
     LIMIT_MASK,
@@ -125,12 +125,12 @@ class OriginalStep:
         """Values of all state fields for starts (k, n)."""
         return {"q": starts}
 
-    def parameter_values(self, problems: Problems) -> dict[str, float | Array]:
+    def parameter_values(self, targets: TargetBatch) -> dict[str, float | Array]:
         """Values of all parameter fields for a batch."""
         named = (name for name in self.parameters.names if hasattr(self.options, name))
         return {
-            **target_values(problems),
-            "enforce_limits": float(problems.enforce_limits),
+            **target_values(targets),
+            "enforce_limits": float(targets.enforce_limits),
             **{name: float(getattr(self.options, name)) for name in named},
         }
 
@@ -159,7 +159,7 @@ class OriginalStep:
         A task is its Jacobian over the actuators that move it, and its error, [J, e] (3, k + 1).
         """
         state, parameters, s, p = self._inputs()
-        robot, goals, body = self.robot, targets(self.robot, p), actuated(self.robot, s["q"])
+        robot, goals, body = self.robot, goal_contacts(self.robot, p), actuated(self.robot, s["q"])
         arm = robot.arm_actuators
         pairs = [
             contact_tasks(body, name, goals[name], (*arm, *robot.finger_actuators(name)))

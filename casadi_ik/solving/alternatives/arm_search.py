@@ -26,8 +26,8 @@ from casadi_ik.kernels.cancellation import DriverCode, check
 from casadi_ik.kernels.codegen import driver_text
 from casadi_ik.kernels.function_kernel import MapJob, MeasureKernel, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import recipe
-from casadi_ik.problem.clearance import ROUNDING, Surroundings
-from casadi_ik.problem.questions import CLEARANCE
+from casadi_ik.problem.clearance import ROUNDING, CollisionQuery
+from casadi_ik.problem.request import CLEARANCE
 from casadi_ik.symbolic.even_spread import evenly
 
 SYMBOL = "casadi_ik_arm_search"
@@ -205,8 +205,8 @@ class ArmSearch:
         starts: Array,
         bounds: tuple[Array, Array],
         prefer: Preference,
-        around: Surroundings | None,
-        room: Array,
+        query: CollisionQuery | None,
+        surplus: Array,
         branches: bool = False,
         closer: bool = True,
         of_one: NDArray[np.intp] | None = None,
@@ -218,8 +218,8 @@ class ArmSearch:
             starts: (k, n) where the robot is.
             bounds: (n,) and (n,).
             prefer: What is preferred.
-            around: What nothing may touch; None: nothing is checked.
-            room: (k,) of what the hand alone decides [m], which no arm can exceed.
+            query: What nothing may touch; None: nothing is checked.
+            surplus: (k,) of what the hand alone decides [m], which no arm can exceed.
             branches: Whether to give the preferred arm of every branch, and the given one, instead
                 of one.
             closer: Whether to look about the values at which they were found.
@@ -232,11 +232,11 @@ class ArmSearch:
         if not len(q):
             return ArmCandidates(q, np.zeros(0, np.intp), np.zeros(0, np.int64))
         inside = bounds[0][self._columns], bounds[1][self._columns]
-        asked = _Asked(q, self._robot.palm(q), starts, inside, prefer, around, room)
+        asked = _Asked(q, self._robot.palm(q), starts, inside, prefer, query, surplus)
         groups = self._family.rows + 1 if branches else 1
         measure = _Measure(self, prefer)
         entries = [self._run, self._arms.entry]
-        entries += [] if around is None else [around.kernel.entry]
+        entries += [] if query is None else [query.kernel.entry]
         entries += [measure.address] if asked.order is Order.MEASURED else []
         if any(entry is None for entry in entries):
             return self._plain(asked, groups, of_one)
@@ -271,8 +271,8 @@ class ArmSearch:
         count, n_arm = len(asked.q), len(self._columns)
         chosen, score = np.zeros((count, groups, n_arm)), np.empty((count, groups))
         tried = np.zeros(count, dtype=np.int64)
-        given = (asked.q, asked.palms, asked.starts, *asked.bounds, asked.room)
-        q, palms, starts, lower, upper, room = map(doubles, given)
+        given = (asked.q, asked.palms, asked.starts, *asked.bounds, asked.surplus)
+        q, palms, starts, lower, upper, surplus = map(doubles, given)
         whose = None if of_one is None else np.ascontiguousarray(of_one, dtype=np.int64)
         for rows in _slices(count, whose):
             job = ArmSearchJob(
@@ -304,15 +304,15 @@ class ArmSearch:
                 score=memory(score[rows]),
                 tried=memory(tried[rows]),
             )
-            around, kept = asked.around, None
-            if around is not None and len(around.table.swung.pairs):
-                poses = around.poses[rows] if around.poses.ndim == 3 else around.poses
-                kernel, table = around.kernel, around.table.swung
+            query, kept = asked.query, None
+            if query is not None and len(query.table.swung.pairs):
+                poses = query.poses[rows] if query.poses.ndim == 3 else query.poses
+                kernel, table = query.kernel, query.table.swung
                 clear, *kept = kernel.job(np.zeros((1, 1)), poses, table, 0.0, 0.0)
                 job.check, job.clear = _address(kernel.entry), ctypes.addressof(clear)
                 job.poses, job.pose_step = clear.poses, clear.pose_step
-                job.margin, job.rounding = around.margin, ROUNDING
-                job.caps = room[rows].ctypes.data
+                job.margin, job.rounding = query.margin, ROUNDING
+                job.caps = surplus[rows].ctypes.data
             code = self._run(ctypes.byref(job))
             del kept
             measure.reraise()
@@ -374,8 +374,8 @@ class _Asked:
     starts: Array
     bounds: tuple[Array, Array]
     prefer: Preference
-    around: Surroundings | None
-    room: Array
+    query: CollisionQuery | None
+    surplus: Array
 
     @property
     def order(self) -> Order:
@@ -385,13 +385,13 @@ class _Asked:
         """(m,) of configurations of hands (m,); -inf where they touch something."""
         if not len(q):
             return np.zeros(0)
-        if self.around is None:
+        if self.query is None:
             return search.scores(q, self.starts[hand], self.prefer)
-        around = self.around.rows(hand)
-        around = Surroundings(around.kernel, around.table.swung, around.poses, around.margin)
+        query = self.query.rows(hand)
+        query = CollisionQuery(query.kernel, query.table.swung, query.poses, query.margin)
         if self.prefer == CLEARANCE:
-            return np.minimum(around.check(q).room, self.room[hand])
-        return np.where(around.free(q), search.scores(q, self.starts[hand], self.prefer), -np.inf)
+            return np.minimum(query.check(q).surplus, self.surplus[hand])
+        return np.where(query.free(q), search.scores(q, self.starts[hand], self.prefer), -np.inf)
 
 
 class _Measure:

@@ -16,13 +16,13 @@ from casadi_ik.errors import InputError
 from casadi_ik.grasps import Tolerance
 from casadi_ik.kernels import FunctionKernel
 from casadi_ik.kernels.cancellation import stop_if_cancelled
-from casadi_ik.problem.clearance import Surroundings
-from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import CLEARANCE, free_palms, preference
+from casadi_ik.problem.clearance import CollisionQuery
+from casadi_ik.problem.request import CLEARANCE, free_palms, preference
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import ContactVerdict, judge
 from casadi_ik.solving.alternatives.arm_search import ArmSearch, Preference
 from casadi_ik.solving.alternatives.branches import ArmBranches
-from casadi_ik.solving.trials import Bounds, Descent, HandMethod, Trials, repeated
+from casadi_ik.solving.trials import Bounds, HandMethod, LocalRefinement, Subproblems, repeated
 from casadi_ik.symbolic.kinematics import actuated
 from casadi_ik.symbolic.singular_values import manipulability
 
@@ -66,7 +66,7 @@ class AlternativeFinder:
     def __init__(self, robot: ArmHand, method: HandMethod, compiled: bool = True) -> None:
         """Take the robot and hand-first on it."""
         self.robot = robot
-        self.trials = Trials(robot, method)
+        self.trials = Subproblems(robot, method)
         self._compiled = compiled
         self._arm = list(robot.description.arm_actuators)
         self.hand = list(robot.description.hand_actuators)
@@ -95,20 +95,20 @@ class AlternativeFinder:
 
     def find(
         self,
-        problems: Problems,
+        targets: TargetBatch,
         q0: Array,
         seed: int,
         limit: int,
         prefer: str,
         apart: float = APART,
-        around: Surroundings | None = None,
+        query: CollisionQuery | None = None,
     ) -> tuple[Alternative, ...]:
         """Different solutions of one target, best first.
 
         All that are found are ranked; one that is closer than `apart` to a better one is left out.
 
         Args:
-            problems: One target.
+            targets: One target.
             q0: (n,) where the robot is.
             seed: Of the starts of arms without a closed form.
             limit: How many at most.
@@ -117,7 +117,7 @@ class AlternativeFinder:
                 a hand that may close as it likes, and elbows that may swing a little further,
                 would else fill the list with what is hardly to be told apart.
 
-            around: What solutions must not touch; None: nothing is checked.
+            query: What solutions must not touch; None: nothing is checked.
 
         Raises:
             InputError: Bad limit, preference or distance.
@@ -126,58 +126,58 @@ class AlternativeFinder:
             raise InputError(f"limit: found {limit!r}, expected an integer >= 1")
         preference(prefer, started=True)
         apart = checked_distance(apart)
-        limits = self.trials.limits(problems).first
+        limits = self.trials.limits(targets).first
         found: list[_Found] = []
-        for number, q in enumerate(self._postures(problems, q0, limits)):
-            found += self._arms(problems, q, number, limits, q0, seed, prefer, around)
+        for number, q in enumerate(self._postures(targets, q0, limits)):
+            found += self._arms(targets, q, number, limits, q0, seed, prefer, query)
         if not found:
             return ()
         q = np.stack([item.q for item in found])
-        solved = self.trials.solved(problems, q, problems.enforce_limits)
-        if around is not None:
-            solved &= around.free(q)
-        keys = np.stack([self._valued(q, q0, prefer, around), self._margins(q, self._arm)])
+        solved = self.trials.solved(targets, q, targets.enforce_limits)
+        if query is not None:
+            solved &= query.free(q)
+        keys = np.stack([self._valued(q, q0, prefer, query), self._margins(q, self._arm)])
         order = [int(i) for i in np.lexsort(-keys[::-1]) if solved[i]]
         parts = self._parts(q[order], list(range(q.shape[1])))
         kept = distinct(parts, apart, limit)
-        return tuple(self._described(problems, found[order[i]], q0) for i in kept)
+        return tuple(self._described(targets, found[order[i]], q0) for i in kept)
 
-    def best_arm(self, problems: Problems, q: Array, q0: Array, seed: int, prefer: str) -> Array:
+    def best_arm(self, targets: TargetBatch, q: Array, q0: Array, seed: int, prefer: str) -> Array:
         """The solution (n,) with the hand where a given one has it, and the best arm for it.
 
         Args:
-            problems: One target.
+            targets: One target.
             q: (n,) a solution.
             q0: (n,) where the robot is.
             seed: Of the starts of arms without a closed form.
             prefer: One of `PREFERENCES`.
         """
-        limits = self.trials.limits(problems).first
-        found = self._arms(problems, q, 0, limits, q0, seed, prefer)
+        limits = self.trials.limits(targets).first
+        found = self._arms(targets, q, 0, limits, q0, seed, prefer)
         every = np.stack([q, *(item.q for item in found)])
-        solved = self.trials.solved(problems, every, problems.enforce_limits)
+        solved = self.trials.solved(targets, every, targets.enforce_limits)
         every = every[solved] if solved.any() else q[None]
         return every[int(np.argmax(self.score(every, q0, prefer)))]
 
-    def _postures(self, problems: Problems, q0: Array, limits: Bounds) -> list[Array]:
+    def _postures(self, targets: TargetBatch, q0: Array, limits: Bounds) -> list[Array]:
         """Solutions (n,) with different hands, from every candidate of every round."""
         trials, method = self.trials, self.trials.method
         rounds = range(method.options.rounds)
-        postures = np.concatenate([method.postures(problems, number)[0] for number in rounds])
+        postures = np.concatenate([method.postures(targets, number)[0] for number in rounds])
         starts = np.tile(limits.clip(q0), (len(postures), 1))
-        asked = repeated(problems, len(postures))
+        asked = repeated(targets, len(postures))
         turns = np.arange(len(postures))
         states, parameters = trials.posture_rows(asked, starts, postures, turns)
         loose = parameters.copy()
         trials.set_tolerance(parameters, CLOSE)
         q = trials.run(states, parameters)
-        exact = replace(problems, tolerance=Tolerance(10 * CLOSE, 10 * CLOSE))
-        kept = q[trials.solved(exact, q, problems.enforce_limits)]
+        exact = replace(targets, tolerance=Tolerance(10 * CLOSE, 10 * CLOSE))
+        kept = q[trials.solved(exact, q, targets.enforce_limits)]
         if not len(kept):
             # Reachable thanks to the tolerances only, if at all.
             q = np.concatenate([q, trials.run(states, loose)])
-            kept = q[trials.solved(problems, q, problems.enforce_limits)]
-        parts = self.hand_parts(kept, np.repeat(free_palms(self.robot, problems), len(kept)))
+            kept = q[trials.solved(targets, q, targets.enforce_limits)]
+        parts = self.hand_parts(kept, np.repeat(free_palms(self.robot, targets), len(kept)))
         return [kept[i] for i in distinct(parts, DISTINCT)]
 
     def hand_parts(self, q: Array, free: NDArray[np.bool_]) -> Array:
@@ -198,20 +198,20 @@ class AlternativeFinder:
 
     def _arms(
         self,
-        problems: Problems,
+        targets: TargetBatch,
         q: Array,
         posture: int,
         limits: Bounds,
         q0: Array,
         seed: int,
         prefer: str,
-        around: Surroundings | None = None,
+        query: CollisionQuery | None = None,
     ) -> list[_Found]:
         """Every arm that brings the hand of q where it is."""
         if not self._arm:
             return [_Found(q, posture)]
         if self._branches is None:
-            return [_Found(arm, posture) for arm in self._searched(problems, q, seed)]
+            return [_Found(arm, posture) for arm in self._searched(targets, q, seed)]
         palm = self.robot.palm(q)
         lower, upper = (self._seen_by_form(end, limits) for end in (limits.lower, limits.upper))
 
@@ -221,7 +221,7 @@ class AlternativeFinder:
             return limits.clip(whole)
 
         def valued(arms: Array) -> Array:
-            return self._valued(with_arm(arms), q0, prefer, around, True)
+            return self._valued(with_arm(arms), q0, prefer, query, True)
 
         found = []
         for branch in self._branches.find(palm, lower, upper):
@@ -230,10 +230,10 @@ class AlternativeFinder:
             found.append(_Found(with_arm(arm[None])[0], posture, branch, swivel))
         if self._branches.family.is_iterative:
             # A stretch may be shorter than the positions are apart.
-            found += [_Found(arm, posture) for arm in self._searched(problems, q, seed)]
+            found += [_Found(arm, posture) for arm in self._searched(targets, q, seed)]
             parts = self._parts(np.stack([item.q for item in found]), self._arm)
             return [found[i] for i in distinct(parts, DISTINCT)]
-        return self._exact(problems, found) or [_Found(q, posture)]
+        return self._exact(targets, found) or [_Found(q, posture)]
 
     def _seen_by_form(self, end: Array, limits: Bounds) -> Array:
         """(a,) bounds of the arm, those of held joints in the turn in which a form gives them."""
@@ -242,24 +242,24 @@ class AlternativeFinder:
         moved = np.where(limits.lower < limits.upper, end, end - 2 * np.pi * turns)
         return moved[self._arm]
 
-    def _exact(self, problems: Problems, found: list[_Found]) -> list[_Found]:
+    def _exact(self, targets: TargetBatch, found: list[_Found]) -> list[_Found]:
         """Arms that are only nearly of their form are brought to the contacts."""
         family = self.trials.method.step.arm
         if not found or family is None or family.exact:
             return found
         starts = np.stack([item.q for item in found])
-        ends = Descent(self.trials, problems).run(np.zeros(len(found), np.intp), starts)
+        ends = LocalRefinement(self.trials, targets).run(np.zeros(len(found), np.intp), starts)
         return [replace(item, q=end) for item, end in zip(found, ends, strict=True)]
 
-    def _searched(self, problems: Problems, q: Array, seed: int) -> list[Array]:
+    def _searched(self, targets: TargetBatch, q: Array, seed: int) -> list[Array]:
         """Different arms found from random ones, the hand starting as in q."""
         starts = self.robot.random(np.random.default_rng(seed), ARMS)
         starts[:, self.hand] = q[self.hand]
         starts[0] = q
-        ends = Descent(self.trials, problems).run(np.zeros(ARMS, np.intp), starts)
+        ends = LocalRefinement(self.trials, targets).run(np.zeros(ARMS, np.intp), starts)
         ends = np.concatenate([q[None], ends])
         same = (np.abs(self._parts(ends - q, self.hand)) < DISTINCT).all(axis=1)
-        kept = ends[same & self.trials.solved(problems, ends, problems.enforce_limits)]
+        kept = ends[same & self.trials.solved(targets, ends, targets.enforce_limits)]
         return [kept[i] for i in distinct(self._parts(kept, self._arm), DISTINCT)]
 
     def _parts(self, q: Array, columns: list[int]) -> Array:
@@ -280,16 +280,16 @@ class AlternativeFinder:
         q: Array,
         q0: Array,
         prefer: str,
-        around: Surroundings | None,
+        query: CollisionQuery | None,
         arm_only: bool = False,
     ) -> Array:
         """(k,) `score`, of margins over the arm only if asked; what is not free comes last."""
         columns = self._arm if arm_only else None
-        if around is None:
+        if query is None:
             return self.score(q, q0, prefer, columns)
-        room = around.check(q).room
-        score = self.score(q, q0, prefer, columns, room)
-        return np.where(room >= 0, score, room - BLOCKED)
+        surplus = query.check(q).surplus
+        score = self.score(q, q0, prefer, columns, surplus)
+        return np.where(surplus >= 0, score, surplus - BLOCKED)
 
     def score(
         self,
@@ -297,7 +297,7 @@ class AlternativeFinder:
         q0: Array,
         prefer: Preference,
         columns: list[int] | None = None,
-        room: Array | None = None,
+        surplus: Array | None = None,
     ) -> Array:
         """(k,) what is preferred of configurations, higher is better.
 
@@ -306,12 +306,12 @@ class AlternativeFinder:
             q0: (n,) or (k, n) where the robot is.
             prefer: What is preferred.
             columns: Motors whose distance from the limits counts; None: all.
-            room: (k,) for "clearance".
+            surplus: (k,) for "clearance".
         """
         if callable(prefer):
             return np.asarray(prefer(q), dtype=float)
-        if prefer == CLEARANCE and room is not None:
-            return room
+        if prefer == CLEARANCE and surplus is not None:
+            return surplus
         every = list(range(q.shape[1]))
         if prefer == "limits":
             return self._margins(q, every if columns is None else columns)
@@ -322,15 +322,15 @@ class AlternativeFinder:
     def _measured(self, q: Array) -> Array:
         return self.manipulability(q)[0] if self._arm else np.zeros(len(q))
 
-    def _described(self, problems: Problems, found: _Found, q0: Array) -> Alternative:
+    def _described(self, targets: TargetBatch, found: _Found, q0: Array) -> Alternative:
         q = found.q[None]
-        verdict = judge(self.robot, problems, q)
+        verdict = judge(self.robot, targets, q)
         contacts = {
             name: ContactVerdict(
                 float(verdict.position_error[0, i]),
                 float(verdict.angle_error[0, i]),
                 bool(verdict.ok[0, i]),
-                problems.tolerances[i],
+                targets.tolerances[i],
             )
             for i, name in enumerate(self.robot.fingers)
         }

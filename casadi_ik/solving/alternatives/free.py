@@ -21,17 +21,17 @@ from numpy.typing import NDArray
 from casadi_ik.answers.solution import BatchSolution, CollisionReport
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Bools
-from casadi_ik.problem.clearance import ROUNDING, Clearances, Surroundings
+from casadi_ik.problem.clearance import ROUNDING, Clearances, CollisionQuery
 from casadi_ik.problem.contacts import by_kinds
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.problems import Problems
-from casadi_ik.problem.questions import CLEARANCE, free_palms
+from casadi_ik.problem.request import CLEARANCE, free_palms
 from casadi_ik.problem.status import Status
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import SolvedVerdict, judge_one
 from casadi_ik.solving.alternatives.arm_search import Preference
 from casadi_ik.solving.alternatives.finder import AlternativeFinder
 from casadi_ik.solving.batch_parts import judged
-from casadi_ik.solving.trials import Descent
+from casadi_ik.solving.trials import LocalRefinement
 from casadi_ik.symbolic.even_spread import even_steps
 
 USUAL = "limits"
@@ -111,8 +111,8 @@ class FreeAnswers:
 
 def free_answers(
     finder: AlternativeFinder,
-    problems: Problems,
-    around: Surroundings,
+    targets: TargetBatch,
+    query: CollisionQuery,
     q: Array,
     starts: Array,
     seed: int,
@@ -123,8 +123,8 @@ def free_answers(
 
     Args:
         finder: Of the robot.
-        problems: The targets.
-        around: What they are checked against.
+        targets: The targets.
+        query: What they are checked against.
         q: (k, n) answers, whether or not they are free.
         starts: (k, n) where the robot is.
         seed: Of random arms.
@@ -133,25 +133,25 @@ def free_answers(
         reasons: Whether to find out if those without one would have one without the scene, or if
             the robot could pass through itself.
     """
-    found = _searched(finder, problems, around, q, starts, seed, every, reasons)
+    found = _searched(finder, targets, query, q, starts, seed, every, reasons)
     home = np.tile(finder.robot.home, (len(q), 1))
-    biased = problems.prefer != USUAL or not np.array_equal(starts, home)
+    biased = targets.prefer != USUAL or not np.array_equal(starts, home)
     left = np.flatnonzero(~found.free)
     if not biased or not len(left):
         return found
     # A preference orders answers; whether there is one it does not decide.
-    some, trials = replace(problems.rows(left), prefer=USUAL), finder.trials
+    some, trials = replace(targets.rows(left), prefer=USUAL), finder.trials
     ends = trials.method.run(some, home[left], seed, False).q
     met = trials.solved(some, ends, some.enforce_limits)
     left, some, ends = left[met], some.rows(np.flatnonzero(met)), ends[met]
-    again = _searched(finder, some, around.rows(left), ends, home[left], seed, False, False)
+    again = _searched(finder, some, query.rows(left), ends, home[left], seed, False, False)
     return found.with_free(left, again)
 
 
 def _searched(
     finder: AlternativeFinder,
-    problems: Problems,
-    around: Surroundings,
+    targets: TargetBatch,
+    query: CollisionQuery,
     q: Array,
     starts: Array,
     seed: int,
@@ -164,7 +164,7 @@ def _searched(
     parts = []
     for first in range(0, len(q), PARAMETERS.together):
         rows = np.arange(first, min(first + PARAMETERS.together, len(q)))
-        some = problems.rows(rows), around.rows(rows), starts[rows]
+        some = targets.rows(rows), query.rows(rows), starts[rows]
         search = FreeSearch(finder, *some, seed)
         if every:
             search.take(q[rows], np.arange(len(rows)))
@@ -186,26 +186,26 @@ class FreeSearch:
     def __init__(
         self,
         finder: AlternativeFinder,
-        problems: Problems,
-        around: Surroundings,
+        targets: TargetBatch,
+        query: CollisionQuery,
         starts: Array,
         seed: int,
     ) -> None:
         self.finder, self.arm_search = finder, finder.arm_search
-        self.problems, self.around = problems, around
+        self.targets, self.query = targets, query
         self.starts, self.seed = starts, seed
         self.trials = finder.trials
-        self.limits = self.trials.limits(problems)
+        self.limits = self.trials.limits(targets)
         count, n = starts.shape
         self.best, self.score = np.full((count, n), np.nan), np.full(count, -np.inf)
-        self.nearest, self.room = np.full((count, n), np.nan), np.full(count, -np.inf)
+        self.nearest, self.surplus = np.full((count, n), np.nan), np.full(count, -np.inf)
         self.free = np.zeros(count, dtype=bool)
         self.tried = np.zeros(count, dtype=np.int64)
         self.hands: list[tuple[Array, NDArray[np.intp], Array]] = []
         robot, hand = finder.robot, finder.hand
-        self._idle = UnconstrainedFingers(robot, problems)
+        self._idle = UnconstrainedFingers(robot, targets)
         self._ranges = np.maximum(robot.upper - robot.lower, PARAMETERS.least_range)
-        self._palms = free_palms(robot, problems)
+        self._palms = free_palms(robot, targets)
         size = len(hand) + 12 * bool(self._palms.any())
         self._known, self._searched = (
             Deduplicator(count, size, PARAMETERS.alike) for _ in range(2)
@@ -213,8 +213,8 @@ class FreeSearch:
         self._fresh = np.ones(count, dtype=bool)
 
     @cached_property
-    def _descent(self) -> Descent:
-        return Descent(self.trials, self.problems)
+    def _descent(self) -> LocalRefinement:
+        return LocalRefinement(self.trials, self.targets)
 
     def run(self, q: Array, every: bool = False) -> None:
         """Look until all are free; or first, if asked, at the hands of a round whether or not."""
@@ -230,48 +230,48 @@ class FreeSearch:
         """Keep the preferred free ones of configurations (m, n), and the nearest; their room."""
         if not len(q):
             return np.zeros(0)
-        room = self.around.rows(owner).check(q).room
-        rows = best_of_each(owner, room, self.room)
-        self.nearest[owner[rows]], self.room[owner[rows]] = q[rows], room[rows]
-        kept = np.flatnonzero(room >= -ROUNDING)
+        surplus = self.query.rows(owner).check(q).surplus
+        rows = best_of_each(owner, surplus, self.surplus)
+        self.nearest[owner[rows]], self.surplus[owner[rows]] = q[rows], surplus[rows]
+        kept = np.flatnonzero(surplus >= -ROUNDING)
         if len(kept):
             some, mine = q[kept], owner[kept]
             score = self.finder.score(
-                some, self.starts[mine], self.problems.prefer, room=room[kept]
+                some, self.starts[mine], self.targets.prefer, surplus=surplus[kept]
             )
             rows = best_of_each(mine, score, self.score)
             self.best[mine[rows]], self.score[mine[rows]] = some[rows], score[rows]
             self.free[mine[rows]] = True
-        return room
+        return surplus
 
     def try_hands(self, q: Array, owner: NDArray[np.intp]) -> None:
         """The preferred free arms of hands (m, n) of targets."""
         if not len(q):
             return
-        q = self._idle.aside(q, owner, self.around.held)
+        q = self._idle.aside(q, owner, self.query.held)
         if self.arm_search is None:
             self.take(q, owner)
             self.hands.append((q, owner, np.zeros(len(q))))
             np.add.at(self.tried, owner, 1)
             self._fresh[owner] = True
             return
-        room = self.around.rows(owner).held.check(q).room
+        surplus = self.query.rows(owner).held.check(q).surplus
         parts = self.finder.hand_parts(q, self._palms[owner])
         fresh = self._known.add(parts, owner)
         self._fresh[owner[fresh]] = True
-        self.hands.append((q[fresh], owner[fresh], room[fresh]))
-        kept = np.flatnonzero(room >= -ROUNDING)
-        np.add.at(self.tried, owner[room < -ROUNDING], 1)
+        self.hands.append((q[fresh], owner[fresh], surplus[fresh]))
+        kept = np.flatnonzero(surplus >= -ROUNDING)
+        np.add.at(self.tried, owner[surplus < -ROUNDING], 1)
         kept = kept[self._searched.add(parts[kept], owner[kept])]
         kept = kept[self._in_order(q[kept], owner[kept])]
-        found, mine, tried = self._arms(q[kept], owner[kept], room[kept], self.around)
+        found, mine, tried = self._arms(q[kept], owner[kept], surplus[kept], self.query)
         np.add.at(self.tried, owner[kept], tried)
         self.take(found, mine)
 
     def _in_order(self, q: Array, owner: NDArray[np.intp]) -> NDArray[np.intp]:
         """Hands target by target, the preferred ones first as far as the hand goes."""
         hand = self.finder.hand
-        if self.problems.prefer == "q0":
+        if self.targets.prefer == "q0":
             off = ((q - self.starts[owner]) / self._ranges)[:, hand]
             return np.lexsort((np.square(off).sum(axis=1), owner))
         return np.lexsort((-self.finder.score(q, q, "limits", hand), owner))
@@ -280,21 +280,21 @@ class FreeSearch:
         self,
         q: Array,
         owner: NDArray[np.intp],
-        room: Array,
-        around: Surroundings,
+        surplus: Array,
+        query: CollisionQuery,
         prefer: Preference | None = None,
     ) -> tuple[Array, NDArray[np.intp], NDArray[np.int64]]:
         """Preferred arms of hands, their targets, and how many were tried for each hand."""
         arms = self.arm_search
         assert arms is not None
-        asked = prefer or self.problems.prefer
+        asked = prefer or self.targets.prefer
         found = arms.choose(
             q,
             self.starts[owner],
             (self.limits.first.lower, self.limits.first.upper),
             asked,
-            around.rows(owner),
-            room,
+            query.rows(owner),
+            surplus,
             of_one=owner if asked in ("limits", "q0") else None,
         )
         return *self._solved(found.q, owner[found.owner]), found.tried
@@ -308,13 +308,13 @@ class FreeSearch:
             if not len(rows):
                 break
             self._fresh[:] = False
-            some = self.problems.rows(rows)
+            some = self.targets.rows(rows)
             postures = method.postures(some, number)
             count = postures.shape[1]
             owner = np.repeat(rows, count)
             starts = self.limits.of(owner).clip(self.starts[owner])
             flat = postures.reshape(len(owner), postures.shape[2])
-            asked = self.problems.rows(owner)
+            asked = self.targets.rows(owner)
             turns = number * count + np.tile(np.arange(count), len(rows))
             ends = self.trials.run(*self.trials.posture_rows(asked, starts, flat, turns))
             yield self._solved(ends, owner)
@@ -326,7 +326,7 @@ class FreeSearch:
             return
         count = PARAMETERS.starts if self.arm_search is None else PARAMETERS.hands
         owner = np.repeat(rows, count)
-        numbers = np.array([self.problems.number(int(row)) for row in rows])
+        numbers = np.array([self.targets.number(int(row)) for row in rows])
         starts = np.concatenate(_shifted(robot, self.seed, numbers, count))
         last = self.hands[0][0]
         starts[::2, hand] = last[owner[::2]][:, hand]
@@ -336,37 +336,37 @@ class FreeSearch:
     def _solved(self, q: Array, owner: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
         if not len(q):
             return q, owner
-        asked = self.problems.rows(owner)
+        asked = self.targets.rows(owner)
         good = self.trials.solved(asked, q, asked.enforce_limits)
         return q[good], owner[good]
 
     def _find_nearest(self, rows: NDArray[np.intp]) -> None:
         """The answers with most room, of the hands with most."""
-        q, owner, room = self._hands_of(rows)
+        q, owner, surplus = self._hands_of(rows)
         if self.arm_search is None:
             return
-        kept = first_of_each(owner, np.lexsort((-room, owner)), 1)
-        found, mine, _ = self._arms(q[kept], owner[kept], room[kept], self.around, CLEARANCE)
+        kept = first_of_each(owner, np.lexsort((-surplus, owner)), 1)
+        found, mine, _ = self._arms(q[kept], owner[kept], surplus[kept], self.query, CLEARANCE)
         self.take(np.concatenate([found, q[kept]]), np.concatenate([mine, owner[kept]]))
 
     def _hands_of(self, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp], Array]:
         """All hands of some targets, their owners and their room."""
-        q, owner, room = (np.concatenate(each) for each in zip(*self.hands, strict=True))
+        q, owner, surplus = (np.concatenate(each) for each in zip(*self.hands, strict=True))
         mine = np.isin(owner, rows)
-        return q[mine], owner[mine], room[mine]
+        return q[mine], owner[mine], surplus[mine]
 
     def _escape(self) -> None:
         """Steps away from what is nearest, brought back to the contacts."""
         ranges, n = self._ranges, len(self._ranges)
-        rows = np.flatnonzero(~self.free & (self.room > -PARAMETERS.deep))
+        rows = np.flatnonzero(~self.free & (self.surplus > -PARAMETERS.deep))
         for _ in range(PARAMETERS.escapes):
             if not len(rows):
                 return
-            before = self.room[rows].copy()
+            before = self.surplus[rows].copy()
             nudged = self.nearest[rows][:, None] + np.diag(PARAMETERS.nudge * ranges)
-            around = self.around.rows(np.repeat(rows, n))
-            room = around.check(nudged.reshape(-1, n)).room.reshape(-1, n)
-            way = (room - before[:, None]) / PARAMETERS.nudge
+            query = self.query.rows(np.repeat(rows, n))
+            surplus = query.check(nudged.reshape(-1, n)).surplus.reshape(-1, n)
+            way = (surplus - before[:, None]) / PARAMETERS.nudge
             way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
             owner = np.repeat(rows, len(PARAMETERS.steps))
             steps = np.tile(PARAMETERS.steps, len(rows))[:, None]
@@ -375,7 +375,7 @@ class FreeSearch:
             )
             ends = self._descent.run(owner, self.limits.of(owner).clip(there))
             self.take(*self._solved(ends, owner))
-            rows = rows[~self.free[rows] & (self.room[rows] > (1 - PARAMETERS.gain) * before)]
+            rows = rows[~self.free[rows] & (self.surplus[rows] > (1 - PARAMETERS.gain) * before)]
 
     def found(self, reasons: bool) -> FreeAnswers:
         """What it came to; whether it would work without the scene or the robot, if asked."""
@@ -384,34 +384,36 @@ class FreeSearch:
         blocked = np.flatnonzero(~self.free)
         if not len(blocked):
             return FreeAnswers(q, self.free, tuple(reports))
-        clear = self.around.rows(blocked).check(q[blocked])
-        alone = self._possible(blocked, self.around.robot_alone) if reasons else None
-        passing = self._possible(blocked, self.around.scene_alone) if reasons else None
+        clear = self.query.rows(blocked).check(q[blocked])
+        alone = self._possible(blocked, self.query.robot_alone) if reasons else None
+        passing = self._possible(blocked, self.query.scene_alone) if reasons else None
         for i, row in enumerate(blocked.tolist()):
             pair = clear.pair(i)
             assert pair is not None
             reports[row] = CollisionReport(
                 pair,
-                -float(clear.room[i]),
+                -float(clear.surplus[i]),
                 int(self.tried[row]),
                 None if alone is None else bool(alone[row]),
                 None if passing is None else bool(passing[row]),
             )
         return FreeAnswers(q, self.free, tuple(reports))
 
-    def _possible(self, rows: NDArray[np.intp], around: Surroundings) -> NDArray[np.bool_]:
+    def _possible(self, rows: NDArray[np.intp], query: CollisionQuery) -> NDArray[np.bool_]:
         """(all targets,) whether one of the hands is free of some of the pairs alone."""
-        q, owner, room = self._hands_of(rows)
+        q, owner, surplus = self._hands_of(rows)
         possible = np.zeros(len(self.free), dtype=bool)
         if self.arm_search is None:
-            possible[owner[around.rows(owner).free(q)]] = True
+            possible[owner[query.rows(owner).free(q)]] = True
             return possible
-        kept = np.flatnonzero(around.rows(owner).held.free(q))
+        kept = np.flatnonzero(query.rows(owner).held.free(q))
         kept = kept[
-            first_of_each(owner[kept], np.lexsort((-room[kept], owner[kept])), PARAMETERS.hopeful)
+            first_of_each(
+                owner[kept], np.lexsort((-surplus[kept], owner[kept])), PARAMETERS.hopeful
+            )
         ]
         any_room = np.full(len(kept), np.inf)
-        _, mine, _ = self._arms(q[kept], owner[kept], any_room, around, "limits")
+        _, mine, _ = self._arms(q[kept], owner[kept], any_room, query, "limits")
         possible[mine] = True
         return possible
 
@@ -431,10 +433,10 @@ def _shifted(robot: ArmHand, seed: int, numbers: NDArray[np.intp], count: int) -
 class UnconstrainedFingers:
     """The motors of k targets' hands that move no finger with a contact."""
 
-    def __init__(self, robot: ArmHand, problems: Problems) -> None:
+    def __init__(self, robot: ArmHand, targets: TargetBatch) -> None:
         self._description = description = robot.description
-        free = np.isnan(problems.points[..., 0]) & np.isnan(problems.normals[..., 0])
-        for more in problems.more.values():
+        free = np.isnan(targets.points[..., 0]) & np.isnan(targets.normals[..., 0])
+        for more in targets.more.values():
             free &= np.isnan(more[..., 0])
         busy = np.zeros((len(description.finger_names), len(robot.lower)), dtype=bool)
         for finger, name in enumerate(description.finger_names):
@@ -442,8 +444,8 @@ class UnconstrainedFingers:
         hand = np.zeros(len(robot.lower), dtype=bool)
         hand[list(description.hand_actuators)] = True
         self._motors: Bools = hand & ~(~free[:, :, None] & busy).any(axis=1)
-        if problems.fixed is not None:
-            self._motors &= np.isnan(problems.fixed)
+        if targets.fixed is not None:
+            self._motors &= np.isnan(targets.fixed)
         parts = (
             0.5 + np.arange(PARAMETERS.idle_postures)[:, None] * even_steps(len(robot.lower))
         ) % 1.0
@@ -453,13 +455,13 @@ class UnconstrainedFingers:
         about = (parts[: PARAMETERS.idle_closer] - 0.5) * ranges
         self._spread = (None, *(part * about for part in PARAMETERS.idle_parts))
 
-    def aside(self, q: Array, owner: NDArray[np.intp], around: Surroundings) -> Array:
+    def aside(self, q: Array, owner: NDArray[np.intp], query: CollisionQuery) -> Array:
         """Hands, those that touch something by themselves with their idle fingers elsewhere.
 
         Args:
             q: (m, n) configurations.
             owner: (m,) their targets.
-            around: What hands by themselves are checked against.
+            query: What hands by themselves are checked against.
 
         Returns:
             (m, n) each as it is, or with the idle fingers where they have most room.
@@ -467,10 +469,10 @@ class UnconstrainedFingers:
         some = np.flatnonzero(self._motors[owner].any(axis=1))
         if not len(some):
             return q
-        of_idle, others = around.parted(self._links)
+        of_idle, others = query.parted(self._links)
         # What the idle fingers have no part in they do not help.
         some = some[others.rows(owner[some]).free(q[some])]
-        before = of_idle.rows(owner[some]).check(q[some]).room
+        before = of_idle.rows(owner[some]).check(q[some]).surplus
         touching = before < -ROUNDING
         some, before = some[touching], before[touching]
         if not len(some):
@@ -483,10 +485,12 @@ class UnconstrainedFingers:
             tried = np.where(motors[:, None], np.clip(there, *self._limits), about)
             count = tried.shape[1]
             rows = np.repeat(owner[some], count)
-            room = of_idle.rows(rows).check(tried.reshape(-1, q.shape[1])).room.reshape(-1, count)
-            best = room.argmax(axis=1)
+            surplus = (
+                of_idle.rows(rows).check(tried.reshape(-1, q.shape[1])).surplus.reshape(-1, count)
+            )
+            best = surplus.argmax(axis=1)
             each = np.arange(len(some))
-            most = room[each, best]
+            most = surplus[each, best]
             better = most > before
             moved[some[better]] = tried[each, best][better]
             before = np.maximum(before, most)
@@ -562,9 +566,9 @@ class Deduplicator:
 
 
 def resolve_collisions(
-    finder_of: Callable[[Problems], AlternativeFinder],
-    problems: Problems,
-    around: Surroundings,
+    finder_of: Callable[[TargetBatch], AlternativeFinder],
+    targets: TargetBatch,
+    query: CollisionQuery,
     starts: Array,
     seed: int,
     outcome: Outcome,
@@ -575,28 +579,28 @@ def resolve_collisions(
 
     Args:
         finder_of: By targets of one kind the finder for them.
-        problems: k targets.
-        around: What they are checked against.
+        targets: k targets.
+        query: What they are checked against.
         starts: (k, n) where the robot is.
         seed: Of all random numbers.
         outcome: What the method came to.
         batch: The verdicts on it.
         reasons: Whether the reports say what else would do, see `free_answers`.
     """
-    every = problems.prefer in RANKED
+    every = targets.prefer in RANKED
     touching = batch.status == Status.COLLISION
     rows = np.flatnonzero(touching | batch.success if every else touching)
     if not len(rows):
         return batch
     begin, q = time.perf_counter(), batch.q.copy()
     reports = list(batch.collisions)
-    numbers = np.array([problems.number(row) for row in rows.tolist()], dtype=np.intp)
+    numbers = np.array([targets.number(row) for row in rows.tolist()], dtype=np.intp)
     # A target's random numbers are its own, whichever others are looked at with it.
-    asked = replace(problems.rows(rows), picked=numbers)
+    asked = replace(targets.rows(rows), picked=numbers)
     robot = finder_of(asked.rows(slice(0, 1))).robot
     for _, of_kinds, some in by_kinds(asked):
         chosen = rows if of_kinds is None else rows[of_kinds]
-        nearby, begun = around.rows(chosen), (q[chosen], starts[chosen])
+        nearby, begun = query.rows(chosen), (q[chosen], starts[chosen])
         found = free_answers(finder_of(some), some, nearby, *begun, seed, every, reasons)
         q[chosen] = found.q
         for row, report in zip(chosen.tolist(), found.reports, strict=True):
@@ -606,15 +610,15 @@ def resolve_collisions(
     status = np.where(touching, int(Status.SOLVED), outcome.status)
     ended = replace(outcome, q=q, time=seconds, status=status)
     return replace(
-        judged(robot, batch.method, problems, ended, around),
+        judged(robot, batch.method, targets, ended, query),
         collisions=tuple(reports),
     )
 
 
 def resolve_at_once(
     finder: AlternativeFinder,
-    problems: Problems,
-    around: Surroundings,
+    targets: TargetBatch,
+    query: CollisionQuery,
     q: Array,
     start: Array,
     others: bool = False,
@@ -625,13 +629,13 @@ def resolve_at_once(
 
     Args:
         finder: For the target's kinds.
-        problems: One target.
-        around: What it is checked against.
+        targets: One target.
+        query: What it is checked against.
         q: (n,) the answer.
         start: (n,) where the robot is.
         others: Whether to look at the hands of further rounds, too, as an exported solver does.
     """
-    search = FreeSearch(finder, problems, around, start[None], 0)
+    search = FreeSearch(finder, targets, query, start[None], 0)
     search.try_hands(q[None], np.zeros(1, dtype=np.intp))
     if others:
         for hands, owner in search.other_hands():
@@ -639,8 +643,8 @@ def resolve_at_once(
     if not search.free[0]:
         return None
     found = search.best[0]
-    verdict = judge_one(finder.robot, problems, found)
+    verdict = judge_one(finder.robot, targets, found)
     if verdict is None:
         return None
-    clear = around.check(found[None])
+    clear = query.check(found[None])
     return (found, verdict, clear) if clear.free[0] else None

@@ -16,7 +16,7 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Item, Scene
 from casadi_ik.problem.clearance import SceneCheck
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.solving.run import Run
 
 STEPS = (0.01, 0.02, 0.04, 0.08, 0.16)
@@ -35,14 +35,14 @@ WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
 ROUNDING = 1e-9
 """By which a moved object may be nearer to something than it stands [m]."""
 
-Free = Callable[[Problems], NDArray[np.bool_]]
+Free = Callable[[TargetBatch], NDArray[np.bool_]]
 """Of k targets, which have a free answer."""
 
 
 def with_way_out(
-    solve: Callable[[Problems, Run], BatchSolution],
+    solve: Callable[[TargetBatch, Run], BatchSolution],
     check: SceneCheck,
-    problems: Problems,
+    targets: TargetBatch,
     start: Array,
     seed: int,
     batch: BatchSolution,
@@ -52,7 +52,7 @@ def with_way_out(
     Args:
         solve: Solves targets.
         check: The scene about the robot.
-        problems: The target.
+        targets: The target.
         start: (n,) where the robot is.
         seed: Of all random numbers.
         batch: The answer.
@@ -60,11 +60,11 @@ def with_way_out(
     (report,) = batch.collisions
     if report is None:
         return batch
-    scene, known = check.scene, problems
-    if problems.object_pose is None and scene.grasped in scene.items:
-        known = problems.holding(scene.grasped or "", scene.items[scene.grasped or ""].pose)
+    scene, known = check.scene, targets
+    if targets.object_pose is None and scene.grasped in scene.items:
+        known = targets.holding(scene.grasped or "", scene.items[scene.grasped or ""].pose)
 
-    def free(asked: Problems) -> NDArray[np.bool_]:
+    def free(asked: TargetBatch) -> NDArray[np.bool_]:
         return solve(asked, Run(start, seed)).success
 
     moved = _moved(known, _standing(check, known), free)
@@ -72,10 +72,10 @@ def with_way_out(
     return replace(batch, collisions=(replace(report, way_out=found),))
 
 
-def _standing(check: SceneCheck, problems: Problems) -> Callable[[Array], NDArray[np.bool_]]:
+def _standing(check: SceneCheck, targets: TargetBatch) -> Callable[[Array], NDArray[np.bool_]]:
     """Which shifts (k, 3) let what is grasped stand as free as it stands now."""
     scene: Scene = check.scene
-    name, pose = problems.object or scene.grasped or "", problems.object_pose
+    name, pose = targets.object or scene.grasped or "", targets.object_pose
     if name and pose is not None:
         scene = scene.holding(name, pose[0])
     item = scene.items.get(name)
@@ -93,14 +93,14 @@ def _standing(check: SceneCheck, problems: Problems) -> Callable[[Array], NDArra
 
 
 def _moved(
-    problems: Problems, stands: Callable[[Array], NDArray[np.bool_]], free: Free
+    targets: TargetBatch, stands: Callable[[Array], NDArray[np.bool_]], free: Free
 ) -> tuple[float, float, float] | None:
     """The shortest shift that helps."""
 
     def helps(shifts: Array) -> NDArray[np.bool_]:
         good = stands(shifts)
         if good.any():
-            good[good] = free(_shifted(problems, shifts[good]))
+            good[good] = free(_shifted(targets, shifts[good]))
         return good
 
     before = 0.0
@@ -121,9 +121,9 @@ def _moved(
     return None
 
 
-def _shifted(problems: Problems, shifts: Array) -> Problems:
+def _shifted(targets: TargetBatch, shifts: Array) -> TargetBatch:
     """One target at as many places."""
-    asked = problems.rows(np.zeros(len(shifts), dtype=np.intp))
+    asked = targets.rows(np.zeros(len(shifts), dtype=np.intp))
     pose = asked.object_pose
     if pose is not None:
         pose = pose.copy()
@@ -133,22 +133,22 @@ def _shifted(problems: Problems, shifts: Array) -> Problems:
     )
 
 
-def _fewer(problems: Problems, fingers: Sequence[str], free: Free) -> tuple[str, ...]:
+def _fewer(targets: TargetBatch, fingers: Sequence[str], free: Free) -> tuple[str, ...]:
     """Fingers without whose contact there is a free answer."""
-    placed = ~np.isnan(problems.points[0]).all(axis=1)
-    facing = ~np.isnan(problems.normals[0]).all(axis=1)
+    placed = ~np.isnan(targets.points[0]).all(axis=1)
+    facing = ~np.isnan(targets.normals[0]).all(axis=1)
     named = np.flatnonzero(placed | facing)
     # A finger with more than a point and a normal would make it a target of other kinds.
     plain = [
-        i for i in named.tolist() if all(np.isnan(v[0, i]).all() for v in problems.more.values())
+        i for i in named.tolist() if all(np.isnan(v[0, i]).all() for v in targets.more.values())
     ]
     if len(named) < 2:
         return ()
-    return tuple(fingers[i] for i in plain if free(_without(problems, i))[0])
+    return tuple(fingers[i] for i in plain if free(_without(targets, i))[0])
 
 
-def _without(problems: Problems, finger: int) -> Problems:
+def _without(targets: TargetBatch, finger: int) -> TargetBatch:
     """One target with a finger free."""
-    points, normals = problems.points.copy(), problems.normals.copy()
+    points, normals = targets.points.copy(), targets.normals.copy()
     points[:, finger], normals[:, finger] = np.nan, np.nan
-    return replace(problems, points=points, normals=normals)
+    return replace(targets, points=points, normals=normals)

@@ -21,10 +21,10 @@ from casadi_ik.arms.srs import SrsArm
 from casadi_ik.arrays import Array
 from casadi_ik.methods.common.contact_fit import fresh_fit
 from casadi_ik.problem.contacts import LENGTH
-from casadi_ik.problem.problems import Problems
 from casadi_ik.problem.status import Phase
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import ContactVerdict, judge
-from casadi_ik.solving.trials import NEVER, Descent, Rows, Trials, allowed, smallest
+from casadi_ik.solving.trials import NEVER, LocalRefinement, Rows, Subproblems, allowed, smallest
 
 
 @dataclass(frozen=True)
@@ -76,20 +76,20 @@ class Closest:
         self.q[rows], self.fair[rows], self.ratio[rows] = found.q, found.fair, found.ratio
 
 
-def closest(descent: Descent, targets: Rows, q: Array, followed: int) -> Closest:
+def closest(descent: LocalRefinement, owner: Rows, q: Array, followed: int) -> Closest:
     """Follow the best of some configurations to the end.
 
     Args:
         descent: Of k targets.
-        targets: (m,) which target a configuration is for; every target has one at least.
+        owner: (m,) which target a configuration is for; every target has one at least.
         q: (m, n).
         followed: How many of a target at most.
     """
-    cost = (descent.misses(targets, q) ** 2).sum(axis=(1, 2))
-    kept = smallest(targets, cost, followed)
-    targets, q = targets[kept], q[kept]
-    count, first = len(q), np.searchsorted(targets, np.arange(len(descent.problems)))
-    tolerated = allowed(descent.problems)[targets]
+    cost = (descent.misses(owner, q) ** 2).sum(axis=(1, 2))
+    kept = smallest(owner, cost, followed)
+    owner, q = owner[kept], q[kept]
+    count, first = len(q), np.searchsorted(owner, np.arange(len(descent.targets)))
+    tolerated = allowed(descent.targets)[owner]
     counted = tolerated > 0
     total = (tolerated**2).sum(axis=(1, 2))
     weights = counted.astype(float)
@@ -99,7 +99,7 @@ def closest(descent: Descent, targets: Rows, q: Array, followed: int) -> Closest
     fair, plain, cost = q.copy(), q, np.zeros(count)
     rows = np.arange(count)
     for number in range(TUNING.rounds):
-        here = targets[rows]
+        here = owner[rows]
         q[rows] = descent.run(here, q[rows], weights=np.sqrt(weights[rows]))
         misses = descent.misses(here, q[rows])
         if number == 0:
@@ -126,7 +126,7 @@ def closest(descent: Descent, targets: Rows, q: Array, followed: int) -> Closest
         weights[rows] = new * scale[:, None, None]
         rows = rows[going]
     ratio = np.minimum.reduceat(bound, first)
-    return Closest(plain[smallest(targets, cost, 1)], fair[smallest(targets, worst, 1)], ratio)
+    return Closest(plain[smallest(owner, cost, 1)], fair[smallest(owner, worst, 1)], ratio)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ class HandFits:
     """Hand postures that were fitted to targets without the arm, each with a palm pose.
 
     Attributes:
-        targets: (m,) number of the target.
+        owner: (m,) number of the target.
         states: (m, ...) of the loop, where the arm would be placed next.
         parameters: (m, ...) of the loop.
         position_error: (m, f) [m], NaN where free.
@@ -145,7 +145,7 @@ class HandFits:
         outside: (m,) how far the wrist is from what the arm can span [m], 0 within.
     """
 
-    targets: Rows
+    owner: Rows
     states: Array
     parameters: Array
     position_error: Array
@@ -162,16 +162,16 @@ class HandFits:
 
     def without(self) -> Rows:
         """Targets without a fit that the arm reaches."""
-        return np.setdiff1d(self.targets, self.targets[self.ok & (self.outside == 0)])
+        return np.setdiff1d(self.owner, self.owner[self.ok & (self.outside == 0)])
 
-    def ratio(self, problems: Problems) -> Array:
+    def ratio(self, targets: TargetBatch) -> Array:
         """(k,) by which factor the tolerances would have to grow at least, near any of the fits."""
-        cost = self.cost[smallest(self.targets, self.cost, 1)]
-        return np.sqrt(cost / (allowed(problems) ** 2).sum(axis=(1, 2)))
+        cost = self.cost[smallest(self.owner, self.cost, 1)]
+        return np.sqrt(cost / (allowed(targets) ** 2).sum(axis=(1, 2)))
 
     def best(self, most: int) -> Rows:
         """Rows of each target that fit best with regard to the arm's reach."""
-        return smallest(self.targets, self.cost + (self.outside / LENGTH) ** 2, most)
+        return smallest(self.owner, self.cost + (self.outside / LENGTH) ** 2, most)
 
     @classmethod
     def joined(cls, parts: Sequence[HandFits]) -> HandFits:
@@ -183,7 +183,7 @@ class HandFits:
 class FloatingPalmFit:
     """Fits the hand alone to targets, whatever the arm could do."""
 
-    def __init__(self, trials: Trials) -> None:
+    def __init__(self, trials: Subproblems) -> None:
         """Ask the loop's hand stage."""
         self._trials = trials
         self._arm = srs_arm(trials.robot.description)
@@ -194,20 +194,22 @@ class FloatingPalmFit:
         robot = self._trials.robot
         return robot.palm(np.zeros(len(robot.actuators)))
 
-    def evidence(self, problems: Problems, fits: HandFits) -> list[tuple[HandFit, ArmReach | None]]:
+    def evidence(
+        self, targets: TargetBatch, fits: HandFits
+    ) -> list[tuple[HandFit, ArmReach | None]]:
         """What the fits say of each target: the best one, and the one nearest to the arm's range.
 
         Nothing is said of the reach where no hand fits, or of an arm without a closed form.
         """
-        best = smallest(fits.targets, np.where(fits.ok, 0.0, 1.0 + fits.cost), 1)
-        nearest = smallest(fits.targets, np.where(fits.ok, fits.outside, np.inf), 1)
+        best = smallest(fits.owner, np.where(fits.ok, 0.0, 1.0 + fits.cost), 1)
+        nearest = smallest(fits.owner, np.where(fits.ok, fits.outside, np.inf), 1)
         columns = fits.position_error, fits.angle_error, fits.met
         found = []
         for row, near in zip(best.tolist(), nearest.tolist(), strict=True):
             values = zip(
                 self._trials.robot.fingers,
                 *(column[row].tolist() for column in columns),
-                problems.tolerances,
+                targets.tolerances,
                 strict=True,
             )
             contacts = {
@@ -216,43 +218,43 @@ class FloatingPalmFit:
             }
             hand, arm = HandFit(bool(fits.ok[row]), contacts), None
             if hand.fits and self._arm is not None:
-                arm = ArmReach(float(fits.distance[near]), *self._span(problems, self._arm))
+                arm = ArmReach(float(fits.distance[near]), *self._span(targets, self._arm))
             found.append((hand, arm))
         return found
 
-    def fits(self, problems: Problems, q0: Array) -> HandFits:
+    def fits(self, targets: TargetBatch, q0: Array) -> HandFits:
         """Fit some postures to each of k targets, more where none of them fits.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             q0: (k, n) where what is free stays.
         """
-        method, every = self._trials.method, np.arange(len(problems))
-        nearest = method.postures(problems, 0)
-        fits = self._fitted(problems, q0, every, nearest[:, : TUNING.first])
+        method, every = self._trials.method, np.arange(len(targets))
+        nearest = method.postures(targets, 0)
+        fits = self._fitted(targets, q0, every, nearest[:, : TUNING.first])
         without = fits.without()
         if len(without):
-            wide = method.postures(problems.rows(without), 1)
+            wide = method.postures(targets.rows(without), 1)
             more = np.concatenate([nearest[without, TUNING.first :], wide], axis=1)
-            fits = HandFits.joined([fits, self._fitted(problems, q0, without, more)])
-        rows = np.flatnonzero(fits.ok & np.isin(fits.targets, fits.without()))
-        rows = rows[smallest(fits.targets[rows], fits.outside[rows], TUNING.slid)]
+            fits = HandFits.joined([fits, self._fitted(targets, q0, without, more)])
+        rows = np.flatnonzero(fits.ok & np.isin(fits.owner, fits.without()))
+        rows = rows[smallest(fits.owner[rows], fits.outside[rows], TUNING.slid)]
         if len(rows):
-            fits = HandFits.joined([fits, self._slid(problems, fits, rows)])
+            fits = HandFits.joined([fits, self._slid(targets, fits, rows)])
         return fits
 
-    def _fitted(self, problems: Problems, q0: Array, chosen: Rows, postures: Array) -> HandFits:
+    def _fitted(self, targets: TargetBatch, q0: Array, chosen: Rows, postures: Array) -> HandFits:
         """Fit postures (c, p, hand) to c of the targets."""
         trials = self._trials
-        targets = np.repeat(chosen, postures.shape[1])
-        start, flat = q0[targets], postures.reshape(len(targets), postures.shape[2])
+        owner = np.repeat(chosen, postures.shape[1])
+        start, flat = q0[owner], postures.reshape(len(owner), postures.shape[2])
         turns = np.tile(np.arange(postures.shape[1]), len(chosen))
-        states, parameters = trials.posture_rows(problems.rows(targets), start, flat, turns)
+        states, parameters = trials.posture_rows(targets.rows(owner), start, flat, turns)
         parameters[:, trials.parameters.slice("alone")] = 1.0
         parameters[:, trials.parameters.slice("reach")] = 0.0
-        return self._run(problems, targets, states, parameters)
+        return self._run(targets, owner, states, parameters)
 
-    def _slid(self, problems: Problems, fits: HandFits, rows: Rows) -> HandFits:
+    def _slid(self, targets: TargetBatch, fits: HandFits, rows: Rows) -> HandFits:
         """Spend what freedom the contacts leave on the arm's reach.
 
         The reach weighs so little that a hand without a freedom stays within the tolerance.
@@ -265,10 +267,10 @@ class FloatingPalmFit:
         weight = np.sqrt(np.minimum(loose / (3 * fits.outside[rows]), 1.0))
         parameters[:, trials.parameters.slice("reach")] = weight[:, None]
         trials.set_tolerance(parameters, NEVER)
-        slid = self._run(problems, fits.targets[rows], states, parameters)
+        slid = self._run(targets, fits.owner[rows], states, parameters)
         return replace(slid, parameters=fits.parameters[rows])
 
-    def _run(self, problems: Problems, targets: Rows, states: Array, parameters: Array) -> HandFits:
+    def _run(self, targets: TargetBatch, owner: Rows, states: Array, parameters: Array) -> HandFits:
         """Run the hand stage of some rows to its end and judge what it came to."""
         trials = self._trials
         states = trials.method.run_rows(states, parameters).states
@@ -278,13 +280,13 @@ class FloatingPalmFit:
         origin = states[:, trials.state.slice("palm_origin")]
         hand = states[:, trials.state.slice("q")].copy()
         hand[:, list(trials.robot.description.arm_actuators)] = 0.0
-        seen = self._seen(problems.rows(targets), rotation, origin)
+        seen = self._seen(targets.rows(owner), rotation, origin)
         verdict = judge(trials.robot, seen, hand)
         position, angle, met = verdict.position_error, verdict.angle_error, verdict.ok
         squares = (position / LENGTH) ** 2, (2 * np.sin(angle / 2)) ** 2
-        distance, outside = self._wrist(problems, rotation, origin)
+        distance, outside = self._wrist(targets, rotation, origin)
         return HandFits(
-            targets=targets,
+            owner=owner,
             states=states,
             parameters=parameters,
             position_error=position,
@@ -295,7 +297,7 @@ class FloatingPalmFit:
             outside=outside,
         )
 
-    def _seen(self, asked: Problems, rotation: Array, origin: Array) -> Problems:
+    def _seen(self, asked: TargetBatch, rotation: Array, origin: Array) -> TargetBatch:
         """Targets moved with their palm poses to where the palm is with the arm at zero."""
         palm = self._palm
         turn = np.einsum("ij,kmj->kim", palm[:3, :3], rotation)
@@ -304,18 +306,18 @@ class FloatingPalmFit:
         more = {key: np.einsum("kij,kfj->kfi", turn, v) for key, v in asked.more.items()}
         return replace(asked, points=points, normals=normals, more=more)
 
-    def _wrist(self, problems: Problems, rotation: Array, origin: Array) -> tuple[Array, Array]:
+    def _wrist(self, targets: TargetBatch, rotation: Array, origin: Array) -> tuple[Array, Array]:
         """(m,) distance of the wrist from the shoulder, and from what the arm can span [m]."""
         if self._arm is None:
             return np.full(len(origin), np.nan), np.zeros(len(origin))
         wrist = origin + rotation @ self._arm.wrist_in_palm
         distance = np.linalg.norm(wrist - self._arm.shoulder, axis=1)
-        near, far = self._span(problems, self._arm)
+        near, far = self._span(targets, self._arm)
         return distance, np.maximum(np.maximum(distance - far, near - distance), 0.0)
 
-    def _span(self, problems: Problems, arm: SrsArm) -> tuple[float, float]:
+    def _span(self, targets: TargetBatch, arm: SrsArm) -> tuple[float, float]:
         """Smallest and largest distance of the wrist from the shoulder [m]."""
-        limits = self._trials.limits(problems)
+        limits = self._trials.limits(targets)
         elbow = self._trials.robot.description.arm_actuators[3]
         near, far = arm.reach(limits.lower[elbow], limits.upper[elbow])
         return float(near), float(far)

@@ -21,13 +21,13 @@ from casadi_ik.answers.diagnosis import (
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array, Counts
 from casadi_ik.grasps import Tolerance
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.problem.verdict import Verdict, deviations, judge, judge_palms
 from casadi_ik.proofs.proof import Proof, ProofKind
 from casadi_ik.proofs.prove import EFFORT, Prover
 from casadi_ik.solving.diagnosis.closest import Closest, FloatingPalmFit, HandFits, closest
 from casadi_ik.solving.diagnosis.remedies import RemedyFinder
-from casadi_ik.solving.trials import Descent, HandMethod, Rows, Trials
+from casadi_ik.solving.trials import HandMethod, LocalRefinement, Rows, Subproblems
 
 
 @dataclass(frozen=True)
@@ -80,93 +80,93 @@ class Diagnostician:
         """Keep robot and method; nothing is built before the first diagnosis."""
         self.robot = robot
         self.method = method
-        self._trials = Trials(robot, method)
+        self._trials = Subproblems(robot, method)
         self._palm_free = FloatingPalmFit(self._trials)
         self._prover = Prover(robot.description, compiled)
 
-    def diagnose(self, problems: Problems, q0: Array, nearest: Array | None) -> list[Diagnosis]:
+    def diagnose(self, targets: TargetBatch, q0: Array, nearest: Array | None) -> list[Diagnosis]:
         """Diagnose k targets; each as if it were alone.
 
         Args:
-            problems: The targets.
+            targets: The targets.
             q0: (k, n) starts.
             nearest: (k, n) what hand-first came to; None if another method was asked.
         """
         self.method.prepare()
-        if problems.fixed is not None and problems.fixed.ndim > 1:
+        if targets.fixed is not None and targets.fixed.ndim > 1:
             # Hands that are held differently have nothing in common.
             found_alone = [
-                self.diagnose(_held_alone(problems, row), q0[row : row + 1], near)[0]
-                for row in range(len(problems))
+                self.diagnose(_held_alone(targets, row), q0[row : row + 1], near)[0]
+                for row in range(len(targets))
                 for near in [None if nearest is None else nearest[row : row + 1]]
             ]
-            return _of_palms(self.robot, problems, found_alone)
-        known = np.zeros(len(problems), dtype=bool)
-        clock = _Clock(np.zeros(len(problems)))
+            return _of_palms(self.robot, targets, found_alone)
+        known = np.zeros(len(targets), dtype=bool)
+        clock = _Clock(np.zeros(len(targets)))
         if nearest is None:
-            nearest = self.method.run(problems, q0, 0, trace=False).q
-            known = judge(self.robot, problems, nearest).solved(problems.enforce_limits)
-            clock.lap(np.arange(len(problems)))
+            nearest = self.method.run(targets, q0, 0, trace=False).q
+            known = judge(self.robot, targets, nearest).solved(targets.enforce_limits)
+            clock.lap(np.arange(len(targets)))
         found: dict[int, Diagnosis] = {}
         for row in np.flatnonzero(known).tolist():
-            one = problems.rows(slice(row, row + 1))
+            one = targets.rows(slice(row, row + 1))
             (near,) = self._nearest(one, nearest[row : row + 1])
             found[row] = _reachable(one, nearest[row], near, clock.seconds[row])
         rest = np.flatnonzero(~known)
         for start in range(0, len(rest), DIAGNOSIS.together):
             rows = rest[start : start + DIAGNOSIS.together]
-            some, spent = problems.rows(rows), clock.seconds[rows]
+            some, spent = targets.rows(rows), clock.seconds[rows]
             whys = self._together(some, q0[rows], nearest[rows], _Clock(spent))
             found |= zip(rows.tolist(), whys, strict=True)
-        return [found[row] for row in range(len(problems))]
+        return [found[row] for row in range(len(targets))]
 
     def _together(
-        self, problems: Problems, q0: Array, nearest: Array, clock: _Clock
+        self, targets: TargetBatch, q0: Array, nearest: Array, clock: _Clock
     ) -> Iterator[Diagnosis]:
         """Diagnose targets that hand-first did not solve."""
-        every = np.arange(len(problems))
-        descent = Descent(self._trials, problems)
-        evidence, fits = self._hands(problems, q0)
-        targets, ends = self._placed(fits)
-        targets, ends = np.concatenate([every, targets]), np.concatenate([nearest, ends])
-        searches = np.bincount(targets, minlength=len(every))
+        every = np.arange(len(targets))
+        descent = LocalRefinement(self._trials, targets)
+        evidence, fits = self._hands(targets, q0)
+        owner, ends = self._placed(fits)
+        owner, ends = np.concatenate([every, owner]), np.concatenate([nearest, ends])
+        searches = np.bincount(owner, minlength=len(every))
         if fits is not None:
-            searches += np.bincount(fits.targets, minlength=len(every))
-        best = closest(descent, targets, ends, DIAGNOSIS.placed + 1)
+            searches += np.bincount(fits.owner, minlength=len(every))
+        best = closest(descent, owner, ends, DIAGNOSIS.placed + 1)
         clock.lap(every)
         proofs: list[Proof | None] = [None] * len(every)
-        rows = np.flatnonzero(~self._solved(problems, best.fair))
+        rows = np.flatnonzero(~self._solved(targets, best.fair))
         if len(rows):
-            found = self._prover.prove(problems.rows(rows), most=_worth(best.ratio[rows]))
+            found = self._prover.prove(targets.rows(rows), most=_worth(best.ratio[rows]))
             for row, proof in zip(rows.tolist(), found, strict=True):
                 proofs[row] = proof
             clock.lap(rows)
         refused = [_refused(*item, proof) for item, proof in zip(evidence, proofs, strict=True)]
         # Where neither the hand nor the reach says no, only searching can.
         unsure = np.array([reason is None for reason in refused])
-        certain = self._certain(problems, fits, best)
+        certain = self._certain(targets, fits, best)
         certain |= np.array([proof is not None for proof in proofs])
         for below, count, followed in DIAGNOSIS.searches:
             rows = np.flatnonzero(unsure | ((best.ratio < below) & ~certain))
-            rows = rows[~self._solved(problems.rows(rows), best.fair[rows])]
+            rows = rows[~self._solved(targets.rows(rows), best.fair[rows])]
             if len(rows):
-                some, found = problems.rows(rows), best.rows(rows)
+                some, found = targets.rows(rows), best.rows(rows)
                 best.put(rows, self._search(some, found, count, followed))
                 searches[rows] += count + 2
                 clock.lap(rows)
             unsure[:] = False
-        fair = judge(self.robot, problems, best.fair)
-        solved, enough = fair.solved(problems.enforce_limits), _enough(problems, fair)
-        near = self._nearest(problems, np.where(solved[:, None], best.fair, best.q))
+        fair = judge(self.robot, targets, best.fair)
+        solved, enough = fair.solved(targets.enforce_limits), _enough(targets, fair)
+        near = self._nearest(targets, np.where(solved[:, None], best.fair, best.q))
         held = self._at_limit(best.q)
         pressed = held | self._at_limit(best.fair) | (best.ratio <= DIAGNOSIS.barely)[:, None]
         clock.lap(every)
         for i in every.tolist():
             if solved[i]:
-                yield _reachable(problems, best.fair[i], near[i], clock.seconds[i])
+                yield _reachable(targets, best.fair[i], near[i], clock.seconds[i])
                 continue
             hand, reach = evidence[i]
-            one, hand_only = problems.rows(slice(i, i + 1)), refused[i] is Reason.HAND
+            one, hand_only = targets.rows(slice(i, i + 1)), refused[i] is Reason.HAND
             remedies = RemedyFinder(self._trials, one, q0[i], best.q[i], pressed[i], hand_only)
             reason = refused[i]
             if reason is None:
@@ -179,7 +179,7 @@ class Diagnostician:
                 searches=int(searches[i]),
                 hand=hand,
                 reach=reach,
-                active=tuple(name for name, at in names if at and problems.enforce_limits),
+                active=tuple(name for name, at in names if at and targets.enforce_limits),
                 enough=enough[i],
                 nearest=near[i],
                 q=best.q[i],
@@ -188,67 +188,65 @@ class Diagnostician:
             )
 
     def _hands(
-        self, problems: Problems, q0: Array
+        self, targets: TargetBatch, q0: Array
     ) -> tuple[Sequence[tuple[HandFit | None, ArmReach | None]], HandFits | None]:
         """What the hand alone says of each target; nothing if there is no arm."""
         if not self.robot.description.arm_actuators:
-            return [(None, None)] * len(problems), None
-        fits = self._palm_free.fits(problems, q0)
-        return self._palm_free.evidence(problems, fits), fits
+            return [(None, None)] * len(targets), None
+        fits = self._palm_free.fits(targets, q0)
+        return self._palm_free.evidence(targets, fits), fits
 
     def _certain(
-        self, problems: Problems, fits: HandFits | None, best: Closest
+        self, targets: TargetBatch, fits: HandFits | None, best: Closest
     ) -> NDArray[np.bool_]:
         """(k,) whether the hand alone already says no, however the arm holds it."""
         if fits is None:
-            return np.zeros(len(problems), dtype=bool)
-        return np.minimum(fits.ratio(problems), best.ratio) >= DIAGNOSIS.certain
+            return np.zeros(len(targets), dtype=bool)
+        return np.minimum(fits.ratio(targets), best.ratio) >= DIAGNOSIS.certain
 
     def _placed(self, fits: HandFits | None) -> tuple[Rows, Array]:
         """Configurations (m, n) that the best fits of each target lead to, and their targets."""
         if fits is None:
             return np.zeros(0, np.intp), np.zeros((0, len(self.robot.actuators)))
         rows = fits.best(DIAGNOSIS.placed)
-        return fits.targets[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
+        return fits.owner[rows], self._trials.run(fits.states[rows], fits.parameters[rows])
 
-    def _search(self, problems: Problems, best: Closest, count: int, followed: int) -> Closest:
+    def _search(self, targets: TargetBatch, best: Closest, count: int, followed: int) -> Closest:
         """The closest to each target from random arms, with hands of all kinds.
 
         The hands are those that came closest so far, and some that look like the grasp. A hand
         without an arm is started at random itself.
         """
-        targets = np.repeat(np.arange(len(problems)), count + 2)
+        owner = np.repeat(np.arange(len(targets)), count + 2)
         random = self.robot.random(np.random.default_rng(count), count)
-        starts = np.tile(random, (len(problems), 1, 1))
+        starts = np.tile(random, (len(targets), 1, 1))
         if self.robot.description.arm_actuators:
             hand = list(self.robot.description.hand_actuators)
             starts[:, ::2, hand] = best.fair[:, None, hand]
             starts[:, 1::2, hand] = best.q[:, None, hand]
-            starts[:, :: DIAGNOSIS.alike, hand] = self._alike(
-                problems, -(-count // DIAGNOSIS.alike)
-            )
+            starts[:, :: DIAGNOSIS.alike, hand] = self._alike(targets, -(-count // DIAGNOSIS.alike))
         starts = np.concatenate([best.q[:, None], best.fair[:, None], starts], axis=1)
-        descent = Descent(self._trials, problems)
-        ends = descent.run(targets, starts.reshape(len(targets), -1))
-        return closest(descent, targets, ends, followed)
+        descent = LocalRefinement(self._trials, targets)
+        ends = descent.run(owner, starts.reshape(len(owner), -1))
+        return closest(descent, owner, ends, followed)
 
-    def _alike(self, problems: Problems, count: int) -> Array:
+    def _alike(self, targets: TargetBatch, count: int) -> Array:
         """(k, count, hand) postures that look like the grasps, in turns."""
         options = self.method.options
         rounds = range(min(options.rounds, -(-count // options.candidates)))
-        found = [self.method.postures(problems, number) for number in rounds]
+        found = [self.method.postures(targets, number) for number in rounds]
         postures = np.concatenate(found, axis=1)
         return postures[:, np.arange(count) % postures.shape[1]]
 
-    def _solved(self, problems: Problems, q: Array) -> NDArray[np.bool_]:
+    def _solved(self, targets: TargetBatch, q: Array) -> NDArray[np.bool_]:
         if not len(q):
             return np.zeros(0, dtype=bool)
-        return judge(self.robot, problems, q).solved(problems.enforce_limits)
+        return judge(self.robot, targets, q).solved(targets.enforce_limits)
 
-    def _nearest(self, problems: Problems, q: Array) -> list[dict[str, NearContact]]:
+    def _nearest(self, targets: TargetBatch, q: Array) -> list[dict[str, NearContact]]:
         """The contacts of configurations (k, n), beside those asked for."""
         points, normals = self.robot.contacts(q)
-        position_error, angle_error, _ = deviations(self.robot, problems, q)
+        position_error, angle_error, _ = deviations(self.robot, targets, q)
         columns = points, normals, position_error, angle_error
         rows = zip(*(column.tolist() for column in columns), strict=True)
         return [
@@ -274,10 +272,10 @@ class _Clock:
         self.seconds = seconds
         self._now = time.perf_counter()
 
-    def lap(self, targets: Rows) -> None:
+    def lap(self, owner: Rows) -> None:
         """Share the time since the last lap among some targets."""
         before, self._now = self._now, time.perf_counter()
-        self.seconds[targets] += (self._now - before) / len(targets)
+        self.seconds[owner] += (self._now - before) / len(owner)
 
 
 def _refused(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) -> Reason | None:
@@ -297,24 +295,24 @@ def _worth(ratio: Array) -> Counts:
     return np.maximum(EFFORT.most * share, DIAGNOSIS.least).astype(np.int64)
 
 
-def _enough(problems: Problems, fair: Verdict) -> list[Tolerance]:
+def _enough(targets: TargetBatch, fair: Verdict) -> list[Tolerance]:
     """Tolerances that were kept to, no smaller than those asked for."""
-    least = problems.largest_tolerance
+    least = targets.largest_tolerance
     position = np.nanmax(fair.position_error, axis=1, initial=least.position)
     angle = np.nanmax(fair.angle_error, axis=1, initial=least.angle)
     return [Tolerance(*pair) for pair in zip(position.tolist(), angle.tolist(), strict=True)]
 
 
-def _held_alone(problems: Problems, row: int) -> Problems:
+def _held_alone(targets: TargetBatch, row: int) -> TargetBatch:
     """One of several targets whose hands are held differently; its contacts place the palm."""
-    one = problems.rows(slice(row, row + 1))
+    one = targets.rows(slice(row, row + 1))
     assert one.fixed is not None
     return replace(one, fixed=one.fixed[0], palms=None)
 
 
-def _of_palms(robot: ArmHand, problems: Problems, found: list[Diagnosis]) -> list[Diagnosis]:
+def _of_palms(robot: ArmHand, targets: TargetBatch, found: list[Diagnosis]) -> list[Diagnosis]:
     """Diagnoses by the contacts that palms lead to, with what they say of the palms."""
-    palms = judge_palms(robot, problems, np.stack([one.q for one in found]))
+    palms = judge_palms(robot, targets, np.stack([one.q for one in found]))
     if palms is None:
         return found
     told = []
@@ -327,7 +325,7 @@ def _of_palms(robot: ArmHand, problems: Problems, found: list[Diagnosis]) -> lis
 
 
 def _reachable(
-    problems: Problems, q: Array, near: dict[str, NearContact], seconds: float
+    targets: TargetBatch, q: Array, near: dict[str, NearContact], seconds: float
 ) -> Diagnosis:
     return Diagnosis(
         reason=Reason.REACHABLE,
@@ -336,7 +334,7 @@ def _reachable(
         hand=None,
         reach=None,
         active=(),
-        enough=problems.largest_tolerance,
+        enough=targets.largest_tolerance,
         nearest=near,
         q=q,
         time=float(seconds),

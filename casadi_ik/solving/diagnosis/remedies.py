@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from casadi_ik.answers.diagnosis import Freed, Relief, Remedies
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.problem.problems import Problems
-from casadi_ik.solving.trials import Bounds, Descent, Trials, repeated
+from casadi_ik.problem.targets import TargetBatch
+from casadi_ik.solving.trials import Bounds, LocalRefinement, Subproblems, repeated
 
 HALVINGS = 8
 """How often what a limit has to give is halved, while a solution remains."""
@@ -62,14 +62,18 @@ def lifts(
     return single + [Lift(name, columns) for name, columns in groups.items() if columns]
 
 
-def relieve(
-    trials: Trials, problems: Problems, limits: Bounds, solved: list[tuple[Lift, Array]], q: Array
+def relax_limits(
+    trials: Subproblems,
+    targets: TargetBatch,
+    limits: Bounds,
+    solved: list[tuple[Lift, Array]],
+    q: Array,
 ) -> Iterator[Relief]:
     """Draw lifted limits back towards where they are, as long as there is a solution.
 
     Args:
         trials: The loop.
-        problems: One target.
+        targets: One target.
         limits: The true limits.
         solved: Lifts with a solution (n,) each.
         q: (n,) the nearest configuration within the true limits, a second start.
@@ -78,7 +82,7 @@ def relieve(
         return
     count, robot = len(solved), trials.robot
     best = np.stack([solution for _, solution in solved])
-    descent, rows = Descent(trials, problems), np.zeros(2 * count, dtype=np.intp)
+    descent, rows = LocalRefinement(trials, targets), np.zeros(2 * count, dtype=np.intp)
     # What is given lies between two configurations: one within the limits, one that solves it.
     least, most = np.zeros((count, 1)), np.ones((count, 1))
     beyond = limits.beyond(best)
@@ -91,7 +95,7 @@ def relieve(
         twice = Bounds(np.tile(bounds.lower, (2, 1)), np.tile(bounds.upper, (2, 1)))
         starts = np.concatenate([best, np.tile(q, (count, 1))])
         reached = descent.run(rows, starts, twice)
-        ok = trials.solved(problems, reached, limits=False).reshape(2, count)
+        ok = trials.solved(targets, reached, limits=False).reshape(2, count)
         reached = reached.reshape(2, count, -1)
         new = np.where(ok[0][:, None], reached[0], reached[1])
         either = np.logical_or(ok[0], ok[1])[:, None]
@@ -114,15 +118,15 @@ class RemedyFinder:
 
     Attributes:
         trials: The loop.
-        problems: One target.
+        targets: One target.
         q0: (n,) start.
         q: (n,) the nearest configuration that was found.
         pressed: (n,) actuators whose limit alone may be what blocks.
         hand_only: Whether the arm cannot help, because the hand does not fit.
     """
 
-    trials: Trials
-    problems: Problems
+    trials: Subproblems
+    targets: TargetBatch
     q0: Array
     q: Array
     pressed: NDArray[np.bool_]
@@ -137,31 +141,31 @@ class RemedyFinder:
         tried = self._lifts()
         if not tried:
             return False
-        asked, bounds = repeated(self.problems, len(tried)), self._lifted(tried)
+        asked, bounds = repeated(self.targets, len(tried)), self._lifted(tried)
         if self._solves(asked, self._descended(asked, bounds), bounds).any():
             return True
         # Lifted all together they help if any of them does.
         last = Bounds(bounds.lower[-1:], bounds.upper[-1:])
-        found = self.trials.search(self.problems, self.q0, last)
-        return bool(self._solves(self.problems, found, last)[0])
+        found = self.trials.search(self.targets, self.q0, last)
+        return bool(self._solves(self.targets, found, last)[0])
 
     def _reliefs(self) -> Iterator[Relief]:
         tried = self._lifts()
-        asked = repeated(self.problems, len(tried))
+        asked = repeated(self.targets, len(tried))
         solutions = self._solutions(asked, self._lifted(tried))
         solved = [(tried[i], q) for i, q in solutions.items()]
-        return relieve(self.trials, self.problems, self._limits, solved, self.q)
+        return relax_limits(self.trials, self.targets, self._limits, solved, self.q)
 
     def _freed(self) -> Iterator[Freed]:
         freeings = self._freeings()
         if freeings:
             asked = replace(
-                self.problems,
-                points=np.concatenate([problems.points for _, _, problems in freeings]),
-                normals=np.concatenate([problems.normals for _, _, problems in freeings]),
+                self.targets,
+                points=np.concatenate([targets.points for _, _, targets in freeings]),
+                normals=np.concatenate([targets.normals for _, _, targets in freeings]),
                 more={
-                    name: np.concatenate([problems.more[name] for _, _, problems in freeings])
-                    for name in self.problems.more
+                    name: np.concatenate([targets.more[name] for _, _, targets in freeings])
+                    for name in self.targets.more
                 },
                 picked=None,
                 object_pose=None,  # contacts alone are looked at here
@@ -172,10 +176,10 @@ class RemedyFinder:
 
     @property
     def _limits(self) -> Bounds:
-        return self.trials.limits(self.problems)
+        return self.trials.limits(self.targets)
 
     def _lifts(self) -> list[Lift]:
-        if not self.problems.enforce_limits:
+        if not self.targets.enforce_limits:
             return []
         movable = self._limits.lower < self._limits.upper
         return lifts(self.trials.robot, movable, movable & self.pressed, self.hand_only)
@@ -186,25 +190,25 @@ class RemedyFinder:
             lift.widen(self.trials.robot, bounds, i)
         return bounds
 
-    def _freeings(self) -> list[tuple[str, str, Problems]]:
+    def _freeings(self) -> list[tuple[str, str, TargetBatch]]:
         """The target with a finger, a normal or all normals left free."""
-        problems, found = self.problems, []
-        known = ~np.isnan(problems.points[0, :, 0])
-        faced = ~np.isnan(problems.normals[0, :, 0])
+        targets, found = self.targets, []
+        known = ~np.isnan(targets.points[0, :, 0])
+        faced = ~np.isnan(targets.normals[0, :, 0])
         for i, name in enumerate(self.trials.robot.fingers):
-            points, normals = problems.points.copy(), problems.normals.copy()
+            points, normals = targets.points.copy(), targets.normals.copy()
             normals[0, i] = np.nan
             if faced[i]:
-                found.append(("normal", name, _freed(problems, points, normals)))
+                found.append(("normal", name, _freed(targets, points, normals)))
             if known[i] and known.sum() > 1:
                 points[0, i] = np.nan
-                found.append(("finger", name, _freed(problems, points, normals)))
+                found.append(("finger", name, _freed(targets, points, normals)))
         if faced.sum() > 1:
-            none = np.full_like(problems.normals, np.nan)
-            found.append(("normal", "all", _freed(problems, problems.points, none)))
+            none = np.full_like(targets.normals, np.nan)
+            found.append(("normal", "all", _freed(targets, targets.points, none)))
         return found
 
-    def _solutions(self, asked: Problems, bounds: Bounds) -> dict[int, Array]:
+    def _solutions(self, asked: TargetBatch, bounds: Bounds) -> dict[int, Array]:
         """Solutions by row: from the nearest configuration, else by a search."""
         q = self._descended(asked, bounds)
         ok = self._solves(asked, q, bounds)
@@ -216,21 +220,21 @@ class RemedyFinder:
             ok[rest] = self._solves(some, q[rest], left)
         return {int(i): q[i] for i in np.flatnonzero(ok)}
 
-    def _descended(self, asked: Problems, bounds: Bounds) -> Array:
+    def _descended(self, asked: TargetBatch, bounds: Bounds) -> Array:
         rows = np.arange(len(asked))
         starts = np.tile(self.q, (len(rows), 1))
-        return Descent(self.trials, asked).run(rows, starts, bounds)
+        return LocalRefinement(self.trials, asked).run(rows, starts, bounds)
 
-    def _solves(self, asked: Problems, q: Array, bounds: Bounds) -> NDArray[np.bool_]:
+    def _solves(self, asked: TargetBatch, q: Array, bounds: Bounds) -> NDArray[np.bool_]:
         inside = (bounds.beyond(q) == 0).all(axis=1)
         return np.logical_and(inside, self.trials.solved(asked, q, limits=False))
 
 
-def _freed(problems: Problems, points: Array, normals: Array) -> Problems:
+def _freed(targets: TargetBatch, points: Array, normals: Array) -> TargetBatch:
     """A target without what goes with the points and normals that are now free."""
     placed, faced = ~np.isnan(points), ~np.isnan(normals)
     more = {
         name: np.where(placed & faced if name == "tangents" else placed, array, np.nan)
-        for name, array in problems.more.items()
+        for name, array in targets.more.items()
     }
-    return replace(problems, points=points.copy(), normals=normals, more=more)
+    return replace(targets, points=points.copy(), normals=normals, more=more)

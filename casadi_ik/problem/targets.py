@@ -20,7 +20,7 @@ LIMITS = ("enforce", "ignore")
 
 
 @dataclass(frozen=True, eq=False)
-class Problems:
+class TargetBatch:
     """A batch of targets.
 
     Attributes:
@@ -78,7 +78,7 @@ class Problems:
         """What every contact keeps to that is within its own tolerance."""
         return Tolerance(float(self.position_tolerance.max()), float(self.angle_tolerance.max()))
 
-    def rows(self, rows: slice | NDArray[np.intp]) -> Problems:
+    def rows(self, rows: slice | NDArray[np.intp]) -> TargetBatch:
         """Some of the targets.
 
         Args:
@@ -108,7 +108,7 @@ class Problems:
             palms=None if self.palms is None else self.palms[rows],
         )
 
-    def holding(self, name: str, object_pose: ArrayLike) -> Problems:
+    def holding(self, name: str, object_pose: ArrayLike) -> TargetBatch:
         """The same targets, which grasp an object at poses (4, 4) or (k, 4, 4).
 
         Raises:
@@ -152,7 +152,7 @@ class Problems:
 def fixed_array(
     fixed: Mapping[str, float], actuators: Sequence[str], lower: Array, upper: Array
 ) -> Array | None:
-    """Locked actuators as an array for `Problems.fixed`.
+    """Locked actuators as an array for `TargetBatch.fixed`.
 
     Args:
         fixed: Position by name of the actuator [rad or m].

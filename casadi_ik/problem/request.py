@@ -19,7 +19,7 @@ from casadi_ik.errors import InputError, UnknownNameError
 from casadi_ik.grasps import Grasp, Tolerance
 from casadi_ik.grasps.pose import checked_pose
 from casadi_ik.problem.contacts import LENGTH, more_arrays
-from casadi_ik.problem.problems import DIRECTIONS, Problems, fixed_array, target_arrays
+from casadi_ik.problem.targets import DIRECTIONS, TargetBatch, fixed_array, target_arrays
 
 CLEARANCE = "clearance"
 """The preference for what is far from everything; for solvers with a scene."""
@@ -174,15 +174,15 @@ def touched(robot: ArmHand, palms: Array, postures: Array) -> tuple[Array, Array
     return points, normals, {"tangents": np.where(free[:, None, None], tangents, np.nan)}
 
 
-def free_palms(robot: ArmHand, problems: Problems) -> NDArray[np.bool_]:
+def free_palms(robot: ArmHand, targets: TargetBatch) -> NDArray[np.bool_]:
     """(k,) whether a hand that meets its contacts can still move as a whole.
 
     A line or a plane is taken for the point it goes through.
     """
     if not robot.description.arm_actuators:
-        return np.zeros(len(problems), dtype=bool)
-    facing = np.concatenate([problems.vectors(name) for name in ("normals", "tangents")], axis=1)
-    return _leave_free(problems.points, facing)
+        return np.zeros(len(targets), dtype=bool)
+    facing = np.concatenate([targets.vectors(name) for name in ("normals", "tangents")], axis=1)
+    return _leave_free(targets.points, facing)
 
 
 def _leave_free(points: Array, facing: Array) -> NDArray[np.bool_]:
@@ -216,7 +216,7 @@ def held_too(postures: Array, fixed: Array | None, actuators: Sequence[str]) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class Questions:
+class Request:
     """What all questions of a solver share.
 
     Attributes:
@@ -237,16 +237,16 @@ class Questions:
         first_row: int = 0,
         more: Mapping[str, ArrayLike | None] | None = None,
         prefer: str = "limits",
-    ) -> Problems:
+    ) -> TargetBatch:
         """Targets as arrays.
 
         Args:
             points: (k, f, 3) [m].
             normals: (k, f, 3).
-            fixed: See `Problems`.
+            fixed: See `TargetBatch`.
             first_row: Number of the first target.
             more: (k, f, 3) what contacts have beside, see `more_arrays`; and directions.
-            prefer: See `Problems`.
+            prefer: See `TargetBatch`.
 
         Raises:
             InputError: See `target_arrays` and `more_arrays`.
@@ -256,7 +256,7 @@ class Questions:
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row, directions)
         tolerances = tuple(self.tolerances.values())
         others = more_arrays(named, p, n, first_row) if named else {}
-        return Problems(
+        return TargetBatch(
             p, n, tolerances, self.enforce_limits, first_row, fixed, others, prefer=prefer
         )
 
@@ -266,7 +266,7 @@ class Questions:
         fixed: Array | None,
         first_row: int = 0,
         prefer: str = "limits",
-    ) -> Problems:
+    ) -> TargetBatch:
         """Targets as arrays by name, see `of_arrays`: points, normals, and what else there is.
 
         Raises:
@@ -281,13 +281,13 @@ class Questions:
         grasps: Sequence[Grasp],
         fixed: Mapping[str, float] | None,
         prefer: str = "limits",
-    ) -> Problems:
+    ) -> TargetBatch:
         """Grasps, at least one, that share the tolerances of the first.
 
         Args:
             grasps: The grasps.
             fixed: Held actuators by name.
-            prefer: See `Problems`.
+            prefer: See `TargetBatch`.
 
         Raises:
             InputError: Something else than a grasp, one with a finger that the robot has not, or
@@ -314,7 +314,7 @@ class Questions:
             if len(arrays) == 1
             else (np.array(both) for both in zip(*arrays, strict=True))
         )
-        return Problems(
+        return TargetBatch(
             points,
             normals,
             tolerances,
@@ -328,14 +328,14 @@ class Questions:
 
     def _of_palm_grasps(
         self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None, prefer: str
-    ) -> Problems:
+    ) -> TargetBatch:
         palms = [grasp.palm for grasp in grasps if grasp.palm is not None]
         if len(palms) < len(grasps):
             raise InputError("grasps: found palms and contacts, expected the same in all")
         postures = postures_of(self.robot, [grasp.posture for grasp in grasps])
-        problems = self.of_palms(np.stack(palms), postures, fixed, prefer)
+        targets = self.of_palms(np.stack(palms), postures, fixed, prefer)
         named, poses = grasps[0].object, _object_poses(grasps)
-        return replace(problems, object=named, object_pose=poses)
+        return replace(targets, object=named, object_pose=poses)
 
     def of_palms(
         self,
@@ -343,14 +343,14 @@ class Questions:
         postures: Array,
         fixed: Mapping[str, float] | None,
         prefer: str = "limits",
-    ) -> Problems:
+    ) -> TargetBatch:
         """Palms that are given with the postures of their hands: only the arm is unknown.
 
         Args:
             palms: (k, 4, 4) poses of the robot's palm frame in the base frame.
             postures: (k, n) as `hand_posture` gives them.
             fixed: Other held actuators by name.
-            prefer: See `Problems`.
+            prefer: See `TargetBatch`.
 
         Raises:
             InputError: No rigid motions, or a motor of the hand among the held ones.
@@ -358,7 +358,7 @@ class Questions:
         poses = checked_pose(palms, "palms")
         points, normals, more = touched(self.robot, poses, postures)
         held = held_too(postures, self.held(fixed) if fixed else None, self.robot.actuators)
-        return Problems(
+        return TargetBatch(
             points,
             normals,
             self._usual,
