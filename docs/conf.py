@@ -7,12 +7,17 @@ relative link means the same on the site as in the tree.
 from __future__ import annotations
 
 import sys
+import tomllib
 from pathlib import Path
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 
+PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+URLS = PROJECT.get("urls", {})
+
 project = "casadi_ik"
+version = release = PROJECT["version"]
 author = "The casadi_ik developers"
 copyright = author  # noqa: A001  (Sphinx's own name)
 root_doc = "docs/index"
@@ -61,7 +66,21 @@ napoleon_use_ivar = True
 napoleon_use_rtype = False
 add_module_names = False
 
-html_title = "casadi_ik"
+html_title = f"casadi_ik {version}"
+html_baseurl = URLS.get("Documentation", "")
+html_favicon = "static/favicon.svg"
+html_context = {"repository": URLS.get("Repository", ""), "version": version}
+html_sidebars = {
+    "**": [
+        "sidebar/brand.html",
+        "sidebar/search.html",
+        "sidebar/scroll-start.html",
+        "sidebar/navigation.html",
+        "about.html",
+        "sidebar/scroll-end.html",
+    ]
+}
+templates_path = ["templates"]
 html_theme = "furo"
 html_static_path = ["static"]
 html_css_files = ["site.css"]

@@ -5,19 +5,14 @@ from __future__ import annotations
 import enum
 import inspect
 import re
+from pathlib import Path
 
 from sphinx.domains.python import PyObject
 
 import casadi_ik
 
-PAGES = {
-    "answers": "#answers",
-    "errors": "errors.md",
-    "logs": "logs.md",
-    "motion": "#motion",
-    "papers": "../slider_hands.md",
-}
-"""Where submodules are described."""
+HERE = re.compile(r"^<!-- here: api-pages (.*?) ?-->$", re.MULTILINE)
+FOLDER = Path(__file__).parents[1] / "reference"
 
 
 def documented(*names: str) -> str:
@@ -44,24 +39,40 @@ def documented(*names: str) -> str:
     return "```{eval-rst}\n" + "\n\n".join(blocks) + "\n```"
 
 
+def pages_of(*names: str) -> str:
+    """Names with the first sentences of their docstrings, linked to a page each."""
+    rows = ["| | |", "|---|---|"]
+    for name in names:
+        thing = found(name)
+        text = inspect.getdoc(thing) if not isinstance(thing, tuple) else "Names of the methods."
+        first = (text or "").split("\n\n")[0].replace("\n", " ").replace("|", r"\|")
+        first = re.sub(r"`([^`]+)`", r"{py:obj}`\1`", first)
+        rows.append(f"| [`{name}`](names/{name}.md) | {first} |")
+    pages = [f"{name} <names/{name}>" for name in names]
+    return "\n".join([*rows, "", "```{toctree}", ":hidden:", "", *pages, "```"])
+
+
+def write_pages(_app: object) -> None:
+    """A page for every name in an `api-pages` of the reference, if it is not there as it is."""
+    folder = FOLDER / "names"
+    folder.mkdir(exist_ok=True)
+    texts = [page.read_text(encoding="utf-8") for page in FOLDER.glob("*.md")]
+    names = {name for text in texts for listed in HERE.findall(text) for name in listed.split()}
+    for page in folder.glob("*.md"):
+        if page.stem not in names:
+            page.unlink()
+    for name in names:
+        page, text = folder / f"{name}.md", f"# {name}\n\n<!-- here: api {name} -->\n"
+        if not page.is_file() or page.read_text(encoding="utf-8") != text:
+            page.write_text(text, encoding="utf-8")
+
+
 def found(name: str) -> object:
     """A public name's object: of casadi_ik, its logs or its errors."""
     thing: object = casadi_ik
     for part in name.split("."):
         thing = getattr(thing, part)
     return thing
-
-
-def index_of_names() -> str:
-    """Every public name with the first sentence of its docstring."""
-    rows = ["| name | |", "|---|---|"]
-    for name in sorted(casadi_ik.__all__, key=str.lower):
-        thing = found(name)
-        text = inspect.getdoc(thing) if not isinstance(thing, tuple) else "Names of the methods."
-        first = (text or "").split("\n\n")[0].replace("\n", " ").replace("|", r"\|")
-        page = f"[`{name}`]({PAGES[name]})" if inspect.ismodule(thing) else ""
-        rows.append(f"| {page or f'{{py:obj}}`~casadi_ik.{name}`'} | {first} |")
-    return "\n".join(rows)
 
 
 def _inherited(thing: type[enum.Enum]) -> str:

@@ -16,7 +16,7 @@ from urllib.parse import unquote
 LINK = re.compile(r"""<(?:a|img|link|script|source)\b[^>]*?\b(?:href|src)="([^"]+)\"""")
 NAMED = re.compile(r"""\b(?:id|name)="([^"]+)\"""")
 
-RAW = re.compile(r"<p>[^<]*?(\|\s*---\s*\||\$[^$<]+\$)")
+RAW = re.compile(r"(?:<p>[^<]*?|<m\w+>)(\|\s*---\s*\||\$[^$<]+\$|\[\d+pt\])")
 """A table or a formula in Markdown that stands in a paragraph as it was written."""
 
 

@@ -13,18 +13,26 @@ from pathlib import Path
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-from building.api import call_them_attributes, documented, in_words, index_of_names, readable
+from building.api import (
+    call_them_attributes,
+    documented,
+    in_words,
+    pages_of,
+    readable,
+    write_pages,
+)
 from building.commands import command_line
 from building.files import file_reference, quantities
-from building.results import results_table
+from building.results import results_table, retitled
 
 HERE = re.compile(r"^<!-- here: ([a-z-]+) ?(.*?) ?-->$", re.MULTILINE)
 ROOT = Path(__file__).parents[2]
 
 
 def _other_pages(*known: str) -> str:
-    """The pages in docs/ that no page of the site's map names."""
-    text = (ROOT / "docs" / "index.md").read_text()
+    """The pages in docs/ that no list of pages names."""
+    lists = ("index.md", "extending.md")
+    text = "\n".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in lists)
     named = set(re.findall(r"^(?:.*<)?(?:/docs/)?([a-z_0-9/]+)>?$", text, re.MULTILINE))
     pages = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
     others = [name for name in pages if name not in {"index", *named, *known}]
@@ -35,10 +43,10 @@ def _other_pages(*known: str) -> str:
 
 PARTS: dict[str, Callable[..., str]] = {
     "api": documented,
+    "api-pages": pages_of,
     "command-line": command_line,
     "files": file_reference,
     "quantities": quantities,
-    "names": index_of_names,
     "other-pages": _other_pages,
     "results": results_table,
 }
@@ -55,10 +63,13 @@ def _expand(app: Sphinx, docname: str, source: list[str]) -> None:
 
     if docname.startswith("docs/"):
         source[0] = HERE.sub(part, source[0])
+    elif docname.startswith("studies/results/"):
+        source[0] = retitled(docname, source[0])
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Tell Sphinx of it."""
+    app.connect("builder-inited", write_pages)
     app.connect("source-read", _expand)
     app.connect("autodoc-process-docstring", readable, priority=900)
     app.connect("autodoc-process-signature", in_words)

@@ -3,28 +3,48 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "studies" / "results"
 
 
 def results_table() -> str:
     """A Markdown table with a row per report in studies/results."""
     rows = ["| study | report of | commit |", "|---|---|---|"]
-    folder = ROOT / "studies" / "results"
-    for report in sorted([*folder.rglob("report.md"), *folder.rglob("README.md")]):
+    for report in _reports():
         day, commit = _last_change(report)
-        name = report.parent.relative_to(folder).as_posix()
+        name = report.parent.relative_to(FOLDER).as_posix()
         link = os.path.relpath(report, ROOT / "docs")
-        rows.append(f"| [{title(report)}]({link}) `{name}` | {day} | {commit} |")
+        rows.append(f"| [{titles()[name]}]({link}) | {day} | {commit} |")
     return "\n".join(rows)
 
 
-def title(page: Path) -> str:
-    """The first heading of a page."""
-    lines = page.read_text().splitlines()
-    return next((line[2:].strip() for line in lines if line.startswith("# ")), page.parent.name)
+def _reports() -> list[Path]:
+    return sorted([*FOLDER.rglob("report.md"), *FOLDER.rglob("README.md")])
+
+
+@cache
+def titles() -> dict[str, str]:
+    """The heading of every report by its folder's name; of several alike, with what differs."""
+    found: dict[str, str] = {}
+    for report in _reports():
+        lines = report.read_text(encoding="utf-8").splitlines()
+        heading = next((line[2:].strip() for line in lines if line.startswith("# ")), "")
+        name = report.parent.relative_to(FOLDER).as_posix()
+        taken = not heading or heading in found.values()
+        words = name.rpartition("/")[2].replace("_", " ")
+        found[name] = f"{heading} ({words})".lstrip() if taken else heading
+    return found
+
+
+def retitled(docname: str, text: str) -> str:
+    """A report under the title that tells it from others."""
+    name = docname.removeprefix("studies/results/").rpartition("/")[0]
+    return re.sub(r"^# .*$", lambda _: f"# {titles()[name]}", text, count=1, flags=re.MULTILINE)
 
 
 def _last_change(path: Path) -> tuple[str, str]:
