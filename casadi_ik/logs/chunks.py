@@ -10,6 +10,7 @@ record in it. No chunk is unpacked that is larger than `RECORD_LIMIT`.
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -19,9 +20,10 @@ from typing import Any
 import lz4.frame
 import numpy as np
 import zstandard
-from mcap.data_stream import RecordBuilder
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Chunk, ChunkIndex
+from mcap.records import Channel, Chunk, ChunkIndex, Schema
 from numpy.typing import NDArray
 
 from casadi_ik.errors import LogError
@@ -143,15 +145,17 @@ def fill(
     return Run(channel, 0, kind.itemsize, log_time)
 
 
-def message_indexes(runs: Sequence[Run]) -> dict[int, bytes]:
-    """The MessageIndex records of a chunk by channel."""
-    found: dict[int, bytes] = {}
+def index_messages(index: ChunkIndex, runs: Sequence[Run], position: int) -> bytes:
+    """The MessageIndex records of a chunk, noted in its index, for an offset of the file."""
+    records = b""
     for channel in dict.fromkeys(run.channel for run in runs):
         entries = b"".join(run.entries for run in runs if run.channel == channel)
-        head = struct.pack("<HI", channel, len(entries))
+        index.message_index_offsets[channel] = position + len(records)
         # Not `mcap.records.MessageIndex.write`: it takes the pairs one by one.
-        found[channel] = RECORD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries)) + head + entries
-    return found
+        records += RECORD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries))
+        records += struct.pack("<HI", channel, len(entries)) + entries
+    index.message_index_length = len(records)
+    return records
 
 
 def packed_chunk(
@@ -185,10 +189,7 @@ def packed_chunk(
     builder = RecordBuilder()
     chunk.write(builder)
     index = chunk_index(chunk, position)
-    for channel, record in message_indexes(runs).items():
-        index.message_index_offsets[channel] = position + builder.count
-        index.message_index_length += len(record)
-        builder.write(record)
+    builder.write(index_messages(index, runs, position + builder.count))
     return builder.end(), index
 
 
@@ -215,13 +216,13 @@ class Unpacked:
         packed: The chunk as it stands in the file.
         data: Its contents.
         runs: The messages, in their order.
-        definitions: Opcode and body of its Schema and Channel records.
+        definitions: Its Schema and Channel records.
     """
 
     packed: Chunk
     data: bytes
     runs: Sequence[Run]
-    definitions: Sequence[tuple[int, bytes]]
+    definitions: Sequence[Schema | Channel]
 
     def messages(self, run: Run, row: np.dtype[Any]) -> NDArray[Any]:
         """Messages of a run, (k,) of `message_type`; a view.
@@ -285,12 +286,12 @@ def _decompressed(packed: bytes, compression: str, size: int) -> bytes:
     )
 
 
-def _records_in(data: bytes, where: str) -> tuple[list[Run], list[tuple[int, bytes]]]:
+def _records_in(data: bytes, where: str) -> tuple[list[Run], list[Schema | Channel]]:
     """The messages of a chunk, and its other records."""
     octets = np.frombuffer(data, np.uint8)
     same, time = _MESSAGE["sequence"], _MESSAGE["log_time"]
     runs: list[Run] = []
-    definitions: list[tuple[int, bytes]] = []
+    definitions: list[Schema | Channel] = []
     offset, most = 0, 1
     while offset < len(data):
         if offset + RECORD.size > len(data):
@@ -301,7 +302,12 @@ def _records_in(data: bytes, where: str) -> tuple[list[Run], list[tuple[int, byt
             raise LogError(f"{where} holds a record that reaches beyond it")
         # Schemas and channels have numbers of 16 bits.
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and len(definitions) < 2**17:
-            definitions.append((opcode, data[offset + RECORD.size : offset + size]))
+            kind = Schema if opcode == Opcode.SCHEMA else Channel
+            body = ReadDataStream(io.BytesIO(data[offset + RECORD.size : offset + size]))
+            try:
+                definitions.append(kind.read(body))
+            except (McapError, struct.error, ValueError) as error:
+                raise LogError(f"{where} holds a damaged {kind.__name__}") from error
             offset += size
             continue
         if opcode != Opcode.MESSAGE or size < _MESSAGE["cdr"]:

@@ -1,8 +1,8 @@
 """What an MCAP file holds: read from its summary, or record by record if it has none.
 
-Records are read and written by the classes of the `mcap` library; a file that ends as it should is
-read by its index. A file without an end (its writer was killed, or is still at it) is read up to
-the last complete record, and everything in it is verified.
+Records and summaries are read and written by the `mcap` library. A file without an end (its writer
+was killed, or is still at it) is read up to the last complete record, and everything in it is
+verified.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import IO, Any, TypeVar, cast
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
 from mcap.records import (
     Attachment,
     AttachmentIndex,
@@ -30,11 +30,12 @@ from mcap.records import (
     Footer,
     Header,
     McapRecord,
+    Message,
+    MessageIndex,
     Metadata,
     MetadataIndex,
     Schema,
     Statistics,
-    SummaryOffset,
 )
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
@@ -43,11 +44,12 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 from casadi_ik.errors import LogError
 from casadi_ik.logs.chunks import (
     RECORD,
+    RECORD_LIMIT,
     Run,
     Unpacked,
     check_size,
     chunk_index,
-    message_indexes,
+    index_messages,
     unpack,
 )
 
@@ -73,7 +75,7 @@ class Contents:
         complete: False if the file has no end: its writer was killed or the disk was full, or it
             is still being written. Then every complete chunk is here, each verified.
         end: Offset behind its last complete record.
-        owed: MessageIndex records of the last chunk that are not whole, by channel.
+        owed: Messages of the last chunk if their indexes are not whole.
     """
 
     path: Path
@@ -82,17 +84,12 @@ class Contents:
     records: list[Metadata] = field(default_factory=list)
     complete: bool = True
     end: int = len(MAGIC)
-    owed: dict[int, bytes] = field(default_factory=dict)
+    owed: Sequence[Run] = ()
 
     @property
     def chunks(self) -> list[ChunkIndex]:
         """Indexes of the chunks."""
         return self.summary.chunk_indexes
-
-    @property
-    def attachments(self) -> list[AttachmentIndex]:
-        """Indexes of the attachments."""
-        return self.summary.attachment_indexes
 
     @property
     def counts(self) -> Mapping[int, int]:
@@ -124,30 +121,39 @@ def read_contents(path: Path) -> Contents:
         LogError: It is missing, is no MCAP file or is damaged.
     """
     with reading(path) as stream:
-        size, complete = check_magic(stream)
-        if not complete:
+        size, closed = check_magic(stream)
+        if not closed:
             return replace(scan(stream, path), complete=False)
         contents = Contents(path, size, read_summary(stream), end=size)
         for index in contents.summary.metadata_indexes:
-            found = parsed(Metadata, record_at(stream, index.offset, index.length))
-            if found.name != index.name:
-                raise LogError(
-                    f"the log is damaged: metadata {index.name!r} are not at their place"
-                )
-            contents.records.append(found)
+            contents.records.append(record_at(Metadata, stream, index.offset, index.length))
     return contents
 
 
-def read_attachment(stream: IO[bytes], index: AttachmentIndex) -> Attachment:
-    """An attachment, its checksum verified.
+def record_at(kind: type[Kind], stream: IO[bytes], offset: int, length: int) -> Kind:
+    """A record as the library reads it: written again it is the very same.
+
+    So its lengths and its checksum hold, if it has any.
 
     Raises:
-        LogError: It is damaged, or not what its index says.
+        LogError: Something else stands there.
     """
-    found = parsed(Attachment, record_at(stream, index.offset, index.length))
-    if (found.name, len(found.data)) != (index.name, index.data_size):
-        raise LogError(f"the log is damaged: attachment {index.name!r} is not what its index says")
+    where = f"{kind.__name__} at byte {offset}"
+    check_size(where, length)
+    with _damage(where):
+        stream.seek(offset)
+        data = stream.read(length)
+        # Every kind that is asked for can be read; their base does not say so.
+        found: Kind = cast(Any, kind).read(ReadDataStream(io.BytesIO(data[RECORD.size :])))
+        if _written(found) != data:
+            raise ValueError("it contradicts its own kind, length or checksum")
     return found
+
+
+def _written(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
 
 
 def read_chunk(stream: IO[bytes], index: ChunkIndex) -> Unpacked:
@@ -156,11 +162,18 @@ def read_chunk(stream: IO[bytes], index: ChunkIndex) -> Unpacked:
     Raises:
         LogError: It is damaged, too large, or not what its index says.
     """
-    found = _whole_chunk(record_at(stream, index.chunk_start_offset, index.chunk_length))
-    expected = replace(index, message_index_length=0, message_index_offsets={})
-    if chunk_index(found.packed, index.chunk_start_offset) != expected:
-        raise LogError(f"the chunk at byte {index.chunk_start_offset} is not what its index says")
-    return found
+    start = index.chunk_start_offset
+    where = f"the chunk at byte {start}"
+    check_size(where, index.chunk_length)
+    with _damage(where):
+        stream.seek(start + RECORD.size)
+        data = stream.read(index.chunk_length - RECORD.size)
+        chunk = Chunk.read(ReadDataStream(io.BytesIO(data)))
+    if chunk_index(chunk, start) != replace(
+        index, message_index_length=0, message_index_offsets={}
+    ):
+        raise LogError(f"{where} is not what its index says")
+    return unpack(chunk, where)
 
 
 def check_magic(stream: IO[bytes]) -> tuple[int, bool]:
@@ -189,45 +202,23 @@ def read_summary(stream: IO[bytes]) -> Summary:
     Raises:
         LogError: It is damaged, or there is none.
     """
-    end = stream.seek(0, os.SEEK_END)
-    length = RECORD.size + 20
-    footer = parsed(Footer, record_at(stream, end - len(MAGIC) - length, length))
-    start, summary = footer.summary_start, Summary()
+    end = stream.seek(-len(MAGIC), os.SEEK_END)
+    with _damage("its end"):
+        stream.seek(end - 20)
+        start, _, checksum = struct.unpack("<QQI", stream.read(20))
     if not len(MAGIC) < start < end:
         raise LogError("the file has no summary")
     check_size("the summary", end - start)
     stream.seek(start)
-    section = stream.read()
-    covered = section[: -len(MAGIC) - 4]
-    if footer.summary_crc and zlib.crc32(covered) != footer.summary_crc:
+    # The checksum covers the summary and the footer up to itself.
+    if checksum and zlib.crc32(stream.read(end - start - 4)) != checksum:
         raise LogError("the log is damaged: the summary does not match its checksum")
-    reader = StreamReader(io.BytesIO(section), skip_magic=True, emit_chunks=True)
+    stream.seek(0)
     with _damage("its summary"):
-        for record in reader.records:
-            if isinstance(record, Statistics):
-                summary.statistics = record
-            elif isinstance(record, Schema | Channel):
-                declare(summary, record)
-            elif isinstance(record, ChunkIndex):
-                summary.chunk_indexes.append(record)
-            elif isinstance(record, AttachmentIndex):
-                summary.attachment_indexes.append(record)
-            elif isinstance(record, MetadataIndex):
-                summary.metadata_indexes.append(record)
-    if summary.statistics is None:
+        summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary()
+    if summary is None or summary.statistics is None:
         raise LogError("the file has no summary")
     return summary
-
-
-def declare(summary: Summary, record: Schema | Channel) -> None:
-    """Note a schema or channel.
-
-    Raises:
-        LogError: Its number already stands for another.
-    """
-    known: Any = summary.schemas if isinstance(record, Schema) else summary.channels
-    if known.setdefault(record.id, record) != record:
-        raise LogError(f"the log is damaged: {type(record).__name__} {record.id} is defined twice")
 
 
 def counts_of(summary: Summary) -> dict[int, int]:
@@ -285,103 +276,16 @@ def ending(summary: Summary, position: int) -> bytes:
         schema_count=len(summary.schemas),
     )
     DataEnd(0).write(builder)
-    start, offsets = position + builder.count, []
-    groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
-        (Opcode.SCHEMA, list(summary.schemas.values())),
-        (Opcode.CHANNEL, list(summary.channels.values())),
-        (Opcode.STATISTICS, [statistics]),
-        (Opcode.CHUNK_INDEX, chunks),
-        (Opcode.ATTACHMENT_INDEX, summary.attachment_indexes),
-        (Opcode.METADATA_INDEX, summary.metadata_indexes),
+    start = builder.count
+    records: list[McapRecord] = [
+        *(*summary.schemas.values(), *summary.channels.values(), statistics, *chunks),
+        *(*summary.attachment_indexes, *summary.metadata_indexes),
+        Footer(position + start, 0, 0),
     ]
-    for opcode, group in groups:
-        before = builder.count
-        for record in group:
-            record.write(builder)
-        if group:
-            offsets.append(SummaryOffset(opcode, position + before, builder.count - before))
-    offset_start = position + builder.count
-    for item in offsets:
-        item.write(builder)
-    Footer(start, offset_start, 0).write(builder)
+    for record in records:
+        record.write(builder)
     data = builder.end()[:-4]
-    # The checksum covers the summary and the footer up to itself.
-    return data + struct.pack("<I", zlib.crc32(data[start - position :])) + MAGIC
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """One record as bytes.
-
-    Attributes:
-        opcode: Its kind.
-        offset: Where it begins.
-        body: Its bytes behind opcode and length.
-    """
-
-    opcode: int
-    offset: int
-    body: bytes
-
-    @property
-    def length(self) -> int:
-        """Of the whole record."""
-        return RECORD.size + len(self.body)
-
-
-def records(stream: IO[bytes], start: int, end: int) -> Iterator[Record]:
-    """The records of a stretch of a file, to its end or to the first that is not whole.
-
-    Args:
-        stream: The file.
-        start: Where the first begins.
-        end: Where the stretch ends.
-
-    Raises:
-        LogError: A record is larger than `RECORD_LIMIT`.
-    """
-    while start + RECORD.size <= end:
-        stream.seek(start)
-        head = stream.read(RECORD.size)
-        opcode, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
-        if opcode == 0 or start + RECORD.size + length > end:
-            return
-        check_size(f"the record at byte {start}", length)
-        record = Record(opcode, start, stream.read(length))
-        if len(record.body) < length:
-            return
-        yield record
-        start += record.length
-
-
-def record_at(stream: IO[bytes], offset: int, length: int) -> Record:
-    """The one record that fills a stretch of a file.
-
-    Raises:
-        LogError: Something else stands there.
-    """
-    record = next(records(stream, offset, offset + length), None)
-    if record is None or record.length != length:
-        raise LogError(f"the log is damaged: no record of {length} bytes at byte {offset}")
-    return record
-
-
-def parsed(kind: type[Kind], record: Record) -> Kind:
-    """A record as the library reads it: written again it is the very same.
-
-    So its lengths and its checksum hold, if it has any.
-
-    Raises:
-        LogError: It is of another kind, or contradicts itself.
-    """
-    with _damage(f"{kind.__name__} at byte {record.offset}"):
-        # Every kind that is asked for can be read; their base does not say so.
-        found: Kind = cast(Any, kind).read(ReadDataStream(io.BytesIO(record.body)))
-        builder = RecordBuilder()
-        found.write(builder)
-        if builder.end() != RECORD.pack(record.opcode, len(record.body)) + record.body:
-            raise ValueError("it contradicts its own kind, length or checksum")
-    return found
+    return data + struct.pack("<I", zlib.crc32(data[start:])) + MAGIC
 
 
 def scan(stream: IO[bytes], path: Path) -> Contents:
@@ -399,18 +303,27 @@ def scan(stream: IO[bytes], path: Path) -> Contents:
         LogError: Not an MCAP file, or damaged where it cannot be torn: in a file that was closed,
             or in front of a chunk that is whole.
     """
-    size, was_closed = check_magic(stream)
-    contents, wrong = Contents(path, size, complete=False), "it is cut off"
-    for record in records(stream, len(MAGIC), size):
-        if record.opcode in (Opcode.DATA_END, Opcode.FOOTER):
-            return replace(contents, complete=True)
-        try:
-            _take(contents, record)
-        except LogError as error:
-            wrong = str(error)
-            break
-        contents.end = record.offset + record.length
-    if was_closed or _chunk_follows(stream, contents.end, size):
+    size, closed = check_magic(stream)
+    contents, wrong, damaged = Contents(path, size, complete=False), "it is cut off", closed
+    stream.seek(len(MAGIC))
+    reader = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=RECORD_LIMIT)
+    start, torn = len(MAGIC), False
+    with contextlib.suppress(*_DAMAGE):
+        for record in reader.records:
+            length = stream.tell() - start
+            try:
+                if torn:
+                    damaged |= isinstance(record, Chunk) and bool(unpack(record, "a chunk"))
+                elif isinstance(record, DataEnd | Footer):
+                    record_at(type(record), stream, start, length)
+                    return replace(contents, complete=True)
+                else:
+                    _take(contents, record, start, length, stream)
+            except LogError as error:
+                if not torn:
+                    torn, wrong = True, str(error)
+            start = stream.tell()
+    if damaged:
         raise LogError(
             f"the log is damaged in its middle: the record at byte {contents.end} is not as it was"
             f" written: {wrong}"
@@ -419,49 +332,55 @@ def scan(stream: IO[bytes], path: Path) -> Contents:
         raise NothingWrittenError(
             f"the log is truncated: none of its {size} bytes is a whole record"
         )
-    if contents.owed:
-        # Its indexes are torn: which channels it holds is to be looked up in it.
-        contents.chunks[-1].message_index_offsets = {}
     return contents
 
 
-def _take(contents: Contents, record: Record) -> None:
-    """Account for one record.
+def _take(
+    contents: Contents, record: McapRecord, start: int, length: int, stream: IO[bytes]
+) -> None:
+    """Account for a record of a file without a summary; the stream stands behind it.
 
     Raises:
         LogError: It is damaged or does not belong there; then nothing has changed.
     """
-    summary = contents.summary
-    if record.opcode == Opcode.CHUNK:
-        chunk = _whole_chunk(record)
-        for opcode, body in chunk.definitions:
-            declare(summary, _definition(Record(opcode, record.offset, body)))
-        contents.owed = message_indexes(chunk.runs)
-        add_chunk(summary, chunk_index(chunk.packed, record.offset), chunk.runs)
-    elif record.opcode == Opcode.MESSAGE_INDEX:
-        channel = int.from_bytes(record.body[:2], "little")
-        if contents.owed.get(channel, b"")[RECORD.size :] != record.body:
-            raise LogError(f"the message index of channel {channel} is wrong")
-        note_index(contents, channel, record.offset)
-    elif record.opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
-        kind = Attachment if record.opcode == Opcode.ATTACHMENT else Metadata
-        found = parsed(kind, record)
-        _note(summary, found, record.offset, record.length)
-        if isinstance(found, Metadata):
-            contents.records.append(found)
-    elif record.opcode == Opcode.HEADER and record.offset == len(MAGIC):
-        parsed(Header, record)
-    elif record.opcode == Opcode.MESSAGE:
+    summary, end = contents.summary, start + length
+    record_at(type(record), stream, start, length)
+    if isinstance(record, MessageIndex):
+        return  # not the one that its chunk would have here
+    owed: Sequence[Run] = ()
+    if isinstance(record, Chunk):
+        chunk = unpack(record, f"the chunk at byte {start}")
+        for definition in chunk.definitions:
+            _declare(summary, definition)
+        index = chunk_index(record, start)
+        expected = index_messages(index, chunk.runs, end)
+        if stream.read(len(expected)) == expected:
+            end += len(expected)
+        else:
+            index.message_index_offsets, index.message_index_length = {}, 0
+            owed = chunk.runs
+        add_chunk(summary, index, chunk.runs)
+    elif isinstance(record, Attachment | Metadata):
+        _note(summary, record, start, length)
+        if isinstance(record, Metadata):
+            contents.records.append(record)
+    elif isinstance(record, Message):
         raise LogError("the messages are not in chunks, which casadi_ik does not read")
-    else:
-        declare(summary, _definition(record))
+    elif isinstance(record, Schema | Channel):
+        _declare(summary, record)
+    contents.end, contents.owed = end, owed
+    stream.seek(end)
 
 
-def note_index(contents: Contents, channel: int, offset: int) -> None:
-    """Note that a MessageIndex record of the last chunk stands at an offset."""
-    chunk = contents.chunks[-1]
-    chunk.message_index_offsets[channel] = offset
-    chunk.message_index_length += len(contents.owed.pop(channel))
+def _declare(summary: Summary, record: Schema | Channel) -> None:
+    """Note a schema or channel.
+
+    Raises:
+        LogError: Its number already stands for another.
+    """
+    known: Any = summary.schemas if isinstance(record, Schema) else summary.channels
+    if known.setdefault(record.id, record) != record:
+        raise LogError(f"the log is damaged: {type(record).__name__} {record.id} is defined twice")
 
 
 def _note(summary: Summary, item: Attachment | Metadata, offset: int, length: int) -> None:
@@ -472,31 +391,6 @@ def _note(summary: Summary, item: Attachment | Metadata, offset: int, length: in
         times = item.log_time, item.create_time
         about = len(item.data), item.name, item.media_type
         summary.attachment_indexes.append(AttachmentIndex(offset, length, *times, *about))
-
-
-def _definition(record: Record) -> Schema | Channel:
-    return parsed(Schema if record.opcode == Opcode.SCHEMA else Channel, record)
-
-
-def _whole_chunk(record: Record) -> Unpacked:
-    where = f"the chunk at byte {record.offset}"
-    with _damage(where):
-        chunk = Chunk.read(ReadDataStream(io.BytesIO(record.body)))
-    start, size = len(record.body) - len(chunk.data), len(chunk.data).to_bytes(8, "little")
-    whole = chunk_index(chunk, 0).chunk_length == record.length
-    if record.opcode != Opcode.CHUNK or not whole or record.body[start - 8 : start] != size:
-        raise LogError(f"{where} contradicts its own length")
-    return unpack(chunk, where)
-
-
-def _chunk_follows(stream: IO[bytes], start: int, size: int) -> bool:
-    """Whether a whole chunk stands behind the record at `start`."""
-    for record in records(stream, start, size):
-        if record.opcode == Opcode.CHUNK and record.offset > start:
-            with contextlib.suppress(LogError):
-                _whole_chunk(record)
-                return True
-    return False
 
 
 @contextlib.contextmanager

@@ -171,7 +171,9 @@ class Log:
             uncompressed=sum(chunk.uncompressed_size for chunk in chunks),
             compressed=sum(chunk.compressed_size for chunk in chunks),
             metadata=self.metadata,
-            attachments={item.name: item.data_size for item in contents[0].attachments},
+            attachments={
+                item.name: item.data_size for item in contents[0].summary.attachment_indexes
+            },
             unfinished=tuple(each.path for each in contents if not each.complete),
             left_out=self.left_out,
             differs=self.sources.differences(),
@@ -184,7 +186,13 @@ class Log:
             UnknownNameError: Nothing of that name is attached.
             LogError: It cannot be read.
         """
-        return self.shards[0].attachment(name)
+        known = self.shards[0].attachments()
+        if name not in known:
+            raise UnknownNameError(
+                f"{self.shards[0].path}: no attachment {name!r}; attached: "
+                f"{', '.join(known) or 'none'}"
+            )
+        return known[name].data
 
     def solves(self, **filters: Unpack[Filters]) -> Table:
         """Solves: the question, the answer, totals of iterations and events.

@@ -23,16 +23,13 @@ from mcap.summary import Summary
 from casadi_ik.arrays import Counts
 from casadi_ik.errors import LogError
 from casadi_ik.files.writing import written_whole
-from casadi_ik.logs.chunks import COMPRESSORS, Run, Unpacked, packed_chunk
+from casadi_ik.logs.chunks import COMPRESSORS, Run, Unpacked, index_messages, packed_chunk
 from casadi_ik.logs.container import (
     Contents,
     add_chunk,
     beginning,
-    check_magic,
     counts_of,
     ending,
-    note_index,
-    read_attachment,
     read_chunk,
     read_summary,
     reading,
@@ -97,9 +94,8 @@ def finish_log(path: str | os.PathLike[str]) -> Finished:
 def _close(contents: Contents) -> int:
     """Cut what is torn and write the end; gives the bytes that were cut."""
     tail = b""
-    for channel, index in list(contents.owed.items()):
-        note_index(contents, channel, contents.end + len(tail))
-        tail += index
+    if contents.owed:
+        tail = index_messages(contents.chunks[-1], contents.owed, contents.end)
     tail += ending(contents.summary, contents.end + len(tail))
     with contents.path.open("r+b") as stream:
         if not locked(stream.fileno(), contents.path) or (
@@ -117,7 +113,9 @@ def _close(contents: Contents) -> int:
 def _ends_well(stream: IO[bytes], contents: Contents) -> bool:
     """Whether the file ends with a summary that says what it holds."""
     with suppress(LogError):
-        return check_magic(stream)[1] and read_summary(stream).chunk_indexes == contents.chunks
+        known, found = read_summary(stream).chunk_indexes, contents.chunks
+        places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in known]
+        return places == [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in found]
     return False
 
 
@@ -371,9 +369,7 @@ def _attachments(shards: Sequence[Shard]) -> list[Attachment]:
     """The attachments of all shards, which must be the same where they have one name."""
     joint: dict[str, Attachment] = {}
     for shard in shards:
-        with reading(shard.path) as stream:
-            found = [read_attachment(stream, item) for item in shard.contents.attachments]
-        for attachment in found:
+        for attachment in shard.attachments().values():
             known = joint.setdefault(attachment.name, attachment)
             if known.data != attachment.data:
                 raise LogError(

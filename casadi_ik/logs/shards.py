@@ -20,7 +20,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from mcap.records import Channel, ChunkIndex, Schema
+from mcap.records import Attachment, Channel, ChunkIndex, Schema
 from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
@@ -29,10 +29,10 @@ from casadi_ik.errors import LogError, UnknownNameError, printable
 from casadi_ik.kernels.layout import Field, Layout, opaque
 from casadi_ik.logs.container import (
     NothingWrittenError,
-    read_attachment,
     read_chunk,
     read_contents,
     reading,
+    record_at,
 )
 from casadi_ik.logs.events import event_layout
 from casadi_ik.logs.format import KINDS, parse_layout, topic
@@ -108,19 +108,17 @@ class Shard:
         found = self._topics.get((method, kind))
         return 0 if found is None else self.contents.counts.get(found.channel, 0)
 
-    def attachment(self, name: str) -> bytes:
-        """An attached file.
+    def attachments(self) -> dict[str, Attachment]:
+        """The attached files by name, their checksums verified.
 
         Raises:
-            UnknownNameError: Nothing of that name is attached.
-            LogError: It is damaged.
+            LogError: One is damaged.
         """
-        for item in self.contents.attachments:
-            if item.name == name:
-                with reading(self.path) as stream:
-                    return read_attachment(stream, item).data
-        names = ", ".join(item.name for item in self.contents.attachments) or "none"
-        raise UnknownNameError(f"{self.path}: no attachment {name!r}; attached: {names}")
+        with reading(self.path) as stream:
+            found = self.contents.summary.attachment_indexes
+            return {
+                item.name: record_at(Attachment, stream, item.offset, item.length) for item in found
+            }
 
     def solves(self, method: str) -> MethodRows:
         """All solves of a method, in the order of the file; they are read once.

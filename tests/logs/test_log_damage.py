@@ -27,12 +27,13 @@ from made_up_solves import main, make_block
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Chunk, Metadata
+from mcap.records import Chunk, Footer, Metadata
+from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from casadi_ik import errors, logs
 from casadi_ik.logs.chunks import RECORD, RECORD_LIMIT, unpack
-from casadi_ik.logs.container import MAGIC, read_chunk, read_contents, records
+from casadi_ik.logs.container import read_chunk, read_contents
 from casadi_ik.logs.provenance import METADATA_NAME, signed
 from casadi_ik.logs.writer import CHUNK_SIZE
 
@@ -385,14 +386,16 @@ def places(data: bytes, path: Path) -> list[int]:
     """Bytes to flip: first and last of every kind of record, of its head, and some between."""
     path.write_bytes(data)
     rng, found = np.random.default_rng(4), {0, len(data) - 1}
-    kinds: dict[int, int] = {}
+    kinds: dict[type, int] = {}
     with path.open("rb") as stream:
-        for record in records(stream, len(MAGIC), len(data) - len(MAGIC)):
-            kinds[record.opcode] = kinds.get(record.opcode, 0) + 1
-            if kinds[record.opcode] <= 2:
-                start, end = record.offset, record.offset + record.length
+        start = stream.seek(len(MCAP0_MAGIC))
+        for record in StreamReader(stream, skip_magic=True, emit_chunks=True).records:
+            end = stream.tell() - len(MCAP0_MAGIC) * isinstance(record, Footer)
+            kinds[type(record)] = kinds.get(type(record), 0) + 1
+            if kinds[type(record)] <= 2:
                 found |= {start, start + 1, end - 1, *rng.integers(start, end, 4).tolist()}
-    assert len(kinds) >= 12, "every kind of record but a message outside of chunks"
+            start = end
+    assert len(kinds) >= 11, "every kind of record but a message outside of chunks"
     return sorted(found)
 
 
