@@ -33,7 +33,7 @@ from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.files.shipped import resolve
 from casadi_ik.files.writing import remove_stale
 from casadi_ik.grasps.pose import moved
-from casadi_ik.logs.provenance import plain
+from casadi_ik.logs.format import plain
 
 BLOCK = 4096
 """Targets in memory at once, at most."""

@@ -12,12 +12,13 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
-from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
+from mcap.records import Attachment, ChunkIndex, Metadata
 from mcap.summary import Summary
 
 from casadi_ik.arrays import Counts
@@ -35,8 +36,7 @@ from casadi_ik.logs.container import (
     reading,
     scan,
 )
-from casadi_ik.logs.format import KINDS
-from casadi_ik.logs.provenance import CHECKSUM, METADATA_NAME, SHARDS, signed
+from casadi_ik.logs.format import CHECKSUM, KINDS, METADATA_NAME, SHARDS, signed
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.shards import Paths, Shard, open_shards
 from casadi_ik.logs.writer import locked
@@ -212,32 +212,27 @@ class _Merge:
         self.summary = Summary()
         self._ids: list[dict[int, int]] = []
         self._same: list[bool] = []
-        self._holders: dict[str, tuple[int, Shard]] = {}
+        numbers: dict[str, int] = {}
         for shard in log.shards:
-            ids, same = dict[int, int](), True
-            for method in shard.methods:
-                for kind in KINDS:
-                    own = shard.contents.summary.channels[shard.topic(method, kind).channel]
-                    ids[own.id] = self._joined(shard, method, own)
-                    same &= own.id == own.schema_id == ids[own.id]
+            ids, same, own = dict[int, int](), True, shard.contents.summary
+            for method, kind in product(shard.methods, KINDS):
+                channel = own.channels[shard.topic(method, kind).channel]
+                number = numbers.setdefault(channel.topic, len(numbers) + 1)
+                if number >= 2**16:
+                    raise LogError("more topics than a log has numbers for")
+                ids[channel.id] = number
+                same &= channel.id == channel.schema_id == number
+                schema = replace(own.schemas[channel.schema_id], id=number)
+                channel = replace(channel, id=number, schema_id=number)
+                known = self.summary.schemas.setdefault(number, schema)
+                if known != schema or self.summary.channels.setdefault(number, channel) != channel:
+                    holder = next(each.path for each in log.shards if method in each.methods)
+                    raise LogError(
+                        f"{shard.path}: method {method!r} has other fields or names than in"
+                        f" {holder} ({channel.topic})"
+                    )
             self._ids.append(ids)
             self._same.append(same)
-
-    def _joined(self, shard: Shard, method: str, own: Channel) -> int:
-        """The number of a shard's channel and schema in the new log."""
-        new = len(self._holders) + 1
-        if new >= 2**16:
-            raise LogError("more topics than a log has numbers for")
-        number, holder = self._holders.setdefault(own.topic, (new, shard))
-        schema = replace(shard.contents.summary.schemas[own.schema_id], id=number)
-        channel = replace(own, id=number, schema_id=number)
-        known = self.summary.schemas.setdefault(number, schema)
-        if known != schema or self.summary.channels.setdefault(number, channel) != channel:
-            raise LogError(
-                f"{shard.path}: method {method!r} has other fields or names than in"
-                f" {holder.path} ({own.topic})"
-            )
-        return number
 
     def write(self, stream: IO[bytes]) -> None:
         """Write the new log.
@@ -251,35 +246,22 @@ class _Merge:
         attachments = _attachments(log.shards)
         head = beginning(self.summary, library, Metadata(METADATA_NAME, record), attachments)
         builder = RecordBuilder()
-        definitions: list[Schema | Channel] = [
-            *self.summary.schemas.values(),
-            *self.summary.channels.values(),
-        ]
-        for definition in definitions:
-            definition.write(builder)
+        for definitions in (self.summary.schemas, self.summary.channels):
+            for definition in definitions.values():
+                definition.write(builder)
         stream.write(head + builder.end())
         chunks = [
             (index.message_start_time + offset * shard.clock.slot, i, index)
             for i, (shard, offset) in enumerate(zip(log.shards, log.sources.offsets, strict=True))
             for index in shard.contents.chunks
         ]
-        counts = [dict[int, int]() for _ in log.shards]
         for _, i, index in sorted(chunks, key=lambda chunk: chunk[:2]):
             with reading(log.shards[i].path) as source:
                 chunk = read_chunk(source, index)
-                found = self._copied(chunk, i, stream.tell()) if chunk.runs else None
-            if found is not None:
-                data, moved, runs = found
-                stream.write(data)
-                add_chunk(self.summary, moved, runs)
-                for run in runs:
-                    counts[i][run.channel] = counts[i].get(run.channel, 0) + len(run.log_time)
-        for shard, ids, found in zip(log.shards, self._ids, counts, strict=True):
-            said = {ids.get(channel): n for channel, n in shard.contents.counts.items() if n}
-            if found != said:
-                raise LogError(
-                    f"{shard.path}: the log is damaged: its summary counts other messages"
-                )
+                if chunk.runs:
+                    data, moved, runs = self._copied(chunk, i, stream.tell())
+                    stream.write(data)
+                    add_chunk(self.summary, moved, runs)
         stream.write(ending(self.summary, stream.tell()))
 
     def _copied(
@@ -291,16 +273,11 @@ class _Merge:
             LogError: It holds what is no part of a log of casadi_ik.
         """
         shard, ids, offset = self.log.shards[i], self._ids[i], self.log.sources.offsets[i]
-        topics = {
-            shard.topic(method, kind).channel: (kind, shard.topic(method, kind).layout)
-            for method in shard.methods
-            for kind in KINDS
-        }
-        for run in chunk.runs:
-            if run.channel not in topics:
-                raise LogError(
-                    f"a message of channel {run.channel}, which is no topic of casadi_ik"
-                )
+        pairs = product(shard.methods, KINDS)
+        topics = {(topic := shard.topic(*pair)).channel: (pair[1], topic.layout) for pair in pairs}
+        strange = [run.channel for run in chunk.runs if run.channel not in topics]
+        if strange:
+            raise LogError(f"a message of channel {strange[0]}, which is no topic of casadi_ik")
         names = {name: key for key, (name, _) in COMPRESSORS.items()}
         compression, runs = names[chunk.packed.compression], chunk.runs
         if offset == 0 and self._same[i]:
@@ -330,33 +307,18 @@ class _Merge:
         base = {key: text for key, text in self.log.shards[0].record.items() if key != SHARDS}
         parts, origins = self.log.solves().parts, []
         for i, source in enumerate(self.log.sources.sources):
-            differs = {
-                key: _text(value)
-                for key, value in source.metadata.items()
-                if key not in (CHECKSUM, SHARDS) and _text(value) != _text(_value(base.get(key)))
+            own = {
+                key: text for key, text in source.record.items() if key not in (CHECKSUM, SHARDS)
             }
             solves = {
                 part.method: _ranges(part.solve_id[part.shard == i])
                 for part in parts
                 if part.shard is not None and (part.shard == i).any()
             }
-            origins.append(
-                {"file": source.name, "first": source.first, "solves": solves, "differs": differs}
-            )
+            differs = {key: text for key, text in own.items() if text != base.get(key)}
+            about = {"file": source.file, "first": source.first}
+            origins.append({**about, "solves": solves, "differs": differs})
         return signed({**base, SHARDS: json.dumps(origins)})
-
-
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def _value(text: str | None) -> Any:
-    """Structured values as what they say, so that they compare."""
-    with suppress(ValueError):
-        found = json.loads(text or "")
-        if isinstance(found, dict):
-            return found
-    return text or ""
 
 
 def _ranges(numbers: Counts) -> list[list[int]]:

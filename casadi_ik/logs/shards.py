@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -35,8 +34,16 @@ from casadi_ik.logs.container import (
     record_at,
 )
 from casadi_ik.logs.events import event_layout
-from casadi_ik.logs.format import KINDS, parse_layout, topic
-from casadi_ik.logs.provenance import SHARDS, clock_of, own_record, parsed_json, values_of
+from casadi_ik.logs.format import (
+    KINDS,
+    SHARDS,
+    clock_of,
+    own_record,
+    parse_layout,
+    parsed_json,
+    topic,
+    values_of,
+)
 from casadi_ik.logs.rows import solve_layout
 from casadi_ik.logs.tables import Labels, MethodRows
 from casadi_ik.problem.trace import CONDITION, SIGMA, STANDARD, Elements
@@ -85,7 +92,7 @@ class Shard:
         self.path = path
         self.name = name or path.name
         self.contents = read_contents(path)
-        with naming(path):
+        with reading(path):
             contents = self.contents
             if not (contents.complete or contents.chunks or contents.records):
                 raise NothingWrittenError("the log is truncated before its metadata")
@@ -154,12 +161,24 @@ class Shard:
             if each not in found.layout.names:
                 names = ", ".join(found.layout.names)
                 raise UnknownNameError(f"no field {each!r}; there are: {names}")
-        with reading(self.path):
-            pairs = list(self._rows(found, solves, fields))
-            times = np.concatenate([np.zeros(0, np.uint64), *(each for each, _ in pairs)])
-            none = _chosen(np.zeros(0, found.layout.dtype), fields)
-            rows = np.concatenate([opaque(none), *(each for _, each in pairs)])
-            rows = rows.view(none.dtype)
+        none = _chosen(np.zeros(0, found.layout.dtype), fields)
+        all_times, all_rows = [np.zeros(0, np.uint64)], [opaque(none)]
+        with reading(self.path) as stream:
+            for index in self.contents.chunks:
+                if not self._may_hold(index, found.channel, solves):
+                    continue
+                chunk = read_chunk(stream, index)
+                for run in chunk.runs:
+                    if run.channel != found.channel:
+                        continue
+                    times, part = run.log_time, chunk.messages(run, found.layout.dtype)["row"]
+                    if solves is not None:
+                        wanted = np.isin(self.clock.locate(times)[0], solves)
+                        times, part = times[wanted], part[wanted]
+                    all_times.append(times)
+                    # A copy, so that the chunk need not be kept.
+                    all_rows.append(opaque(_chosen(part, fields)))
+            times, rows = np.concatenate(all_times), np.concatenate(all_rows).view(none.dtype)
             if solves is None and len(times) != self.count(method, kind):
                 raise LogError(
                     f"{len(times)} messages on {name!r}, but the summary counts"
@@ -172,25 +191,6 @@ class Shard:
                 raise LogError(f"{name!r}: a solve's number is not that of its time")
         units = {item.name: item.unit for item in found.layout}
         return MethodRows(method, rows, solve_id, iteration, found.labels, units)
-
-    def _rows(
-        self, found: Topic, solves: Counts | None, fields: Sequence[str] | None
-    ) -> Iterator[tuple[NDArray[np.uint64], NDArray[Any]]]:
-        """Log times and rows as bytes, chunk by chunk."""
-        with reading(self.path) as stream:
-            for index in self.contents.chunks:
-                if not self._may_hold(index, found.channel, solves):
-                    continue
-                chunk = read_chunk(stream, index)
-                for run in chunk.runs:
-                    if run.channel == found.channel:
-                        times = run.log_time
-                        rows = chunk.messages(run, found.layout.dtype)["row"]
-                        if solves is not None:
-                            wanted = np.isin(self.clock.locate(times)[0], solves)
-                            times, rows = times[wanted], rows[wanted]
-                        # A copy, so that the chunk need not be kept.
-                        yield times, opaque(_chosen(rows, fields))
 
     def _may_hold(self, index: ChunkIndex, channel: int, solves: Counts | None) -> bool:
         """Whether a chunk may hold messages of a channel and of some solves."""
@@ -280,32 +280,27 @@ def open_shards(path: Paths) -> tuple[list[Shard], list[Path]]:
     return shards, empty
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A shard, as it was written; a merged log has several in one file.
+class Source(msgspec.Struct):
+    """A shard as it was written; a merged log, which says so of each, has several in one file.
 
     Attributes:
-        file: Number of the file in which its solves stand now.
-        name: Of its own file; below a folder the path from there.
+        file: Name of its own file; below a folder the path from there.
         first: What its solves' numbers were raised by.
-        metadata: Its provenance.
-        ranges: (m, 2) first and last numbers of its solves here, by method; empty: all of the file.
+        solves: First and last numbers of its solves in every stretch, by method; empty: all that
+            are in the file.
+        differs: Entries of its provenance that are not as in the file's.
+        holder: Number of the file in which its solves stand now.
+        record: Its provenance, as it stands in the file.
+        metadata: The same, structured values as what they say.
     """
-
-    file: int
-    name: str
-    first: int
-    metadata: Mapping[str, Any]
-    ranges: Mapping[str, Counts] = field(default_factory=dict)
-
-
-class Merged(msgspec.Struct):
-    """What a merged log says of one of its shards."""
 
     file: str
     first: int = 0
     solves: dict[str, list[tuple[int, int]]] = {}
     differs: dict[str, str] = {}
+    holder: int = 0
+    record: Mapping[str, str] = {}
+    metadata: Mapping[str, Any] = {}
 
 
 class Sources:
@@ -326,23 +321,21 @@ class Sources:
         self.offsets = _offsets(shards) if _overlapping(shards) else [0] * len(shards)
         self.sources: list[Source] = []
         for i, (shard, offset) in enumerate(zip(shards, self.offsets, strict=True)):
-            with naming(shard.path):
-                merged = _merged(shard.record.get(SHARDS, "[]"))
-                if not merged:
-                    self.sources.append(Source(i, shard.name, offset, shard.metadata))
-                for each in merged:
-                    ranges = {
-                        method: np.array(pairs, np.int64).reshape(-1, 2) + offset
-                        for method, pairs in each.solves.items()
+            with reading(shard.path):
+                for source in _sources(shard):
+                    source.holder, source.first = i, source.first + offset
+                    source.solves = {
+                        method: [(first + offset, last + offset) for first, last in pairs]
+                        for method, pairs in source.solves.items()
                     }
-                    metadata = values_of({**shard.record, **each.differs})
-                    first = offset + each.first
-                    self.sources.append(Source(i, each.file, first, metadata, ranges))
+                    source.record = {**shard.record, **source.differs}
+                    source.metadata = values_of(source.record)
+                    self.sources.append(source)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the sources."""
-        return tuple(source.name for source in self.sources)
+        return tuple(source.file for source in self.sources)
 
     def differences(self) -> dict[str, tuple[Any, ...]]:
         """Entries of the metadata in which they differ, and all that is said there."""
@@ -358,23 +351,14 @@ class Sources:
 
     def of(self, file: int, method: str, numbers: Counts) -> Counts:
         """The source that each of the solves (k,) of a file comes from, by their numbers here."""
-        own = [i for i, source in enumerate(self.sources) if source.file == file]
+        own = [i for i, source in enumerate(self.sources) if source.holder == file]
         found = np.full(len(numbers), own[0])
         for i in own:
-            ranges = self.sources[i].ranges.get(method, np.zeros((0, 2), np.int64))
+            ranges = np.array(self.sources[i].solves.get(method, ()), np.int64).reshape(-1, 2)
             if len(ranges):
                 place = np.searchsorted(ranges[:, 0], numbers, "right") - 1
                 found[(place >= 0) & (numbers <= ranges[place, 1])] = i
         return found
-
-
-@contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Put the file's name before what is wrong with it."""
-    try:
-        yield
-    except LogError as error:
-        raise type(error)(f"{path}: {error}") from error
 
 
 def described(kind: str, channel: Channel, schema: Schema) -> tuple[Layout, Labels]:
@@ -469,14 +453,15 @@ def _chosen(rows: NDArray[Any], fields: Sequence[str] | None) -> NDArray[Any]:
     return repack_fields(rows[[name for name in rows.dtype.names or () if name in fields]])
 
 
-def _merged(text: str) -> list[Merged]:
+def _sources(shard: Shard) -> list[Source]:
+    """What a merged log says of its shards; of any other the one that it is."""
     what = f"metadata: {SHARDS}"
-    found: list[Merged] = parsed_json(what, text, list[Merged])
+    found: list[Source] = parsed_json(what, shard.record.get(SHARDS, "[]"), list[Source])
     for each in found:
         pairs = [number for ranges in each.solves.values() for pair in ranges for number in pair]
         if not all(0 <= number < 2**32 for number in (each.first, *pairs)):
             raise LogError(f"{what}: a number of a solve is negative or too large")
-    return found
+    return found or [Source(shard.name)]
 
 
 def _overlapping(shards: Sequence[Shard]) -> bool:

@@ -239,7 +239,7 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
         events=tuple(map(happening, events.records())),
         parameters=source.metadata["parameters"],
         asked=_asked(part),
-        shard=source.name if len(sources) > 1 else "",
+        shard=source.file if len(sources) > 1 else "",
         number=number - source.first,
         target_more={name: array for name, array in more.items() if not np.isnan(array).all()},
         clearance=float(row["clearance"]) if checked else None,

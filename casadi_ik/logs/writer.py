@@ -34,8 +34,15 @@ from casadi_ik.logs.chunks import COMPRESSORS, MESSAGE, Run, check_size, fill, p
 from casadi_ik.logs.container import add_chunk, beginning, ending
 from casadi_ik.logs.detect import detect_events
 from casadi_ik.logs.events import SINGULAR, EventKind, EventRules, event_format
-from casadi_ik.logs.format import KINDS, LogClock, schema_name, schema_text, topic
-from casadi_ik.logs.provenance import METADATA_NAME, log_metadata
+from casadi_ik.logs.format import (
+    KINDS,
+    METADATA_NAME,
+    LogClock,
+    log_metadata,
+    schema_name,
+    schema_text,
+    topic,
+)
 from casadi_ik.logs.rows import measured_format, measured_rows, solve_format, solve_rows
 from casadi_ik.problem.trace import CLEARANCE, TraceFormat
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.kernels.compiler import find_compiler
-from casadi_ik.logs.provenance import machine, package_versions
+from casadi_ik.logs.format import machine, package_versions
 
 Z95 = 1.959963984540054
 """Quantile of the normal distribution for 95 % confidence."""
