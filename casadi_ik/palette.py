@@ -6,12 +6,13 @@ from collections.abc import Iterable
 
 ARM, ARM_JOINT = "#e8944a", "#5f6975"
 HAND, PALM, HAND_JOINT = "#65727f", "#414c58", "#333c46"
+PAD = "#2fb5ad"
 
 OBJECT = "#8cc4e8"
 SCENE = "#b9c0c7"
 TARGET = "#f0b400"
 MET, MISSED = "#1f9d55", "#d62f3c"
-NEAREST = "#e00000"
+NEAREST = "#b5179e"
 
 INK, FAINT = "#2b333b", "#7a848e"
 """Of text."""

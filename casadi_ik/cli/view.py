@@ -31,7 +31,6 @@ from casadi_ik.datasets import load_candidates
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.files.shipped import shipped_names
-from casadi_ik.importing.surfaces import Surface
 from casadi_ik.logs.solve import OneSolve, one_solve
 
 if TYPE_CHECKING:
@@ -58,7 +57,6 @@ if TYPE_CHECKING:
         "--solve N...", "which solve of each log", opt.each(opt.whole(0)), otherwise="the only one"
     ),
     opt.Option("--pads", "correct the pads of a robot's file"),
-    opt.Option("--meshes", "draw the meshes of the robot's files"),
     opt.Option(
         "--host ADDRESS",
         "where it is served; 0.0.0.0: to everybody",
@@ -121,14 +119,13 @@ def opened(said: Said) -> Viewer:
     more = {"scene": scene, "settings": settings, **served}
     if kind == "robot":
         robot = load_robot(path if path.is_file() else name)
-        return viewing.view_grasp(robot, meshes=_meshes(robot, path, said), **more)
+        return viewing.view_grasp(robot, **more)
     if kind == "grasp":
         path, grasp = the_grasp(said)
         robot = the_robot(said.robot, path, grasp)
-        meshes = _meshes(robot, Path(said.robot or grasp.robot), said)
         with located(str(path)):
             grasp.arrays(robot.fingers)
-        return viewing.view_grasp(robot, grasp, meshes=meshes, **more)
+        return viewing.view_grasp(robot, grasp, **more)
     ranked = path.suffix == ".json"
     robot, choices = (_ranked if ranked else _candidates)(path, said, scene, settings)
     first, q = next(iter(choices.values()))()
@@ -176,17 +173,6 @@ def _kind(name: str) -> str:
     )
 
 
-def _meshes(robot: ArmHand, path: Path, said: Said) -> dict[str, Surface] | None:
-    """What the robot's files show, if that is asked for."""
-    if not said.meshes:
-        return None
-    from casadi_ik.viewing import file_meshes
-
-    if not path.is_file():
-        raise InputError(f"--meshes: {robot.name} has no files of its own, expected a YAML file")
-    return file_meshes(robot, path)
-
-
 def _the_logs(said: Said) -> list[tuple[OneSolve, ArmHand]]:
     """A solve of each log, and its robot.
 
@@ -219,7 +205,7 @@ def _candidates(
 
     robot, pose = the_robot(said.robot, path), the_object_pose(said)
     choices: Choices = {}
-    for number, grasp in enumerate(load_candidates(path, robot)):
+    for number, grasp in enumerate(load_candidates(path, robot), 1):
         placed = grasp if pose is None else grasp.in_object_frame().at(pose)
 
         def ask(placed: Any = placed) -> tuple[PageRequest, Array]:

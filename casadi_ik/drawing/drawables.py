@@ -1,14 +1,15 @@
-"""What there is to draw: a list of named surfaces, made alike for pictures and for pages.
+"""What there is to draw: named shapes, made alike for pictures, for the viewer and for pages.
 
 Every function gives drawables in a frame that it names. Pictures put them there at once; pages make
-a node of the frame and move that.
+a node of the frame and move that. `Drawable.data` is what a page takes, as JSON.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,23 +21,25 @@ from casadi_ik.collision.model import own_solids
 from casadi_ik.collision.scene import Item, Scene
 from casadi_ik.collision.solids import Solid
 from casadi_ik.drawing.surfaces import (
+    Shape,
     arrow,
     ball,
     coarser,
     drum,
     joined,
+    mesh_of,
     ring,
     rod,
     stretched,
 )
-from casadi_ik.errors import UnknownNameError
+from casadi_ik.errors import CasadiIKError, UnknownNameError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.grasps import Contact, Grasp, load_object
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.importing.imported import tree_of
 from casadi_ik.importing.surfaces import Surface, link_surfaces
 from casadi_ik.problem.clearance import Closest
-from casadi_ik.robots.description import Joint, RobotDescription
+from casadi_ik.robots.description import Finger, Joint, RobotDescription
 from casadi_ik.robots.parts import PREFIX
 
 ARM_RADIUS, FINGER_RADIUS = 0.048, 0.009
@@ -48,23 +51,36 @@ BEYOND = 0.04
 
 @dataclass(frozen=True, eq=False)
 class Drawable:
-    """A surface that is drawn.
+    """A shape that is drawn.
 
     Attributes:
         name: What it is.
-        surface: In its frame.
+        shape: In its frame.
         color: As in `casadi_ik.palette`.
         frame: The frame that it moves with: a link, or "" for the base frame.
+        role: What it belongs to: "arm", "hand", "pad", "object", "scene", "target", "reached",
+            "missed" or "nearest".
     """
 
     name: str
-    surface: Surface
+    shape: Shape
     color: str
     frame: str = ""
+    role: str = ""
+
+    @property
+    def surface(self) -> Surface:
+        """Its triangles, in its frame."""
+        return self.shape.surface
 
     def at(self, pose: Array) -> Drawable:
         """The same in the base frame, in which its frame has a (4, 4) pose."""
-        return replace(self, surface=self.surface.moved(pose), frame="")
+        return replace(self, shape=self.shape.moved(pose), frame="")
+
+    def data(self) -> dict[str, Any]:
+        """Name, role, colour, frame and shape as JSON has them."""
+        own = {"name": self.name, "role": self.role, "color": self.color, "frame": self.frame}
+        return own | self.shape.data()
 
 
 # Robots.
@@ -78,86 +94,97 @@ def side_of(description: RobotDescription) -> dict[str, str]:
     }
 
 
-def links_seen(robot: ArmHand, meshes: Mapping[str, Surface] | None = None) -> list[Drawable]:
-    """A robot as what is known of it: one drawable a link, in the link's frame.
+def bodies(robot: ArmHand, q: ArrayLike | None = None) -> list[Drawable]:
+    """A robot in the frames of its links, with a pad at each fingertip.
 
-    A link is drawn by the mesh of its file, or the shapes that collisions are checked with; an arm
-    or a hand of which nothing is described by its skeleton.
-
-    Args:
-        robot: The robot.
-        meshes: By link what its files show.
-    """
-    description = robot.description
-    sides, found = side_of(description), _shapes(description)
-    described = {sides[link] for link in found}
-    by_link: dict[str, list[Surface]] = {}
-    arm, hand = skeleton(robot, robot.home)
-    for one in arm + hand:
-        if sides[one.frame] not in described:
-            by_link.setdefault(one.frame, []).append(one.surface)
-    found |= {link: joined(parts) for link, parts in by_link.items()}
-    found |= {link: coarser(one) for link, one in (meshes or {}).items() if len(one.triangles)}
-
-    def color(link: str) -> str:
-        if sides[link] == "arm":
-            joint = description.links.index(link) % 2 == 0
-            return palette.ARM_JOINT if joint else palette.ARM
-        return palette.PALM if link == description.palm_link else palette.HAND
-
-    links = [link for link in description.links if link in found]
-    return [Drawable(link, found[link], color(link), link) for link in links]
-
-
-def _shapes(description: RobotDescription) -> dict[str, Surface]:
-    by_link: dict[str, list[Surface]] = {}
-    for one in description.shapes.capsules:
-        if one.covers < 0:
-            body = rod(one.center - one.half, one.center + one.half, one.radius)
-            by_link.setdefault(one.link, []).append(body)
-    for one, solid in zip(description.shapes.solids, own_solids(description), strict=True):
-        by_link.setdefault(one.link, []).append(Surface(*solid.mesh()).moved(one.pose))
-    return {link: joined(parts) for link, parts in by_link.items()}
-
-
-def skeleton(robot: ArmHand, q: ArrayLike) -> tuple[list[Drawable], list[Drawable]]:
-    """A robot by its kinematics alone: thick tubes for the arm, thin ones for the hand, a palm.
-
-    It is not the real shell, but any robot has one.
+    The links are those that the robot's files show. An arm or a hand of which they show nothing is
+    drawn by its kinematics: thick tubes for an arm, thin ones for a hand, a palm. That is not the
+    real shell, but any robot has one.
 
     Args:
         robot: The robot.
-        q: (n,) actuator positions [rad or m]: what slides is as long as it is there.
-
-    Returns:
-        The arm, and the hand with the fingertips last; in the frames of links.
+        q: (n,) actuator positions [rad or m]: what slides is as long as it is there; None: home.
 
     Raises:
         InputError: Bad q.
     """
-    poses, description = robot.links(q), robot.description
-    arm, hand = _foot(description), _palm(description, poses)
+    description = robot.description
+    sides, meshes = side_of(description), meshes_of(description)
+    shown = {sides[link] for link in meshes}
+    found = [one for one in _skeleton(robot, q) if one.role not in shown]
+    for link, surface in meshes.items():
+        dark = palette.PALM if link == description.palm_link else palette.HAND
+        color = _alternating(description, link) if sides[link] == "arm" else dark
+        found.append(Drawable(link, mesh_of(surface), color, link, sides[link]))
+    return found + [_pad(finger) for finger in description.fingers]
+
+
+def collision_bodies(robot: ArmHand) -> list[Drawable]:
+    """The shapes that collisions are checked with, in the frames of links."""
+    description = robot.description
+    shapes, sides = description.shapes, side_of(description)
+    found = [
+        (one.link, rod(one.center - one.half, one.center + one.half, one.radius))
+        for one in shapes.capsules
+        if one.covers < 0
+    ]
+    for one, solid in zip(shapes.solids, own_solids(description), strict=True):
+        found.append((one.link, mesh_of(Surface(*solid.mesh())).moved(one.pose)))
+
+    def color(link: str) -> str:
+        return _alternating(description, link) if sides[link] == "arm" else palette.HAND
+
+    return [Drawable(link, shape, color(link), link, sides[link]) for link, shape in found]
+
+
+def placed(robot: ArmHand, q: ArrayLike, drawables: Sequence[Drawable]) -> list[Drawable]:
+    """Drawables of links where they are at q (n,) [rad or m], in the base frame."""
+    poses = robot.links(q)
+    return [one.at(poses[one.frame]) for one in drawables]
+
+
+def merged(drawables: Sequence[Drawable]) -> list[Drawable]:
+    """Those of one frame and colour as one mesh each: fewer things to be moved."""
+    groups: dict[tuple[str, str], list[Drawable]] = {}
+    for one in drawables:
+        groups.setdefault((one.frame, one.color), []).append(one)
+    return [
+        replace(many[0], shape=mesh_of(joined([one.surface for one in many])))
+        for many in groups.values()
+    ]
+
+
+def _alternating(description: RobotDescription, link: str) -> str:
+    return palette.ARM_JOINT if description.links.index(link) % 2 == 0 else palette.ARM
+
+
+def _skeleton(robot: ArmHand, q: ArrayLike | None) -> list[Drawable]:
+    description = robot.description
+    poses = robot.links(robot.configuration(q))
+    found = [*_foot(description), *_palm(description, poses)]
     for joint in description.joints:
         end = (inverse(poses[joint.parent]) @ poses[joint.child])[:3, 3]
-        if joint.part == "hand":
-            hand += _finger_link(description, joint, end)
-        else:
-            arm += _arm_link(description, joint, end)
+        link = _finger_link if joint.part == "hand" else _arm_link
+        found += link(description, joint, end)
     for finger in description.fingers:
-        # How far the pad is from the axis of the last link, along the normal.
+        radius = _pad_radius(finger)
         place, normal = finger.placement[:3, 3], finger.placement[:3, :3] @ finger.normal
-        height = float(place @ normal)
-        radius = height if 0.004 < height < 0.02 else FINGER_RADIUS
         tip = rod(np.zeros(3), place - radius * normal, radius)
-        hand.append(Drawable(f"tip {finger.name}", tip, palette.HAND, finger.link))
-    return arm, hand
+        found.append(Drawable(f"tip {finger.name}", tip, palette.HAND, finger.link, "hand"))
+    return found
 
 
-def body(robot: ArmHand, q: ArrayLike) -> tuple[list[Drawable], list[Drawable]]:
-    """The same in the base frame."""
-    poses = robot.links(q)
-    arm, hand = skeleton(robot, q)
-    return [one.at(poses[one.frame]) for one in arm], [one.at(poses[one.frame]) for one in hand]
+def _pad_radius(finger: Finger) -> float:
+    """How far the pad is from the axis of the last link, along the normal [m]."""
+    height = float(finger.placement[:3, 3] @ finger.placement[:3, :3] @ finger.normal)
+    return height if 0.004 < height < 0.02 else FINGER_RADIUS
+
+
+def _pad(finger: Finger) -> Drawable:
+    radius, normal = _pad_radius(finger), finger.placement[:3, :3] @ finger.normal
+    center = finger.placement[:3, 3] - 0.13 * radius * normal
+    pad = drum(center, normal, 0.62 * radius, 0.36 * radius)
+    return Drawable(f"pad {finger.name}", pad, palette.PAD, finger.link, "pad")
 
 
 def _foot(description: RobotDescription) -> list[Drawable]:
@@ -166,7 +193,7 @@ def _foot(description: RobotDescription) -> list[Drawable]:
         return []
     z = np.array([0.0, 0.0, 1.0])
     foot = drum(0.0125 * z, z, 1.9 * ARM_RADIUS, 0.025)
-    return [Drawable("foot", foot, palette.ARM_JOINT, description.root)]
+    return [Drawable("foot", foot, palette.ARM_JOINT, description.root, "arm")]
 
 
 def _arm_link(description: RobotDescription, joint: Joint, end: Array) -> list[Drawable]:
@@ -176,14 +203,14 @@ def _arm_link(description: RobotDescription, joint: Joint, end: Array) -> list[D
         lowest = joint.parent == description.root
         begin = min(1.0, ARM_RADIUS / length) * end if lowest else np.zeros(3)
         tube = rod(begin, end, ARM_RADIUS)
-        found.append(Drawable(f"tube {joint.name}", tube, palette.ARM, joint.parent))
+        found.append(Drawable(f"tube {joint.name}", tube, palette.ARM, joint.parent, "arm"))
     if joint.type == "revolute":
         # A roll joint is a band around the tube, a pitch joint a drum across it.
         way = joint.placement[:3, :3].T @ end
         along = length > 2e-3 and abs(joint.axis @ way) > 0.9 * length
         radius, width = (1.09, 0.35) if along else (1.12, 2.5)
         band = drum(np.zeros(3), joint.axis, radius * ARM_RADIUS, width * ARM_RADIUS)
-        found.append(Drawable(joint.name, band, palette.ARM_JOINT, joint.child))
+        found.append(Drawable(joint.name, band, palette.ARM_JOINT, joint.child, "arm"))
     return found
 
 
@@ -191,10 +218,10 @@ def _finger_link(description: RobotDescription, joint: Joint, end: Array) -> lis
     found = []
     if joint.parent != description.palm_link and np.linalg.norm(end) > 2e-3:
         tube = rod(np.zeros(3), end, 1.15 * FINGER_RADIUS)
-        found.append(Drawable(f"tube {joint.name}", tube, palette.HAND, joint.parent))
+        found.append(Drawable(f"tube {joint.name}", tube, palette.HAND, joint.parent, "hand"))
     if joint.type == "revolute":
         knuckle = drum(np.zeros(3), joint.axis, 1.3 * FINGER_RADIUS, 2.7 * FINGER_RADIUS)
-        found.append(Drawable(joint.name, knuckle, palette.HAND_JOINT, joint.child))
+        found.append(Drawable(joint.name, knuckle, palette.HAND_JOINT, joint.child, "hand"))
     return found
 
 
@@ -213,24 +240,36 @@ def _palm(description: RobotDescription, poses: Mapping[str, Array]) -> list[Dra
     heights, radius = corners @ up, 2.2 * FINGER_RADIUS
     middle = (heights.min() + heights.max()) / 2 * up
     block = drum(middle, up, radius, max(float(np.ptp(heights)), 2 * radius))
-    body = stretched(block, corners - heights[:, None] * up)
-    return [Drawable("palm", body, palette.PALM, link)]
+    body = stretched(block.surface, corners - heights[:, None] * up)
+    return [Drawable("palm", mesh_of(body), palette.PALM, link, "hand")]
 
 
-def file_meshes(robot: ArmHand, path: Path) -> dict[str, Surface]:
-    """What the files that a description points to show of its links.
+@lru_cache(maxsize=8)
+def meshes_of(description: RobotDescription) -> dict[str, Surface]:
+    """By link what the files show that a description points to, coarse enough to be drawn."""
+    try:
+        found = {} if description.path is None else file_meshes(description, seen=True)
+    except CasadiIKError:  # the files are gone, the kinematics are not
+        return {}
+    return {link: coarser(one) for link, one in found.items() if len(one.triangles)}
+
+
+def file_meshes(description: RobotDescription, seen: bool = False) -> dict[str, Surface]:
+    """Shapes that the files have to which a description points.
 
     Args:
-        robot: The robot of the description.
-        path: The description.
+        description: The robot; it was read from a file.
+        seen: Whether those that are seen are wanted, else those for collisions.
 
     Returns:
         By link its surface in its frame; links of which no file has a shape are left out.
 
     Raises:
-        CasadiIKError: The description cannot be read.
+        CasadiIKError: A file cannot be read.
     """
-    raw, links = read_yaml(path), set(robot.description.links)
+    path = description.path
+    assert path is not None
+    raw, links = read_yaml(path), set(description.links)
     found: dict[str, Surface] = {}
     for key in ("arm", "hand", "robot"):
         entry = raw.get(key)
@@ -240,7 +279,7 @@ def file_meshes(robot: ArmHand, path: Path) -> dict[str, Surface]:
         # A name that arm and hand both have is prefixed in the hand.
         named = {link.removeprefix(prefix) if prefix else link: link for link in links}
         named |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}
-        surfaces, _ = link_surfaces(tree_of(path, entry), list(named))
+        surfaces, _ = link_surfaces(tree_of(path, entry), list(named), seen)
         for link, surface in surfaces.items():
             found.setdefault(named[link], surface)
     return found
@@ -287,16 +326,16 @@ def asked_marks(contact: Contact, tip: Array, size: float = 1.0) -> list[Drawabl
         found["normal"] = arrow(place, contact.normal, 0.030 * size, 0.0048 * size)
     if contact.tangent is not None:
         found["tangent"] = arrow(place, contact.tangent, 0.021 * size, 0.0048 * size)
-    return [Drawable(name, surface, palette.TARGET) for name, surface in found.items()]
+    return [Drawable(name, one, palette.TARGET, role="target") for name, one in found.items()]
 
 
-def reached_mark(color: str, tangent: bool = False) -> Drawable:
+def reached_marks(color: str, tangent: bool = False) -> list[Drawable]:
     """What a finger reaches: thin and long arrows, in the frame of its contact (x its normal)."""
     x, y, _ = np.eye(3)
     parts = [ball(0.0042), arrow(np.zeros(3), x, 0.046, 0.0022)]
     if tangent:
         parts.append(arrow(np.zeros(3), y, 0.034, 0.0022))
-    return Drawable("reached", joined(parts), color)
+    return [Drawable("reached", part, color, role="reached") for part in parts]
 
 
 def contact_marks(
@@ -319,10 +358,11 @@ def contact_marks(
         contact, tip = grasp.contacts.get(finger), frame[:3, 3]
         if contact is not None:
             found += asked_marks(contact, tip)
-            found.append(reached_mark(colors[finger], contact.tangent is not None).at(frame))
+            reached = reached_marks(colors[finger], contact.tangent is not None)
+            found += [one.at(frame) for one in reached]
             if colors[finger] == palette.MISSED:
                 gap = rod(tip, target_place(contact, tip), 0.0006)
-                found.append(Drawable("gap", gap, palette.MISSED))
+                found.append(Drawable("gap", gap, palette.MISSED, role="missed"))
     return found
 
 
@@ -341,7 +381,8 @@ def object_of(name: str) -> Drawable | None:
         points, triangles = load_object(name).mesh(64)
     except UnknownNameError:
         return None
-    return Drawable("object", Surface(points, np.asarray(triangles, np.int64)), palette.OBJECT)
+    shape = mesh_of(Surface(points, np.asarray(triangles, np.int64)))
+    return Drawable("object", shape, palette.OBJECT, role="object")
 
 
 def item_of(item: Item, about: Array) -> list[Drawable]:
@@ -353,18 +394,18 @@ def item_of(item: Item, about: Array) -> list[Drawable]:
     """
     near = (inverse(item.pose) @ np.append(about, 1.0))[:3]
     return [
-        Drawable(f"{item.name} {i}", _placed(solid, place, near), palette.SCENE)
+        Drawable(f"{item.name} {i}", _placed(solid, place, near), palette.SCENE, role="scene")
         for i, (solid, place) in enumerate(item.parts)
     ]
 
 
-def _placed(solid: Solid, pose: Array, near: Array) -> Surface:
+def _placed(solid: Solid, pose: Array, near: Array) -> Shape:
     """A solid at a (4, 4) pose; of one that reaches without end the part near a point (3,)."""
     surface = Surface(*solid.mesh())
     if not np.isfinite(solid.reach):
         x, y, _ = pose[:3, :3].T @ (near - pose[:3, 3])
         surface = Surface(surface.points + np.array([x, y, 0.0]), surface.triangles)
-    return surface.moved(pose)
+    return mesh_of(surface).moved(pose)
 
 
 def scene_of(scene: Scene, about: Array, without: str = "") -> list[Drawable]:
@@ -380,22 +421,21 @@ def with_object(scene: Scene, grasp: Grasp | None) -> Scene:
     return scene
 
 
-# The nearest pair.
+def nearest_pair(closest: Closest, touching: bool = False) -> list[Drawable]:
+    """A rod between the nearest points of two shapes, a ball at each end, in the base frame.
 
-
-def closest_rod(closest: Closest) -> Drawable:
-    """A rod between the nearest points of two shapes, with a ball at each, in the base frame."""
+    Args:
+        closest: The pair.
+        touching: Whether the two shapes are drawn instead, a millimetre larger to be seen; not
+            what reaches without end.
+    """
     start, end = closest.ends
-    parts = [rod(start, end, 0.002), ball(0.004, start), ball(0.004, end)]
-    return Drawable("nearest", joined(parts), palette.NEAREST)
-
-
-def closest_bodies(closest: Closest) -> list[Drawable]:
-    """The two shapes, a millimetre larger to be seen; not what reaches without end."""
-    found = []
-    for solid, pose in closest.shapes:
-        if np.isfinite(solid.reach):
-            surface = Surface(*solid.mesh())
-            larger = Surface(surface.points * (1 + 1e-3 / solid.reach), surface.triangles)
-            found.append(Drawable("touching", larger.moved(pose), palette.NEAREST))
-    return found
+    shapes = [rod(start, end, 0.0012), ball(0.0022, start), ball(0.0022, end)]
+    if touching:
+        shapes = []
+        for solid, pose in closest.shapes:
+            if np.isfinite(solid.reach):
+                points, triangles = solid.mesh()
+                larger = Surface(points * (1 + 1e-3 / solid.reach), triangles)
+                shapes.append(mesh_of(larger).moved(pose))
+    return [Drawable("nearest", one, palette.NEAREST, role="nearest") for one in shapes]

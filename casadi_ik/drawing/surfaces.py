@@ -1,8 +1,11 @@
-"""Surfaces that things are drawn with: turned bodies, rods, arrows, rings; care of meshes."""
+"""Shapes that things are drawn with: rods, drums, arrows, rings, meshes; care of meshes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,12 +42,83 @@ def upright(point: Array, axis: Array) -> Array:
     return facing(point, axis)[:, [1, 2, 0, 3]]
 
 
-def turned(profile: ArrayLike) -> Surface:
-    """A closed body about z.
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A shape by its numbers, or as triangles.
 
-    Args:
-        profile: (m, 2) radius and height, from below to above [m]; the ends are closed flat.
+    Attributes:
+        kind: One of `KINDS`, or "mesh".
+        size: Its numbers [m], as the function of its kind takes them.
+        pose: (4, 4) of its own frame, along whose z axis it is turned.
+        mesh: Triangles in its own frame, of a mesh.
     """
+
+    kind: str
+    size: tuple[float, ...] = ()
+    pose: Array = field(default_factory=lambda: np.eye(4))
+    mesh: Surface | None = None
+
+    @cached_property
+    def surface(self) -> Surface:
+        """Triangles that wind outwards."""
+        own = KINDS[self.kind](*self.size) if self.mesh is None else self.mesh
+        return own.moved(self.pose)
+
+    def moved(self, pose: Array) -> Shape:
+        """The same in another frame, in which its own has a (4, 4) pose."""
+        return replace(self, pose=pose @ self.pose)
+
+    def data(self) -> dict[str, Any]:
+        """Kind, size and pose (rotation row by row, then the origin); of a mesh its triangles."""
+        rotation, origin = self.pose[:3, :3].ravel(), self.pose[:3, 3]
+        found = {
+            "kind": self.kind,
+            "size": [float(value) for value in self.size],
+            "pose": [*rotation.tolist(), *origin.tolist()],
+        }
+        if self.mesh is not None:
+            found["points"] = np.round(self.mesh.points, 6).ravel().tolist()
+            found["triangles"] = self.mesh.triangles.ravel().tolist()
+        return found
+
+
+def mesh_of(surface: Surface) -> Shape:
+    """Triangles as a shape."""
+    return Shape("mesh", mesh=surface)
+
+
+def ball(radius: float, center: ArrayLike = (0.0, 0.0, 0.0)) -> Shape:
+    """A ball."""
+    pose = np.eye(4)
+    pose[:3, 3] = center
+    return Shape("capsule", (radius, 0.0), pose)
+
+
+def rod(start: Array, end: Array, radius: float) -> Shape:
+    """A tube with round ends between two points."""
+    length = float(np.linalg.norm(end - start))
+    if length < 1e-9:
+        return ball(radius, start)
+    return Shape("capsule", (radius, length), upright((start + end) / 2, end - start))
+
+
+def drum(center: Array, axis: Array, radius: float, length: float) -> Shape:
+    """A cylinder with rounded edges about a point."""
+    return Shape("drum", (radius, length), upright(center, axis))
+
+
+def arrow(start: Array, direction: Array, length: float, width: float) -> Shape:
+    """An arrow whose shaft is `width` thick."""
+    return Shape("arrow", (length, width), upright(start, direction))
+
+
+def ring(center: Array, axis: Array, radius: float, width: float) -> Shape:
+    """A thin ring about an axis through its centre."""
+    return Shape("ring", (radius, width), upright(center, axis))
+
+
+def _turned(profile: ArrayLike) -> Surface:
+    """A closed body about z of a profile (m, 2): radius and height, from below to above [m]."""
     radii, heights = np.asarray(profile, dtype=float).T
     rings = circle(AROUND)[None] * radii[:, None, None]
     rings[..., 2] = heights[:, None]
@@ -52,41 +126,22 @@ def turned(profile: ArrayLike) -> Surface:
     return Surface(*tube_mesh(rings, *ends))
 
 
-def ball(radius: float, center: ArrayLike = (0.0, 0.0, 0.0)) -> Surface:
-    """A ball."""
-    points, triangles = capsule_mesh(radius, 0.0, AROUND)
-    return Surface(points + np.asarray(center), triangles)
-
-
-def rod(start: Array, end: Array, radius: float) -> Surface:
-    """A tube with round ends between two points."""
-    length = float(np.linalg.norm(end - start))
-    if length < 1e-9:
-        return ball(radius, start)
-    body = Surface(*capsule_mesh(radius, length / 2, AROUND))
-    return body.moved(upright((start + end) / 2, end - start))
-
-
-def drum(center: Array, axis: Array, radius: float, length: float) -> Surface:
-    """A cylinder with rounded edges about a point."""
+def _drum(radius: float, length: float) -> Surface:
     edge = 0.12 * min(radius, length)
     bow = edge * np.sin(np.linspace(0, np.pi / 2, 5))
     rise = np.column_stack([radius - edge + bow, -length / 2 + edge - bow[::-1]])
-    return turned(np.concatenate([rise, rise[::-1] * [1, -1]])).moved(upright(center, axis))
+    return _turned(np.concatenate([rise, rise[::-1] * [1, -1]]))
 
 
-def arrow(start: Array, direction: Array, length: float, width: float) -> Surface:
-    """An arrow whose shaft is `width` thick."""
+def _arrow(length: float, width: float) -> Surface:
     tip = min(0.45 * length, 3.2 * width)
     shaft, head = width / 2, 1.35 * width
     profile = [(shaft, 0), (shaft, length - tip), (head, length - tip), (1e-3 * head, length)]
-    return turned(profile).moved(upright(start, direction))
+    return _turned(profile)
 
 
-def ring(center: Array, axis: Array, radius: float, width: float) -> Surface:
-    """A thin ring about an axis through its centre."""
-    around = circle(2 * AROUND)
-    across = circle(12)
+def _ring(radius: float, width: float) -> Surface:
+    around, across = circle(2 * AROUND), circle(12)
     out = radius + width / 2 * across[:, 0]
     points = around[:, None] * out[None, :, None]
     points[..., 2] = width / 2 * across[:, 1]
@@ -94,7 +149,17 @@ def ring(center: Array, axis: Array, radius: float, width: float) -> Surface:
     a, b = 12 * i + j, 12 * ((i + 1) % (2 * AROUND)) + j
     c, d = 12 * i + (j + 1) % 12, 12 * ((i + 1) % (2 * AROUND)) + (j + 1) % 12
     triangles = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
-    return Surface(points.reshape(-1, 3), triangles).moved(upright(center, axis))
+    return Surface(points.reshape(-1, 3), triangles)
+
+
+KINDS: dict[str, Callable[..., Surface]] = {
+    "capsule": lambda radius, length: Surface(*capsule_mesh(radius, length / 2, AROUND)),
+    "drum": _drum,
+    "arrow": _arrow,
+    "ring": _ring,
+}
+"""Of shapes by their numbers: capsule (radius, length without the caps), drum (radius, length),
+arrow (length, width of its shaft), ring (radius, width)."""
 
 
 def stretched(convex: Surface, offsets: Array) -> Surface:

@@ -100,13 +100,13 @@ def link_surfaces(
     Args:
         tree: The file.
         links: Those that are wanted: fine meshes take a second each.
-        seen: Whether those that are seen are wanted instead (URDF).
+        seen: Whether those that are seen are wanted instead.
 
     Returns:
         By link its shape in its frame; and what is not there, a line each.
     """
     if tree.model is not None:
-        found = _of_mjcf(*tree.model)
+        found = _of_mjcf(*tree.model, seen)
         return {link: found[link] for link in links if link in found}, []
     assert tree.element is not None
     missing = Missing(tree.path)
@@ -226,7 +226,7 @@ def simple_surface(kind: str, size: Array) -> Surface:
     return Surface(*capsule_mesh(size[0], size[1] / 2 if kind == "capsule" else 0.0, AROUND))
 
 
-def _of_mjcf(mujoco: Any, model: Any) -> dict[str, Surface]:
+def _of_mjcf(mujoco: Any, model: Any, seen: bool) -> dict[str, Surface]:
     by_body: dict[int, list[tuple[bool, Surface]]] = {}
     for geom in range(model.ngeom):
         surface = _of_geom(mujoco, model, geom)
@@ -240,7 +240,7 @@ def _of_mjcf(mujoco: Any, model: Any) -> dict[str, Surface]:
         by_body.setdefault(body, []).append((solid, surface.moved(pose)))
     found: dict[str, Surface] = {}
     for body, parts in by_body.items():
-        chosen = [one for solid, one in parts if solid] or [one for _, one in parts]
+        chosen = [one for solid, one in parts if solid != seen] or [one for _, one in parts]
         whole = together(chosen)
         if whole is not None:
             found[model.body(body).name or f"body_{body}"] = whole

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -107,6 +108,7 @@ class RobotDescription:
         home: (n,) home position of the actuators.
         sources: Where the numbers come from, by tag.
         shapes: Of its links, for collisions; none where they are not described.
+        path: The file that it was read from; None: its parts are shipped.
     """
 
     name: str
@@ -120,6 +122,7 @@ class RobotDescription:
     home: Array
     sources: dict[str, str]
     shapes: Shapes = NO_SHAPES
+    path: Path | None = None
 
     @property
     def thumb(self) -> str:

@@ -265,7 +265,7 @@ def _robot(path: Path) -> RobotDescription:
     # What a description says of a link goes before what its file says.
     said = () if top.collision is None else top.collision.links
     more = link_shapes(top.collision, robot.links, path)
-    return replace(robot, shapes=robot.shapes.without(said) + more)
+    return replace(robot, shapes=robot.shapes.without(said) + more, path=path)
 
 
 def _imports(raw: Any) -> bool:

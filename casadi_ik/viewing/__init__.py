@@ -15,7 +15,6 @@ from casadi_ik.drawing.drawables import file_meshes
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.grasps import Grasp
-from casadi_ik.importing.surfaces import Surface
 from casadi_ik.logs.solve import OneSolve
 
 try:
@@ -38,7 +37,6 @@ __all__ = [
     "PageRequest",
     "Settings",
     "Viewer",
-    "file_meshes",
     "request_of",
     "view_grasp",
     "view_log",
@@ -53,7 +51,6 @@ def view_grasp(
     q: ArrayLike | None = None,
     scene: Scene | None = None,
     settings: Settings | None = None,
-    meshes: Mapping[str, Surface] | None = None,
     candidates: Mapping[str, Callable[[], tuple[PageRequest, Array]]] | None = None,
     host: str = HOST,
     port: int | None = None,
@@ -67,7 +64,6 @@ def view_grasp(
             there, unless q meets the contacts already.
         scene: What stands about; None: nothing is checked.
         settings: How it is solved.
-        meshes: What the robot's files show, by link.
         candidates: Other requests to choose from, by name: each gives it, and a start.
         host: Who may see it; "0.0.0.0": everybody in the network.
         port: Where; None: the first free one from 8080 on.
@@ -80,7 +76,7 @@ def view_grasp(
     asked = request_of(robot, grasp, start, scene, settings)
     server = serve(host, port)
     try:
-        page = GraspPage(server, robot, asked, start, meshes, candidates, solved=q is None)
+        page = GraspPage(server, robot, asked, start, candidates, solved=q is None)
     except BaseException:
         server.stop()
         raise
@@ -130,7 +126,7 @@ def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None =
     robot = load_robot(file)
     if not isinstance(read_yaml(file).get("fingers"), dict):
         raise DescriptionError(f"{file}: fingers: expected the pads of the fingers, by name")
-    surfaces = file_meshes(robot, file)
+    surfaces = file_meshes(robot.description)
     writable = host in LOOPBACK
     server = serve(host, port, secret=writable)
     page = PadPage(server, robot, file, surfaces, writable)

@@ -19,9 +19,12 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.drawing.drawables import (
     Drawable,
     asked_marks,
+    bodies,
+    collision_bodies,
     item_of,
+    merged,
     object_of,
-    reached_mark,
+    reached_marks,
 )
 from casadi_ik.drawing.surfaces import sharp
 from casadi_ik.grasps.pose import rotations_of
@@ -93,36 +96,54 @@ class DrawnRobot:
         self,
         server: viser.ViserServer,
         robot: ArmHand,
-        links: Sequence[Drawable],
         name: str = "/robot",
+        skin: Sequence[Drawable] | None = None,
+        **look: Any,
     ) -> None:
         """Draw it at home.
 
         Args:
             server: The page.
             robot: The robot.
-            links: One drawable a link.
             name: Of its node.
+            skin: What it is drawn with, in the frames of links; None: its bodies.
+            look: As `add_mesh_simple` of viser has it.
         """
         self._server, self._robot = server, robot
+        self._look = {"side": "double", "receive_shadow": False, **look}
+        links, before = robot.description.links, _hung_on(robot)
+        nodes: list[str] = []
+        for link, on in zip(links, before, strict=True):
+            nodes.append(f"{nodes[on] if on >= 0 else name}/{link}")
         server.scene.add_frame(name, show_axes=False)
-        self._before = _drawn_before(robot, links)
-        names: list[str] = []
-        for one, before in zip(links, self._before, strict=True):
-            names.append(f"{names[before] if before >= 0 else name}/{one.frame}")
-        look = {"side": "double", "receive_shadow": False}
-        self._meshes = [
-            add_drawable(server, node, one, **look) for node, one in zip(names, links, strict=True)
-        ]
-        self._links = [robot.description.links.index(one.frame) for one in links]
+        self._nodes = dict(zip(links, nodes, strict=True))
+        self._frames = [server.scene.add_frame(node, show_axes=False) for node in nodes]
+        self._before = before
         self._poses = np.full((len(links), 4, 4), np.nan)
+        self._skins: dict[str, list[Any]] = {}
+        self._add_skin("bodies", bodies(robot) if skin is None else skin)
         self.place(robot.home)
+
+    def skin(self, name: str) -> None:
+        """Show its bodies ("bodies"), or what collisions are checked with ("collision shapes")."""
+        if name not in self._skins:
+            self._add_skin(name, collision_bodies(self._robot))
+        for other, meshes in self._skins.items():
+            for mesh in meshes:
+                mesh.visible = other == name
+
+    def _add_skin(self, name: str, skin: Sequence[Drawable]) -> None:
+        nodes = [f"{self._nodes[one.frame]}/{name}_{i}" for i, one in enumerate(merged(skin))]
+        self._skins[name] = [
+            add_drawable(self._server, node, one, **self._look)
+            for node, one in zip(nodes, merged(skin), strict=True)
+        ]
 
     def place(self, q: Array) -> None:
         """Move it to q (n,) [rad or m]."""
         self.q = np.array(q)
-        every = np.array(list(self._robot.links(q).values()))[self._links]
-        # The last stands for the base frame, which the first links hang on.
+        every = np.array(list(self._robot.links(q).values()))
+        # The last stands for the base frame, which the first link hangs on.
         on = np.concatenate([every, np.eye(4)[None]])[self._before]
         poses = np.linalg.inv(on) @ every
         gone = ~(np.abs(poses - self._poses) < 1e-9)
@@ -130,24 +151,18 @@ class DrawnRobot:
         wxyz = quaternions(poses[:, :3, :3])
         with self._server.atomic():
             for i in np.flatnonzero(shifted):
-                self._meshes[i].position = poses[i, :3, 3]
+                self._frames[i].position = poses[i, :3, 3]
             for i in np.flatnonzero(turned):
-                self._meshes[i].wxyz = wxyz[i]
+                self._frames[i].wxyz = wxyz[i]
         self._poses[shifted, :3, 3] = poses[shifted, :3, 3]
         self._poses[turned, :3, :3] = poses[turned, :3, :3]
 
 
-def _drawn_before(robot: ArmHand, links: Sequence[Drawable]) -> list[int]:
-    """By link the number of the one that it hangs on; -1: none of them."""
-    drawn = {one.frame: i for i, one in enumerate(links)}
-    parents = {joint.child: joint.parent for joint in robot.description.joints}
-    found = []
-    for one in links:
-        link = parents.get(one.frame)
-        while link is not None and link not in drawn:
-            link = parents.get(link)
-        found.append(-1 if link is None else drawn[link])
-    return found
+def _hung_on(robot: ArmHand) -> list[int]:
+    """By link the number of the one that it hangs on; -1: the base frame."""
+    links = robot.description.links
+    parents = {joint.child: links.index(joint.parent) for joint in robot.description.joints}
+    return [parents.get(link, -1) for link in links]
 
 
 class Control:
@@ -307,7 +322,7 @@ class _Tip:
     def __init__(self, server: viser.ViserServer, finger: str, above: str) -> None:
         scene, name = server.scene, f"{above}/tips/{finger}"
         self._finger, self._frame = finger, scene.add_frame(name, show_axes=False)
-        mark = reached_mark(palette.MET)
+        (mark,) = merged(reached_marks(palette.MET))
         self._mesh = add_drawable(server, f"{name}/reached", mark, cast_shadow=False)
         self._label = scene.add_label(
             f"{name}/errors", "", anchor="bottom-center", font_screen_scale=0.85, visible=False

@@ -19,11 +19,9 @@ from casadi_ik import palette
 from casadi_ik.answers.solution import Alternative
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.drawing.drawables import links_seen
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.grasps import Grasp, Tolerance
 from casadi_ik.grasps.load import grasp_data
-from casadi_ik.importing.surfaces import Surface
 from casadi_ik.problem.request import CLEARANCE, PREFERENCES
 from casadi_ik.problem.targets import LIMITS
 from casadi_ik.registry import METHODS
@@ -87,7 +85,6 @@ class GraspPage:
         robot: ArmHand,
         asked: PageRequest,
         q: Array,
-        meshes: Mapping[str, Surface] | None = None,
         candidates: Mapping[str, Callable[[], tuple[PageRequest, Array]]] | None = None,
         solved: bool = True,
     ) -> None:
@@ -98,7 +95,6 @@ class GraspPage:
             robot: The robot.
             asked: What is asked first.
             q: (n,) where the robot is [rad or m].
-            meshes: What its files show, by link.
             candidates: Other requests to choose from, by name: each gives it, and a start.
             solved: Whether the first request is solved at once; else q is judged.
         """
@@ -115,7 +111,7 @@ class GraspPage:
         self._untold_since: float | None = None
         set_stage(server, asked.name or robot.name, lowest(asked.scene))
         look_at_robot(server, robot, self.answer.q)
-        self._drawn = DrawnRobot(server, robot, links_seen(robot, meshes))
+        self._drawn = DrawnRobot(server, robot)
         drags = Drags(self.drag_control, self.drag_point, self.drag_normal, self.select)
         self._contacts = DrawnContacts(server, asked, drags)
         self._things = DrawnThings(server, asked, replace(drags, pose=self.drag_thing))

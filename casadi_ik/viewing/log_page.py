@@ -17,7 +17,6 @@ from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
-from casadi_ik.drawing.drawables import links_seen
 from casadi_ik.errors import LogError
 from casadi_ik.grasps import Contact, Grasp
 from casadi_ik.logs.events import EVENT_COLORS, plain_name, told
@@ -221,7 +220,7 @@ class LogPage:
         name = f"/log_{number}"
         frame = self.server.scene.add_frame(name, show_axes=False)
         frame.position = self._aside(number)
-        drawn = DrawnRobot(self.server, track.robot, links_seen(track.robot), name=f"{name}/robot")
+        drawn = DrawnRobot(self.server, track.robot, f"{name}/robot")
         contacts = DrawnContacts(self.server, track.asked, Drags(), name)
         if self._scene is not None:
             draw_scene(self.server, self._scene, name)

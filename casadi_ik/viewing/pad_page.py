@@ -8,7 +8,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ import yaml
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
-from casadi_ik.drawing.drawables import links_seen
+from casadi_ik.drawing.drawables import bodies, collision_bodies, placed
 from casadi_ik.errors import CasadiIKError, DescriptionError
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.writing import written_whole
@@ -80,16 +80,12 @@ class PadPage:
         self._surfaces = dict(surfaces)
         self.asked = self._first = request_of(robot, None, None)
         self._links, self._dragged = robot.links(robot.home), ""
-        parts = links_seen(robot, surfaces)
-        lowest = min(
-            float(part.surface.moved(self._links[part.frame]).points[:, 2].min()) for part in parts
-        )
+        skin = [one for one in bodies(robot) if one.role != "pad"]
+        points = [one.surface.points for one in placed(robot, robot.home, skin)]
+        lowest = float(np.concatenate(points)[:, 2].min())
         set_stage(server, f"pads of {robot.name}", min(lowest, 0.0))
         look_at_hand(server, robot, robot.home)
-        # Paler than elsewhere, so that edges and skin are seen.
-        self._drawn = DrawnRobot(
-            server, robot, [replace(part, color=palette.FAINT) for part in parts]
-        )
+        self._drawn = DrawnRobot(server, robot, skin=skin)
         self._contacts = DrawnContacts(
             server,
             self.asked,
@@ -205,8 +201,9 @@ class PadPage:
         for joint in self.robot.description.joints:
             if joint.type == "fixed" and joint.parent in rigid:
                 rigid.add(joint.child)
-        skins = {part.frame: part.surface for part in links_seen(self.robot)} | self._surfaces
-        return together([skins[one].moved(back @ self._links[one]) for one in skins.keys() & rigid])
+        skins = [one for one in collision_bodies(self.robot) if one.frame not in self._surfaces]
+        parts = [(one.frame, one.surface) for one in skins] + list(self._surfaces.items())
+        return together([one.moved(back @ self._links[at]) for at, one in parts if at in rigid])
 
     def _add_panel(self, writable: bool) -> None:
         gui = self.server.gui

@@ -24,16 +24,16 @@ from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.drawing.drawables import (
     Drawable,
-    body,
-    closest_bodies,
-    closest_rod,
+    bodies,
     contact_marks,
+    nearest_pair,
     object_of,
+    placed,
     scene_of,
     target_place,
     with_object,
 )
-from casadi_ik.drawing.surfaces import arrow, ball
+from casadi_ik.drawing.surfaces import arrow, ball, mesh_of
 from casadi_ik.errors import InputError
 from casadi_ik.grasps import Grasp
 from casadi_ik.grasps.pose import inverse
@@ -166,7 +166,7 @@ def draw_alternatives(
     first = alternatives[0].q
     target = robot.contacts(first)[0].mean(axis=0)
     view = view or whole_view(target, close_view(robot, first))
-    everything = points_of([one for a in alternatives for part in body(robot, a.q) for one in part])
+    everything = points_of([one for a in alternatives for one in _body(robot, a.q)])
     for number, found in enumerate(alternatives):
         row, column = divmod(number, columns)
         box = (column / columns, 1 - (row + 1) / rows, 1 / columns, 0.86 / rows)
@@ -249,14 +249,14 @@ def draw_motion(
     q = np.stack([np.interp(times, motion.times, column) for column in motion.q.T], axis=1)
     step = max(round(1e3 * seconds / (count - 1)), 20)
     pictures = _shots(motion.robot, q, grasp, scene)
-    save_picture(_gif(pictures, [*[step] * (count - 1), 1500]), path)  # the last one stays [ms]
+    save_picture(animated(pictures, [*[step] * (count - 1), 1500]), path)  # the last one stays [ms]
     return count
 
 
 def _shots(robot: ArmHand, q: Array, grasp: Grasp, scene: Scene | None) -> list[Image]:
     """Images (h, w, 3) of postures (k, n)."""
     end, sizes = q[-1], ((420, 420), (340, 420))
-    passed = [one for row in q[:: max(len(q) // 8, 1)] for part in body(robot, row) for one in part]
+    passed = [one for row in q[:: max(len(q) // 8, 1)] for one in _body(robot, row)]
     there = _object(grasp)
     tips = robot.contacts(end)[0]
     close_up = tips.mean(axis=0) + 0.11 * np.vstack([np.eye(3), -np.eye(3)])
@@ -276,8 +276,7 @@ def _shots(robot: ArmHand, q: Array, grasp: Grasp, scene: Scene | None) -> list[
             (view, np.vstack([close_up, points_of(there or marks)]), sizes[1]),
         )
         for row in q:
-            for name, part in zip(("arm", "hand"), body(robot, row), strict=True):
-                stage.replace(name, part)
+            stage.replace("robot", _body(robot, row))
             panels = []
             for where, points, pixels in seen:
                 stage.aim(where, points, pixels, (0.04, 0.04))
@@ -286,15 +285,23 @@ def _shots(robot: ArmHand, q: Array, grasp: Grasp, scene: Scene | None) -> list[
     return found
 
 
-def _gif(images: list[Image], milliseconds: list[int]) -> bytes:
-    """Images as a GIF whose pictures share the palette of first, middle and last."""
-    whole = [Pillow.fromarray(np.round(255 * image).astype(np.uint8)) for image in images]
+def animated(images: Sequence[Image], milliseconds: Sequence[int], colors: int = 96) -> bytes:
+    """Images (h, w, 3) as a GIF; all share a palette, in which every colour of ours has shades."""
+    whole = [
+        Pillow.fromarray(np.round(255 * np.clip(image, 0.0, 1.0)).astype(np.uint8))
+        for image in images
+    ]
     width, height = whole[0].size
     some = [whole[0], whole[len(whole) // 2], whole[-1]]
-    sheet = Pillow.new("RGB", (width, height * len(some)))
+    ours = [palette.ARM, palette.HAND, palette.PAD, palette.OBJECT, palette.TARGET, palette.MET]
+    sheet = Pillow.new("RGB", (width, height * len(some) + 24 * len(ours)))
     for i, one in enumerate(some):
         sheet.paste(one, (0, i * height))
-    shared = sheet.quantize(96)
+    for i, color in enumerate(ours):
+        shades = np.linspace(0.45, 1.2, width)[None, :, None] * np.array(palette.rgb(color))
+        shaded = np.repeat(np.clip(shades, 0, 255).astype(np.uint8), 24, axis=0)
+        sheet.paste(Pillow.fromarray(shaded), (0, height * len(some) + 24 * i))
+    shared = sheet.quantize(colors)
     frames = [one.quantize(palette=shared, dither=Pillow.Dither.NONE) for one in whole]
     written = io.BytesIO()
     frames[0].save(
@@ -302,7 +309,7 @@ def _gif(images: list[Image], milliseconds: list[int]) -> bytes:
         format="GIF",
         save_all=True,
         append_images=frames[1:],
-        duration=milliseconds,
+        duration=list(milliseconds),
         loop=0,
         optimize=False,
         disposal=1,
@@ -335,11 +342,13 @@ def draw_pads(
     # In the palm frame, whose z is up and whose y goes to the thumb.
     back, links = inverse(robot.palm(robot.home)), robot.links(robot.home)
     hand = [
-        Drawable(link, surface.moved(back @ links[link]), palette.HAND)
+        Drawable(link, mesh_of(surface).moved(back @ links[link]), palette.HAND)
         for link, surface in surfaces.items()
         if link in links and len(surface.triangles)
     ]
-    hand = hand or [one.at(back) for one in body(robot, robot.home)[1]]
+    hand = hand or [
+        one.at(back) for one in _body(robot, robot.home) if one.role not in ("arm", "pad")
+    ]
     size = float(np.ptp(points_of(hand), axis=0).max())
     frames, marks = back @ robot.contact_frames(robot.home), []
     for name, frame in zip(robot.fingers, frames, strict=True):
@@ -377,16 +386,16 @@ def _fill(
     stage: Stage, robot: ArmHand, q: ArrayLike, grasp: Grasp | None, colors: Mapping[str, str]
 ) -> dict[str, list[Drawable]]:
     """Put all there is to see on the stage, and give it back by group."""
-    arm, hand = body(robot, q)
-    palm = robot.palm(q)[:3, 3]
-    groups: dict[str, list[Drawable]] = {"arm": [], "wrist": [], "hand": hand}
-    for one in arm:  # the close-up shows what is no further than this from the palm
-        groups["wrist" if _distances(one, palm).min() < 0.10 else "arm"].append(one)
+    body, palm = _body(robot, q), robot.palm(q)[:3, 3]
+    groups: dict[str, list[Drawable]] = {"arm": [], "wrist": [], "hand": []}
+    for one in body:  # the close-up shows what is no further than this from the palm
+        near = one.role == "arm" and _distances(one, palm).min() < 0.10
+        groups["wrist" if near else "arm" if one.role == "arm" else "hand"].append(one)
     groups["object"] = _object(grasp) if grasp else []
     groups["marks"] = contact_marks(robot, q, grasp, colors) if grasp else []
     for name, members in groups.items():
         stage.add(name, members, OPACITY.get(name, 1.0))
-    stage.add_floor(float(robot.links(q)[robot.description.root][2, 3]), arm + hand)
+    stage.add_floor(float(robot.links(q)[robot.description.root][2, 3]), body)
     return groups
 
 
@@ -399,9 +408,14 @@ def _surround(stage: Stage, robot: ArmHand, solution: Solution, grasp: Grasp, sc
     if pair is not None and np.isfinite(solution.q).all():
         found = closest_points(robot, solution.q, whole, pair)
         if found is not None:
-            stage.add("nearest", [closest_rod(found)])
-            touching = [] if solution.success else closest_bodies(found)
+            stage.add("nearest", nearest_pair(found))
+            touching = [] if solution.success else nearest_pair(found, touching=True)
             stage.add("touching", touching, OPACITY["touching"])
+
+
+def _body(robot: ArmHand, q: ArrayLike) -> list[Drawable]:
+    """The robot at q, in the base frame."""
+    return placed(robot, q, bodies(robot, q))
 
 
 def _object(grasp: Grasp) -> list[Drawable]:

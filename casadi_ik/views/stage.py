@@ -93,17 +93,23 @@ class Stage:
         self.add(group, drawables, opacity)
 
     def add_floor(
-        self, height: float, drawables: Sequence[Drawable], grid: float = 0.25, texels: int = 1024
+        self,
+        height: float,
+        drawables: Sequence[Drawable],
+        about: Array | None = None,
+        dark: bool = False,
+        texels: int = 1024,
     ) -> None:
         """A floor that fades out, with a grid and the soft shadow of drawables.
 
         Args:
             height: Of the floor [m].
             drawables: Of what the shadow is.
-            grid: Distance of its lines [m].
+            about: (k, 3) above what it lies [m]; None: the drawables.
+            dark: Whether it is paler than the ground about it.
             texels: Of its texture along each side.
         """
-        points = points_of(drawables)
+        points, grid = points_of(drawables) if about is None else about, 0.25
         low, high = points.min(axis=0), points.max(axis=0)
         middle = np.array([*(low + high)[:2] / 2, height])
         radius = 0.35 + float(np.linalg.norm(high[:2] - low[:2])) / 2
@@ -122,10 +128,16 @@ class Stage:
         off = [np.abs((v / grid + 0.5) % 1 - 0.5) * grid for v in (x + middle[0], y - middle[1])]
         line = np.clip(1.5 - np.minimum(*off) / (1.2 * radius / texels + 0.0012), 0.0, 1.0)
         texture = np.zeros((texels, texels, 4), dtype=np.uint8)
-        light = (1 - 0.26 * shadow) * (1 - fade * (0.035 + 0.10 * line))
-        texture[..., 3] = np.round(255 * (1 - light))
+        if dark:
+            texture[..., :3] = 255
+            shade = fade * (0.05 + 0.09 * line) * (1 - 0.75 * shadow)
+        else:
+            shade = 1 - (1 - 0.26 * shadow) * (1 - fade * (0.035 + 0.10 * line))
+        texture[..., 3] = np.round(255 * shade)
         plane = pv.Plane(center=middle, i_size=2 * radius, j_size=2 * radius)
         look = {"texture": pv.Texture(texture), "lighting": False, "render": False}
+        for actor in self._groups.pop("floor", []):
+            self.plotter.renderer.remove_actor(actor, render=False)
         self._groups["floor"] = [self.plotter.add_mesh(plane, **look)]
 
     def aim(
