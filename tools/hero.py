@@ -33,14 +33,11 @@ WHOLE, CLOSE, BESIDE = (470, 400), (290, 290), 55
 PICTURES, SECONDS = 60, 5.4
 """Of a round."""
 
-SWAY = np.array([0.12, 0.17, 0.14])
+SWAY = np.array([0.09, 0.15, 0.12])
 """How far the object goes to either side of where the grasp has it [m]."""
 
-TURN = 0.45
+TURN = 0.35
 """By how much it turns about the vertical to either side [rad]."""
-
-FOLLOWED = 0.85
-"""Part of the object's way that the camera of the close-up goes as well."""
 
 
 def path(grasp: ik.Grasp) -> list[ik.Grasp]:
@@ -65,7 +62,7 @@ def pictures(
     thing = object_of(GRASP)
     assert thing is not None
     bodied = [placed(robot, q, bodies(robot)) for q in every_q]
-    about = points_of([one for body in bodied[::6] for one in body])
+    about = points_of([one for body in bodied[::3] for one in body])
     places = np.array([one.object_pose[:3, 3] for one in grasps if one.object_pose is not None])
     close = close_view(robot, every_q[0])
     whole = whole_view(places.mean(axis=0), close)
@@ -75,7 +72,9 @@ def pictures(
         for grasp, body, place in zip(grasps, bodied, places, strict=True):
             pose = grasp.object_pose
             assert pose is not None
-            stage.replace("robot", body)
+            far = [np.linalg.norm(one.surface.points - place, axis=1).min() > 0.3 for one in body]
+            stage.replace("robot", [one for one, off in zip(body, far, strict=True) if not off])
+            stage.replace("far", [one for one, off in zip(body, far, strict=True) if off])
             stage.replace("object", [thing.at(pose)], 0.6)
             marks = [
                 one
@@ -84,13 +83,13 @@ def pictures(
             ]
             stage.replace("marks", marks)
             stage.aim(whole, about, WHOLE, (0.02, 0.04))
-            layers, tip = _layers(stage), stage.project(place[None])[0]
+            layers, tip = _layers(stage, "far"), stage.project(place[None])[0]
             floors = []
             for dark in (False, True):
                 stage.add_floor(0.0, [*body, thing.at(pose)], about, dark, texels=512)
                 stage.aim(whole, about, WHOLE, (0.02, 0.04))
                 floors.append(stage.shoot("floor"))
-            stage.aim(close, near + _drawn_to(place, places.mean(axis=0)), CLOSE)
+            stage.aim(close, near + place, CLOSE)
             inset, second = _layers(stage), stage.project(place[None])[0]
             for images, floor, color in zip(found, floors, PAPERS, strict=True):
                 paper = np.array(palette.rgb(color), np.float32) / 255
@@ -107,17 +106,13 @@ def pictures(
 PAPERS = ("#ffffff", palette.DARK_PAPER)
 
 
-def _layers(stage: Stage) -> tuple[Image, Image]:
-    return stage.shoot("robot", "object", "marks"), stage.shoot("marks")
+def _layers(stage: Stage, *more: str) -> tuple[Image, Image]:
+    return stage.shoot("robot", "object", "marks", *more), stage.shoot("marks")
 
 
 def _composed(below: Image, layers: tuple[Image, Image]) -> Image:
     """Marks that something hides are half seen."""
     return over(over(below, layers[0]), layers[1], 0.5)
-
-
-def _drawn_to(place: Array, middle: Array) -> Array:
-    return middle + FOLLOWED * (place - middle)
 
 
 def _rounded(image: Image, paper: Array) -> Image:
@@ -156,9 +151,8 @@ def main(arguments: list[str] | None = None) -> None:
         q = solution.q
         found.append(q)
     every_q = np.array(found[PICTURES:])
-    print(
-        f"largest step {np.rad2deg(np.abs(np.diff(every_q, axis=0, append=every_q[:1])).max()):.0f} deg"
-    )
+    steps = np.abs(np.diff(every_q, axis=0, append=every_q[:1]))
+    print(f"largest step {np.rad2deg(steps.max()):.0f} deg")
     for name, images in zip(("light", "dark"), pictures(robot, grasps, every_q), strict=True):
         file = options.out / f"hero_{name}.gif"
         pause = round(1e3 * SECONDS / PICTURES / 10) * 10

@@ -110,9 +110,10 @@ def link_surfaces(
         return {link: found[link] for link in links if link in found}, []
     assert tree.element is not None
     missing = Missing(tree.path)
-    found = {} if seen else _of_urdf(tree.element, "collision", links, missing)
-    rest = [link for link in links if link not in found]
-    found |= _of_urdf(tree.element, "visual", rest, missing)
+    found: dict[str, Surface] = {}
+    for kind in ("visual", "collision") if seen else ("collision", "visual"):
+        rest = [link for link in links if link not in found]
+        found |= _of_urdf(tree.element, kind, rest, missing)
     return found, missing.lines()
 
 

@@ -293,7 +293,15 @@ def animated(images: Sequence[Image], milliseconds: Sequence[int], colors: int =
     ]
     width, height = whole[0].size
     some = [whole[0], whole[len(whole) // 2], whole[-1]]
-    ours = [palette.ARM, palette.HAND, palette.PAD, palette.OBJECT, palette.TARGET, palette.MET]
+    ours = [
+        "#ffffff",
+        palette.ARM,
+        palette.HAND,
+        palette.PAD,
+        palette.OBJECT,
+        palette.TARGET,
+        palette.MET,
+    ]
     sheet = Pillow.new("RGB", (width, height * len(some) + 24 * len(ours)))
     for i, one in enumerate(some):
         sheet.paste(one, (0, i * height))
