@@ -7,7 +7,9 @@ what was expected.
 
 from __future__ import annotations
 
+import difflib
 import unicodedata
+from collections.abc import Iterable
 
 
 def printable(text: str, most: int = 0) -> str:
@@ -43,6 +45,15 @@ def shortened(text: str) -> str:
     """A text of any length as one of a few hundred characters, fit for a terminal."""
     text = printable(text)
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 200]} [...] {text[-180:]}"
+
+
+def did_you_mean(word: str, known: Iterable[str], otherwise: str | None = None) -> str:
+    """The known word that is nearest to one that is not; else `otherwise`, or all of them."""
+    known = list(known)
+    near = difflib.get_close_matches(word, known, 1)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    return f"expected one of {', '.join(known)}" if otherwise is None else otherwise
 
 
 class CasadiIKError(Exception):

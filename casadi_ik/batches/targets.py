@@ -281,7 +281,7 @@ def polars_module() -> Any:
         import polars as pl
     except ImportError as error:
         raise UnsupportedError(
-            "Parquet files are read with polars: pip install 'casadi-ik[dataframes]'"
+            "Parquet files need polars: pip install 'casadi-ik[dataframes]'"
         ) from error
     return pl
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 from rich.console import Group
 from rich.text import Text
 
+from casadi_ik.answers.report import counted, fields, headline
 from casadi_ik.arm_hand import load_robot
 from casadi_ik.cli import options as opt
+from casadi_ik.cli.options import Option
 from casadi_ik.cli.outputs import say
-from casadi_ik.cli.report import counted, fields, headline
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.exporting.project import (
@@ -28,22 +28,22 @@ from casadi_ik.kernels.compiler import find_compiler
 
 
 @command(
-    opt.Option("ROBOT", "a shipped name or a YAML file"),
-    opt.out("DIR", "folder to write", Path),
-    opt.Option("--method M", "hand-first is the only one that can be", default="hand-first"),
-    opt.Option("--prefix NAME", "what all names begin with", otherwise="the robot's name"),
-    opt.Option(
+    Option("ROBOT", "a shipped name or a YAML file"),
+    opt.out("DIR", "folder to write"),
+    Option("--method M", "hand-first is the only one that can be", "hand-first"),
+    Option("--prefix NAME", "what all names begin with (default: the robot's name)"),
+    Option(
         "--target c|wasm",
-        "plain C, or a WebAssembly module for JavaScript (needs casadi-ik[compiler])",
-        default="c",
+        "plain C, or a WebAssembly module for JavaScript (needs 'casadi-ik[compiler]')",
+        "c",
     ),
-    opt.Option(
+    Option(
         "--scene CAPACITY",
         "collisions are checked: the robot with itself, and with so many solids at most",
-        opt.whole(1),
+        read=opt.whole(1),
     ),
-    opt.Option("--single", "in single precision, for controllers that have no other (--target c)"),
-    opt.Option(
+    Option("--single", "in single precision, for controllers that have no other (--target c)"),
+    Option(
         "--follow", "with a follower of moving contacts that keeps velocities and accelerations"
     ),
 )
@@ -89,9 +89,7 @@ def export(said: Said) -> Answer:
     return Answer(Group(headline(True, "EXPORTED", f"{robot.name} to {said.out}"), fields(pairs)))
 
 
-@command(
-    opt.Option("ROBOT...", "a shipped name, ARM+HAND, or a YAML file", key="robots"),
-)
+@command(Option("ROBOT...", "a shipped name, ARM+HAND, or a YAML file", key="robots"))
 def compile_ahead(said: Said) -> Answer:
     """Compile what solving, batches and logs of robots need, ahead of use.
 

@@ -6,10 +6,11 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
+from casadi_ik.answers.report import HUMAN, SI, Units
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
-from casadi_ik.cli.table import Said
+from casadi_ik.cli.table import Said, in_si
 from casadi_ik.collision.scene import Scene, load_scene
 from casadi_ik.errors import (
     CasadiIKError,
@@ -17,6 +18,7 @@ from casadi_ik.errors import (
     InputError,
     UnknownNameError,
     UnsupportedError,
+    did_you_mean,
 )
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.files.shipped import resolve, resolve_robot
@@ -95,7 +97,7 @@ def the_method(said: Said) -> str:
     """
     method = said.method or METHODS[0]
     if method not in METHODS:
-        raise UnknownNameError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
+        raise UnknownNameError(f"--method: found {method!r}, {did_you_mean(method, METHODS)}")
     return method
 
 
@@ -157,18 +159,29 @@ def the_object_pose(said: Said) -> Array | None:
     return frame_matrix(Frame((x, y, z), (roll, pitch, yaw)))
 
 
+def the_units(said: Said) -> Units:
+    """What reports are in: degrees and mm, unless radians or m were asked for."""
+    return {
+        "rad": (SI if said.deg is False else HUMAN)["rad"],
+        "m": (SI if said.mm is False else HUMAN)["m"],
+    }
+
+
 def the_start(said: Said, robot: ArmHand) -> list[float] | None:
     """The start, a number per actuator; None for home.
 
     Raises:
         InputError: As many numbers as actuators were expected.
     """
-    if said.q0 is not None and len(said.q0) != len(robot.actuators):
+    if said.q0 is None:
+        return None
+    if len(said.q0) != len(robot.actuators):
         raise InputError(
             f"--q0: found {len(said.q0)} numbers, expected {len(robot.actuators)}: "
             + ", ".join(robot.actuators)
         )
-    return said.q0
+    units = (actuator.unit for actuator in robot.description.actuators)
+    return [in_si(value, unit, said) for value, unit in zip(said.q0, units, strict=True)]
 
 
 def the_fixed(said: Said, robot: ArmHand) -> dict[str, float]:
@@ -178,10 +191,11 @@ def the_fixed(said: Said, robot: ArmHand) -> dict[str, float]:
         InputError: One is named twice, or its position is not within its limits.
         UnknownNameError: No such actuator.
     """
+    units = {actuator.name: actuator.unit for actuator in robot.description.actuators}
     fixed: dict[str, float] = {}
     for name, value in said.fixed:
         if name in fixed:
             raise InputError(f"--fixed: {name} appears twice")
-        fixed[name] = value
+        fixed[name] = in_si(value, units.get(name, ""), said)
     fixed_array(fixed, robot.actuators, robot.lower, robot.upper)
     return fixed

@@ -1,19 +1,18 @@
-"""`casadi-ik robots`, `methods`, `grasps` and `schemas`: what there is, and how files have it."""
+"""Lists of what there is (`casadi-ik robots`, `methods`, ...), and schemas of files."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from casadi_ik.answers.report import headline, robot_report, table
 from casadi_ik.arms.recognise import family_in_words
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.outputs import writing
-from casadi_ik.cli.report import fields, headline, table
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.collision.scene import SceneFile
 from casadi_ik.datasets.conventions import ConventionFile
@@ -65,17 +64,8 @@ def robots(_: Said) -> Answer:
     parts: list[RenderableType] = []
     for name in shipped_names("arm_hands"):
         path = resolve(name, "arm_hands")
-        robot = load_description(path)
-        thumb = robot.named_thumb
-        fingers = (f"{f} (placed first)" if f == thumb else f for f in robot.finger_names)
-        pairs = {
-            "fingers": f"{len(robot.fingers)}: {', '.join(fingers)}",
-            "actuators": f"{len(robot.actuators)}: {', '.join(robot.actuator_names)}",
-        }
-        if robot.arm_actuators:
-            pairs["arm"] = f"closed form: {family_in_words(robot)}"
-        description = convert(read_yaml(path), ArmHandFile, path).description
-        parts += [Text(name, "bold"), Text(f"  {description}"), fields(pairs)]
+        about = convert(read_yaml(path), ArmHandFile, path).description
+        parts.append(robot_report(load_description(path), about))
     return Answer(Group(*parts, *_catalogue()))
 
 
@@ -131,7 +121,27 @@ def grasps(_: Said) -> Answer:
     return Answer(Group(*parts))
 
 
-@command(opt.out("DIR", "folder to write", Path))
+@command()
+def objects(_: Said) -> Answer:
+    """List the shipped objects, which grasps and scenes name."""
+    return Answer(_described("objects", "object", ObjectFile))
+
+
+@command()
+def scenes(_: Said) -> Answer:
+    """List the shipped scenes: what `--scene` may be, beside a file of your own."""
+    return Answer(_described("scenes", "scene", SceneFile))
+
+
+def _described(kind: str, head: str, schema: type[ObjectFile | SceneFile]) -> Table:
+    rows = table(head, "description")
+    for name in shipped_names(kind):
+        path = resolve(name, kind)
+        rows.add_row(name, convert(read_yaml(path), schema, path).description)
+    return rows
+
+
+@command(opt.out("DIR", "folder to write"))
 def schemas(said: Said) -> Answer:
     """Write JSON Schemas of the files that people write, with which editors complete keys.
 

@@ -16,10 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from casadi_ik import logs
-from casadi_ik.cli import options as opt
-from casadi_ik.cli.inputs import located, robot_of_log
-from casadi_ik.cli.outputs import check_outputs, write_output
-from casadi_ik.cli.report import (
+from casadi_ik.answers.report import (
     counted,
     duration,
     fields,
@@ -28,6 +25,10 @@ from casadi_ik.cli.report import (
     indented,
     table,
 )
+from casadi_ik.cli import options as opt
+from casadi_ik.cli.inputs import located, robot_of_log
+from casadi_ik.cli.options import Option
+from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
 from casadi_ik.logs.compare import Matched, matched, side_by_side
@@ -45,19 +46,28 @@ SHOWN = 12
 USUAL_EVENTS = ("PHASE_CHANGE", "LIMIT_LEFT", "RELEASED")
 """What happens in every solve and so is not told of each."""
 
-LOGS = opt.Option("FILE...", "logs, or folders of logs", key="files")
-LOG = opt.Option("FILE", "a log, or a folder of shards")
-SOLVE = opt.Option("--solve N", "number of the solve", opt.whole(0))
-ONE_SOLVE = opt.Option(SOLVE.said, SOLVE.help, opt.whole(0), otherwise="the only one")
-METHOD = opt.Option("--method M", "method", otherwise="the only one")
-FILTERS = (
-    opt.Option("--method M", "of the solve"),
-    SOLVE,
-    opt.Option("--status S", "of the solve, e.g. STALLED"),
-    opt.Option("--event E", "solves in which one happened, and those events, e.g. NEAR_SINGULAR"),
-    opt.Option("--phase P", "solves, iterations and events in it, e.g. hand-alignment"),
+TORN, EMPTY = (
+    "killed while writing, or still at it (casadi-ik log finish)",
+    "nothing in it is whole",
 )
-MOST = opt.Option("--most N", "rows shown", opt.whole(1), default=40)
+"""Why files of a study are named."""
+
+LOGS = Option("FILE...", "logs, or folders of logs", key="files")
+LOG = Option("FILE", "a log, or a folder of shards")
+SOLVE = Option("--solve N", "number of the solve", read=opt.whole(0))
+ONE_SOLVE = (
+    Option("[SOLVE]", "number of the solve (default: the only one)", read=opt.whole(0), key="one"),
+    Option("--solve N", "the same", read=opt.whole(0)),
+    Option("--method M", "method (default: the only one)"),
+)
+FILTERS = (
+    Option("--method M", "of the solve"),
+    SOLVE,
+    Option("--status S", "of the solve, e.g. STALLED"),
+    Option("--event E", "solves in which one happened, and those events, e.g. NEAR_SINGULAR"),
+    Option("--phase P", "solves, iterations and events in it, e.g. hand-alignment"),
+)
+MOST = Option("--most N", "rows shown", 40)
 KINDS = {".mcap": "viewer", ".parquet": "parquet", ".csv": "csv"}
 """What `log export` writes, by the name's end."""
 
@@ -105,11 +115,7 @@ def events(said: Said) -> Answer:
     return Answer(Group(_only_last_wraps(rows), _count(len(found), said.most, "event")))
 
 
-@command(
-    LOG,
-    opt.Option("[SOLVE]", ONE_SOLVE.help, opt.whole(0), otherwise=ONE_SOLVE.otherwise),
-    METHOD,
-)
+@command(LOG, *ONE_SOLVE)
 def why(said: Said) -> Answer:
     """Explain one solve in words."""
     solve = _the_solve(said, logs.open(said.file))
@@ -131,23 +137,20 @@ def why(said: Said) -> Answer:
 
 @command(
     LOG,
-    ONE_SOLVE,
-    METHOD,
-    opt.Option(
+    *ONE_SOLVE,
+    Option(
         "--out FILE.png",
-        "where to",
-        opt.file_name(".png"),
-        otherwise="named after log, method and solve, in this folder",
+        "where to (default: named after log, method and solve, in this folder)",
+        read=opt.file_name(".png"),
     ),
-    opt.Option(
+    Option(
         "--range FIRST LAST",
-        "iterations drawn; long runs hide what happens at their beginning",
-        opt.each(opt.whole(0)),
-        otherwise="all",
+        "iterations drawn; long runs hide what happens at their beginning (default: all)",
+        read=opt.each(opt.whole(0)),
     ),
 )
 def plot(said: Said) -> Answer:
-    """Draw how one solve went (needs casadi-ik[plots])."""
+    """Draw how one solve went (needs 'casadi-ik[plots]')."""
     with located("log plot", (MissingExtraError,)):
         from casadi_ik.views import draw_convergence
     log = logs.open(said.file)
@@ -171,8 +174,8 @@ def plot(said: Said) -> Answer:
 
 @command(
     LOGS,
-    opt.Option("--solve N", "one solve, by its number with the first method", opt.whole(0)),
-    opt.Option("--methods M M", "which two; last on the line", otherwise="the only two"),
+    Option("--solve N", "one solve, by its number with the first method", read=opt.whole(0)),
+    Option("--methods M M", "which two; last on the line (default: the only two)"),
 )
 def compare(said: Said) -> Answer:
     """Compare two methods on the same targets: one side by side, many in numbers."""
@@ -198,11 +201,11 @@ def compare(said: Said) -> Answer:
 @command(
     LOG,
     opt.out("REPORT.html", "where to"),
-    opt.Option("--title TEXT", "of the page", otherwise="what the log is called"),
-    opt.Option("--most N", "solves that can be opened", opt.whole(1), default=200),
+    Option("--title TEXT", "of the page (default: what the log is called)"),
+    Option("--most N", "solves that can be opened", 200),
 )
 def report(said: Said) -> Answer:
-    """Write a study as a page that needs nothing but a browser (needs casadi-ik[plots]).
+    """Write a study as a page that needs nothing but a browser (needs 'casadi-ik[plots]').
 
     It has success, time and iterations by method and targets, where solves fail or
     meet singularities, and the hardest with their stories.
@@ -221,17 +224,12 @@ def report(said: Said) -> Answer:
 @command(
     LOG,
     *FILTERS,
-    opt.Option(
-        "--what iterations|solves|events",
-        "rows of a table",
-        default="iterations",
-    ),
-    opt.Option(
+    Option("--what iterations|solves|events", "rows of a table", "iterations"),
+    Option(
         "--to viewer|parquet|csv",
-        "kind of file",
-        otherwise=f"what --out ends in: {', '.join(KINDS)}",
+        f"kind of file (default: what --out ends in: {', '.join(KINDS)})",
     ),
-    opt.Option("--robot R", "for a viewer: a shipped name or a YAML file", otherwise="the log's"),
+    Option("--robot R", "for a viewer: a shipped name or a YAML file (default: the log's)"),
     opt.out("FILE", "where to", opt.file_name()),
 )
 def export(said: Said) -> Answer:
@@ -239,9 +237,9 @@ def export(said: Said) -> Answer:
 
     VIEW.mcap, for Foxglove (app.foxglove.dev) and Lichtblick: one solve with the
     robot, its frames, joints, contacts, phases and events, 10 ms an iteration; needs
-    casadi-ik[viewer]. Beside it VIEW.layout.json is written, a layout to import
+    'casadi-ik[viewer]'. Beside it VIEW.layout.json is written, a layout to import
     there.
-    TABLE.parquet or TABLE.csv: rows of numbers, needs casadi-ik[dataframes].
+    TABLE.parquet or TABLE.csv: rows of numbers, needs 'casadi-ik[dataframes]'.
     """
     kind = said.to or KINDS.get(said.out.suffix.lower())
     if kind is None:
@@ -273,7 +271,7 @@ def finish(said: Said) -> Answer:
         except NothingWrittenError:
             if len(found) == 1:
                 raise
-            about = {"done": "left as it is: nothing in it is whole"}
+            about = {"done": f"left as it is: {EMPTY}"}
         else:
             cut = f"finished, {_size(done.cut)} of a torn tail cut"
             about = {
@@ -294,7 +292,7 @@ def merge(said: Said) -> Answer:
         "solves": ", ".join(f"{count} of {name}" for name, count in done.solves.items()) or "none",
         "messages": str(done.messages),
         "size": _size(done.size),
-        "left out": _named(done.left_out, "nothing in it is whole"),
+        "left out": _named(done.left_out, EMPTY),
     }
     return Answer(Group(fields(about), *files({"log": said.out})))
 
@@ -321,8 +319,9 @@ def _the_solve(said: Said, log: logs.Log) -> OneSolve:
         LogError: The log is damaged.
         UnknownNameError: There is no such solve, or several; the message names the file.
     """
+    number = getattr(said, "one", None)
     try:
-        return one_solve(log, said.solve, said.method)
+        return one_solve(log, said.solve if number is None else number, said.method)
     except UnknownNameError as error:
         where = "" if said.file in str(error) else f"{said.file}: "
         raise UnknownNameError(f"{where}{error}") from error
@@ -414,10 +413,8 @@ def _container(log: logs.Log, about: logs.LogInfo) -> dict[str, str]:
         "size": f"{_size(about.size)}{each_takes}",
         "chunks": packed,
         "attached": ", ".join(attached) or "nothing",
-        "unfinished": _named(
-            about.unfinished, "killed while writing, or still at it (casadi-ik log finish)"
-        ),
-        "left out": _named(about.left_out, "nothing in it is whole"),
+        "unfinished": _named(about.unfinished, TORN),
+        "left out": _named(about.left_out, EMPTY),
     }
 
 
@@ -463,7 +460,7 @@ def _origin(about: logs.LogInfo) -> dict[str, str]:
     if "scene" not in metadata.get("parameters", {}):
         pairs["collision"] = "not checked"
     for name, value in metadata.get("parameters", {}).items():
-        pairs[name.replace("_", " ")] = _flat(value)
+        pairs[name.replace("_", " ")] = _tolerance(value) if name == "tolerance" else _flat(value)
     for key, values in about.differs.items():
         if key == "parameters":
             for name in dict.fromkeys(name for each in values for name in each):
@@ -473,6 +470,18 @@ def _origin(about: logs.LogInfo) -> dict[str, str]:
         elif key in pairs and key != "created":
             pairs[key] = _by_shard([_flat(value) for value in values])
     return {printable(name, 60): printable(text, 2000) for name, text in pairs.items()}
+
+
+def _tolerance(value: Any) -> str:
+    """The fingers' tolerances, once where they are the same."""
+    try:
+        texts = {
+            name: f"{1e3 * one['position']:.4g} mm, {math.degrees(one['angle']):.4g} deg"
+            for name, one in value.items()
+        }
+    except (TypeError, KeyError, AttributeError):  # of another writer
+        return _flat(value)
+    return _flat(texts) if len(set(texts.values())) > 1 else next(iter(texts.values()), "none")
 
 
 def _by_shard(texts: Sequence[str]) -> str:

@@ -3,42 +3,45 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from rich.console import Group
 from rich.text import Text
 
+from casadi_ik.answers.report import Units, fields, files, headline
+from casadi_ik.answers.stored import ChosenPosture, chosen_posture
 from casadi_ik.api import Solver
 from casadi_ik.arrays import Array
 from casadi_ik.cli import options as opt
-from casadi_ik.cli.choose import ChosenPosture, chosen_posture
-from casadi_ik.cli.inputs import located, the_grasp, the_robot, the_solver, the_start
+from casadi_ik.cli.inputs import (
+    located,
+    the_grasp,
+    the_robot,
+    the_solver,
+    the_start,
+    the_units,
+)
+from casadi_ik.cli.options import Option
 from casadi_ik.cli.outputs import check_outputs, write_output
-from casadi_ik.cli.report import fields, files, headline
-from casadi_ik.cli.table import Answer, Exit, Said, command
+from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError
-from casadi_ik.files.limits import LIMITS, RAISED, limit
-from casadi_ik.files.npz import read_npz
 from casadi_ik.grasps import Grasp
-from casadi_ik.motion.follower import Follower, FollowStatus
+from casadi_ik.motion.follower import FollowStatus
+from casadi_ik.motion.frames import Frames, follow_frames, read_frames
 from casadi_ik.motion.motion import Motion
 from casadi_ik.motion.reach import PARTS, Reach
-from casadi_ik.motion.retarget import KEYPOINTS, Retargeter, load_retarget, usual_retarget
+from casadi_ik.motion.retarget import Retargeter, load_retarget, usual_retarget
 
 MOTION = opt.out("MOTION.mcap", "write the motion", opt.file_name(".mcap", ".npz", ".csv"))
 
 
 @command(
-    opt.Option("KEYPOINTS.npz", "the frames, see below", key="frames"),
+    Option("KEYPOINTS.npz", "the frames, see below", key="frames"),
     opt.ROBOT,
     MOTION,
-    opt.Option(
-        "--retarget FILE.yaml", "how a hand moves the robot's", otherwise="as suits most hands"
-    ),
-    opt.Option("--period S", "of a cycle", opt.positive, default=0.005),
+    Option("--retarget FILE.yaml", "how a hand moves the robot's (default: as suits most hands)"),
+    Option("--period SECONDS", "of a cycle", 0.005),
     opt.SCENE,
     *opt.TOLERANCES,
     opt.Q0,
@@ -79,132 +82,44 @@ def follow(said: Said) -> Answer:
     if not name:
         raise InputError("--robot: missing, expected it here or as robot in --retarget")
     robot = the_robot(name)
-    frames = _read_frames(path, len(robot.fingers))
+    frames = read_frames(path, len(robot.fingers))
     inputs = [path] + ([Path(said.retarget)] if said.retarget else [])
     check_outputs({"--out": said.out}, inputs)
+    frames.cycles(said.period)  # are not too many
     solver = the_solver(said, robot)
     start = np.asarray(the_start(said, robot) or _start(solver, frames))
-    seconds = float(frames.times[-1])
-    if seconds > limit(LIMITS.stream_cycles) * said.period:
-        raise InputError(
-            f"{path}: times: found {seconds:g} s, expected at most "
-            f"{limit(LIMITS.stream_cycles) * said.period:g} s at this period {RAISED}"
-        )
     follower = solver.follow(start, said.period)
-    times = np.arange(1, int(np.ceil(seconds / said.period)) + 2) * said.period
-    q = np.empty((len(times) + 1, len(robot.actuators)))
-    q[0] = follower.state.q
-    status = np.full(len(q), FollowStatus.HOLDING.value, dtype="<U9")
-    error = np.full((len(q), len(robot.fingers)), np.nan)
     with located("--retarget" if said.retarget is None else said.retarget):
         retargeter = Retargeter(config or usual_retarget(robot), robot, start)
     began = time.perf_counter()
-    for i, reached in enumerate(_followed(path, follower, frames, times, retargeter), start=1):
-        state = follower.state
-        q[i], status[i], error[i] = reached, state.status.value, state.position_error
-    spent = (time.perf_counter() - began) / len(times)
-    notes = {"status": status, "position_error": error}
-    motion = Motion.of_cycles(robot, said.period, q, notes)
+    with located(str(path)):
+        motion = follow_frames(robot, follower, frames, retargeter)
+    count = len(motion) - 1
+    spent = (time.perf_counter() - began) / count
     write_output(said.out, "--out", motion.write_to)
-    counts = {one.value: int((status[1:] == one.value).sum()) for one in FollowStatus}
-    step, far = np.abs(motion.velocity) / follower.velocity, error[1:][np.isfinite(error[1:])]
+    status, error = motion.notes["status"][1:], motion.notes["position_error"][1:]
+    counts = {one.value: int((status == one.value).sum()) for one in FollowStatus}
+    step = np.abs(motion.velocity) / follower.velocity
+    scale, unit = the_units(said)["m"]
+    far = scale * np.nanmax(error) if np.isfinite(error).any() else None
     stays = retargeter.in_hand and retargeter.config.travel is None
     pairs = {
         "robot": robot.name,
         "wrist": "stays: the keypoints' origin is in the hand (MediaPipe's world landmarks)"
         if stays
         else "",
-        "cycles": f"{len(times)} of {1e3 * said.period:g} ms, {1e6 * spent:.0f} us each",
+        "cycles": f"{count} of {1e3 * said.period:g} ms, {1e6 * spent:.0f} us each",
         "how they went": ", ".join(f"{name} {count}" for name, count in counts.items() if count),
         "fastest motor": f"{100 * step.max():.0f} % of its velocity limit",
-        "largest error": f"{1e3 * far.max():.2f} mm" if len(far) else "",
+        "largest error": "" if far is None else f"{far:.3g} {unit}",
+        "collision": _checked(solver),
         "written": str(said.out),
     }
-    followed = counts[FollowStatus.FOLLOWING.value] == len(times)
-    return Answer.solved(followed, Group(Text(path.name, "bold"), fields(pairs)))
+    followed = counts[FollowStatus.FOLLOWING.value] == count
+    return Answer.solved(followed, Text(path.name, "bold"), fields(pairs))
 
 
-@dataclass(frozen=True, eq=False)
-class _Frames:
-    """Frames of a stream.
-
-    Attributes:
-        times: (k,) [s], the first 0.
-        keypoints: (k, 21, 3) of a person's hand [m]; None: contacts are given.
-        points: (k, f, 3) contact points [m], base frame; nothing where keypoints are given.
-        normals: (k, f, 3) outward pad normals; NaN where free.
-    """
-
-    times: Array
-    keypoints: Array | None
-    points: Array
-    normals: Array
-
-    def at(self, times: Array, values: Array) -> Array:
-        """Values of frames between the frames, linearly; NaN beside a frame that has NaN."""
-        after = np.clip(np.searchsorted(self.times, times), 1, max(len(self.times) - 1, 1))
-        if len(self.times) == 1:
-            return np.repeat(values, len(times), axis=0)
-        start, end = self.times[after - 1], self.times[after]
-        share = np.clip((times - start) / (end - start), 0.0, 1.0)[:, None, None]
-        before, behind = values[after - 1], values[after]
-        with np.errstate(invalid="ignore"):  # a frame that is none gives none
-            between = before + share * (behind - before)
-        return np.where(share <= 0, before, np.where(share >= 1, behind, between))
-
-
-def _read_frames(path: Path, fingers: int) -> _Frames:
-    """Read what `follow` reads, for a robot of so many fingers.
-
-    Raises:
-        DescriptionError: Missing, damaged or too large; the message names the file.
-        InputError: Other arrays than expected; the message names file and key.
-    """
-    arrays = read_npz(path, LIMITS.stream_bytes)
-    known = ["keypoints", "normals", "points", "times"]
-    if ("keypoints" in arrays) == ("points" in arrays):
-        raise InputError(
-            f"{path}: expected keypoints (k, {KEYPOINTS}, 3) or points (k, {fingers}, 3); "
-            f"found {', '.join(arrays) or 'nothing'}"
-        )
-    for name in sorted(set(arrays).difference(known)):
-        raise InputError(f"{path}: {name}: unknown, expected {', '.join(known)}")
-    key = "keypoints" if "keypoints" in arrays else "points"
-    count = KEYPOINTS if key == "keypoints" else fingers
-    frames = arrays[key]
-    if frames.ndim != 3 or frames.shape[1:] != (count, 3) or not len(frames):
-        raise InputError(
-            f"{path}: {key}: found shape {frames.shape}, expected (k, {count}, 3), k >= 1"
-        )
-    # One bad frame is no error of a stream; most of them too large are in other units.
-    middle = frames.mean(axis=1, keepdims=True) if key == "keypoints" else 0.0
-    with np.errstate(invalid="ignore"):
-        away = np.linalg.norm(frames - middle, axis=2)
-    away = away[np.isfinite(away)]
-    if len(away) and np.median(away) > LIMITS.stream_reach:
-        of = "middle of the hand" if key == "keypoints" else "base"
-        raise InputError(
-            f"{path}: {key}: found {np.median(away):.4g} m from the {of}, expected at most "
-            f"{LIMITS.stream_reach:g} m (numbers in mm?)"
-        )
-    normals = arrays.get("normals")
-    if normals is not None and (key == "keypoints" or normals.shape != frames.shape):
-        expected = "points beside them" if key == "keypoints" else f"{frames.shape}"
-        raise InputError(f"{path}: normals: found shape {normals.shape}, expected {expected}")
-    times = arrays.get("times", np.arange(len(frames)) / 30.0)
-    steady = times.shape == (len(frames),) and np.isfinite(times).all()
-    if not (steady and (np.diff(times) > 0).all()):
-        raise InputError(
-            f"{path}: times: expected {len(frames)} growing numbers of seconds, one per frame"
-        )
-    if key == "keypoints":
-        nothing = np.zeros((len(frames), 0, 3))
-        return _Frames(times - times[0], frames, nothing, nothing)
-    free = np.full(frames.shape, np.nan) if normals is None else normals
-    return _Frames(times - times[0], None, frames, free)
-
-
-def _start(solver: Solver, frames: _Frames) -> Array:
+def _start(solver: Solver, frames: Frames) -> Array:
     """Where a robot begins of which nobody says where it is."""
     first = frames.points[:1], frames.normals[:1]
     if np.isfinite(first[0]).any():
@@ -214,59 +129,31 @@ def _start(solver: Solver, frames: _Frames) -> Array:
     return solver.robot.home
 
 
-def _followed(
-    path: Path, follower: Follower, frames: _Frames, times: Array, retargeter: Retargeter
-) -> Iterator[Array]:
-    """Where the motors are at the end of each cycle."""
-    weight = retargeter.config.wrist_weight, retargeter.config.wrist_weight
-    at_once = 1024  # whose targets are in memory
-    for first in range(0, len(times), at_once):
-        now = times[first : first + at_once]
-        if frames.keypoints is None:
-            both = frames.at(now, frames.points), frames.at(now, frames.normals)
-            yield from (follower(*target) for target in zip(*both, strict=True))
-            continue
-        for keypoints in frames.at(now, frames.keypoints):
-            with located(str(path)):
-                wanted = retargeter(keypoints, follower.period)
-            palm = wanted.palm if follower.moves_palm else None
-            yield follower(wanted.points, palm=palm, palm_weight=weight)
+def _checked(solver: Solver) -> str:
+    return f"kept clear of scene {solver.scene.name}" if solver.scene else "not checked"
 
 
 @command(
-    opt.Option("GRASP", f"{opt.GRASP.help}, or RANKED.json"),
-    opt.Option(
-        "--rank N", "which of the answers of RANKED.json", opt.whole(1), otherwise="1, the best"
-    ),
+    Option("GRASP", f"{opt.GRASP.help}, or RANKED.json"),
+    Option("--rank N", "which of the answers of RANKED.json (default: 1, the best)"),
     opt.ROBOT,
     MOTION,
     opt.picture("--animation", "draw the motion in real time"),
     opt.OBJECT_POSE,
     opt.SCENE,
-    opt.Option(
-        "--opening M",
-        "how far fingertips are from their contacts before they close",
-        opt.positive,
-        default=0.02,
+    Option(
+        "--opening METRES", "how far fingertips are from their contacts before they close [m]", 0.02
     ),
-    opt.Option("--distance M", "how far the hand comes straight", opt.positive, default=0.08),
-    opt.Option(
+    Option("--distance METRES", "that the hand comes straight [m]", 0.08),
+    Option(
         "--direction X...",
-        "the way the hand comes: x y z in the base frame, 0 0 -1 from above",
-        opt.vector(3, "x y z"),
-        otherwise="from where the grasp has its palm before it, if it says, else from the palm to "
-        "the contacts",
+        "the way the hand comes: x y z in the base frame, 0 0 -1 from above (default: from where "
+        "the grasp has its palm before it, if it says, else from the palm to the contacts)",
+        read=partial(opt.numbers, count=3, meaning="x y z"),
     ),
-    opt.Option(
-        "--lift M", "how far the hand then goes up, with what it holds", opt.positive, default=0.0
-    ),
-    opt.Option(
-        "--retreat M",
-        "how far it goes back after that, against the way it came",
-        opt.positive,
-        default=0.0,
-    ),
-    opt.Option("--period S", "between two samples", opt.positive, default=0.01),
+    Option("--lift METRES", "how far the hand then goes up, with what it holds [m]", 0.0),
+    Option("--retreat METRES", "how far it goes back after that, against the way it came [m]", 0.0),
+    Option("--period SECONDS", "between two samples", 0.01),
     opt.SEED,
     *opt.TOLERANCES,
     opt.Q0,
@@ -321,12 +208,13 @@ def reach(said: Said) -> Answer:
     name, motion = grasp.name or str(path), found.motion
     if motion is None:
         status = found.status.name.replace("_", " ")
-        return Answer(headline(False, status, f"{name}: {found.reason}"), Exit.NOT_SOLVED)
+        return Answer.solved(False, headline(False, status, f"{name}: {found.reason}"))
     write_output(said.out, "--out", motion.write_to)
     if draw is not None and animation is not None:
         draw(motion, grasp, animation, solver.scene)
     head = headline(True, "REACHED", f"{name}: {robot.name}")
-    return Answer(Group(head, fields(_reached(found, motion)), *files(outputs)))
+    pairs = _reached(found, motion, the_units(said))
+    return Answer.solved(True, head, fields(pairs), *files(outputs))
 
 
 def _asked(said: Said) -> tuple[Path, Grasp | ChosenPosture]:
@@ -345,16 +233,17 @@ def _asked(said: Said) -> tuple[Path, Grasp | ChosenPosture]:
     return path, chosen_posture(path, said.rank or 1)
 
 
-def _reached(found: Reach, motion: Motion) -> dict[str, str]:
+def _reached(found: Reach, motion: Motion, units: Units) -> dict[str, str]:
     part, times = motion.notes["part"], motion.times
     ends = {one: float(times[part == one][-1]) for one in PARTS if (part == one).any()}
     begins = [0.0, *ends.values()]
     spent = [f"{one} {end - a:.2f} s" for (one, end), a in zip(ends.items(), begins, strict=False)]
-    room = "not checked" if found.clearance is None else f"{1e3 * found.clearance:.1f} mm"
+    scale, unit = units["m"]
+    room = "collision not checked" if found.clearance is None else ""
     return {
         "time": f"{times[-1]:.2f} s: {', '.join(spent)}",
         "way there": found.reason.removeprefix("way there: "),
-        "clearance": room,
+        "clearance": room or f"{scale * (found.clearance or 0.0):.3g} {unit}",
         "motors": f"up to {100 * found.velocity_share:.0f} % of their velocity limits, "
         f"{100 * found.acceleration_share:.0f} % of their acceleration limits (by the samples)",
         "solutions tried": str(found.tried),

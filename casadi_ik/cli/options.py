@@ -8,7 +8,8 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,11 @@ class Option:
     Attributes:
         said: How it is said, in the way of usage lines: "--seed N", "--q0 V..." (one or more
             words), "--limits enforce|ignore" (one of these), "--pads" (yes, if it is said),
-            "GRASP", "[SOLVE]" (may be left out), "[LOG...]".
-        help: What it means, without its default.
-        read: Makes the value of a word, or of all words where there may be several; None: the
-            word or words as they are.
+            "--[no-]deg" (yes or no), "GRASP", "[SOLVE]" (may be left out), "[LOG...]".
+        help: What it means; without its default, unless `default` does not tell it.
         default: The value if it is not said.
-        otherwise: The default in words, if its value does not say it.
+        read: Makes the value of a word, or of all words where there may be several; None: what
+            `KINDS` has for what stands for the value, else the word or words as they are.
         needed: Whether an option has to be said.
         repeated: Whether it may be said again, for more.
         key: What holds the value, if it is not called as the option or the argument.
@@ -36,9 +36,8 @@ class Option:
 
     said: str
     help: str
-    read: Callable[[Any], Any] | None = None
     default: Any = None
-    otherwise: str = ""
+    read: Callable[[Any], Any] | None = None
     needed: bool = False
     repeated: bool = False
     key: str = ""
@@ -46,8 +45,9 @@ class Option:
     @property
     def name(self) -> str:
         """The option with its dashes; of an argument without dashes its key."""
-        key = self.key or self.metavar.lower()
-        return self.said.partition(" ")[0] if self.dashed else key
+        if not self.dashed:
+            return self.key or self.metavar.lower()
+        return self.said.partition(" ")[0].replace("[no-]", "")
 
     @property
     def attribute(self) -> str:
@@ -70,6 +70,11 @@ class Option:
         return self.value.strip("[].")
 
     @property
+    def choices(self) -> list[str]:
+        """The words that an option takes, if they are some and no others."""
+        return self.metavar.split("|") if self.dashed and "|" in self.metavar else []
+
+    @property
     def count(self) -> str | int | None:
         """How many words there are, as argparse's ``nargs``."""
         if "..." in self.value:
@@ -79,12 +84,16 @@ class Option:
         return self.value.count(" ") + 1 if " " in self.value else None
 
     @property
+    def unit(self) -> str:
+        """Of its numbers: "m", "rad", "pose" (both), "motor" (of each motor its own), or ""."""
+        return UNITS.get(self.value, "") if self.dashed else ""
+
+    @property
     def text(self) -> str:
         """The help, its default included."""
-        default = self.otherwise
-        if not default and isinstance(self.default, (int, float, str)):
-            default = str(self.default)
-        return f"{self.help} (default: {default})" if default else self.help
+        given = isinstance(self.default, (int, float, str)) and self.default is not False
+        plain = given and "(default:" not in self.help
+        return f"{self.help} (default: {self.default})" if plain else self.help
 
     def of(self, words: Any) -> Any:
         """The value of the word, or words, that were said.
@@ -92,22 +101,10 @@ class Option:
         Raises:
             ValueError: They are none; the message says what was found and what was expected.
         """
-        if self.read is not None:
-            return self.read(words)
-        choices = self.metavar.split("|")
-        if self.dashed and len(choices) > 1 and words not in choices:
-            raise ValueError(f"found {words!r}, expected one of {', '.join(choices)}")
-        return words
-
-
-def needed(option: Option, **changes: Any) -> Option:
-    """The option of a command that cannot do without it."""
-    return replace(option, needed=True, default=None, otherwise="", **changes)
-
-
-def out(metavar: str, text: str, read: Callable[[str], Any] | None = None) -> Option:
-    """A needed ``--out``; names must end in the metavar's suffix, unless `read` is given."""
-    return Option(f"--out {metavar}", text, read or file_name(Path(metavar).suffix), needed=True)
+        read = self.read or (KINDS.get(self.value) if self.dashed else None)
+        if self.choices and read is None:
+            read = one_of(*self.choices)
+        return words if read is None else read(words)
 
 
 # How words become values; a ValueError says what was found and what was expected.
@@ -124,46 +121,31 @@ def number(word: str) -> float:
     return value
 
 
-def numbers(words: Sequence[str]) -> list[float]:
-    """Finite numbers, separated by commas or spaces."""
-    return [number(word) for word in " ".join(words).replace(",", " ").split()]
-
-
-def vector(count: int, meaning: str) -> Callable[[Sequence[str]], list[float]]:
-    """So many numbers, as `numbers`."""
-
-    def read(words: Sequence[str]) -> list[float]:
-        values = numbers(words)
-        if len(values) != count:
-            raise ValueError(f"found {len(values)} numbers, expected {count}: {meaning}")
-        return values
-
-    return read
+def numbers(words: Sequence[str], count: int = 0, meaning: str = "") -> list[float]:
+    """Finite numbers, separated by commas or spaces; any count of them unless one is given."""
+    values = [number(word) for word in " ".join(words).replace(",", " ").split()]
+    if count and len(values) != count:
+        raise ValueError(f"found {len(values)} numbers, expected {count}: {meaning}")
+    return values
 
 
 def positive(word: str) -> float:
     """A positive finite number."""
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise ValueError(f"found {word!r}, expected a number > 0")
-    return value
+    with contextlib.suppress(ValueError):
+        if (value := number(word)) > 0:
+            return value
+    raise ValueError(f"found {word!r}, expected a number > 0")
 
 
 def whole(least: int, most: int = 2**63 - 1) -> Callable[[str], int]:
     """A whole number; what 64 bits hold, unless said."""
-    expected = f">= {least}" if most >= 2**63 - 1 else f"from {least} to {most}"
 
     def read(word: str) -> int:
-        try:
-            value = int(word)
-        except ValueError:
-            value = least - 1
-        if not least <= value <= most:
-            raise ValueError(f"found {word!r}, expected a whole number {expected}")
-        return value
+        with contextlib.suppress(ValueError):
+            if least <= int(word) <= most:
+                return int(word)
+        expected = f">= {least}" if most == 2**63 - 1 else f"from {least} to {most}"
+        raise ValueError(f"found {word!r}, expected a whole number {expected}")
 
     return read
 
@@ -186,19 +168,16 @@ def file_name(*suffixes: str) -> Callable[[str], Path]:
         if not word:
             raise ValueError("found '', expected the name of a file")
         path = Path(word)
-        if any(suffixes) and path.suffix.lower() not in suffixes:
+        if suffixes and path.suffix.lower() not in suffixes:
             raise ValueError(f"found {word!r}, expected a name ending in {', '.join(suffixes)}")
         return path
 
     return read
 
 
-def npz_or_folder(word: str) -> Path:
-    """An npz file to be written, or a folder: one that is there, or a name without suffix."""
-    path = file_name()(word)
-    if path.suffix.lower() not in ("", ".npz") and not path.is_dir():
-        raise ValueError(f"found {word!r}, expected OUT.npz or a folder without suffix")
-    return path
+def json_name(word: str) -> Path:
+    """A JSON file to be written; one without suffix is one, too."""
+    return file_name(".json")(word) if Path(word).suffix else file_name()(word)
 
 
 def assignment(word: str) -> tuple[str, float]:
@@ -215,63 +194,91 @@ def each(read: Callable[[str], Any]) -> Callable[[Sequence[str]], list[Any]]:
     return lambda words: [read(word) for word in words]
 
 
+KINDS: dict[str, Callable[[Any], Any]] = {
+    "N": whole(1),
+    "SECONDS": positive,
+    "METRES": positive,
+    "RADIANS": positive,
+    "FACTOR": positive,
+    "V...": numbers,
+    "NAME=V...": each(assignment),
+    "POSE...": partial(numbers, count=6, meaning="x y z [m] roll pitch yaw [rad]"),
+}
+"""How the value of an option is read, by what stands for it."""
+
+UNITS = {
+    "METRES": "m",
+    "RADIANS": "rad",
+    "POSE...": "pose",
+    "V...": "motor",
+    "NAME=V...": "motor",
+}
+"""Units of the values of options, by what stands for them: see `Option.unit`."""
+
+IN_UNITS = (
+    Option(
+        "--[no-]deg",
+        "angles said here and in the report are in degrees (--no-deg: in radians; default: said in "
+        "radians, reported in degrees)",
+    ),
+    Option(
+        "--[no-]mm",
+        "lengths said here and in the report are in mm (--no-mm: in m; default: said in m, "
+        "reported in mm)",
+    ),
+)
+"""Of every command that takes lengths or angles; what files hold is in m and rad."""
+
+
 # What several commands take.
 
-POSE = vector(6, "x y z [m] roll pitch yaw [rad]")
-
 GRASP = Option("GRASP", "a shipped name (`casadi-ik grasps`) or a YAML file")
-ROBOT = Option("--robot R", "a shipped name or a YAML file", otherwise="what the file read says")
-METHOD = Option("--method M", "one of `casadi-ik methods`", otherwise="the first of them")
+ROBOT = Option(
+    "--robot R",
+    "a shipped name (`casadi-ik robots`) or a YAML file (default: what the file read says)",
+)
+THE_ROBOT = Option("--robot R", "a shipped name (`casadi-ik robots`) or a YAML file", needed=True)
+METHOD = Option("--method M", "one of `casadi-ik methods` (default: the first of them)")
 Q0 = Option(
     "--q0 V...",
     "where the robot is: a number per actuator [rad or m], spaces or commas between; last "
-    "on the line",
-    numbers,
-    otherwise="home",
+    "on the line (default: home)",
 )
 PREFER = Option(
     "--prefer limits|manipulability|q0|clearance",
     "which of several solutions comes first: far from its limits, with a manipulable arm, near the "
-    "start, or with --scene far from what may be hit",
-    otherwise="q0 if it is given, else limits",
+    "start, or with --scene far from what may be hit (default: q0 if it is given, else limits)",
 )
 SCENE = Option(
     "--scene FILE",
-    "what must not be touched: a shipped name or a YAML file",
-    otherwise="collisions are not checked",
+    "what must not be touched: a shipped name (`casadi-ik scenes`) or a YAML file (default: "
+    "collisions are not checked)",
 )
 OBJECT_POSE = Option(
-    "--object-pose X...",
+    "--object-pose POSE...",
     "where the object is: x y z [m] roll pitch yaw [rad] in the base frame; contacts move "
     "with it, and those of a file that does not say where its object is are in its frame",
-    POSE,
 )
-SEED = Option("--seed N", "of all random numbers", whole(0), default=0)
+SEED = Option("--seed N", "of all random numbers", 0, whole(0))
 TOLERANCES = (
     Option(
         "--tolerance-position METRES",
-        "when a contact point counts as reached",
-        positive,
-        otherwise="0.005",
+        "when a contact point counts as reached (default: 0.005, 5 mm)",
     ),
     Option(
         "--tolerance-angle RADIANS",
-        "when a contact normal counts as reached",
-        positive,
-        otherwise="0.0524, 3 deg",
+        "when a contact normal counts as reached (default: 0.0524, 3 deg)",
     ),
 )
 MAX_ROUNDS = Option(
     "--max-rounds N",
     "rounds of hand postures at most before a target is given up; 1 solves nearly all that "
-    "can be reached",
-    whole(1),
-    otherwise="as many as may help",
+    "can be reached (default: as many as may help)",
 )
 LIMITS = Option(
     "--limits enforce|ignore",
     "whether being solved includes the limits; ignore: the paper's way",
-    default="enforce",
+    "enforce",
 )
 SOLVER = (
     METHOD,
@@ -286,20 +293,18 @@ SOLVER = (
     Option(
         "--finger-step ipopt|closed-form",
         "solver of the fingers' own step in the paper's methods; closed-form gives the same "
-        "answer much faster",
-        otherwise="ipopt",
+        "answer much faster (default: ipopt)",
     ),
     Option(
         "--fixed NAME=V...",
         "actuators that are not to move, and where they stand [rad or m]",
-        each(assignment),
-        default=(),
+        (),
         repeated=True,
     ),
     Option(
         "--log FILE.mcap",
         "write every iteration to a log; a batch in parts: into a folder, read as one log",
-        file_name(),
+        read=file_name(),
     ),
 )
 """Of `solve` and `batch`."""
@@ -307,18 +312,25 @@ SOLVER = (
 SIZE_LIMITS = Option(
     "--size-limits FACTOR",
     "allow files that are so many times as large as usual, packed and unpacked",
-    positive,
 )
 """Of commands that read what is somebody else's."""
 
 
+def out(metavar: str, text: str, read: Callable[[str], Any] | None = None) -> Option:
+    """A needed ``--out``; names must end in the metavar's suffix, unless `read` is given."""
+    read = read or file_name(*filter(None, [Path(metavar).suffix]))
+    return Option(f"--out {metavar}", text, read=read, needed=True)
+
+
 def diagnose(default: bool) -> Option:
     """Whether failures are explained; ``--no-diagnose`` says no."""
-    text = "find out why what is not solved is not"
-    return Option("--diagnose", text, default=default, otherwise="yes" if default else "no")
+    usual = "yes" if default else "no"
+    text = f"find out why what is not solved is not (default: {usual})"
+    return Option("--[no-]diagnose", text, default)
 
 
 def picture(name: str, text: str) -> Option:
     """A picture to be written."""
     suffix = ".gif" if name == "--animation" else ".png"
-    return Option(f"{name} FILE{suffix}", f"{text} (needs casadi-ik[plots])", file_name(suffix))
+    help_of = f"{text} (needs 'casadi-ik[plots]')"
+    return Option(f"{name} FILE{suffix}", help_of, read=file_name(suffix))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from casadi_ik.cli.options import PROGRAM
 from casadi_ik.errors import CasadiIKError, shortened
@@ -75,6 +77,16 @@ def write_output(path: Path, option: str, write: Callable[[Path], object]) -> No
     """
     with writing(path, option), written_whole(path) as part:
         write(part)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write what ``--out`` asks for as JSON.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+    write_output(path, "--out", lambda part: part.write_text(text, encoding="utf-8"))
 
 
 @contextlib.contextmanager

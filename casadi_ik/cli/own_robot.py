@@ -8,16 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from rich.console import Group, RenderableType
+from rich.console import RenderableType
 from rich.text import Text
 
 from casadi_ik import calibration
+from casadi_ik.answers.report import Units, fields, files, headline, table
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arms.recognise import family_in_words, is_searched
 from casadi_ik.cli import options as opt
-from casadi_ik.cli.inputs import located, the_robot
+from casadi_ik.cli.inputs import located, the_robot, the_units
+from casadi_ik.cli.options import Option
 from casadi_ik.cli.outputs import check_outputs, write_output
-from casadi_ik.cli.report import UNITS, fields, files, headline, table
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.importing import imported
@@ -32,25 +33,23 @@ SAME = 1e-9
 
 
 @command(
-    opt.Option("ARM|ROBOT", "file of the arm, or of everything", key="first"),
-    opt.Option("[HAND]", "file of the hand"),
-    opt.Option(
+    Option("ARM|ROBOT", "file of the arm, or of everything", key="first"),
+    Option("[HAND]", "file of the hand"),
+    Option(
         "--out ROBOT.yaml",
         "write the description (needed unless one is given to be drawn again)",
-        opt.file_name(".yaml", ".yml"),
+        read=opt.file_name(".yaml", ".yml"),
     ),
-    opt.Option("--tip LINK", "link of the arm that carries the hand"),
-    opt.Option("--palm LINK", "link that the fingers hang on"),
-    opt.Option(
-        "--mount V...",
-        "the hand's base on the tip: x y z [m] roll pitch yaw [rad]",
-        opt.POSE,
-        otherwise="on it",
+    Option("--tip LINK", "link of the arm that carries the hand"),
+    Option("--palm LINK", "link that the fingers hang on"),
+    Option(
+        "--mount POSE...",
+        "the hand's base on the tip: x y z [m] roll pitch yaw [rad] (default: on it)",
     ),
-    opt.Option("--srdf FILE.srdf", "links that may touch, beside those that are found to"),
-    opt.Option("--xacro", "expand the macros of files that are not called .xacro"),
+    Option("--srdf FILE.srdf", "links that may touch, beside those that are found to"),
+    Option("--xacro", "expand the macros of files that are not called .xacro"),
     opt.picture("--picture", "draw the hand and the guessed pads"),
-    opt.Option("--check", "compare the kinematics with pinocchio's (MuJoCo's) of the files"),
+    Option("--check", "compare the kinematics with pinocchio's (MuJoCo's) of the files"),
     opt.SIZE_LIMITS,
 )
 def import_robot(said: Said) -> Answer:
@@ -111,7 +110,7 @@ def import_robot(said: Said) -> Answer:
     write_output(said.out, "--out", write)
     same = all(value <= SAME for value in differences.values())
     report = _import_report(robots[0], found, differences)
-    return Answer.solved(same, Group(*report, *files(outputs)))
+    return Answer.solved(same, *report, *files(outputs))
 
 
 def _drawn_again(path: Path, said: Said) -> Answer:
@@ -123,7 +122,7 @@ def _drawn_again(path: Path, said: Said) -> Answer:
     draw, robot = _drawing(), imported.loaded(path)
     draw(robot, imported.described_surfaces(path), said.picture)
     what = f"{robot.name}: {len(robot.fingers)} pads"
-    return Answer(Group(headline(True, "DRAWN", what), *files(outputs)))
+    return Answer.solved(True, headline(True, "DRAWN", what), *files(outputs))
 
 
 def _command(said: Said) -> str:
@@ -221,32 +220,28 @@ def _import_report(
 
 
 @command(
-    opt.Option("DATA.csv", "measured poses, see below", key="data"),
-    opt.needed(opt.ROBOT),
-    opt.Option(
+    Option("DATA.csv", "measured poses, see below", key="data"),
+    opt.THE_ROBOT,
+    Option(
         "--estimate GROUP...",
-        "which numbers: linkage, axes, tips",
+        "which numbers: linkage, axes, tips (default: all three)",
+        ("linkage", "axes", "tips"),
         opt.each(opt.one_of("linkage", "axes", "tips")),
-        default=("linkage", "axes", "tips"),
-        otherwise="all three",
     ),
-    opt.Option(
+    Option(
         "--loss cauchy|huber|squares",
         "how outliers count; squares takes them in full",
-        default="cauchy",
+        "cauchy",
     ),
-    opt.Option(
+    Option(
         "--noise-position METRES",
         "standard deviation of a measured coordinate, as long as the data are too few to show it",
-        opt.positive,
-        default=0.5e-3,
+        0.5e-3,
     ),
-    opt.Option(
+    Option(
         "--noise-angle RADIANS",
-        "the same of a measured angle",
-        opt.positive,
-        default=math.radians(1.0),
-        otherwise="0.0175, 1 deg",
+        "the same of a measured angle (default: 0.0175, 1 deg)",
+        math.radians(1.0),
     ),
     opt.out("CALIBRATED.yaml", "write the robot with its estimated numbers"),
 )
@@ -286,10 +281,10 @@ def calibrate(said: Said) -> Answer:
 
         write_output(said.out, "--out", write)
     written = files(outputs) if found.converged else []
-    return Answer.solved(found.converged, Group(*_calibration_report(found), *written))
+    return Answer.solved(found.converged, *_calibration_report(found, the_units(said)), *written)
 
 
-def _calibration_report(found: calibration.Calibration) -> list[RenderableType]:
+def _calibration_report(found: calibration.Calibration, units: Units) -> list[RenderableType]:
     count = f"{len(found.parameters)} numbers from {len(found.weights)} poses"
     status = "ESTIMATED" if found.converged else "NOT CONVERGED"
     noise = f"{1e3 * found.noise[0]:.3f} mm"
@@ -308,7 +303,7 @@ def _calibration_report(found: calibration.Calibration) -> list[RenderableType]:
     rows = table("number", "described", "estimated", "±95%", "unit", "learned", right=right)
     numbers = np.stack([found.values, found.interval, found.learned], axis=1).tolist()
     for parameter, (value, interval, learned) in zip(found.parameters, numbers, strict=True):
-        scale, unit = UNITS[parameter.unit]
+        scale, unit = units[parameter.unit]
         shown = (f"{scale * one:.3f}" for one in (parameter.nominal, value, interval))
         rows.add_row(parameter.name, *shown, unit, f"{100 * learned:.0f} %")
     parts: list[RenderableType] = [headline(found.converged, status, count), fields(lines), rows]

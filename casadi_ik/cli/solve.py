@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from casadi_ik.answers.report import duration, files, solution_report
 from casadi_ik.answers.solution import Solution
+from casadi_ik.answers.stored import solution_data
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.cli import options as opt
 from casadi_ik.cli.inputs import (
@@ -18,9 +21,10 @@ from casadi_ik.cli.inputs import (
     the_robot,
     the_solver,
     the_start,
+    the_units,
 )
-from casadi_ik.cli.outputs import check_outputs
-from casadi_ik.cli.report import as_json, solution_report, write_json
+from casadi_ik.cli.options import Option
+from casadi_ik.cli.outputs import check_outputs, write_json
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, MissingExtraError
@@ -28,12 +32,18 @@ from casadi_ik.grasps import Grasp, load_object
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.request import Request, tolerances_by_finger
 
+REPEATED_FOR = 0.2
+"""How long a solve is repeated to time it [s], unless one alone takes longer."""
+
+SLOW = 1.0
+"""A first solve that takes longer [s], where others do not, is told of."""
+
 
 @command(
     opt.GRASP,
     opt.ROBOT,
     *opt.SOLVER,
-    opt.Option("--out FILE.json", "write the solution as JSON", opt.file_name()),
+    Option("--out FILE.json", "write the solution as JSON", read=opt.json_name),
     opt.picture("--picture", "draw the grasp"),
     opt.picture("--picture-dark", "the same for a dark page"),
     opt.diagnose(default=True),
@@ -46,7 +56,7 @@ def solve(said: Said) -> Answer:
       casadi-ik solve cup
       casadi-ik solve cup --method enhanced-dls --out cup.json --log cup.mcap
       casadi-ik solve cup --scene table --picture cup.png
-      casadi-ik solve my_grasp.yaml --robot my_robot.yaml --tolerance-position 0.002
+      casadi-ik solve my.yaml --robot mine.yaml --tolerance-position 2 --mm
 
     a grasp file:
       robot: kuka_lwr_barrett
@@ -67,37 +77,56 @@ def solve(said: Said) -> Answer:
     check_outputs(outputs, inputs=[path])
     draw = _drawing(path, grasp) if any(pictures.values()) else None
     solver = the_solver(said, robot)
+
+    def solved(log: Path | None = None, diagnose: bool = False) -> Solution:
+        return solver.solve(grasp, q0, said.seed, log, diagnose, fixed, said.prefer)
+
     with located(str(path)):
-        solution = solver.solve(grasp, q0, said.seed, said.log, said.diagnose, fixed, said.prefer)
+        solution = solved(said.log, said.diagnose)
+    first, solution = solution.time, replace(solution, time=_warm_time(solved, solution))
     if said.out is not None:
-        write_json(said.out, as_json(solution))
+        write_json(said.out, solution_data(solution))
     for option, file in pictures.items():
         if draw is not None and file is not None:
             dark = option == "--picture-dark"
             draw(robot, solution, grasp, file, scene=solver.scene, dark=dark)
-    warning = "" if said.scene else _penetration(robot, grasp, solution)
-    report = solution_report(grasp.name or str(path), solver, solution, outputs, warning)
-    return Answer.solved(solution.success, report)
+    notes = [] if said.scene else _penetration(robot, grasp, solution)
+    if first > max(10 * solution.time, SLOW):
+        notes.append(f"the first solve took {duration(first)}: kernels were compiled or loaded")
+    name, enforced = grasp.name or str(path), solver.limits == "enforce"
+    report = solution_report(solution, robot, name, the_units(said), enforced, notes)
+    return Answer.solved(solution.success, report, *files(outputs))
 
 
-def _penetration(robot: ArmHand, grasp: Grasp, solution: Solution) -> str:
-    """That an answer penetrates the object it grasps, if it does; "" where that is not known."""
+def _warm_time(solved: Callable[[], Solution], solution: Solution) -> float:
+    """How long a solve takes where nothing has to be compiled or loaded [s].
+
+    What was not solved is not solved again: it takes its time.
+    """
+    times = [solution.time]
+    while solution.success and len(times) < 4 and sum(times[1:]) < REPEATED_FOR:
+        times.append(solved().time)
+    return min(times)
+
+
+def _penetration(robot: ArmHand, grasp: Grasp, solution: Solution) -> list[str]:
+    """That an answer penetrates the object it grasps, if it does and that is known."""
     shapes = robot.description.shapes.capsules
     if not (solution.success and grasp.object and grasp.object_pose is not None and shapes):
-        return ""
+        return []
     request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
     try:
         check = SceneCheck(robot, Scene(), compiled=False)
         query = check.collision_query(request.of_grasps([grasp], None))
     except CasadiIKError:  # a robot or an object without shapes
-        return ""
+        return []
     mine = np.array([grasp.object in names for names in query.table.names], dtype=bool)
     clear = query.only(mine).check(solution.q[None])
     pair = clear.pair(0)
     if clear.free[0] or pair is None:
-        return ""
+        return []
     depth = -1e3 * float(clear.distance[0])
-    return f"the shapes of {pair[0]} and {pair[1]} overlap by {depth:.3g} mm; try --scene table"
+    return [f"the shapes of {pair[0]} and {pair[1]} overlap by {depth:.3g} mm; try --scene table"]
 
 
 def _drawing(path: Path, grasp: Grasp) -> Callable[..., Any]:

@@ -2,7 +2,7 @@
 
 To add a command, write its function with its options in a module of this folder, new or not::
 
-    @command(GRASP, ROBOT, Option("--colour C", "what it is drawn in", default="red"))
+    @command(GRASP, ROBOT, Option("--colour C", "what it is drawn in", "red"))
     def paint(said: Said) -> Answer:
         \"\"\"Paint a grasp.
 
@@ -12,13 +12,14 @@ To add a command, write its function with its options in a module of this folder
 
 and give it a row in `COMMANDS`. Its module is imported when it is called. Its value is read by the
 option's `read`, errors of which become one line on stderr that begins with the option's name.
+Lengths and angles come to the function in m and rad, whatever `--mm` and `--deg` say.
 """
 
 from __future__ import annotations
 
 import argparse
-import difflib
 import inspect
+import math
 import re
 import textwrap
 from argparse import Namespace as Said
@@ -28,8 +29,8 @@ from enum import IntEnum
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from casadi_ik.cli.options import PROGRAM, Option
-from casadi_ik.errors import InputError
+from casadi_ik.cli.options import IN_UNITS, PROGRAM, Option
+from casadi_ik.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -48,6 +49,8 @@ COMMANDS = {
     "robots": ("lists.robots", "list the shipped robots: fingers and actuators"),
     "methods": ("lists.methods", "list the methods"),
     "grasps": ("lists.grasps", "list the shipped grasps"),
+    "objects": ("lists.objects", "list the shipped objects"),
+    "scenes": ("lists.scenes", "list the shipped scenes"),
     "log": ("", "look into logs"),
     "log info": ("log.info", "what logs hold"),
     "log solves": ("log.solves", "list solves and how they ended"),
@@ -60,6 +63,7 @@ COMMANDS = {
     "log finish": ("log.finish", "repair logs in place whose writer was killed"),
     "log merge": ("log.merge", "join the shards of a study, without recompressing"),
     "view": ("view.view", "drag contacts in the browser, arm and hand follow; play a log"),
+    "completion": ("completion.completion", "complete words in bash, zsh or fish with TAB"),
 }
 """What is said: module and function in this folder, and what it does, in a few words."""
 
@@ -74,6 +78,9 @@ Examples:
   casadi-ik solve my.yaml --log my.mcap your own, with a log of every iteration
   casadi-ik log info my.mcap            what the log holds
 
+Lengths are in m and angles in rad, in files and in options; behind --mm and
+--deg those of options and reports are in mm and degrees.
+
 exit codes: 0 solved (or done), 1 a valid problem not solved, 2 bad input
 """,
     "log": """\
@@ -84,7 +91,7 @@ Examples:
   casadi-ik log solves study/ --status STALLED       those that stalled
   casadi-ik log events cup.mcap --event NEAR_SINGULAR
   casadi-ik log why cup.mcap 3                       solve 3 in words
-  casadi-ik log plot cup.mcap --solve 3 --out 3.png
+  casadi-ik log plot cup.mcap 3 --out 3.png
   casadi-ik log compare ours.mcap paper.mcap         two methods
   casadi-ik log report study/ --out report.html      success, times, the hardest
   casadi-ik log export cup.mcap --solve 3 --out view.mcap      for Foxglove
@@ -127,9 +134,11 @@ class Answer:
     exit: Exit = Exit.DONE
 
     @staticmethod
-    def solved(solved: bool, report: RenderableType) -> Answer:
-        """The end of a command that has something to solve."""
-        return Answer(report, Exit.DONE if solved else Exit.NOT_SOLVED)
+    def solved(solved: bool, *report: RenderableType) -> Answer:
+        """The end of a command that has something to solve, and the parts of its report."""
+        from rich.console import Group
+
+        return Answer(Group(*report), Exit.DONE if solved else Exit.NOT_SOLVED)
 
 
 @dataclass(frozen=True)
@@ -152,7 +161,8 @@ class Command:
 
 def command(*options: Option) -> Callable[[Callable[[Said], Answer]], Command]:
     """Make a command of a function that takes what was said."""
-    return lambda run: Command(run, options)
+    in_units = IN_UNITS if any(option.unit for option in options) else ()
+    return lambda run: Command(run, options + in_units)
 
 
 def load(name: str) -> Command:
@@ -224,9 +234,7 @@ def _next(group: str, word: str) -> str:
     if word in known:
         return known[word]
     program = f"{PROGRAM} {group}".strip()
-    near = difflib.get_close_matches(word, known, 1)
-    expected = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
-    raise InputError(f"COMMAND: found {word!r}, {expected} (see {program} --help)")
+    raise InputError(f"COMMAND: found {word!r}, {did_you_mean(word, known)} (see {program} --help)")
 
 
 def _version() -> Answer:
@@ -255,7 +263,7 @@ class _Parser(argparse.ArgumentParser):
             self.add_argument(option.name, **_argument(option))
 
     def values(self, words: Sequence[str]) -> Said:
-        """What was said, every option by its key.
+        """What was said, every option by its key, lengths and angles in m and rad.
 
         Raises:
             InputError: A word that has no place, one that is missing, or a value that is none.
@@ -269,17 +277,18 @@ class _Parser(argparse.ArgumentParser):
                 setattr(said, option.attribute, option.default)
             elif option.metavar:
                 try:
-                    setattr(said, option.attribute, option.of(raw))
+                    value = option.of(raw)
                 except ValueError as error:
                     self.error(f"{option.name if option.dashed else option.metavar}: {error}")
+                setattr(said, option.attribute, _all_in_si(value, option.unit, said))
         return said
 
     def _unknown(self, word: str) -> str:
-        if not word.startswith("-"):
-            places = " ".join(one.metavar for one in self._options if not one.dashed)
-            return f"found {word!r}, expected nothing behind {places or self.prog}"
-        near = difflib.get_close_matches(word, [one.name for one in self._options], 1)
-        return f"{word}: no such option" + (f", did you mean {near[0]}?" if near else "")
+        if word.startswith("-"):
+            names = [one.name for one in self._options if one.dashed]
+            return f"{word}: no such option, {did_you_mean(word, names, 'none is like it')}"
+        places = " ".join(one.metavar for one in self._options if not one.dashed)
+        return f"found {word!r}, expected nothing behind {places or self.prog}"
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line.
@@ -294,11 +303,25 @@ def _argument(option: Option) -> dict[str, Any]:
     """An option as argparse takes it; values are read, and defaults put in, afterwards."""
     found: dict[str, Any] = {"help": option.text.replace("%", "%%")}
     if not option.metavar:
-        switch = argparse.BooleanOptionalAction if option.default is not None else "store_true"
-        return found | {"action": switch, "dest": option.attribute}
+        switch = argparse.BooleanOptionalAction if "[no-]" in option.said else "store_true"
+        return found | {"action": switch, "dest": option.attribute, "default": None}
     several = isinstance(option.count, int)
     found["metavar"] = tuple(option.metavar.split()) if several else option.metavar
     found["nargs"] = option.count
     if option.dashed:
         found |= {"required": option.needed, "dest": option.attribute}
     return found | ({"action": "extend"} if option.repeated else {})
+
+
+def in_si(value: float, unit: str, said: Said) -> float:
+    """A number that was said, in m or rad, whatever `--mm` and `--deg` say."""
+    if unit == "m":
+        return 1e-3 * value if said.mm else value
+    return math.radians(value) if unit == "rad" and said.deg else value
+
+
+def _all_in_si(value: Any, unit: str, said: Said) -> Any:
+    """The value of an option likewise; that of motors, whose units are the robot's, as it is."""
+    if unit == "pose":
+        return [in_si(one, "m" if i < 3 else "rad", said) for i, one in enumerate(value)]
+    return in_si(value, unit, said)

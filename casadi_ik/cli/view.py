@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from casadi_ik import logs
+from casadi_ik.answers.stored import read_ranked
 from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
 from casadi_ik.cli import options as opt
-from casadi_ik.cli.choose import read_ranked
 from casadi_ik.cli.inputs import (
     located,
     robot_of_log,
@@ -25,10 +24,11 @@ from casadi_ik.cli.inputs import (
     the_scene,
     the_tolerance,
 )
+from casadi_ik.cli.options import Option
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.collision.scene import Scene
 from casadi_ik.datasets import load_candidates
-from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError
+from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, did_you_mean
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.logs.solve import OneSolve, one_solve
@@ -39,12 +39,14 @@ if TYPE_CHECKING:
     Choices = dict[str, Callable[[], tuple[PageRequest, Array]]]
 
 
+SOLVES = opt.each(opt.whole(0))
+
+
 @command(
-    opt.Option(
+    Option(
         "[GRASP|ROBOT|LOG|CHOICES...]",
-        "a shipped name or a file; of logs one or two",
-        default=["cup"],
-        otherwise="cup",
+        "a shipped name or a file; of logs one or two (default: cup)",
+        ["cup"],
         key="what",
     ),
     opt.ROBOT,
@@ -53,23 +55,22 @@ if TYPE_CHECKING:
     opt.LIMITS,
     *opt.TOLERANCES,
     opt.OBJECT_POSE,
-    opt.Option(
-        "--solve N...", "which solve of each log", opt.each(opt.whole(0)), otherwise="the only one"
-    ),
-    opt.Option("--pads", "correct the pads of a robot's file"),
-    opt.Option(
+    Option("--solve N...", "which solve of each log (default: the only one)", read=SOLVES),
+    Option("--pads", "correct the pads of a robot's file"),
+    Option(
         "--host ADDRESS",
-        "where it is served; 0.0.0.0: to everybody",
-        default="127.0.0.1",
-        otherwise="127.0.0.1, this machine only",
+        "where it is served; 0.0.0.0: to everybody (default: 127.0.0.1, this machine only)",
+        "127.0.0.1",
     ),
-    opt.Option(
-        "--port N", "where it is served", opt.whole(1, 65535), otherwise="the first free from 8080"
+    Option(
+        "--port N",
+        "where it is served (default: the first free from 8080)",
+        read=opt.whole(1, 65535),
     ),
     opt.SIZE_LIMITS,
 )
 def view(said: Said) -> Answer:
-    """Show a grasp, a robot, answers or a solve in the browser (needs casadi-ik[view]).
+    """Show a grasp, a robot, answers or a solve in the browser (needs 'casadi-ik[view]').
 
     Examples:
       casadi-ik view cup --scene table          drag contacts, the cup, the table
@@ -165,8 +166,7 @@ def _kind(name: str) -> str:
     if "+" in name or any(name in shipped_names(kind) for kind in kinds):
         return "robot"
     known = [one for kind in ("grasps", *kinds) for one in shipped_names(kind)]
-    near = difflib.get_close_matches(name, known, 1)
-    meant = f"did you mean {near[0]!r}?" if near else "or give the path of a file"
+    meant = did_you_mean(name, known, "or give the path of a file")
     raise UnknownNameError(
         f"{name!r} is neither a shipped grasp (casadi-ik grasps) nor a shipped robot (casadi-ik "
         f"robots); {meant}"

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 
-from casadi_ik.errors import DescriptionError, UnknownNameError
+from casadi_ik.errors import DescriptionError, UnknownNameError, did_you_mean
 
 FOREIGN = (".urdf", ".xacro", ".xml", ".mjcf")
 """Names' ends of robots' files that are imported."""
@@ -61,8 +60,7 @@ def resolve(name_or_path: str | Path, kind: str, beside: Path | None = None) -> 
     path = models_folder() / kind / f"{text}.yaml"
     if text not in shipped_names(kind):
         noun, known = kind.replace("_", "-").removesuffix("s"), shipped_names(kind)
-        near = difflib.get_close_matches(text, known, 1)
-        rest = f"did you mean {near[0]!r}?" if near else f"shipped: {', '.join(known)}"
+        rest = did_you_mean(text, known, f"shipped: {', '.join(known)}")
         raise UnknownNameError(
             f"no shipped {noun} is called {text!r}; {rest} (or give the path of a YAML file)"
         )
@@ -99,6 +97,10 @@ def resolve_robot(
         return None, resolve(text, "hands")
     try:
         return resolve(name_or_path, "arm_hands", beside)
-    except UnknownNameError as error:
-        more = "or an arm, a hand or ARM+HAND of the catalogue (casadi-ik robots)"
-        raise UnknownNameError(f"{error}, {more}") from None
+    except UnknownNameError:
+        known = [name for kind in ("arm_hands", "arms", "hands") for name in shipped_names(kind)]
+        listed = f"shipped: {', '.join(shipped_names('arm_hands'))}"
+        raise UnknownNameError(
+            f"no shipped arm-hand is called {text!r}; {did_you_mean(text, known, listed)} (or give "
+            "the path of a YAML file, or ARM+HAND of the catalogue, see casadi-ik robots)"
+        ) from None

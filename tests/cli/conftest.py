@@ -101,7 +101,8 @@ def refused(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ca
 
     def call(command: str, subject: object, *words: object) -> str:
         before = sorted(tmp_path.rglob("*"))
-        outputs = ("--out", tmp_path / "new.npz", "--log", tmp_path / "new.mcap")
+        kind = "npz" if command == "batch" else "json"
+        outputs = ("--out", tmp_path / f"new.{kind}", "--log", tmp_path / "new.mcap")
         error = run(command, subject, *outputs, *words).error
         assert sorted(tmp_path.rglob("*")) == before
         return error

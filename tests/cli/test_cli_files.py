@@ -46,21 +46,24 @@ def test_unwritable(
     grasp_file: GraspFile,
     tmp_path: Path,
 ) -> None:
+    place = place if option == "--picture" else place.replace(".png", ".json")
     grasp, path = grasp_file(), tmp_path / place
-    (tmp_path / "folder.png").mkdir()
+    folder = tmp_path / ("folder" + path.suffix)
+    folder.mkdir()
     error = run("solve", grasp, *FAST, option, path).error
     assert error == f"{path}: {option}: cannot be written: {reason}"
-    assert sorted(item.name for item in tmp_path.iterdir()) == ["folder.png", "pinch.yaml"]
+    assert sorted(item.name for item in tmp_path.iterdir()) == [folder.name, "pinch.yaml"]
 
 
 @pytest.mark.usefixtures("unsolved")
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 @pytest.mark.parametrize("option", ["--out", "--log", "--picture"])
 def test_read_only(option: str, run: Command, grasp_file: GraspFile, tmp_path: Path) -> None:
-    folder, file = tmp_path / "folder", tmp_path / "file.png"
+    suffix = ".png" if option == "--picture" else ".json"
+    folder, file = tmp_path / "folder", tmp_path / f"file{suffix}"
     folder.mkdir(mode=0o500)
     file.touch(mode=0o400)
-    for path, reason in ((folder / "new.png", "Permission denied"), (file, "read-only")):
+    for path, reason in ((folder / f"new{suffix}", "Permission denied"), (file, "read-only")):
         assert reason in run("solve", grasp_file(), *FAST, option, path).error
 
 
@@ -79,7 +82,8 @@ def test_outputs_do_not_overwrite_each_other_or_the_input(
     (tmp_path / "link").symlink_to("same")
     error = run("solve", grasp, "--out", same, "--log", tmp_path / "link").error
     assert error == f"{same}: --out: found the file of --log, expected another"
-    error = run("solve", grasp, "--out", tmp_path / "." / grasp.name).error
+    (tmp_path / "input.json").hardlink_to(grasp)
+    error = run("solve", grasp, "--out", tmp_path / "input.json").error
     assert "found the file of the input" in error
     assert grasp.read_text().startswith("contacts:")
 
@@ -200,7 +204,7 @@ def test_what_is_too_large(
     """Limits a thousand times as small as usual stand for files a thousand times as large."""
     path = tmp_path / name
     write(path, robot)
-    out = tmp_path / ("out.npz" if command == "batch" else "out.csv")
+    out = tmp_path / {"batch": "out.npz", "choose": "out.json", "follow": "out.csv"}[command]
     words = (command, path, "--robot", robot.name, "--out", out)
     error = run(*words, "--size-limits", factor).error
     assert says in error

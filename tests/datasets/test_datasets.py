@@ -14,7 +14,7 @@ from commands import main
 from make_grasp_sets import ROBOTS, TABLES, Written, made
 
 import casadi_ik as ik
-from casadi_ik.cli.report import reasons
+from casadi_ik.answers.report import reasons
 from casadi_ik.datasets.conventions import load_convention
 from casadi_ik.datasets.postures import HandPoses
 from casadi_ik.grasps import load_object
@@ -106,7 +106,7 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     assert missed.diagnosis is not None
     assert missed.diagnosis.palm is not None
     assert missed.diagnosis.palm.position_error > 1
-    said = reasons(solver, missed)
+    said = reasons(missed)
     assert "the arm does not reach where the palm is asked" in said
     assert "proved: the palm has the wrist where the arm does not reach" in said
     assert not any(finger in line for line in said for finger in (*robot.fingers, "contact"))

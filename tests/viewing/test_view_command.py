@@ -12,7 +12,7 @@ from commands import main
 
 import casadi_ik as ik
 from casadi_ik import viewing
-from casadi_ik.cli.report import as_json
+from casadi_ik.answers.stored import solution_data as as_json
 from casadi_ik.cli.table import parse
 from casadi_ik.cli.view import opened
 

@@ -1,0 +1,184 @@
+"""Answers as JSON: what `casadi-ik solve` and `choose` write, and what is read back of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from casadi_ik.answers.diagnosis import Diagnosis
+from casadi_ik.answers.solution import Ranking, Solution
+from casadi_ik.arrays import Array
+from casadi_ik.errors import DescriptionError, InputError
+from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.grasps import Grasp
+from casadi_ik.grasps.load import GraspFile, grasp_data, grasp_of
+
+
+def solution_data(solution: Solution) -> dict[str, Any]:
+    """A solution as JSON holds it; null stands for what is not a finite number (a free finger)."""
+    names = ["success", "status", "method", "robot", "actuators", "q", "iterations", "restarts"]
+    names += ["time", "contacts", "diagnosis"]
+    names += ["palm"] if solution.palm is not None else []
+    names += ["clearance", "closest", "collision"] if solution.clearance is not None else []
+    found = _plain({name: getattr(solution, name) for name in names})
+    for contact in found["contacts"].values():
+        del contact["tolerance"]
+    return found
+
+
+def ranking_data(ranking: Ranking, names: Sequence[str]) -> dict[str, Any]:
+    """A ranking as JSON holds it.
+
+    Args:
+        ranking: The answers.
+        names: Of the candidates.
+    """
+    ranked = []
+    for one in ranking:
+        before = one.grasp.pregrasp
+        ranked.append(
+            {
+                "candidate": one.candidate,
+                "name": names[one.candidate],
+                "score": one.score,
+                "grasp": grasp_data(one.grasp),
+                **({} if before is None else {"pregrasp": grasp_data(before)}),
+                "solution": solution_data(one.solution),
+            }
+        )
+    about = {name: getattr(ranking, name) for name in ("candidates", "answered", "prefer")}
+    return about | {"failures": dict(ranking.failures), "ranked": ranked}
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: arrays as lists, enums by name, null for what is not finite."""
+    if isinstance(value, Enum):
+        return value.name
+    if is_dataclass(value):
+        found = {one.name: getattr(value, one.name) for one in fields(value) if one.repr}
+        if isinstance(value, Diagnosis):
+            names = ("established", "reliefs", "freed", "lines")
+            found |= {name: getattr(value, name) for name in names}
+        return _plain(found)
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class RankedSolution(msgspec.Struct, frozen=True):
+    """What is needed of an answer.
+
+    Attributes:
+        robot: Whose it is.
+        q: A number per actuator [rad or m].
+    """
+
+    robot: str
+    q: list[float]
+
+
+class RankedEntry(msgspec.Struct, frozen=True):
+    """One of the answers of a file.
+
+    Attributes:
+        candidate: Number of its grasp among the candidates.
+        score: What it was ranked by.
+        solution: How to take it.
+        name: Of its grasp.
+        grasp: The grasp, where the object is; None in older files.
+        pregrasp: The same hand before it, if the candidate said it.
+    """
+
+    candidate: int
+    score: float
+    solution: RankedSolution
+    name: str = ""
+    grasp: GraspFile | None = None
+    pregrasp: GraspFile | None = None
+
+    @property
+    def label(self) -> str:
+        """It in a few words."""
+        return f"{self.name or 'candidate'} ({self.candidate}), score {self.score:.4g}"
+
+
+class _RankedFile(msgspec.Struct, frozen=True):
+    ranked: list[RankedEntry]
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenPosture:
+    """One of the answers, to be reached.
+
+    Attributes:
+        grasp: The grasp, base frame.
+        q: (n,) the posture [rad or m].
+        robot: Name of the robot.
+    """
+
+    grasp: Grasp
+    q: Array
+    robot: str
+
+
+def chosen_posture(path: Path, rank: int) -> ChosenPosture:
+    """One of the answers of a file.
+
+    Args:
+        path: What ``casadi-ik choose --out`` wrote.
+        rank: Which, from 1.
+
+    Raises:
+        InputError: As for `read_ranked`, or there are fewer.
+        DescriptionError: Its grasp is missing or malformed.
+    """
+    found = read_ranked(path)
+    if rank > len(found):
+        raise InputError(f"--rank: found {rank}, but {path} has {len(found)} answers")
+    one, where = found[rank - 1], f"ranked[{rank - 1}]."
+    if one.grasp is None:
+        raise DescriptionError(
+            f"{path}: {where}grasp: missing, expected what `casadi-ik choose` writes now"
+        )
+    name = one.name or f"{path.stem}[{rank - 1}]"
+    grasp = grasp_of(one.grasp, path, name, f"{where}grasp.")
+    if one.pregrasp is not None:
+        before = grasp_of(one.pregrasp, path, name, f"{where}pregrasp.")
+        grasp = replace(grasp, pregrasp=before)
+    return ChosenPosture(grasp, np.array(one.solution.q), one.solution.robot)
+
+
+def read_ranked(path: Path) -> list[RankedEntry]:
+    """The answers of a file, best first, at least one.
+
+    Args:
+        path: What ``casadi-ik choose --out`` wrote.
+
+    Raises:
+        InputError: It cannot be read, is too large, is none of that kind, or has no answers; the
+            message names file and key.
+    """
+    try:
+        size, most = path.stat().st_size, limit(LIMITS.ranked_bytes)
+        if size > most:
+            raise InputError(f"{path}: found {size} bytes, expected at most {most} {RAISED}")
+        found = msgspec.json.decode(path.read_bytes(), type=_RankedFile).ranked
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        text = str(error).replace("`$.", "`")
+        raise InputError(f"{path}: expected what `casadi-ik choose` writes: {text}") from error
+    if not found:
+        raise InputError(f"{path}: ranked: found none, expected at least one answer")
+    return found

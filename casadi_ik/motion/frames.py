@@ -1,0 +1,163 @@
+"""Recorded frames, keypoints of a person's hand or contacts, and the motion that follows them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.errors import InputError
+from casadi_ik.files.limits import LIMITS, RAISED, limit
+from casadi_ik.files.npz import read_npz
+from casadi_ik.motion.follower import Follower, FollowStatus
+from casadi_ik.motion.motion import Motion
+from casadi_ik.motion.retarget import KEYPOINTS, RATE, Retargeter
+
+AT_ONCE = 1024
+"""Cycles whose targets are in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames of a stream.
+
+    Attributes:
+        path: The file they are from.
+        times: (k,) [s], the first 0.
+        keypoints: (k, 21, 3) of a person's hand [m]; None: contacts are given.
+        points: (k, f, 3) contact points [m], base frame; nothing where keypoints are given.
+        normals: (k, f, 3) outward pad normals; NaN where free.
+    """
+
+    path: Path
+    times: Array
+    keypoints: Array | None
+    points: Array
+    normals: Array
+
+    def at(self, times: Array, values: Array) -> Array:
+        """Values of frames between the frames, linearly; NaN beside a frame that has NaN."""
+        after = np.clip(np.searchsorted(self.times, times), 1, max(len(self.times) - 1, 1))
+        if len(self.times) == 1:
+            return np.repeat(values, len(times), axis=0)
+        start, end = self.times[after - 1], self.times[after]
+        share = np.clip((times - start) / (end - start), 0.0, 1.0)[:, None, None]
+        before, behind = values[after - 1], values[after]
+        with np.errstate(invalid="ignore"):  # a frame that is none gives none
+            between = before + share * (behind - before)
+        return np.where(share <= 0, before, np.where(share >= 1, behind, between))
+
+    def cycles(self, period: float) -> Array:
+        """Ends of the cycles that it takes to follow them [s].
+
+        Raises:
+            InputError: There are too many of them.
+        """
+        seconds, most = float(self.times[-1]), limit(LIMITS.stream_cycles) * period
+        if seconds > most:
+            raise InputError(
+                f"{self.path}: times: found {seconds:g} s, expected at most {most:g} s at this "
+                f"period {RAISED}"
+            )
+        return period * np.arange(1, int(np.ceil(seconds / period)) + 2, dtype=float)
+
+
+def read_frames(path: Path, fingers: int) -> Frames:
+    """Read a stream for a robot of so many fingers.
+
+    Raises:
+        DescriptionError: Missing, damaged or too large; the message names the file.
+        InputError: Other arrays than expected; the message names file and key.
+    """
+    arrays = read_npz(path, LIMITS.stream_bytes)
+    known = ["keypoints", "normals", "points", "times"]
+    if ("keypoints" in arrays) == ("points" in arrays):
+        raise InputError(
+            f"{path}: expected keypoints (k, {KEYPOINTS}, 3) or points (k, {fingers}, 3); "
+            f"found {', '.join(arrays) or 'nothing'}"
+        )
+    for name in sorted(set(arrays).difference(known)):
+        raise InputError(f"{path}: {name}: unknown, expected {', '.join(known)}")
+    key = "keypoints" if "keypoints" in arrays else "points"
+    count = KEYPOINTS if key == "keypoints" else fingers
+    frames = arrays[key]
+    if frames.ndim != 3 or frames.shape[1:] != (count, 3) or not len(frames):
+        raise InputError(
+            f"{path}: {key}: found shape {frames.shape}, expected (k, {count}, 3), k >= 1"
+        )
+    # One bad frame is no error of a stream; most of them too large are in other units.
+    middle = frames.mean(axis=1, keepdims=True) if key == "keypoints" else 0.0
+    with np.errstate(invalid="ignore"):
+        away = np.linalg.norm(frames - middle, axis=2)
+    away = away[np.isfinite(away)]
+    if len(away) and np.median(away) > LIMITS.stream_reach:
+        of = "middle of the hand" if key == "keypoints" else "base"
+        raise InputError(
+            f"{path}: {key}: found {np.median(away):.4g} m from the {of}, expected at most "
+            f"{LIMITS.stream_reach:g} m (numbers in mm?)"
+        )
+    normals = arrays.get("normals")
+    if normals is not None and (key == "keypoints" or normals.shape != frames.shape):
+        expected = "points beside them" if key == "keypoints" else f"{frames.shape}"
+        raise InputError(f"{path}: normals: found shape {normals.shape}, expected {expected}")
+    times = arrays.get("times", np.arange(len(frames)) / RATE)
+    steady = times.shape == (len(frames),) and np.isfinite(times).all()
+    if not (steady and (np.diff(times) > 0).all()):
+        raise InputError(
+            f"{path}: times: expected {len(frames)} growing numbers of seconds, one per frame"
+        )
+    if key == "keypoints":
+        nothing = np.zeros((len(frames), 0, 3))
+        return Frames(path, times - times[0], frames, nothing, nothing)
+    free = np.full(frames.shape, np.nan) if normals is None else normals
+    return Frames(path, times - times[0], None, frames, free)
+
+
+def follow_frames(
+    robot: ArmHand, follower: Follower, frames: Frames, retargeter: Retargeter
+) -> Motion:
+    """Follow frames to their end.
+
+    Args:
+        robot: The robot.
+        follower: Follows, from where it is.
+        frames: The frames.
+        retargeter: Makes targets of keypoints.
+
+    Returns:
+        The motion; of every cycle its notes have the status and the contacts' position errors.
+
+    Raises:
+        InputError: There are too many cycles, or keypoints are none of a hand.
+    """
+    times = frames.cycles(follower.period)
+    q = np.empty((len(times) + 1, len(robot.actuators)))
+    q[0] = follower.state.q
+    status = np.full(len(q), FollowStatus.HOLDING.value, dtype="<U9")
+    error = np.full((len(q), len(robot.fingers)), np.nan)
+    for i, reached in enumerate(_followed(follower, frames, times, retargeter), start=1):
+        state = follower.state
+        q[i], status[i], error[i] = reached, state.status.value, state.position_error
+    notes = {"status": status, "position_error": error}
+    return Motion.of_cycles(robot, follower.period, q, notes)
+
+
+def _followed(
+    follower: Follower, frames: Frames, times: Array, retargeter: Retargeter
+) -> Iterator[Array]:
+    """Where the motors are at the end of each cycle."""
+    weight = retargeter.config.wrist_weight, retargeter.config.wrist_weight
+    for first in range(0, len(times), AT_ONCE):
+        now = times[first : first + AT_ONCE]
+        if frames.keypoints is None:
+            both = frames.at(now, frames.points), frames.at(now, frames.normals)
+            yield from (follower(*target) for target in zip(*both, strict=True))
+            continue
+        for keypoints in frames.at(now, frames.keypoints):
+            wanted = retargeter(keypoints, follower.period)
+            palm = wanted.palm if follower.moves_palm else None
+            yield follower(wanted.points, palm=palm, palm_weight=weight)
