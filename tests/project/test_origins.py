@@ -1,0 +1,36 @@
+"""The table of origins names every shipped arm and hand, and the sources that its file names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "robots_origin.md").read_text()
+ROBOTS, LICENCES = (
+    dict(re.findall(r"^\| (\S+) \| (.*) \|$", part, re.MULTILINE))
+    for part in PAGE.split("## Licences")
+)
+del LICENCES["source"], ROBOTS["robot"]
+FILES = sorted(path for kind in ("arms", "hands") for path in (ROOT / "models" / kind).iterdir())
+
+
+def test_every_robot_has_a_row():
+    assert set(ROBOTS) == {f"`{path.stem}`" for path in FILES}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_row_names_the_sources_of_its_file(path):
+    text = " ".join(" ".join(yaml.safe_load(path.read_text())["sources"].values()).split())
+    known = [x for x in LICENCES if re.search(rf"(?<![\w/-]){re.escape(x)}(?![\w-])", text)]
+    assert ROBOTS[f"`{path.stem}`"].rpartition("| ")[2] == (", ".join(known) or "assumed")
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_repository_with_a_commit_has_its_licence_listed(path):
+    text = " ".join(" ".join(yaml.safe_load(path.read_text())["sources"].values()).split())
+    named = re.findall(r"([A-Za-z0-9][\w.-]*/[A-Za-z][\w.-]*) at [0-9a-f]{7,}", text)
+    assert set(named) <= set(LICENCES)
