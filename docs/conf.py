@@ -37,7 +37,9 @@ include_patterns = [
     "docs/**.md",
     "notebooks/*.ipynb",
     "studies/results/**.md",
+    "CODE_OF_CONDUCT.md",
     "CONTRIBUTING.md",
+    "GOVERNANCE.md",
     "SECURITY.md",
     "CHANGELOG.md",
 ]

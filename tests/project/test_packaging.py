@@ -37,3 +37,27 @@ def test_what_is_imported(program):
     more = f"; import sys; print(*(x for x in {ON_DEMAND!r}.split() if x in sys.modules))"
     done = subprocess.run([sys.executable, "-c", program + more], capture_output=True, text=True)
     assert (done.stdout.strip(), done.stderr, done.returncode) == ("", "", 0)
+
+
+def test_the_oldest_dependencies_are_the_lower_bounds():
+    lines = (ROOT / "oldest.txt").read_text().splitlines()
+    oldest = dict(line.split("==") for line in lines if not line.startswith("#"))
+    bounds = dict(line.split(">=") for line in PROJECT["dependencies"])
+    assert oldest.keys() == bounds.keys()
+    for name, bound in bounds.items():
+        assert f"{oldest[name]}.".startswith(f"{bound}.")
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda p: p.stem)
+def test_workflows_and_forms_are_yaml(path):
+    found = yaml.safe_load(path.read_text())
+    for job in found.get("jobs", {}).values():
+        assert {"runs-on", "steps"} <= job.keys()
+
+
+def test_the_recipe_has_the_dependencies_of_the_core():
+    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text())
+    run = recipe["requirements"]["run"]
+    bounds = sorted(line.rpartition(" ")[2] for line in run if not line.startswith("python >"))
+    assert bounds == sorted(">=" + line.split(">=")[1] for line in PROJECT["dependencies"])
+    assert recipe["context"]["version"] == ik.__version__
