@@ -31,6 +31,7 @@ from casadi_ik.solving.choose import Judgement, choose
 from casadi_ik.solving.engine import Engine
 from casadi_ik.solving.fast import FastSolver
 from casadi_ik.solving.run import Run
+from casadi_ik.solving.sensitivity import Sensitivity
 from casadi_ik.solving.stream import SolvedBlock, Stream
 
 
@@ -472,6 +473,56 @@ class Solver(MovingSolver):
             apart,
             per_candidate,
         )
+
+    def sensitivity(
+        self,
+        q: ArrayLike,
+        points: ArrayLike,
+        normals: ArrayLike,
+        gradient: ArrayLike | None = None,
+        **more: ArrayLike | None,
+    ) -> Sensitivity:
+        """How answers move with their targets, by the implicit function theorem.
+
+        What an answer leaves of its contacts' errors stays, in the sense of least squares; motors
+        at a limit stay there; of motions that contacts leave free none is made.
+
+        Args:
+            q: (k, n) answers [rad or m].
+            points: (k, f, 3) contact points [m], as for `solve_batch`.
+            normals: (k, f, 3), likewise.
+            gradient: (k, n) of a number by q [1/rad or 1/m]: its derivatives by the contacts are
+                found, which takes a part of the time. None: those of q.
+            more: As for `solve_batch`.
+
+        Returns:
+            Derivatives (k, n, f, 3) of q by points [rad/m or 1] and by normals [rad or m]; with a
+            gradient (k, f, 3).
+
+        Raises:
+            InputError: Bad shapes or values, or targets of several kinds.
+
+        Example:
+            >>> points, normals = robot.contacts(solution.q[None])
+            >>> rates = solver.sensitivity(solution.q[None], points, normals)
+            >>> rates.points.shape
+            (1, 14, 3, 3)
+        """
+        every = self.robot.configuration(q)
+        targets = self._request.of_arrays(points, normals, None, more=more)
+        k, n = len(targets), len(self.robot.actuators)
+        if every.shape != (k, n):
+            raise InputError(f"q: found shape {every.shape}, expected {(k, n)}")
+        kernel = self._engine.kinds_of(targets).sensitivity
+        if gradient is not None:
+            given = np.asarray(gradient, dtype=float)
+            if given.shape != every.shape:
+                raise InputError(f"gradient: found shape {given.shape}, expected {every.shape}")
+            return kernel(targets, every, given)
+        rows = np.repeat(np.arange(k), n)
+        found = kernel(targets.rows(rows), every[rows], np.tile(np.eye(n), (k, 1)))
+        f = len(self.robot.fingers)
+        return Sensitivity(found.points.reshape(k, n, f, 3), found.normals.reshape(k, n, f, 3))
 
     def moved(self, name: str, pose: ArrayLike) -> Self:
         """The same solver with something in its scene elsewhere, in less than a millisecond.

@@ -40,6 +40,7 @@ from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
 from casadi_ik.solving.run import Run
+from casadi_ik.solving.sensitivity import SensitivityKernel
 from casadi_ik.solving.trials import HandMethod
 
 MANIPULABILITY = "manipulability"
@@ -128,6 +129,12 @@ class Engine:
             UnsupportedError: The method gives one.
         """
         return AlternativeFinder(self.robot, self._several, self.compiled)
+
+    @cached_property
+    def sensitivity(self) -> SensitivityKernel:
+        """Derivatives of answers with respect to their contacts."""
+        kinds = self.kinds or usual(len(self.robot.fingers))
+        return SensitivityKernel(self.robot.description, kinds, self.compiled)
 
     def about(self, check: SceneCheck) -> Engine:
         """The engine with another scene; all that was worked out for the robot stays."""

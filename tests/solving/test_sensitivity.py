@@ -1,0 +1,153 @@
+"""Derivatives of answers: against answers of targets nearby, found by numpy alone; the layers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik import differentiable, errors
+
+STEP = 1e-5
+
+
+def jacobian(robot, q, known):
+    """Rows of points [0.1 m] and normals that count, by central differences."""
+    columns = []
+    for motor in range(len(q)):
+        ends = [robot.contacts(q + side * 1e-6 * np.eye(len(q))[motor]) for side in (1, -1)]
+        moved = [(high - low)[known] / 2e-6 for high, low in zip(*ends, strict=True)]
+        columns.append(np.concatenate([moved[0].ravel() / 0.1, moved[1].ravel()]))
+    return np.stack(columns, axis=1)
+
+
+def answer(robot, q, free, known, points, normals, scales):
+    """The nearest answer by Newton's method, with motors that may move, in units of scales."""
+    for _ in range(12):
+        at = robot.contacts(q)
+        left = np.concatenate(
+            [((at[0] - points) / 0.1)[known].ravel(), (at[1] - normals)[known].ravel()]
+        )
+        step = (
+            scales
+            * free
+            * (np.linalg.pinv(jacobian(robot, q, known) * scales * free, rcond=1e-5) @ -left)
+        )
+        q = q + step
+    return q
+
+
+@pytest.mark.parametrize("name", ["kuka_lwr_barrett", "ar10"])
+@pytest.mark.parametrize("case", ["inside", "at limits", "a finger left out"])
+def test_as_answers_nearby(name, case):
+    robot = ik.load_robot(name)
+    solver, rng = ik.Solver(robot), np.random.default_rng(3)
+    k, n, f = 4, len(robot.actuators), len(robot.fingers)
+    q = robot.lower + rng.uniform(0.15, 0.85, (k, n)) * (robot.upper - robot.lower)
+    held = np.zeros((k, n), dtype=bool)
+    if case == "at limits":
+        held = rng.random((k, n)) < 0.15
+        q = np.where(held, robot.upper, q)
+        assert held.any()
+    points, normals = robot.contacts(q)
+    known = np.ones((f,), dtype=bool)
+    if case == "a finger left out":
+        known[-1] = False
+    asked = [np.where(known[:, None], array, np.nan) for array in (points, normals)]
+    rates = solver.sensitivity(q, *asked)
+    assert rates.points.shape == rates.normals.shape == (k, n, f, 3)
+    slider = np.array([actuator.unit != "rad" for actuator in robot.description.actuators])
+    scales = np.where(slider, robot.upper - robot.lower, 1.0)
+    for row in range(k):
+        moved = 0.1 * rng.normal(size=(f, 3)), rng.normal(size=(f, 3))
+        ends = []
+        for side in (STEP, -STEP):
+            facing = normals[row] + side * moved[1]
+            facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+            near = points[row] + side * moved[0], facing
+            ends.append(answer(robot, q[row], ~held[row], known, *near, scales))
+        expected = (ends[0] - ends[1]) / (2 * STEP)
+        given = (rates.points[row], rates.normals[row])
+        found = sum(np.einsum("nfi,fi->n", *pair) for pair in zip(given, moved, strict=True))
+        np.testing.assert_allclose(found, expected, atol=2e-6 * np.abs(expected).max())
+        assert (found[held[row]] == 0).all()
+        assert known.all() or not np.any([each[:, -1] for each in given])
+
+
+def test_gradients_and_other_kinds(robot):
+    """A gradient gives the same as all derivatives; a plane leaves motions along it free."""
+    solver, rng = ik.Solver(robot), np.random.default_rng(5)
+    q, gradient = robot.random(rng, 5), rng.normal(size=(5, 14))
+    targets = robot.contacts(q)
+    every, one = solver.sensitivity(q, *targets), solver.sensitivity(q, *targets, gradient)
+    for whole, number in ((every.points, one.points), (every.normals, one.normals)):
+        np.testing.assert_allclose(np.einsum("kn,knfi->kfi", gradient, whole), number, 1e-6)
+    planes = np.full_like(targets[0], np.nan)
+    planes[:, 1] = targets[1][:, 1]
+    free = solver.sensitivity(q, *targets, planes=planes)
+    across = np.cross(planes[:, 1], rng.normal(size=3))
+    size = np.abs(free.points[:, :, 1]).max()
+    assert np.abs(np.einsum("kni,ki->kn", free.points[:, :, 1], across)).max() < 1e-9 * size
+
+
+def test_refused(robot):
+    solver, q = ik.Solver(robot), robot.home[None]
+    points, normals = robot.contacts(q)
+    with pytest.raises(errors.InputError, match="q: found shape"):
+        solver.sensitivity(robot.home, points, normals)
+    with pytest.raises(errors.InputError, match="gradient: found shape"):
+        solver.sensitivity(q, points, normals, [1.0, 2.0])
+    with pytest.raises(errors.InputError, match="row 0, finger 0"):
+        solver.sensitivity(q, np.where(np.eye(3)[:1], np.nan, points), normals)
+
+
+@pytest.fixture(scope="module")
+def targets(robot):
+    points, normals = robot.contacts(robot.random(np.random.default_rng(2), 4))
+    points[3] += 5.0  # out of reach
+    return points, normals
+
+
+@pytest.fixture(scope="module")
+def expected(robot, targets):
+    """Answers and derivatives of the sum of their squares."""
+    solver = ik.Solver(robot)
+    batch = solver.solve_batch(*targets, q0=robot.home)
+    found = solver.sensitivity(batch.q, *targets, 2 * batch.q)
+    solved = batch.success[:, None, None]
+    return batch, found.points * solved, found.normals * solved
+
+
+def test_torch(robot, targets, expected):
+    torch = pytest.importorskip("torch")
+    layer = differentiable.torch_layer(ik.Solver(robot), q0=robot.home)
+    given = [torch.tensor(array, requires_grad=True) for array in targets]
+    q, solved = layer(*given)
+    (q**2).sum().backward()
+    batch, *rates = expected
+    np.testing.assert_array_equal(q.detach().numpy(), batch.q)
+    assert solved.tolist() == [True] * 3 + [False]
+    for tensor, rate in zip(given, rates, strict=True):
+        np.testing.assert_allclose(tensor.grad.numpy(), rate, 1e-6)
+
+
+def test_jax(robot, targets, expected):
+    jax = pytest.importorskip("jax")
+    layer = differentiable.jax_layer(ik.Solver(robot), q0=robot.home)
+    batch, *rates = expected
+
+    def loss(points, normals):
+        return (layer(points, normals)[0] ** 2).sum()
+
+    with jax.enable_x64(True):
+        given = [jax.numpy.asarray(array) for array in targets]
+        np.testing.assert_array_equal(jax.jit(layer)(*given)[0], batch.q)
+        mapped = jax.vmap(jax.grad(loss, (0, 1)))(*given)
+        for found in (jax.jit(jax.grad(loss, (0, 1)))(*given), mapped):
+            for one, rate in zip(found, rates, strict=True):
+                np.testing.assert_allclose(one, rate, 1e-6, 1e-9)
+        ways = [
+            way(lambda points: layer(points, given[1][0])[0])(given[0][0])
+            for way in (jax.jacfwd, jax.jacrev)
+        ]
+        np.testing.assert_allclose(*ways, 1e-6, 1e-9)
