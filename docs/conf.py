@@ -13,11 +13,13 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 
+import casadi_ik  # noqa: E402
+
 PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 URLS = PROJECT.get("urls", {})
 
 project = "casadi_ik"
-version = release = PROJECT["version"]
+version = release = casadi_ik.__version__
 author = "The casadi_ik developers"
 copyright = author  # noqa: A001  (Sphinx's own name)
 root_doc = "docs/index"
