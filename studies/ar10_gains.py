@@ -277,22 +277,19 @@ def offsets(robot: ik.ArmHand, out: Path, goals: int, rng: np.random.Generator, 
         for label, v in left.items()
     ]  # fmt: skip
     drawn, ((axes,),) = figure(1, 1, 8, 3.6)
-    # Tasks that leave nothing lie on each other at the left edge: one wide, one narrow.
-    widths = (1.6, 1.6, 1.6, 5.0, 1.8)
-    for (label, values), color, width in zip(
-        left.items(), (*COLORS, "#222222"), widths, strict=True
-    ):
-        ranked = np.sort(np.maximum(values, FLOOR))
-        share = np.linspace(0, 100, len(ranked))
+    for (label, values), color in zip(left.items(), (*COLORS, "#222222"), strict=True):
         name = f"{label} ({ROWS[kinds[label][0]]} of 6 rows)"
-        axes.plot(ranked, share, color=color, lw=width, label=name)
+        if values.max() < FLOOR:
+            name += f": less than {FLOOR:g} mm, always"
+        axes.plot(
+            np.sort(values), np.linspace(0, 100, len(values)), color=color, lw=1.8, label=name
+        )
     offset = float(np.hypot(*RELATIVE_OFFSET))
     axes.axvline(offset, color="black", lw=1, ls="--", label="offset of the paper's Fig. 5")
     name = "What is left of a relative pose that the hand cannot take"
-    least = f"left at the end [mm]; {FLOOR:g} mm stands for less"
-    title(axes, name, least, "goals with no more left [%]")
-    axes.set_xscale("log")
-    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0.06, 1.0))
+    title(axes, name, "left at the end [mm]", "goals with no more left [%]")
+    axes.set(xscale="log", xlim=(1e-2, 1e2))
+    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     drawn.tight_layout()
     drawn.savefig(out / "offsets.png")
     return f"""

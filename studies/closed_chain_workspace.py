@@ -80,10 +80,11 @@ def main(arguments: list[str] | None = None) -> None:
     shown = rng.permutation(len(turn))[:6000]
     for which, color, label in ((~follows, "0.85", "out of reach"), (follows, OURS, "reachable")):
         part = shown[which[shown]]
-        grid[1, 0].scatter(*seen[:, part], s=2, color=color, label=label, rasterized=True)
+        grid[1, 0].scatter(*seen[:, part], s=2, color=color, rasterized=True)
+        grid[1, 0].plot([], [], "o", ms=5, color=color, label=label)
     grid[1, 0].plot(0, 0, "o", color=PAPER, ms=8, label="thumb's contact")
-    grid[1, 0].set_aspect("equal")
-    grid[1, 0].legend(frameon=False, fontsize=8, markerscale=2)
+    grid[1, 0].set_aspect("equal", adjustable="datalim")
+    grid[1, 0].legend(frameon=False, fontsize=8, loc="lower left")
     title(
         grid[1, 0],
         f"{given.grasp}: where the palm can be",

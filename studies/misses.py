@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 from climbing import climb, read_search
+from matplotlib.colors import LogNorm
 from minimax import MinimaxProgram
 from runner.figures import figure, title
 from runner.parts import read_parts, run_parts
@@ -498,19 +499,27 @@ def heat_map(rows: list[Row], path: Path) -> None:
     pairs = {tuple(row["robot"].split("+")): row for row in rows if row["tolerance"] == finest}
     arms, hands = (sorted({pair[i] for pair in pairs}) for i in (0, 1))
     ratios = np.full((len(arms), len(hands)), np.nan)
-    drawn, grid = figure(1, 1, 4.5 + 0.3 * len(hands), 3.4 + 0.25 * len(arms))
+    drawn, grid = figure(1, 1, 3.0 + 0.32 * len(hands), 2.6 + 0.22 * len(arms))
     axes = grid[0, 0]
     for (arm, hand), row in pairs.items():
         i, j = arms.index(arm), hands.index(hand)
         ratios[i, j], missed = row["usual"], len(row["missed"])
-        text = f"{ratios[i, j]:.1f}" + (f"\n({missed})" if missed else "")
-        color = "white" if ratios[i, j] > 4.5 else "#c0392b" if missed else "black"
-        axes.text(j, i, text, ha="center", va="center", fontsize=7, color=color)
-    image = axes.imshow(ratios, cmap="YlGnBu", vmin=0, vmax=8, alpha=0.7, aspect="auto")
+        if missed:
+            around = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+            axes.text(j, i, str(missed), ha="center", va="center", fontsize=9, color="#c0392b",
+                      bbox=around)  # fmt: skip
+    scale = LogNorm(np.nanmin(ratios), np.nanmax(ratios))
+    image = axes.imshow(ratios, cmap="YlGnBu", norm=scale, alpha=0.8, aspect="auto")
     axes.set_xticks(range(len(hands)), hands, rotation=45, ha="right")
     axes.set_yticks(range(len(arms)), arms)
-    drawn.colorbar(image, ax=axes, shrink=0.6).set_label(f"time of a target, {REFERENCE} = 1")
-    name = f"random targets, {tolerance_name(finest)}; (missed of all kinds)"
+    bar = drawn.colorbar(image, ax=axes, shrink=0.7)
+    ticks = [t for t in (0.5, 1, 2, 3, 5, 10, 20) if scale.vmin <= t <= scale.vmax]
+    bar.set_ticks(ticks, labels=[f"{t:g}" for t in ticks])
+    bar.ax.minorticks_off()
+    bar.set_label(f"time of a target over that of {REFERENCE}")
+    name = (
+        f"Random targets, {tolerance_name(finest)}; red: how many targets of all kinds were missed"
+    )
     title(axes, name, "hand", "arm")
     drawn.tight_layout()
     drawn.savefig(path)

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 from matplotlib.axes import Axes
 from qiu_settings import LIMITS, METHODS, TABLE_I, Printed, printed_mean
-from runner.figures import figure
+from runner.figures import figure, title
 from runner.report import (
     Metric,
     interval_text,
@@ -25,6 +25,7 @@ from runner.report import (
 from runner.study import Setting, Study, code_of, read_results, robot_of
 
 import casadi_ik as ik
+from casadi_ik.arrays import Array
 from casadi_ik.errors import InputError
 from casadi_ik.palette import method_colors
 
@@ -186,65 +187,48 @@ def _milliseconds(metric: Metric) -> str:
 
 
 COLOURS = method_colors(METHODS)
-CURVES = 8
-"""Solved and failed runs drawn per method."""
+RUNS = 40
+"""Solved and failed runs behind a band of a panel."""
 LONGEST = 1000
-"""Iterations drawn of a run."""
+"""Iterations of a run that are drawn."""
+SOLVED, FAILED = "#2f6db3", "#c0392b"
 
 
-def draw_success(table: pl.DataFrame, path: Path) -> None:
-    """Success by object and method, with 95 % intervals, and what the paper printed."""
-    objects = sorted(table["targets"].unique())
-    drawn, grid = figure(2, 1, 11, 3.75)
-    panels = grid[:, 0]
-    for panel, limits in zip(panels, LIMITS, strict=True):
-        rows = table.filter(pl.col("limits") == limits)
-        present = [name for name in METHODS if name in rows["method"].unique()]
-        width = 0.84 / max(1, len(present))
-        for i, method in enumerate(present):
-            mine = rows.filter(pl.col("method") == method)
-            x = np.arange(len(objects)) - 0.42 + width * (i + 0.5)
-            for at, name in zip(x, objects, strict=True):
-                solved = mine.filter(pl.col("targets") == name)["success"]
-                rate = rate_metric(name, int(solved.sum()), len(solved))
-                error = [[rate.value - rate.low], [rate.high - rate.value]]
-                panel.bar(at, rate.value, width, color=COLOURS[method], yerr=error)
-            panel.bar(0, 0, color=COLOURS[method], label=method)
-            if limits == "ignore":
-                printed = [
-                    (at, TABLE_I[o]) for at, o in zip(x, objects, strict=True) if o in TABLE_I
-                ]
-                pairs = [(at, cells[method].success) for at, cells in printed if method in cells]
-                panel.plot(*zip(*pairs, strict=True), "kD", ms=4) if pairs else None
-        panel.set(ylabel="solved [%]", ylim=(0, 105), title=HEADS[limits])
-        panel.grid(axis="y", alpha=0.3)
-    panels[0].plot([], [], "kD", ms=4, label="printed in the paper")
-    panels[0].legend(loc="lower center", ncols=7, fontsize="small")
-    panels[1].set_xticks(range(len(objects)), [o.replace("_", " ") for o in objects], rotation=25)
-    drawn.tight_layout()
-    drawn.savefig(path)
+def draw_dots(metrics: Sequence[Metric], quantity: str, label: str, path: Path) -> None:
+    """A dot per object and method with its 95 % interval, and a diamond for what the paper printed.
 
-
-def draw_iterations(table: pl.DataFrame, path: Path) -> None:
-    """How many iterations the solved cases took; the paper's means as dashed lines."""
-    drawn, (panels,) = figure(1, 2, 5.5, 4)
-    edges = np.logspace(0, 4, 61)
-    for panel, limits in zip(panels, LIMITS, strict=True):
-        rows = table.filter((pl.col("limits") == limits) & pl.col("success"))
-        for method in METHODS:
-            counts = rows.filter(pl.col("method") == method)["iterations"].to_numpy()
-            if len(counts):
-                shares = np.histogram(counts, edges)[0] / len(counts)
-                panel.stairs(100 * shares, edges, color=COLOURS[method], label=method, lw=1.6)
-            if limits == "ignore" and method in TABLE_I["cup"]:
-                panel.axvline(printed_mean(method).iterations, color=COLOURS[method], ls="--", lw=1)
-        panel.set(xscale="log", xlabel="iterations of a solved case", title=HEADS[limits])
-        panel.set(yscale="log", ylim=(0.02, 110))
-        panel.grid(alpha=0.3)
-    panels[0].set_ylabel("share of the solved cases [%]")
-    panels[0].plot([], [], color="black", ls="--", lw=1, label="mean printed in the paper")
-    panels[0].legend(fontsize="small")
-    panels[1].legend(fontsize="small")
+    Args:
+        metrics: Figures of the table by object (`by_object`).
+        quantity: "success" or "iterations".
+        label: What is drawn, with its unit.
+        path: Of the picture.
+    """
+    values = {metric.name: metric for metric in metrics}
+    objects = sorted({name.split("/")[3] for name in values if name.count("/") == 4})
+    drawn, grid = figure(1, 2, 5.4, 0.42 * len(objects) + 1.4)
+    for panel, limits in zip(grid[0], LIMITS, strict=True):
+        for i, method in enumerate(METHODS):
+            for row, name in enumerate(objects):
+                at = row + 0.7 * ((i + 0.5) / len(METHODS) - 0.5)
+                metric = values.get(f"table-one/{method}/{limits}/{name}/{quantity}")
+                if metric is not None and metric.n:
+                    ends = [[metric.value - metric.low], [metric.high - metric.value]]
+                    panel.errorbar(
+                        metric.value, at, xerr=ends, fmt="o", ms=4, color=COLOURS[method]
+                    )
+                printed = TABLE_I.get(name, {}).get(method) if limits == "ignore" else None
+                if printed:
+                    x = getattr(printed, quantity)
+                    panel.plot(x, at, "D", ms=5, mfc="none", mec=COLOURS[method])
+            panel.plot([], [], "o", ms=4, color=COLOURS[method], label=method)
+        title(panel, HEADS[limits], label, "")
+        panel.set_yticks(range(len(objects)), [name.replace("_", " ") for name in objects])
+        panel.set_ylim(len(objects) - 0.5, -0.5)
+        panel.grid(axis="y", alpha=0.15)
+        if quantity == "iterations":
+            panel.set(xscale="log", xlim=(1, 1e4))
+        panel.plot([], [], "D", ms=5, mfc="none", mec="black", label="printed in the paper")
+    grid[0, 1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     drawn.tight_layout()
     drawn.savefig(path)
 
@@ -252,8 +236,9 @@ def draw_iterations(table: pl.DataFrame, path: Path) -> None:
 def draw_convergence(studies: Sequence[Study], table: pl.DataFrame, path: Path) -> None:
     """The worst error over the iterations, of solved and of failed runs, limits ignored.
 
-    The runs are the first solved and the first failed ones; they are stepped through once more,
-    from targets whose last bit may differ, and drawn as what they are then.
+    Drawn are the median and the band from 10 to 90 % of the first solved and the first failed
+    runs. They are stepped through once more, from targets whose last bit may differ, and drawn as
+    what they are then; a run that has ended keeps its last error.
     """
     settings = [
         (study, setting)
@@ -264,24 +249,34 @@ def draw_convergence(studies: Sequence[Study], table: pl.DataFrame, path: Path) 
     drawn, panels = figure(2, 2, 5.5, 3.5)
     for panel, (study, setting) in zip(panels.flat, settings, strict=True):
         rows = table.filter(pl.col("setting") == setting.key).sort("target", "targets")
-        for solved in (False, True):
-            for row in rows.filter(pl.col("success") == solved).head(CURVES).iter_rows(named=True):
-                _curve(panel, study, setting, row["targets"], row["target"])
+        runs: dict[bool, list[Array]] = {True: [], False: []}
+        for success in (True, False):
+            part = rows.filter(pl.col("success") == success).head(RUNS)
+            for row in part.iter_rows(named=True):
+                solved, errors = _run(study, setting, row["targets"], row["target"])
+                runs[solved].append(errors)
+        for solved, errors in runs.items():
+            if errors:
+                _band(panel, np.stack(errors), solved)
         panel.axhline(1, color="black", lw=0.8, ls=":")
-        panel.set(xscale="log", yscale="log", title=setting.method)
-        panel.grid(alpha=0.3)
-    for label, colour in (("solved", "tab:blue"), (f"not within {LONGEST}", "tab:red")):
-        panels[0, 1].plot([], [], color=colour, label=label)
-    panels[0, 1].legend()
-    for panel in panels[1]:
-        panel.set_xlabel("iteration")
-    for panel in panels[:, 0]:
-        panel.set_ylabel("worst error / tolerance")
+        panel.set(xscale="log", yscale="log", ylim=(0.3, 400))
+        title(panel, setting.method, "iteration", "worst error / tolerance")
+    panels[0, 0].legend(frameon=False, fontsize=8, loc="lower left")
     drawn.tight_layout()
     drawn.savefig(path)
 
 
-def _curve(panel: Axes, study: Study, setting: Setting, targets: str, target: int) -> None:
+def _band(panel: Axes, errors: Array, solved: bool) -> None:
+    """Median and 10 to 90 % of runs (k, iterations)."""
+    low, middle, high = np.percentile(errors, [10, 50, 90], axis=0)
+    color, iterations = (SOLVED if solved else FAILED), np.arange(1, LONGEST + 1)
+    name = f"solved within {LONGEST}" if solved else f"not within {LONGEST}"
+    panel.fill_between(iterations, low, high, color=color, alpha=0.2, lw=0)
+    panel.plot(iterations, middle, color=color, lw=1.8, label=name)
+
+
+def _run(study: Study, setting: Setting, targets: str, target: int) -> tuple[bool, Array]:
+    """Whether a run is solved, and its worst error over the tolerance, (LONGEST,)."""
     group = next(item for item in study.sets if item.key == targets)
     number, row = divmod(target, study.block)
     robot = robot_of(study.robot)
@@ -293,8 +288,7 @@ def _curve(panel: Axes, study: Study, setting: Setting, targets: str, target: in
         max(record["position_error"].max() / position, record["angle_error"].max() / angle)
         for record in islice(stepper, LONGEST)
     ]
-    colour = "tab:blue" if stepper.status == ik.Status.SOLVED else "tab:red"
-    panel.plot(np.arange(1, len(errors) + 1), errors, color=colour, lw=0.9, alpha=0.7)
+    return stepper.status == ik.Status.SOLVED, np.pad(errors, (0, LONGEST - len(errors)), "edge")
 
 
 NOT_RUN = "*Not run yet.*"
@@ -338,6 +332,8 @@ closes only to rounding, not to the last bit. "Iterations saved" is the share of
 the proofs spared.
 """
 
+DOTS = "Lines are 95 % intervals, where they are wider than a dot; diamonds, in the paper's table."
+
 ABLATION = """
 One choice changed at a time, limits ignored, on the first targets of every object: the same
 targets for every line, so differences are more certain than the intervals look.
@@ -361,8 +357,6 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path, command:
     if not len(table):
         raise InputError(f"{results}: found no results of the table, expected some")
     folder.mkdir(parents=True, exist_ok=True)
-    draw_success(table, folder / "success.png")
-    draw_iterations(table, folder / "iterations.png")
     draw_convergence(studies[:2], table, folder / "convergence.png")
     metrics: list[Metric] = []
 
@@ -376,10 +370,11 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path, command:
         kept(summary(table)),
         "![Success by object](success.png)",
         "![Iterations of solved cases](iterations.png)",
-        "Dashed: the mean that the paper prints for the method of that colour.",
+        DOTS,
         "## Convergence",
-        "The worst error over all contacts in units of its tolerance, limits ignored, of the first "
-        "targets that were solved and the first that were not.",
+        "The worst error over all contacts in units of its tolerance, limits ignored: median and "
+        f"10 to 90 % of the first {RUNS} targets that were solved and of the first {RUNS} that "
+        "were not.",
         "![Convergence of solved and failed runs](convergence.png)",
         "## How solves end",
         CYCLES,
@@ -396,5 +391,7 @@ def write_report(studies: Sequence[Study], results: Path, folder: Path, command:
         provenance({study.name: code_of(results / study.name) for study in studies}),
         f"Seed {studies[0].seed}. Made by, and to go on where it stopped: `{command}`.",
     ]
+    draw_dots(metrics, "success", "solved [%]", folder / "success.png")
+    draw_dots(metrics, "iterations", "mean iterations of solved cases", folder / "iterations.png")
     write_page(TITLE, parts, folder)
     write_metrics(metrics, folder / "metrics.json")

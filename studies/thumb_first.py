@@ -35,12 +35,8 @@ VARIANTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 SHOWN = range(1, 16)
 """Iterations that are drawn."""
 
-CURVES = (
-    ("one start, ProxQP", PAPER, 4.0, "o-"),
-    ("one start, freeze", OURS, 1.5, "o-"),
-    ("all starts, freeze", "#1f9d55", 1.5, "o:"),
-)
-"""Lines, their colours and widths: the first two nearly coincide, so one is wider."""
+CURVES = (("one start, ProxQP", PAPER, "o"), ("one start, freeze", OURS, "-"))
+"""Variants that are drawn: points that lie on a line."""
 
 
 def bent_targets(robot: ik.ArmHand, count: int, rng: np.random.Generator) -> Targets:
@@ -86,17 +82,19 @@ def main(arguments: list[str] | None = None) -> None:
             )
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
 
-    drawn, grid = figure(1, 2, 5.0, 3.6)
-    for axes, name in zip(grid[0], sets, strict=True):
-        for label, color, width, marker in CURVES:
+    drawn, ((axes,),) = figure(1, 1, 7.0, 3.6)
+    for name, filled in zip(sets, (True, False), strict=True):
+        for label, color, marker in CURVES:
             batch = batches[label, name]
             within = [(batch.iterations[batch.success] <= i).sum() for i in SHOWN]
             left = 100 * (1 - np.array(within) / len(batch))
-            drawn_at = np.where(left > 0, left, np.nan)
-            axes.plot(SHOWN, drawn_at, marker, color=color, lw=width, ms=2 * width, label=label)
-        axes.set(yscale="log", ylim=(50 / given.count / len(grasps), 150), xticks=SHOWN[1::2])
-        axes.legend(frameon=False, fontsize=9, loc="upper right")
-        title(axes, f"{name}: not yet solved", "iterations", "not yet solved [%]")
+            style = {"mfc": color if filled else "white", "ms": 6, "lw": 1.8, "color": color}
+            line = marker if filled or marker == "o" else "--"
+            named = f"{name}: {label.partition(', ')[2]}"
+            axes.plot(SHOWN, np.where(left > 0, left, np.nan), line, label=named, **style)
+    axes.set(yscale="log", ylim=(50 / given.count / len(grasps), 150), xticks=SHOWN[1::2])
+    axes.legend(frameon=False, fontsize=9, loc="upper right")
+    title(axes, "One start: not yet solved [%]", "iterations", "not yet solved [%]")
     total = given.count * len(grasps)
     text = f"""
 # thumb-first: one start, all starts, and two ways to keep to limits

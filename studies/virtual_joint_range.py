@@ -62,17 +62,12 @@ def main(arguments: list[str] | None = None) -> None:
     width, whole = connected(follows), 360.0 * follows.mean(axis=1)
 
     drawn, grid = figure(2, 2, 5.4, 4.0)
-    order = np.argsort(whole)[:: max(len(q) // 300, 1)]
-    grid[0, 0].imshow(
-        follows[order],
-        aspect="auto",
-        cmap="Blues",
-        extent=(-180, 180, 100, 0),
-        interpolation="nearest",
-    )
+    turns = 360.0 * (np.arange(given.steps) / given.steps - 0.5)
+    grid[0, 0].plot(turns, 100 * follows.mean(axis=0), color=OURS, lw=2)
+    grid[0, 0].set(xlim=(-180, 180), ylim=(0, 102), xticks=range(-180, 181, 60))
     title(
         grid[0, 0],
-        "blue: turns the arm follows, one row per arm",
+        "arms that follow a turn [%]",
         "turn of the virtual joint [deg]",
         "arm configurations [%]",
     )
