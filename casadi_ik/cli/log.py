@@ -33,7 +33,7 @@ from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
 from casadi_ik.logs.compare import Matched, matched, side_by_side
 from casadi_ik.logs.container import NothingWrittenError
-from casadi_ik.logs.events import SERIOUS, plain_name, told
+from casadi_ik.logs.events import SERIOUS, plain_name, quantity, told
 from casadi_ik.logs.explanation import explain
 from casadi_ik.logs.repair import finish_log, merge_logs
 from casadi_ik.logs.shards import log_files
@@ -54,10 +54,15 @@ TORN, EMPTY = (
 
 LOGS = Option("FILE...", "logs, or folders of logs", key="files")
 LOG = Option("FILE", "a log, or a folder of shards")
-SOLVE = Option("--solve N", "number of the solve", read=opt.whole(0))
+SOLVE = Option("--solve N", "number of the solve, from 1", read=opt.whole(1))
 ONE_SOLVE = (
-    Option("[SOLVE]", "number of the solve (default: the only one)", read=opt.whole(0), key="one"),
-    Option("--solve N", "the same", read=opt.whole(0)),
+    Option(
+        "[SOLVE]",
+        "number of the solve, from 1 (default: the only one)",
+        read=opt.whole(1),
+        key="one",
+    ),
+    Option("--solve N", "the same", read=opt.whole(1)),
     Option("--method M", "method (default: the only one)"),
 )
 FILTERS = (
@@ -110,8 +115,8 @@ def events(said: Said) -> Answer:
     for record in islice(found.records() if len(found) else (), said.most):
         event = happening(record)
         text = Text(told(event), "yellow" if event.kind in SERIOUS else "")
-        solve = str(record["solve_id"])
-        rows.add_row(solve, str(event.iteration), record["method"], event.phase, text)
+        solve = str(record["solve_id"] + 1)
+        rows.add_row(solve, str(event.iteration + 1), record["method"], event.phase, text)
     return Answer(Group(_only_last_wraps(rows), _count(len(found), said.most, "event")))
 
 
@@ -122,7 +127,7 @@ def why(said: Said) -> Answer:
     found = explain(solve)
     parts: list[RenderableType] = [headline(solve.success, solve.status, found.headline)]
     if solve.shard:
-        parts.append(Text(f"  solve {solve.number} of {solve.shard}"))
+        parts.append(Text(f"  solve {solve.number + 1} of {solve.shard}"))
     for title, lines in (
         ("phases", found.phases),
         ("fingers", found.fingers),
@@ -145,8 +150,8 @@ def why(said: Said) -> Answer:
     ),
     Option(
         "--range FIRST LAST",
-        "iterations drawn; long runs hide what happens at their beginning (default: all)",
-        read=opt.each(opt.whole(0)),
+        "iterations drawn, from 1; long runs hide what happens at their beginning (default: all)",
+        read=opt.each(opt.whole(1)),
     ),
 )
 def plot(said: Said) -> Answer:
@@ -155,18 +160,18 @@ def plot(said: Said) -> Answer:
         from casadi_ik.views import draw_convergence
     log = logs.open(said.file)
     solve = _the_solve(said, log)
-    named = Path(f"{Path(said.file).stem}-{solve.method}-{solve.solve_id}.png")
+    named = Path(f"{Path(said.file).stem}-{solve.method}-{solve.solve_id + 1}.png")
     file = said.out or named
     check_outputs({"--out": file}, inputs=[Path(said.file)])
     chosen = {"method": solve.method, "solve": solve.solve_id}
-    with located(f"{said.file}: solve {solve.solve_id}"):
+    with located(f"{said.file}: solve {solve.solve_id + 1}"):
         draw_convergence(
             log.iterations(**chosen),
             file,
             events=log.events(**chosen),
             tolerance=min(solve.tolerances, key=lambda each: each.position),
             span=tuple(said.range) if said.range else None,
-            title=f"{solve.method} · solve {solve.solve_id} · {solve.iterations} iterations"
+            title=f"{solve.method} · solve {solve.solve_id + 1} · {solve.iterations} iterations"
             f" · {solve.status}",
         )
     return Answer(Group(*files({"plot": file})))
@@ -174,7 +179,7 @@ def plot(said: Said) -> Answer:
 
 @command(
     LOGS,
-    Option("--solve N", "one solve, by its number with the first method", read=opt.whole(0)),
+    Option("--solve N", "one solve, by its number with the first method", read=opt.whole(1)),
     Option("--methods M M", "which two; last on the line (default: the only two)"),
 )
 def compare(said: Said) -> Answer:
@@ -183,7 +188,7 @@ def compare(said: Said) -> Answer:
     first, second = _two_methods(opened, said.methods)
     pairs = matched(opened, first, second)
     if said.solve is not None:
-        pairs = pairs.of_first(said.solve)
+        pairs = pairs.of_first(said.solve - 1)
     if len(pairs) == 0:
         asked = "" if said.solve is None else f" of solve {said.solve}"
         where = ", ".join(said.files)
@@ -192,30 +197,32 @@ def compare(said: Said) -> Answer:
         return Answer(_many_compared(pairs))
     (pair,) = pairs.pairs
     both = [one_solve(each.log, each.solve_id, each.method) for each in pair]
-    rows = table("", *(f"{each.method}, solve {each.solve_id}" for each in both))
+    rows = table("", *(f"{each.method}, solve {each.solve_id + 1}" for each in both))
     for line in side_by_side(*both):
         rows.add_row(line.what, line.first, line.second)
     return Answer(rows)
 
 
 @command(
-    LOG,
+    LOGS,
     opt.out("REPORT.html", "where to"),
     Option("--title TEXT", "of the page (default: what the log is called)"),
-    Option("--most N", "solves that can be opened", 200),
+    Option("--most N", "solves listed with their stories", 200),
 )
 def report(said: Said) -> Answer:
     """Write a study as a page that needs nothing but a browser (needs 'casadi-ik[plots]').
 
-    It has success, time and iterations by method and targets, where solves fail or
-    meet singularities, and the hardest with their stories.
+    It has success, time and iterations by method and targets, failures by reason, the
+    hardest solves with their stories, to filter and sort, and where solves fail. Several
+    logs of one robot are told as one.
     """
     with located("log report", (MissingExtraError,)):
         from casadi_ik.views import study_page
-    path = Path(said.file)
-    log = logs.open(path)
-    check_outputs({"--out": said.out}, inputs=[path])
-    page = study_page(log, said.title or path.stem, said.most)
+    paths = [Path(name) for name in said.files]
+    log = logs.open(paths)
+    check_outputs({"--out": said.out}, inputs=paths)
+    title = said.title or ", ".join(path.stem for path in paths)
+    page = study_page(log, title, said.most)
     write_output(said.out, "--out", lambda part: part.write_text(page, encoding="utf-8"))
     count = counted(sum(len(part) for part in log.solves().parts), "solve")
     return Answer(Group(Text(f"  {count}"), *files({"page": said.out})))
@@ -321,7 +328,8 @@ def _the_solve(said: Said, log: logs.Log) -> OneSolve:
     """
     number = getattr(said, "one", None)
     try:
-        return one_solve(log, said.solve if number is None else number, said.method)
+        asked = said.solve if number is None else number
+        return one_solve(log, asked, said.method, counted_from=1)
     except UnknownNameError as error:
         where = "" if said.file in str(error) else f"{said.file}: "
         raise UnknownNameError(f"{where}{error}") from error
@@ -329,7 +337,8 @@ def _the_solve(said: Said, log: logs.Log) -> OneSolve:
 
 def _filters(said: Said) -> dict[str, Any]:
     """The filters of a command as `Log` takes them."""
-    return {one.name.strip("-"): getattr(said, one.attribute) for one in FILTERS}
+    found = {one.name.strip("-"): getattr(said, one.attribute) for one in FILTERS}
+    return found if said.solve is None else {**found, "solve": said.solve - 1}
 
 
 def _title(name: str) -> Text:
@@ -373,7 +382,7 @@ def _solve_rows(part: logs.MethodRows, records: Iterable[Mapping[str, Any]]) -> 
     rows = table("solve", "status", *numbers, "events", right=("solve", *numbers))
     for record in records:
         rows.add_row(
-            str(record["solve_id"]),
+            str(record["solve_id"] + 1),
             Text(record["status"], "green" if record["success"] else "red"),
             str(record["iterations"]),
             *(str(record[name]) for name in restarts),
@@ -464,7 +473,8 @@ def _origin(about: logs.LogInfo) -> dict[str, str]:
     for key, values in about.differs.items():
         if key == "parameters":
             for name in dict.fromkeys(name for each in values for name in each):
-                own = list(dict.fromkeys(_flat(each.get(name)) for each in values))
+                told = _tolerance if name == "tolerance" else _flat
+                own = list(dict.fromkeys(told(each.get(name)) for each in values))
                 if len(own) > 1:
                     pairs[name.replace("_", " ")] = _by_shard(own)
         elif key in pairs and key != "created":
@@ -488,6 +498,19 @@ def _by_shard(texts: Sequence[str]) -> str:
     """What shards differ in."""
     more = f" | {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
     return " | ".join(texts[:SHOWN]) + more + " (by shard)"
+
+
+def _tolerance(value: Any) -> str:
+    """Tolerances by finger in millimetres and degrees; said once if they are the same for all."""
+    try:
+        texts = {
+            finger: f"{quantity(each['position'], 'm')} and {quantity(each['angle'], 'rad')}"
+            for finger, each in value.items()
+        }
+    except (AttributeError, TypeError, KeyError, ValueError, OverflowError):
+        return _flat(value)  # not as this package writes it
+    one = set(texts.values())
+    return one.pop() if len(one) == 1 else _flat(texts)
 
 
 def _flat(value: Any) -> str:
@@ -525,7 +548,7 @@ def _many_compared(pairs: Matched) -> RenderableType:
             means = (f"{iterations[both, i].mean():.1f}", f"{1e3 * times[both, i].mean():.3g} ms")
         rows.add_row(name, f"{success[:, i].sum()} of {len(success)}", *means)
         only = np.flatnonzero(success[:, i] & ~success[:, 1 - i]).tolist()
-        numbers = _named([pairs.pairs[j][0].solve_id for j in only]).partition(": ")
+        numbers = _named([pairs.pairs[j][0].solve_id + 1 for j in only]).partition(": ")
         named = f" (solve {numbers[2] or numbers[0]})" if only else ""
         lines.append(f"only by {name}: {len(only)}{named}")
     return Group(rows, *(Text(f"  {line}") for line in lines))

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     Choices = dict[str, Callable[[], tuple[PageRequest, Array]]]
 
 
-SOLVES = opt.each(opt.whole(0))
+SOLVES = opt.each(opt.whole(1))
 
 
 @command(
@@ -188,7 +188,8 @@ def _the_logs(said: Said) -> list[tuple[OneSolve, ArmHand]]:
     for i, file in enumerate(said.what):
         log = logs.open(file)
         with located(f"{file} (say --solve, --method)", (UnknownNameError,)):
-            solve = one_solve(log, numbers[i] if i < len(numbers) else None, said.method)
+            number = numbers[i] if i < len(numbers) else None
+            solve = one_solve(log, number, said.method, counted_from=1)
         found.append((solve, robot_of_log(log, file, said.robot or solve.robot)))
     return found
 

@@ -68,7 +68,7 @@ def side_by_side(first: OneSolve, second: OneSolve) -> list[Line]:
     ]
     if first.fingers != second.fingers or keys[0] != keys[1]:
         raise InputError(
-            f"solve {first.solve_id} of {first.method} and solve {second.solve_id} of"
+            f"solve {first.solve_id + 1} of {first.method} and solve {second.solve_id + 1} of"
             f" {second.method}: not the same target"
         )
     parts = [_lines(each) for each in (first, second)]
@@ -101,8 +101,8 @@ def _lines(solve: OneSolve) -> dict[str, str]:
     nearest = int(np.nanargmin(share))
     lines |= {
         "phases": ", ".join(f"{name} {count}" for name, count in counts.items() if name) or "one",
-        "all within tolerance": f"from iteration {inside[0]}" if len(inside) else "never",
-        "nearest": f"{number(float(share[nearest]))} tolerances in iteration {nearest}",
+        "all within tolerance": f"from iteration {inside[0] + 1}" if len(inside) else "never",
+        "nearest": f"{number(float(share[nearest]))} tolerances in iteration {nearest + 1}",
         **_smallest(solve),
         "limits at the end": ", ".join(limits_held(solve)) or "none",
     }
@@ -124,7 +124,7 @@ def _smallest(solve: OneSolve) -> dict[str, str]:
         row = int(np.nanargmin(np.nanmin(np.where(np.isnan(sigma), np.inf, sigma), axis=1)))
         jacobian = plain_name(name.removeprefix("sigma_"))
         found[f"smallest sigma, {jacobian}"] = (
-            f"{number(float(np.nanmin(sigma)))} in iteration {row}"
+            f"{number(float(np.nanmin(sigma)))} in iteration {row + 1}"
         )
     return found
 

@@ -105,6 +105,9 @@ class EventKind(IntEnum):
 SINGULAR = (EventKind.NEAR_SINGULAR, EventKind.ILL_CONDITIONED)
 """The kinds that make a solve a singular one."""
 
+MOVES = (EventKind.LIMIT_HIT, EventKind.LIMIT_LEFT, EventKind.OSCILLATION)
+"""The kinds whose numbers are positions or steps of actuators."""
+
 SERIOUS = tuple(kind.name for kind in EventKind if kind.serious)
 """Names of the kinds that may be why a solve fails."""
 
@@ -173,6 +176,7 @@ class Happening:
         phase: The phase it happened in; "" without phases.
         value: The number that made it an event.
         threshold: The number it was compared with, or the value before.
+        unit: Of both, "rad" or "m", if they are positions or steps of actuators.
     """
 
     iteration: int
@@ -182,6 +186,7 @@ class Happening:
     phase: str
     value: float
     threshold: float
+    unit: str = ""
 
 
 def told(event: Happening) -> str:
@@ -192,8 +197,8 @@ def told(event: Happening) -> str:
         jacobian=plain_name(event.jacobian),
         joints=listed(event.joints),
         phase=plain_name(event.phase),
-        value=number(event.value),
-        threshold=number(event.threshold),
+        value=quantity(event.value, event.unit),
+        threshold=quantity(event.threshold, event.unit),
         mm=f"{1e3 * event.value:.2f}",
     )
 
@@ -206,6 +211,18 @@ def plain_name(name: str) -> str:
 def number(value: float) -> str:
     """Three digits."""
     return f"{value:.3g}"
+
+
+def quantity(value: float, unit: str) -> str:
+    """A value with its unit as people read it: angles in degrees, lengths in millimetres."""
+    if unit == "rad":
+        return f"{math.degrees(value):.4g} deg"
+    return f"{1e3 * value:.4g} mm" if unit == "m" else number(value)
+
+
+def plural(count: int, thing: str) -> str:
+    """How many of a thing: "1 restart", "2 restarts"."""
+    return f"{count} {thing}" + ("" if count == 1 else "s")
 
 
 def listed(names: Sequence[str], most: int = 4) -> str:
@@ -270,6 +287,7 @@ def event_format(form: TraceFormat) -> TraceFormat:
         "kind": tuple(kind.name for kind in EventKind),
         "jacobian": ("none", *jacobian_names(form)),
         "joint_mask": form.labels.get(Q.name) or form.labels.get(LIMIT_MASK.name, ()),
+        "joint_unit": form.labels.get("q_unit", ()),
         "phase": form.labels.get(PHASE.name, ()),
     }
     return TraceFormat(event_layout(mask_words(form)), labels)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
-from casadi_ik.logs.events import errors_text, listed, number, plain_name
+from casadi_ik.logs.events import errors_text, listed, number, plain_name, plural
 from casadi_ik.logs.solve import OneSolve, Stretch
 from casadi_ik.problem.trace import CLEARANCE, SIGMA
 
@@ -65,10 +65,11 @@ def explain(solve: OneSolve) -> Explanation:
     """
     outcome = "solved" if solve.success else f"not solved ({solve.status})"
     headline = (
-        f"{solve.method}, solve {solve.solve_id}: {outcome} after {solve.iterations} iterations"
+        f"{solve.method}, solve {solve.solve_id + 1}: {outcome} after "
+        f"{plural(solve.iterations, 'iteration')}"
     )
     if solve.restarts:
-        headline += f" and {solve.restarts} restarts"
+        headline += f" and {plural(solve.restarts, 'restart')}"
     if len(solve.rows) == 0:
         kept = "the log kept no iterations of this solve"
         return Explanation(headline, verdict=(kept, *_verdict(solve)))
@@ -91,11 +92,14 @@ def _phases(solve: OneSolve) -> Iterator[str]:
     seen: NDArray[np.bool_] = np.any(~np.isnan(solve.columns("position_error")), axis=1)
     for name, stretches in _by_phase(solve).items():
         first, last = stretches[0].first, stretches[-1].last
-        count = sum(map(len, stretches))
-        times = f" in {len(stretches)} goes" if len(stretches) > 1 else ""
+        where = (
+            f"iterations {first + 1} to {last + 1}" if last > first else f"iteration {first + 1}"
+        )
+        if len(stretches) > 1:
+            where += f", {sum(map(len, stretches))} in {len(stretches)} stretches"
         measured = [i for each in stretches for i in range(each.first, each.last + 1) if seen[i]]
         if not measured:
-            yield f"{name} (iterations {first} to {last}, {count}{times}): errors not measured"
+            yield f"{name} ({where}): errors not measured"
             continue
         begin, end = measured[0], measured[-1]
         ways = [
@@ -104,7 +108,7 @@ def _phases(solve: OneSolve) -> Iterator[str]:
             for i, finger in enumerate(solve.fingers)
             if not (math.isnan(position[end, i]) and math.isnan(angle[end, i]))
         ]
-        yield (f"{name} (iterations {first} to {last}, {count}{times}): " + ", ".join(ways))
+        yield f"{name} ({where}): " + ", ".join(ways)
 
 
 def _by_phase(solve: OneSolve) -> dict[str, list[Stretch]]:
@@ -140,10 +144,10 @@ def _fingers(solve: OneSolve) -> Iterator[str]:
         if inside[:, i].any():
             last = int(np.flatnonzero(inside[:, i])[-1])
             line += f"; it was within tolerance in {int(inside[:, i].sum())} iterations"
-            line += f", the last of them {last}"
+            line += f", the last of them {last + 1}"
         else:
             line += (
-                f"; at its nearest, in iteration {best}, it was"
+                f"; at its nearest, in iteration {best + 1}, it was"
                 f" {errors_text(position[best, i], angle[best, i])} off"
             )
         yield line
@@ -153,10 +157,12 @@ def _fingers(solve: OneSolve) -> Iterator[str]:
         if entered[order[-1]] > entered[order[-2]]:
             yield (
                 f"{solve.fingers[order[-1]]} was the last to come within tolerance, in iteration"
-                f" {entered[order[-1]]}; the others were there in iteration {entered[order[-2]]}"
+                f" {entered[order[-1]] + 1}; the others were there in iteration"
+                f" {entered[order[-2]] + 1}"
             )
         else:
-            yield f"the fingers came within tolerance together, in iteration {entered[order[-1]]}"
+            when = entered[order[-1]] + 1
+            yield f"the fingers came within tolerance together, in iteration {when}"
 
 
 def _entered(inside: NDArray[np.bool_]) -> int:
@@ -173,7 +179,7 @@ def _singularities(solve: OneSolve) -> Iterator[str]:
             entries.setdefault(event.jacobian, []).append(event.iteration)
             thresholds[event.jacobian] = event.threshold
     for jacobian, iterations in entries.items():
-        line = f"{plain_name(jacobian)} near singular from iteration {iterations[0]} on"
+        line = f"{plain_name(jacobian)} near singular from iteration {iterations[0] + 1} on"
         name = SIGMA + jacobian
         if name in solve.layout.names and solve.rows[name].ndim == 1:
             sigma = solve.rows[name].astype(float)
@@ -181,7 +187,7 @@ def _singularities(solve: OneSolve) -> Iterator[str]:
             lowest = int(np.nanargmin(sigma))
             line += (
                 f", {below} iterations in all; smallest singular value {number(sigma[lowest])} in"
-                f" iteration {lowest} (threshold {number(thresholds[jacobian])})"
+                f" iteration {lowest + 1} (threshold {number(thresholds[jacobian])})"
             )
         if len(iterations) > 1:
             line += f", entered {len(iterations)} times"
@@ -202,7 +208,7 @@ def _singularities(solve: OneSolve) -> Iterator[str]:
             row = int(np.nanargmin(np.fmin.reduce(sigma, axis=1)))
             yield (
                 f"smallest singular value of the {plain_name(jacobian)} down to {number(lowest)} in"
-                f" iteration {row} (median {number(usual)})"
+                f" iteration {row + 1} (median {number(usual)})"
             )
         else:
             yield (
@@ -221,7 +227,7 @@ def _limits(solve: OneSolve) -> Iterator[str]:
         yield f"to its limit and off again: {listed(shown)}"
     beyond = " or beyond" if solve.asked.limits == "ignore" else ""
     for joint, since in limits_held(solve).items():
-        yield f"{joint} at{beyond} its limit from iteration {since} to the end"
+        yield f"{joint} at{beyond} its limit from iteration {since + 1} to the end"
 
 
 def limits_held(solve: OneSolve) -> dict[str, int]:
@@ -239,13 +245,13 @@ def _standstills(solve: OneSolve) -> Iterator[str]:
     stalls = [event for event in solve.events if event.kind == "STALL"]
     if stalls:
         phase = plain_name(stalls[0].phase) or "it"
-        line = f"{phase} stood still in iteration {stalls[0].iteration}"
+        line = f"{phase} stood still in iteration {stalls[0].iteration + 1}"
         yield line + (f" and {len(stalls) - 1} times more" if len(stalls) > 1 else "")
     swings = [event for event in solve.events if event.kind == "OSCILLATION"]
     if swings:
         joints = Counter(joint for event in swings for joint in event.joints)
         line = f"{listed([joint for joint, _ in joints.most_common()])} went to and fro without"
-        line += f" progress, first in iteration {swings[0].iteration}"
+        line += f" progress, first in iteration {swings[0].iteration + 1}"
         yield line + (f", {len(swings)} times" if len(swings) > 1 else "")
 
 
@@ -310,12 +316,12 @@ def collision_lines(solve: OneSolve) -> Iterator[str]:
         yield f"nothing touched on the way: clearance at least {_mm(float(np.nanmin(clearance)))}"
         return
     deepest = int(np.nanargmin(clearance))
-    line = f"something touched from iteration {entered[0].iteration} on"
+    line = f"something touched from iteration {entered[0].iteration + 1} on"
     if len(entered) > 1:
         line += f", {len(entered)} times"
-    line += f"; clearance down to {_mm(float(clearance[deepest]))} in iteration {deepest}"
+    line += f"; clearance down to {_mm(float(clearance[deepest]))} in iteration {deepest + 1}"
     if len(left) == len(entered):
-        line += f"; free from iteration {left[-1].iteration} on"
+        line += f"; free from iteration {left[-1].iteration + 1} on"
     yield line
 
 

@@ -520,7 +520,7 @@ def _refuse_same(method: str, shards: Sequence[Shard]) -> None:
         if same:
             first = min(same, key=lambda i: numbers[i])
             raise LogError(
-                f"{shard.path}: solve {numbers[first]} of {method} is in"
+                f"{shard.path}: solve {numbers[first] + 1} of {method} is in"
                 f" {seen[own[first]].path} too ({len(same)} such solves)"
             )
         seen.update(dict.fromkeys(own, shard))

@@ -182,13 +182,16 @@ class OneSolve:
         )
 
 
-def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> OneSolve:
+def one_solve(
+    log: Log, solve: int | None = None, method: str | None = None, counted_from: int = 0
+) -> OneSolve:
     """Take one solve out of a log.
 
     Args:
         log: The log.
         solve: Its number; may be left out if the log holds one solve only.
         method: Its method; may be left out if only one has a solve of that number.
+        counted_from: Number that the first solve has for who asks.
 
     Raises:
         UnknownNameError: There is no such solve, or it is not said which of several.
@@ -198,11 +201,12 @@ def one_solve(log: Log, solve: int | None = None, method: str | None = None) -> 
         >>> ik.logs.one_solve(ik.logs.open("cup.mcap"), 0).method
         'hand-first'
     """
-    table = log.solves(solve=solve, method=method)
+    table = log.solves(solve=None if solve is None else solve - counted_from, method=method)
     found = [part for part in table.parts if len(part)]
     if len(table) != 1:
         held = ", ".join(
-            f"{part.method} {_range(part.solve_id)}" for part in found or log.solves().parts
+            f"{part.method} {_range(part.solve_id + counted_from)}"
+            for part in found or log.solves().parts
         )
         problem = f"no solve {solve}" if solve is not None else "no solve"
         if found:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.errors import LogError, MissingExtraError, UnknownNameError
 from casadi_ik.kernels.layout import opaque
 from casadi_ik.logs.detect import as_matrix, bits_of
-from casadi_ik.logs.events import SINGULAR, EventKind, Happening
+from casadi_ik.logs.events import MOVES, SINGULAR, EventKind, Happening
 
 if TYPE_CHECKING:
     import polars as pl
@@ -204,14 +204,17 @@ class Table:
             raise LogError(f"{path}: cannot be written: {error.strerror or error}") from error
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """The rows one by one, for people: codes and masks as names, events with a "subject"."""
+        """The rows one by one, for people: codes and masks as names.
+
+        Events have a "subject" and the "unit" of their value beside.
+        """
         for part in self.parts:
             columns = {name: getattr(part, name).tolist() for name in self._keys}
             columns |= {name: part.readable(name) for name in part.names}
             if (origins := part.origins) is not None:
                 columns["shard"] = origins
             if self.kind == "event":
-                columns["subject"] = _subjects(part)
+                columns["subject"], columns["unit"] = _subjects(part), _units(part)
             for values in zip(*columns.values(), strict=True):
                 yield {"method": part.method, **dict(zip(columns, values, strict=True))}
 
@@ -231,6 +234,7 @@ def happening(record: Mapping[str, Any]) -> Happening:
         phase=record["phase"] if isinstance(record["phase"], str) else "",
         value=record["value"],
         threshold=record["threshold"],
+        unit=record["unit"],
     )
 
 
@@ -291,6 +295,13 @@ def _subjects(part: MethodRows) -> list[str]:
             )
         )
     return subjects
+
+
+def _units(part: MethodRows) -> list[str]:
+    """What the numbers of each event are measured in, as far as they are of actuators."""
+    units, bits = part.labels.get("joint_unit", ()), bits_of(as_matrix(part.rows["joint_mask"]))
+    first = np.where(np.isin(part.rows["kind"], MOVES), np.argmax(bits, axis=1), len(units))
+    return [units[i] if i < len(units) else "" for i in first.tolist()]
 
 
 def _label_of_float(labels: Sequence[str], code: float) -> str:

@@ -72,7 +72,7 @@ def write_view(path: str | os.PathLike[str], solve: OneSolve, robot: ArmHand) ->
     """
     if len(solve.rows) == 0:
         raise LogError(
-            f"solve {solve.solve_id} of {solve.method}: the log kept no iterations of it"
+            f"solve {solve.solve_id + 1} of {solve.method}: the log kept no iterations of it"
         )
     try:
         with written_whole(Path(path)) as part, part.open("xb") as stream:
@@ -213,7 +213,9 @@ class _View:
 
     def _messages(self) -> None:
         solve, last = self.solve, len(self.q) - 1
-        lines = [(0, fox.LogLevel.Info, f"{solve.method} on {solve.robot}, solve {solve.solve_id}")]
+        lines = [
+            (0, fox.LogLevel.Info, f"{solve.method} on {solve.robot}, solve {solve.solve_id + 1}")
+        ]
         lines += [(each.first, fox.LogLevel.Info, each.phase) for each in solve.stretches]
         lines += [
             (
@@ -236,7 +238,7 @@ class _View:
         channel = self._protobuf("/ik/messages", fox.Log.get_schema())
         for i, level, text in sorted(lines, key=lambda line: line[0]):
             stamp = stamp_of(int(self.times[i]))
-            log = fox.Log(timestamp=stamp, level=level, message=text, name=f"iteration {i}")
+            log = fox.Log(timestamp=stamp, level=level, message=text, name=f"iteration {i + 1}")
             self._add(channel, i, log.encode())
 
 

@@ -209,7 +209,8 @@ class TraceFormat:
         layout: Fields of a row.
         labels: Names that make a field readable: of the codes 0, 1, ... of an integer scalar
             ("phase"; "" for a code not used), of the bits of a field ending in "_mask", of the
-            elements along the first axis of any other field ("q": actuator names).
+            elements along the first axis of any other field ("q": actuator names); "q_unit":
+            what actuators are measured in.
         jacobians: What there is to know of the Jacobians in fields ``sigma_<name>`` and
             ``condition_<name>``, by name. One that is not named here is never near singular.
         measures: What a log adds to the rows; None: nothing.
@@ -254,4 +255,5 @@ def trace_format(
                 )
         if names := standard.labels(robot):
             labels[standard.name] = names
+    labels["q_unit"] = tuple(actuator.unit for actuator in robot.actuators)
     return TraceFormat(layout, labels, jacobians or {}, measures)

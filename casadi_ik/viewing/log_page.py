@@ -129,7 +129,7 @@ def track_of(solve: OneSolve, robot: ArmHand) -> Track:
     """
     if len(solve.rows) == 0:
         raise LogError(
-            f"solve {solve.solve_id} of {solve.method}: the log kept no iterations of it"
+            f"solve {solve.solve_id + 1} of {solve.method}: the log kept no iterations of it"
         )
     q = solve.columns("q")
     finite = np.asarray(np.isfinite(q).all(axis=1))
@@ -148,7 +148,7 @@ def track_of(solve: OneSolve, robot: ArmHand) -> Track:
         elif faced:
             contacts[finger] = Contact(direction=normal)
     grasp = Grasp(contacts) if contacts else None
-    label = f"{solve.method} · solve {solve.solve_id}"
+    label = f"{solve.method} · solve {solve.solve_id + 1}"
     return Track(solve, robot, label, q, request_of(robot, grasp, q[0]))
 
 

@@ -136,7 +136,7 @@ def draw_convergence(
         path: PNG file to write, if any.
         events: Its events, e.g. ``log.events(method="hand-first", solve=3)``.
         tolerance: What counts as reached; `Tolerance()` unless said.
-        span: First and last iteration drawn; all unless said.
+        span: First and last iteration drawn, counted from 1; all unless said.
         title: Above the picture; method, number of iterations and ending unless said.
         dpi: Dots per inch.
 
@@ -152,9 +152,10 @@ def draw_convergence(
     if len(np.unique(iterations.solve_id)) > 1:
         raise InputError("iterations: of several solves, expected one (give a solve)")
     count = len(iterations.rows)
-    first, last = span or (0, count - 1)
-    if not 0 <= first <= last < count:
-        raise InputError(f"span: found {first} to {last}, expected within 0 to {count - 1}")
+    first, last = span or (1, count)
+    if not 1 <= first <= last <= count:
+        raise InputError(f"span: found {first} to {last}, expected within 1 to {count}")
+    first, last = first - 1, last - 1
     panels = _panels(iterations, tolerance or Tolerance(), _thresholds(events))
     for panel in panels:
         for values in panel.lines.values():
@@ -175,6 +176,7 @@ def draw_convergence(
         _draw_rows(axes, title_of, rows)
     grid[-1].set_xlabel("iteration", color=INK)
     grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    grid[-1].xaxis.set_major_formatter(lambda place, _: f"{place + 1:.0f}")
     grid[-1].set_xlim(first - 0.5, last + 0.5)
     _head(figure, iterations, title)
     inches = float(figure.get_size_inches()[1])

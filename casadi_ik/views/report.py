@@ -17,39 +17,22 @@ from matplotlib.figure import Figure
 from casadi_ik import palette
 from casadi_ik.arrays import Array, Bools, Counts
 from casadi_ik.errors import printable
-from casadi_ik.logs.events import SINGULAR
+from casadi_ik.files.shipped import models_folder
+from casadi_ik.logs.events import SINGULAR, EventKind
 from casadi_ik.logs.explanation import explain, worst
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.solve import one_solve
 from casadi_ik.logs.tables import MethodRows
 from casadi_ik.views.charts import new_figure
 
-STYLE = """
-:root { color-scheme: light dark; --ink: #2b333b; --faint: #66717c; --line: #dfe4e8;
-  --paper: #fff; --bad: #c2334d; --good: #1f7d48 }
-@media (prefers-color-scheme: dark) { :root { --ink: #e3e8ec; --faint: #9aa5af; --line: #39424a;
-  --paper: #171b1f; --bad: #f07f92; --good: #67c48d } img { background: #fff } }
-body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper);
-  max-width: 64rem; margin: 2rem auto; padding: 0 1rem }
-table { border-collapse: collapse; font-size: .9rem; display: block; overflow-x: auto }
-th, td { padding: .15rem .7rem; border-bottom: 1px solid var(--line); text-align: right }
-th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left }
-img { max-width: 100%; border-radius: 4px }
-details { border-bottom: 1px solid var(--line); padding: .25rem 0 }
-summary { cursor: pointer } .bad { color: var(--bad) } .good { color: var(--good) }
-.faint { color: var(--faint) } h4 { margin: .5rem 0 0 }
-svg polyline { fill: none; stroke: currentColor; stroke-width: 1.4 }
-svg .bound { stroke: var(--bad); stroke-dasharray: 4 3 }
-"""
-
 
 def study_page(log: Log, title: str, most: int) -> str:
-    """A study's log as a page of its own.
+    """A study's log as a page of its own: totals, failures by reason, solves to filter and sort.
 
     Args:
         log: The log.
         title: What it is called.
-        most: How many of the worst solves can be opened.
+        most: How many of the worst solves are listed with their stories.
 
     Returns:
         HTML that refers to nothing outside itself.
@@ -58,35 +41,37 @@ def study_page(log: Log, title: str, most: int) -> str:
         LogError: The log is damaged.
     """
     groups = groups_of(log)
-    about = log.info()
+    about, count = log.info(), sum(map(len, groups))
     parts = [
         f"<h1>{_text(title)}</h1>",
-        f'<p class="faint">{_text(about.robot)}; {sum(map(len, groups)):,} solves in '
+        f'<p class="faint">{_text(about.robot)}; {count:,} solve{"s" * (count != 1)} in '
         f"{len(about.paths)} file(s), {about.size / 1e6:.1f} MB; written "
         f"{_text(about.metadata['created'])} by casadi-ik "
         f"{_text(about.metadata['code_version'])}.</p>",
         "<h2>Results</h2>",
         _totals(groups),
     ]
-    if any(map(len, groups)):
+    if count:
+        chosen = list(hardest(groups, most))
         parts += [
-            "<h2>How long it took</h2>",
+            "<h2>Failures by reason</h2>",
+            _clusters(groups),
+            f"<h2>{'Solves' if len(chosen) == count else f'The {len(chosen)} hardest solves'}</h2>",
+            "<p>What is not solved comes first, by its error, then what took the most iterations. "
+            "A number opens the story of a solve: its curve is the worst error over the "
+            "iterations, from a thousand times its tolerance (top) to a thousandth; dashed: the "
+            "tolerance.</p>",
+            _filter(groups, chosen),
+            _solves(log, chosen),
+            "<h2>Iterations and time</h2>",
             effort(groups),
             "<h2>Where</h2>",
-            "<p>The middle of a target's contact points, in the robot's base frame.</p>",
+            "<p>The mean of a target's contact points, in the robot's base frame.</p>",
             places(groups),
-            f"<h2>The {min(most, sum(map(len, groups)))} hardest</h2>",
-            "<p>What is not solved comes first, by its error, then what took the most iterations. "
-            "The curve is the worst error over the iterations, from a thousand times its tolerance "
-            "(top) to a thousandth; dashed: the tolerance.</p>",
-            *_hardest(log, groups, most),
         ]
-    body = "\n".join(parts)
-    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-    return (
-        f'<!doctype html>\n<html lang="en"><head>{head}<title>{_text(title)}</title>'
-        f"<style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
-    )
+    page = (models_folder() / "viewer" / "report.html").read_text(encoding="utf-8")
+    before, after = page.split("BODY")
+    return before.replace("TITLE", _text(title)) + "\n".join(parts) + after
 
 
 def _totals(groups: Sequence[Group]) -> str:
@@ -95,7 +80,7 @@ def _totals(groups: Sequence[Group]) -> str:
         *("iterations, median", "99 %", "restarted %", "time, median [µs]", "99 %", "singular %"),
     )
     rows = [_total(group) for group in groups]
-    return _table(heads, rows)
+    return _table(heads, [[_text(cell) for cell in row] for row in rows])
 
 
 def _total(group: Group) -> list[str]:
@@ -119,35 +104,116 @@ def _total(group: Group) -> list[str]:
     ]
 
 
-def _hardest(log: Log, groups: tuple[Group, ...], most: int) -> Iterator[str]:
-    for group, number in hardest(groups, most):
-        solve = one_solve(log, number, group.method)
-        found = explain(solve)
-        kind = "good" if solve.success else "bad"
-        where = "" if group.name == "all" else f" {_text(group.name)}"
-        parts = [
-            f'<details><summary><span class="{kind}">{_text(solve.status)}</span> '
-            f'{_text(found.headline)}<span class="faint">{where}</span></summary>'
-        ]
-        if len(solve.rows):
-            parts.append(curve(worst(solve)))
-        for title, lines in (
-            ("phases", found.phases),
-            ("fingers", found.fingers),
-            ("met on its way", found.met),
-            ("verdict", found.verdict),
-        ):
-            if lines:
-                items = "".join(f"<li>{_text(line)}</li>" for line in lines)
-                parts.append(f"<h4>{title}</h4><ul>{items}</ul>")
-        yield "".join(parts) + "</details>"
+def _clusters(groups: Sequence[Group]) -> str:
+    """The failures of all groups by reason, the most frequent first."""
+    found: dict[tuple[str, str], list[tuple[Group, int]]] = {}
+    for group in groups:
+        for i in np.flatnonzero(~group.success).tolist():
+            found.setdefault((str(group.status[i]), group.reason(i)), []).append((group, i))
+    failed = sum(map(len, found.values()))
+    if not failed:
+        return "<p>Every target is solved.</p>"
+    rows = []
+    for (status, reason), members in sorted(found.items(), key=lambda item: -len(item[1])):
+        error = np.median([group.worst[i] for group, i in members])
+        group, i = min(members, key=lambda member: np.nan_to_num(member[0].worst[member[1]]))
+        keys = f'data-status="{_text(status)}" data-reason="{_text(reason)}"'
+        shown = f'<button type="button" {keys}>{_text(status)}: {_text(reason)}</button>'
+        example = f"{group.method}, solve {group.solve_id[i] + 1}"
+        numbers = f"{len(members):,}", f"{100 * len(members) / failed:.1f}", f"{error:.3g}"
+        rows.append([shown, *numbers, _text(example)])
+    heads = "reason", "solves", "% of failures", "error / tolerance, median", "nearest solve"
+    return _table(heads, rows)
+
+
+def _filter(groups: Sequence[Group], chosen: Sequence[tuple[Group, int]]) -> str:
+    """What narrows down the list of solves."""
+    values = {
+        "method": [group.method for group in groups],
+        "status": [str(group.status[i]) for group, i in chosen],
+        "reason": [group.reason(i) for group, i in chosen if not group.success[i]],
+    }
+    fields = [
+        f'<label>{name} <select name="{name}"><option value="">all</option>'
+        + "".join(f"<option>{_text(value)}</option>" for value in dict.fromkeys(known))
+        + "</select></label>"
+        for name, known in values.items()
+    ]
+    return (
+        '<form id="filter"><label>text <input name="words" type="search"></label>'
+        + "".join(fields)
+        + '<button type="reset">Show all</button><span id="count" role="status"></span></form>'
+    )
+
+
+def _solves(log: Log, chosen: Sequence[tuple[Group, int]]) -> str:
+    """Solves as a table, each with its story behind a button."""
+    heads = ["solve", "method", "targets", "status", "reason"]
+    heads += ["iterations", "restarts", "time [µs]", "error / tolerance"]
+    head = "".join(
+        f'<th scope="col" class="{"left" if 0 < i < 5 else ""}" aria-sort="none">'
+        f'<button type="button">{text}</button></th>'
+        for i, text in enumerate(heads)
+    )
+    bodies = []
+    for group, i in chosen:
+        number, status = int(group.solve_id[i]) + 1, str(group.status[i])
+        reason, kind = ("", "good") if group.success[i] else (group.reason(i), "bad")
+        texts = _text(group.method), _text(group.name), _text(status), _text(reason)
+        left = '<td class="left">{}</td><td class="left">{}</td><td class="left {kind}">{}</td>'
+        left = f'{left}<td class="left">{{}}</td>'.format(*texts, kind=kind)
+        worst_error = float(np.nan_to_num(group.worst[i], nan=0.0))
+        numbers = group.iterations[i], group.restarts[i], 1e6 * group.time[i], worst_error
+        right = "".join(f'<td data-value="{value:.9g}">{_digits(value)}</td>' for value in numbers)
+        keys = f'data-method="{_text(group.method)}" data-status="{_text(status)}"'
+        bodies.append(
+            f'<tbody class="solve" {keys} data-reason="{_text(reason)}">'
+            f'<tr><td data-value="{number}"><button type="button" aria-expanded="false">{number}'
+            f"</button></td>{left}{right}</tr>"
+            f'<tr hidden><td class="story" colspan="{len(heads)}"><div>'
+            f"{_story(log, group, i)}</div></td></tr></tbody>"
+        )
+    return (
+        f'<div class="wide"><table id="solves"><thead><tr>{head}</tr></thead>'
+        f"{''.join(bodies)}</table></div>"
+    )
+
+
+def _digits(value: float) -> str:
+    """A number with three digits at least, and never with an exponent of ten if it is large."""
+    return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
+
+
+def _story(log: Log, group: Group, i: int) -> str:
+    """What `explain` tells of a solve."""
+    solve = one_solve(log, int(group.solve_id[i]), group.method)
+    found = explain(solve)
+    parts = [f"<p>{_text(found.headline)}</p>"]
+    if len(solve.rows):
+        parts.append(curve(worst(solve)))
+    for title, lines in (
+        ("phases", found.phases),
+        ("fingers", found.fingers),
+        ("met on its way", found.met),
+        ("verdict", found.verdict),
+    ):
+        if lines:
+            items = "".join(f"<li>{_text(line)}</li>" for line in lines)
+            parts.append(f"<h4>{title}</h4><ul>{items}</ul>")
+    return "".join(parts)
 
 
 def _table(heads: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
-    def line(cells: Iterable[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{_text(cell)}</{tag}>" for cell in cells) + "</tr>"
+    """A table of HTML cells; the first column is text."""
 
-    return f"<table>{line(heads, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"
+    def line(cells: Iterable[str], tag: str) -> str:
+        first, *rest = cells
+        return f'<tr><{tag} class="left">{first}</{tag}>' + "".join(
+            f"<{tag}>{cell}</{tag}>" for cell in rest
+        )
+
+    lines = "".join(line(row, "td") for row in rows)
+    return f'<div class="wide"><table>{line(heads, "th")}{lines}</table></div>'
 
 
 def _text(text: str) -> str:
@@ -177,6 +243,10 @@ class Group:
         worst: (k,) largest error in multiples of its tolerance.
         centre: (k, 3) mean of the contact points [m], base frame; NaN if all are free.
         status: (k,) names.
+        fingers: Names of the f fingers.
+        ok: (k, f) whether each contact is within tolerance.
+        limited: (k,) whether a limit was violated or an actuator came to one and stayed.
+        touching: (k,) whether shapes touch in the answer.
     """
 
     method: str
@@ -190,9 +260,25 @@ class Group:
     worst: Array
     centre: Array
     status: np.ndarray
+    fingers: tuple[str, ...]
+    ok: Bools
+    limited: Bools
+    touching: Bools
 
     def __len__(self) -> int:
         return len(self.solve_id)
+
+    def reason(self, i: int) -> str:
+        """Why a solve is none, as far as its totals tell: what is missed, and what was met."""
+        missed = [finger for finger, ok in zip(self.fingers, self.ok[i], strict=True) if not ok]
+        every = "every contact" if len(missed) == len(self.fingers) else ", ".join(missed)
+        met = {
+            f"{every} missed": bool(missed),
+            "at a limit": self.limited[i],
+            "near singular": self.singular[i],
+            "in collision": self.touching[i],
+        }
+        return ", ".join(text for text, holds in met.items() if holds) or "nothing was missed"
 
 
 def groups_of(log: Log) -> tuple[Group, ...]:
@@ -224,7 +310,7 @@ def hardest(groups: tuple[Group, ...], count: int) -> Iterator[tuple[Group, int]
         count: How many at most.
 
     Yields:
-        Group and number of the solve.
+        Group and place of the solve in it.
     """
     keys = [
         (bool(group.success[i]), -error, -int(group.iterations[i]), g, i)
@@ -232,7 +318,7 @@ def hardest(groups: tuple[Group, ...], count: int) -> Iterator[tuple[Group, int]
         for i, error in enumerate(_error(group).tolist())
     ]
     for _, _, _, g, i in sorted(keys)[:count]:
-        yield groups[g], int(groups[g].solve_id[i])
+        yield groups[g], i
 
 
 def _error(group: Group) -> Array:
@@ -243,6 +329,12 @@ def _error(group: Group) -> Array:
 def _group(part: MethodRows) -> Group:
     rows = part.rows
     known = list(part.labels["events"])
+    hits, leavings = (
+        rows["events"][:, known.index(kind.name)]
+        if kind.name in known
+        else np.zeros(len(rows), np.int64)
+        for kind in (EventKind.LIMIT_HIT, EventKind.LIMIT_LEFT)
+    )
     singular = [known.index(kind.name) for kind in SINGULAR if kind.name in known]
     share = np.fmax(
         _largest(rows["position_error"] / rows["position_tolerance"]),
@@ -264,6 +356,10 @@ def _group(part: MethodRows) -> Group:
         worst=share,
         centre=np.where(counted > 0, total / np.maximum(counted, 1), np.nan),
         status=np.array(part.labels["status"])[rows["status"]],
+        fingers=tuple(part.labels["position_error"]),
+        ok=rows["ok"] > 0,
+        limited=(rows["limits_ok"] == 0) | (hits > leavings),
+        touching=rows["clearance"] < 0 if "clearance" in part.names else rows["success"] > 1,
     )
 
 
@@ -276,10 +372,13 @@ def _rows(group: Group, name: str, chosen: Bools) -> Group:
     arrays = {
         key: value[chosen] for key, value in vars(group).items() if isinstance(value, np.ndarray)
     }
-    return Group(method=group.method, name=name, **arrays)
+    return Group(method=group.method, name=name, fingers=group.fingers, **arrays)
 
 
 # Figures.
+
+READABLE = "#7c8792"
+"""Colour of what is written in figures, which stand on a light or a dark page."""
 
 
 def effort(groups: Sequence[Group]) -> str:
@@ -300,7 +399,7 @@ def effort(groups: Sequence[Group]) -> str:
         axes.set_ylabel("solves with no more [%]")
         _plain(axes)
         if place == 1:
-            axes.legend(frameon=False, fontsize=8, loc="lower right")
+            axes.legend(frameon=False, fontsize=8, loc="upper left", labelcolor=READABLE)
     figure.tight_layout()
     return _embedded(figure, "shares of the solves by iterations and by time")
 
@@ -312,7 +411,7 @@ def places(groups: Sequence[Group]) -> str:
     success = np.concatenate([group.success for group in groups])
     singular = np.concatenate([group.singular for group in groups])
     kinds = (
-        ("solved", "#c9d3dc", success & ~singular, 4),
+        ("solved", "#9fb0bf", success & ~singular, 4),
         ("solved, singular on the way", palette.LINES[0], success & singular, 7),
         ("not solved", palette.LINES[4], ~success, 12),
     )
@@ -331,14 +430,16 @@ def places(groups: Sequence[Group]) -> str:
                 lw=0,
                 label=f"{label} ({int(rows.sum()):,})",
             )
-        axes.plot([0], [0], marker="+", color=palette.INK, ms=9, ls="none", label="base")
+        axes.plot([0], [0], marker="+", color=READABLE, ms=9, ls="none", label="base")
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("x [m]")
         axes.set_ylabel(f"{up} [m]")
-        axes.set_title(title, fontsize=9, color=palette.INK)
+        axes.set_title(title, fontsize=9)
         _plain(axes)
     lines, labels = panels[0].get_legend_handles_labels()
-    figure.legend(lines, labels, frameon=False, fontsize=8, loc="lower center", ncols=4)
+    figure.legend(
+        lines, labels, frameon=False, fontsize=8, loc="lower center", ncols=4, labelcolor=READABLE
+    )
     figure.tight_layout(rect=(0, 0.06, 1, 1))
     return _embedded(figure, "where solves fail and where they meet singularities")
 
@@ -368,13 +469,16 @@ def curve(errors: Array) -> str:
 
 def _plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8, colors=palette.FAINT)
-    axes.grid(color="#eceff2", lw=0.6)
+    axes.spines[["left", "bottom"]].set_color(READABLE)
+    axes.tick_params(which="both", labelsize=8, colors=READABLE)
+    for text in (axes.xaxis.label, axes.yaxis.label, axes.title):
+        text.set_color(READABLE)
+    axes.grid(color=READABLE, alpha=0.25, lw=0.6)
     axes.set_axisbelow(True)
 
 
 def _embedded(figure: Figure, text: str) -> str:
     drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=figure.dpi)
+    figure.savefig(drawn, format="png", dpi=figure.dpi, transparent=True)
     data = base64.b64encode(drawn.getvalue()).decode("ascii")
     return f'<img alt="{text}" src="data:image/png;base64,{data}">'

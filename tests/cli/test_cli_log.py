@@ -47,7 +47,7 @@ def test_solves_as_a_table(run_process: Command, folder: Path) -> None:
 
 def test_solves_that_are_asked_for(run: Command, folder: Path) -> None:
     log = folder / "hand-first.mcap"
-    assert "1 solve\n" in run("log", "solves", log, "--most", "2", "--solve", "1").out
+    assert "1 solve\n" in run("log", "solves", log, "--most", "2", "--solve", "2").out
     assert "the first 2 of 4 solves" in run("log", "solves", log, "--most", "2").out
     assert "3 solves" in run("log", "solves", log, "--status", "SOLVED").out
 
@@ -63,20 +63,20 @@ def test_events_as_a_table(run: Command, folder: Path) -> None:
     assert (done.exit, done.err) == (0, "")
     assert "on to hand alignment" in done.out
     assert max(map(len, done.out.splitlines())) <= 80
-    none = run("log", "events", folder / "hand-first.mcap", "--event", "STALL", "--solve", 0)
+    none = run("log", "events", folder / "hand-first.mcap", "--event", "STALL", "--solve", 1)
     assert "no events" in none.out
 
 
 def test_why(run_process: Command, folder: Path) -> None:
-    good = run_process("log", "why", folder / "enhanced-dls.mcap", "0")
+    good = run_process("log", "why", folder / "enhanced-dls.mcap", "1")
     assert (good.exit, good.err) == (0, "")
-    assert "enhanced-dls, solve 0: solved after" in good.out
+    assert "enhanced-dls, solve 1: solved after" in good.out
     assert "every contact is within tolerance" in good.out
-    bad = run_process("log", "why", folder / "enhanced-dls.mcap", "3")
+    bad = run_process("log", "why", folder / "enhanced-dls.mcap", "4")
     text = " ".join(bad.out.split())
     assert bad.exit == 0
-    assert "enhanced-dls, solve 3: not solved" in text
-    for words in ("thumb reaching (iterations 0 to", "thumb lagged: it ends", "misses its point"):
+    assert "enhanced-dls, solve 4: not solved" in text
+    for words in ("thumb reaching (iterations 1 to", "thumb lagged: it ends", "misses its point"):
         assert words in text
 
 
@@ -85,8 +85,8 @@ def test_compare(run: Command, folder: Path) -> None:
     many = run("log", "compare", *files)
     assert (many.exit, many.err) == (0, "")
     assert "solved by both 3, by neither 1" in many.out
-    one = run("log", "compare", *files, "--solve", 3)
-    assert "hand-first, solve 3" in one.out
+    one = run("log", "compare", *files, "--solve", 4)
+    assert "hand-first, solve 4" in one.out
     assert "limits at the end" in one.out
     other = run("log", "compare", *files, "--methods", "enhanced-dls", "hand-first").out
     rows = [line.split()[0] for line in other.splitlines() if " of 4" in line]
@@ -95,15 +95,15 @@ def test_compare(run: Command, folder: Path) -> None:
 
 def test_plot(run: Command, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    done = run("log", "plot", folder / "enhanced-dls.mcap", "--solve", 1)
+    done = run("log", "plot", folder / "enhanced-dls.mcap", 2)
     assert (done.exit, done.err) == (0, "")
-    assert done.out.split() == ["plot", "enhanced-dls-enhanced-dls-1.png"]
-    assert (tmp_path / "enhanced-dls-enhanced-dls-1.png").read_bytes()[:4] == b"\x89PNG"
+    assert done.out.split() == ["plot", "enhanced-dls-enhanced-dls-2.png"]
+    assert (tmp_path / "enhanced-dls-enhanced-dls-2.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_export_for_a_viewer(run_process: Command, folder: Path, tmp_path: Path) -> None:
     log = folder / "enhanced-dls.mcap"
-    done = run_process("log", "export", log, "--solve", 0, "--out", "view.mcap")
+    done = run_process("log", "export", log, "--solve", 1, "--out", "view.mcap")
     assert (done.exit, done.err) == (0, "")
     assert done.out.split() == ["viewer", "view.mcap", "layout", "view.layout.json"]
     with (tmp_path / "view.mcap").open("rb") as stream:
@@ -152,31 +152,31 @@ def test_finish_and_merge(run: Command, folder: Path, tmp_path: Path) -> None:
     [
         ("solves {log} --status SOLV", "{log}: no status 'SOLV'; there are: "),
         ("solves {log} --method paper", "{log}: no method 'paper'; the log holds: enhanced-dls"),
-        ("solves {log} --solve -1", "--solve: found '-1', expected a whole number >= 0"),
+        ("solves {log} --solve 0", "--solve: found '0', expected a whole number >= 1"),
         ("solves {log} --most 0", "--most: found '0', expected a whole number >= 1"),
         ("events {log} --event BOOM", "{log}: no event 'BOOM'; there are: "),
         ("events {log} --phase nap", "{log}: no phase 'nap'; there are: "),
-        ("why {log} 99", "{log}: no solve 99; the log holds: enhanced-dls solves 0 to 3"),
-        ("why {log}", "{log}: which solve?; the log holds: enhanced-dls solves 0 to 3"),
+        ("why {log} 99", "{log}: no solve 99; the log holds: enhanced-dls solves 1 to 4"),
+        ("why {log}", "{log}: which solve?; the log holds: enhanced-dls solves 1 to 4"),
         ("why {folder}/nothing.mcap", "{folder}/nothing.mcap: cannot read the log: No such file"),
-        ("plot {log} --solve 0 --out {folder}/a.jpg", "--out: found '{folder}/a.jpg', expected a"),
-        ("plot {log} --solve 0 --out {folder}/no/a.png", "{folder}/no/a.png: --out: cannot be"),
+        ("plot {log} 1 --out {folder}/a.jpg", "--out: found '{folder}/a.jpg', expected a"),
+        ("plot {log} 1 --out {folder}/no/a.png", "{folder}/no/a.png: --out: cannot be"),
         ("compare {log}", "the logs hold enhanced-dls, expected two methods (say --methods)"),
         ("compare {log} --methods paper hand-first", "--methods: found 'paper', the logs hold"),
-        ("export {log} --solve 0 --out {folder}/a.txt", "--out: found '{folder}/a.txt', expected"),
-        ("export {log} --solve 0 --out {log}", "{log}: --out: found the file of the input"),
+        ("export {log} --solve 1 --out {folder}/a.txt", "--out: found '{folder}/a.txt', expected"),
+        ("export {log} --solve 1 --out {log}", "{log}: --out: found the file of the input"),
         ("export {log} --out {folder}/view.mcap", "{log}: which solve?; the log holds"),
         (
-            "export {log} --solve 0 --robot nobody --out {folder}/view.mcap",
+            "export {log} --solve 1 --robot nobody --out {folder}/view.mcap",
             "{log}: robot (say --robot): no shipped arm-hand is called 'nobody'",
         ),
         (
-            "export {log} --solve 0 --robot kuka_lwr_barrett_coupled --out {folder}/view.mcap",
+            "export {log} --solve 1 --robot kuka_lwr_barrett_coupled --out {folder}/view.mcap",
             "{log}: the robot 'kuka_lwr_barrett_coupled' is not the one in the log",
         ),
         ("export {log} --what rows --out {folder}/a.csv", "--what: found 'rows', expected one of"),
         ("finish {folder}/nothing.mcap", "{folder}/nothing.mcap: cannot finish the log: No such"),
-        ("merge {log} {log} --out {folder}/all.mcap", "{log}: solve 0 of enhanced-dls is in {log}"),
+        ("merge {log} {log} --out {folder}/all.mcap", "{log}: solve 1 of enhanced-dls is in {log}"),
         ("merge {log} --out {log}", "{log}: --out: found the file of the input"),
         ("merge {log}", "the following arguments are required: --out"),
         ("wonder {log}", "COMMAND: found 'wonder', expected one of info, solves"),

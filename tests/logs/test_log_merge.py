@@ -89,7 +89,7 @@ def test_one_solve_in_two_shards_is_refused(write: Write, tmp_path: Path) -> Non
         with pytest.raises(errors.LogError) as caught:
             logs.merge_logs(shards, target)
         assert str(caught.value) == (
-            f"{shards[1]}: solve 0 of enhanced-dls is in {first} too ({number} such solves)"
+            f"{shards[1]}: solve 1 of enhanced-dls is in {first} too ({number} such solves)"
         )
     assert not target.exists()
 

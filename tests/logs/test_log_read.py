@@ -137,7 +137,7 @@ def test_files_that_do_not_belong_together(write: Write, tmp_path: Path) -> None
     copy = tmp_path / "1.mcap"
     copy.write_bytes(first.read_bytes())
     with pytest.raises(
-        errors.LogError, match=r"1\.mcap: solve 0 of enhanced-dls is in .*0\.mcap too"
+        errors.LogError, match=r"1\.mcap: solve 1 of enhanced-dls is in .*0\.mcap too"
     ):
         logs.open([first, copy]).solves()
     other = write(make_block(6, first=2), name="2.mcap", robot_name="ar10")
@@ -393,7 +393,7 @@ def test_the_same_solve_is_never_counted_twice(study: Path) -> None:
     """A merged log beside its shards, whatever numbers it has."""
     logs.merge_logs(study, study / "all.mcap")
     with pytest.raises(
-        errors.LogError, match=r"00000\.mcap: solve 0 of enhanced-dls is in .*all\.mcap too"
+        errors.LogError, match=r"00000\.mcap: solve 1 of enhanced-dls is in .*all\.mcap too"
     ):
         logs.open(study).solves()
 

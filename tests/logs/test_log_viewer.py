@@ -114,7 +114,7 @@ def test_contacts_turn_green_when_they_are_reached(decoded: Decoded, solve: logs
 
 def test_messages_tell_the_story(decoded: Decoded, solve: logs.OneSolve) -> None:
     lines = [message.message for _, message in decoded.topics["/ik/messages"]]
-    assert lines[0] == "enhanced-dls on kuka_lwr_barrett, solve 0"
+    assert lines[0] == "enhanced-dls on kuka_lwr_barrett, solve 1"
     assert "thumb-reaching" in lines
     assert "hand-alignment" in lines
     assert f"SOLVED after {len(solve.rows)} iterations" in lines

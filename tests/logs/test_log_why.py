@@ -26,21 +26,21 @@ def test_a_finger_that_lags_at_a_limit() -> None:
     rows["limit_mask"][24:] = 0b010
     stall = event(36, "STALL", 1e-6, phase="hand-alignment", threshold=1e-4)
     found = logs.explain(make_one(rows, events=(stall,)))
-    assert found.headline == "enhanced-dls, solve 7: not solved (STALLED) after 40 iterations"
+    assert found.headline == "enhanced-dls, solve 8: not solved (STALLED) after 40 iterations"
     assert found.phases == (
-        "thumb reaching (iterations 0 to 19, 20): thumb 100.0 mm 2.0 deg -> 1.0 mm 2.0 deg, "
+        "thumb reaching (iterations 1 to 20): thumb 100.0 mm 2.0 deg -> 1.0 mm 2.0 deg, "
         "finger_2 100.0 mm 2.0 deg -> 100.0 mm 2.0 deg",
-        "hand alignment (iterations 20 to 39, 20): thumb 1.0 mm 2.0 deg -> 1.0 mm 2.0 deg, "
+        "hand alignment (iterations 21 to 40): thumb 1.0 mm 2.0 deg -> 1.0 mm 2.0 deg, "
         "finger_2 100.0 mm 2.0 deg -> 9.0 mm 2.0 deg",
     )
     assert found.fingers == (
-        "finger_2 lagged: it ends 9.00 mm and 2.00 deg off; at its nearest, in iteration 30, it "
+        "finger_2 lagged: it ends 9.00 mm and 2.00 deg off; at its nearest, in iteration 31, it "
         "was 8.00 mm and 2.00 deg off",
     )
     assert found.met == (
         "closed chain never near singular: smallest singular value 0.5",
-        "joint_b at its limit from iteration 24 to the end",
-        "hand alignment stood still in iteration 36",
+        "joint_b at its limit from iteration 25 to the end",
+        "hand alignment stood still in iteration 37",
     )
     assert found.verdict == (
         "finger_2 misses its point by 9.00 mm",
@@ -58,8 +58,8 @@ def test_a_singularity_is_told_with_its_depth_and_time() -> None:
     ]
     found = logs.explain(make_one(rows, events=tuple(singular)))
     assert found.met == (
-        "closed chain near singular from iteration 28 on, 8 iterations in all; smallest singular "
-        "value 0.002 in iteration 29 (threshold 0.01), entered 2 times",
+        "closed chain near singular from iteration 29 on, 8 iterations in all; smallest singular "
+        "value 0.002 in iteration 30 (threshold 0.01), entered 2 times",
     )
     assert "at its end the closed chain is near singular" in found.verdict
     rows["sigma_closed_chain"][-1] = 0.4
@@ -72,7 +72,7 @@ def test_a_dip_without_a_threshold_is_told_against_the_median() -> None:
     rows["sigma_closed_chain"][:20] = np.nan
     rows["sigma_closed_chain"][33] = 0.004
     assert logs.explain(make_one(rows)).met == (
-        "smallest singular value of the closed chain down to 0.004 in iteration 33 (median 0.5)",
+        "smallest singular value of the closed chain down to 0.004 in iteration 34 (median 0.5)",
     )
     rows["sigma_closed_chain"][33] = 0.06
     assert logs.explain(make_one(rows)).met == (
@@ -91,7 +91,7 @@ def test_a_finger_that_was_there_and_left() -> None:
     found = logs.explain(make_one(rows))
     assert found.fingers == (
         "thumb lagged: it ends 1.00 mm and 10.00 deg off; it was within tolerance in 31 "
-        "iterations, the last of them 30",
+        "iterations, the last of them 31",
     )
     assert found.verdict == (
         "thumb misses its normal by 10.00 deg",
@@ -105,15 +105,15 @@ def test_who_came_last_when_it_is_solved() -> None:
     rows["position_error"][:22, 0] = 0.05
     rows["position_error"][:34, 1] = 0.05
     found = logs.explain(make_one(rows, restarts=2))
-    assert found.headline == "enhanced-dls, solve 7: solved after 40 iterations and 2 restarts"
+    assert found.headline == "enhanced-dls, solve 8: solved after 40 iterations and 2 restarts"
     assert found.fingers == (
-        "finger_2 was the last to come within tolerance, in iteration 34; the others were there "
-        "in iteration 22",
+        "finger_2 was the last to come within tolerance, in iteration 35; the others were there "
+        "in iteration 23",
     )
     assert found.verdict == ("every contact is within tolerance", "collision not checked")
     rows["position_error"][:34, 0] = 0.05
     assert logs.explain(make_one(rows)).fingers == (
-        "the fingers came within tolerance together, in iteration 34",
+        "the fingers came within tolerance together, in iteration 35",
     )
 
 
@@ -143,7 +143,7 @@ def test_restless_joints_and_oscillations() -> None:
     assert found.met == (
         "closed chain never near singular: smallest singular value 0.5",
         "to its limit and off again: joint_c 5 times",
-        "joint_c, joint_a went to and fro without progress, first in iteration 11, 3 times",
+        "joint_c, joint_a went to and fro without progress, first in iteration 12, 3 times",
     )
 
 
@@ -161,8 +161,8 @@ def test_phases_that_come_again_are_told_one_by_one_or_together() -> None:
     rows["phase"] = np.arange(40) % 2 + 1
     lines = logs.explain(make_one(rows)).phases
     assert [line.partition(":")[0] for line in lines] == [
-        "thumb reaching (iterations 0 to 38, 20 in 20 goes)",
-        "hand alignment (iterations 1 to 39, 20 in 20 goes)",
+        "thumb reaching (iterations 1 to 39, 20 in 20 stretches)",
+        "hand alignment (iterations 2 to 40, 20 in 20 stretches)",
     ]
     assert "-> 20.0 mm" in lines[0]
 
@@ -177,8 +177,8 @@ def test_free_fingers_and_unmeasured_rows() -> None:
     solve = make_one(rows, position_error=nan[0], angle_error=nan[1])
     found = logs.explain(solve)
     assert found.phases == (
-        "thumb reaching (iterations 0 to 19, 20): errors not measured",
-        "hand alignment (iterations 20 to 39, 20): thumb 100.0 mm 11.5 deg -> 1.0 mm 0.0 deg",
+        "thumb reaching (iterations 1 to 20): errors not measured",
+        "hand alignment (iterations 21 to 40): thumb 100.0 mm 11.5 deg -> 1.0 mm 0.0 deg",
     )
     assert found.fingers[0].startswith("thumb was the last to come within tolerance, in iteration")
 
@@ -208,7 +208,7 @@ def test_without_limits_phases_or_singular_values() -> None:
     rows = np.zeros(3, lean.dtype)
     rows["position_error"] = 0.1
     found = logs.explain(make_one(rows, layout=lean))
-    assert found.phases[0].startswith("the solve (iterations 0 to 2, 3): thumb 100.0 mm")
+    assert found.phases[0].startswith("the solve (iterations 1 to 3): thumb 100.0 mm")
     assert found.met == ("singular values: not measured",)
 
 
@@ -224,6 +224,11 @@ def test_without_limits_phases_or_singular_values() -> None:
             "closed chain ill-conditioned: condition number 2.5e+04 (above 1e+04)",
         ),
         (event(1, "LIMIT_HIT", 2.09, joints=("a",)), "a at its limit (2.09)"),
+        (
+            event(1, "LIMIT_HIT", np.pi / 4, joints=("a",), unit="rad"),
+            "a at its limit (45 deg)",
+        ),
+        (event(1, "LIMIT_HIT", 0.0125, joints=("a",), unit="m"), "a at its limit (12.5 mm)"),
         (event(1, "LIMIT_LEFT", 1.5, joints=("a",), threshold=2), "a off its limit (2), now 1.5"),
         (
             event(1, "ACTIVATED", 3, joints=("a", "b"), threshold=1),
@@ -257,9 +262,9 @@ def test_two_methods_side_by_side() -> None:
     assert lines["time"] == ("12 ms", "500 ms")
     assert lines["thumb off by"] == ("1.00 mm and 0.00 deg", "100.00 mm and 11.46 deg")
     assert lines["phases"] == ("thumb reaching 20, hand alignment 20", "hand alignment 20")
-    assert lines["all within tolerance"] == ("from iteration 30", "never")
-    assert lines["nearest"][1] == "20 tolerances in iteration 0"
-    assert lines["smallest sigma, closed chain"] == ("0.03 in iteration 7", "0.5 in iteration 0")
+    assert lines["all within tolerance"] == ("from iteration 31", "never")
+    assert lines["nearest"][1] == "20 tolerances in iteration 1"
+    assert lines["smallest sigma, closed chain"] == ("0.03 in iteration 8", "0.5 in iteration 1")
     assert lines["limits at the end"] == ("none", "none")
     other = make_one(make_rows(), target_points=np.ones((2, 3)))
     with pytest.raises(errors.InputError, match="not the same target"):
@@ -320,12 +325,12 @@ def test_phases_tell_the_errors_of_the_robot_in_that_posture(
         distance = 1e3 * np.linalg.norm(points[:, thumb] - solve.target_points[thumb], axis=1)
         for line in logs.explain(solve).phases:
             match = re.search(
-                r"\(iterations (\d+) to (\d+), \d+\): .*?thumb ([\d.]+) mm .*? -> ([\d.]+) mm", line
+                r"\(iterations (\d+) to (\d+)[^)]*\): .*?thumb ([\d.]+) mm .*? -> ([\d.]+) mm", line
             )
             assert match is not None, line
             first, last, begin, end = (float(text) for text in match.groups())
-            assert begin == pytest.approx(distance[int(first)], abs=0.06)
-            assert end == pytest.approx(distance[int(last)], abs=0.06)
+            assert begin == pytest.approx(distance[int(first) - 1], abs=0.06)
+            assert end == pytest.approx(distance[int(last) - 1], abs=0.06)
 
 
 def test_singularities_are_where_the_singular_value_is_small(failed: list[logs.OneSolve]) -> None:
@@ -342,9 +347,9 @@ def test_singularities_are_where_the_singular_value_is_small(failed: list[logs.O
             sigma = solve.rows["sigma_closed_chain"].astype(float)
             threshold = float(match[5])
             below = np.flatnonzero(sigma < threshold)
-            assert int(match[1]) == below[0]
+            assert int(match[1]) - 1 == below[0]
             assert int(match[2]) == len(below)
-            assert int(match[4]) == np.nanargmin(sigma)
+            assert int(match[4]) - 1 == np.nanargmin(sigma)
             assert float(match[3]) == pytest.approx(np.nanmin(sigma), rel=0.01)
             told += 1
     assert told
@@ -359,7 +364,7 @@ def test_motors_at_a_limit_are_at_a_limit(failed: list[logs.OneSolve], robot: ik
             match = re.match(r"(\w+) at its limit from iteration (\d+) to the end", line)
             if match is None:
                 continue
-            column, since = at_limit[:, robot.actuators.index(match[1])], int(match[2])
+            column, since = at_limit[:, robot.actuators.index(match[1])], int(match[2]) - 1
             assert column[since:].all()
             assert since == 0 or not column[since - 1]
             told += 1

@@ -53,22 +53,26 @@ def test_page(study: Path) -> None:
     text = views.study_page(logs.open(study), "<script>alert(1)</script>", 24)
     assert "24 solves" in text
     page = Page(text)
-    assert "script" not in page.tags
+    assert page.tags.count("script") == 1
+    assert "&lt;script&gt;alert(1)" in text
     assert "i" not in page.tags
     assert all(source.startswith("data:image/png") for source in page.sources)
     assert page.tags.count("img") == 2
-    assert page.tags.count("details") == 24
+    assert text.count('<tbody class="solve"') == 24
     assert page.tags.count("svg") == 24
-    rows = {row[1]: row for row in page.cells if len(row) > 4}
+    rows = {row[1]: row for row in page.cells if len(row) > 8}
     assert rows["near"][2:4] == ["12", "100.00"]
     assert rows["<i>far</i>"][2:4] == ["12", "0.00"]
-    # What is not solved is listed first.
-    first = text.index("<details>")
-    assert "STALLED" in text[first : first + 200]
+    # What is not solved is listed first, and counted by its reason.
+    first = text.index('<tbody class="solve"')
+    assert 'data-status="STALLED"' in text[first : first + 200]
+    assert sum(int(row[0]) for row in page.cells if len(row) == 4) == 12
 
 
 def test_most(study: Path) -> None:
-    assert Page(views.study_page(logs.open(study), "a study", 5)).tags.count("details") == 5
+    text = views.study_page(logs.open(study), "a study", 5)
+    assert text.count('<tbody class="solve"') == 5
+    assert "The 5 hardest solves" in text
 
 
 @pytest.mark.parametrize(
