@@ -29,6 +29,8 @@ REFERENCE = re.compile(r"^ *(?:import|from) (?:pinocchio|coal)(?:_oracle)?\b", r
 # a bit of a result is another (`test_optimisation_changes_no_bit`, of kernels and of hand-first).
 # What solves much takes the usual flags: `usual_flags`.
 os.environ.setdefault("CASADI_IK_CFLAGS", "-O0")
+# Every answer from compiled code, of the first solve too.
+os.environ.setdefault("CASADI_IK_COMPILE", "wait")
 
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("any machine", deadline=None)

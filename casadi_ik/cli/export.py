@@ -14,12 +14,12 @@ from casadi_ik.cli.options import Option
 from casadi_ik.cli.outputs import say
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import UnsupportedError
+from casadi_ik.exporting.ahead import uses
 from casadi_ik.exporting.project import (
     c_project,
     check_folder,
     check_method,
     checked_prefix,
-    uses,
     wasm_project,
     write_folder,
 )
@@ -89,16 +89,19 @@ def export(said: Said) -> Answer:
     return Answer(Group(headline(True, "EXPORTED", f"{robot.name} to {said.out}"), fields(pairs)))
 
 
-@command(Option("ROBOT...", "a shipped name, ARM+HAND, or a YAML file", key="robots"))
+@command(
+    Option("ROBOT...", "a shipped name, ARM+HAND, or a YAML file", key="robots"),
+    Option("--all", "also scenes, choices, motions, logs and diagnoses"),
+)
 def compile_ahead(said: Said) -> Answer:
-    """Compile what solving, batches and logs of robots need, ahead of use.
+    """Compile what robots need, ahead of use.
 
-    Example:
+    Examples:
       casadi-ik compile kuka_lwr_barrett panda+allegro_right
+      casadi-ik compile --all kuka_lwr_barrett
 
-    Makes what solving, batches and logs of a robot compile when first used, so that
-    nothing has to be compiled later; also for a machine without a compiler that
-    shares CASADI_IK_CACHE.
+    Compiles what single solves and batches of a robot need, with --all everything
+    that it can be used for, so that nothing has to be compiled later.
 
     exit codes: 0 done, 2 bad input
     """
@@ -109,7 +112,7 @@ def compile_ahead(said: Said) -> Answer:
         )
     lines = []
     for robot in robots:
-        whole_time, parts = time.perf_counter(), list(uses(robot))
+        whole_time, parts = time.perf_counter(), list(uses(robot, said.all))
         for i, (what, use) in enumerate(parts, start=1):
             began = time.perf_counter()
             use()

@@ -1,4 +1,4 @@
-"""What is written of a robot: a C project, a WebAssembly module, kernels compiled ahead of use.
+"""What is written of a robot: a C project, a WebAssembly module.
 
 A folder is built beside its place, and put there when it is whole.
 """
@@ -12,11 +12,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from casadi_ik.api import Solver
 from casadi_ik.arm_hand import ArmHand
@@ -37,7 +35,6 @@ from casadi_ik.exporting.targets import (
     targets_header,
     written,
 )
-from casadi_ik.grasps import Contact, Grasp
 
 MARK = ".casadi_ik_export"
 """A file by which a folder is known as an export."""
@@ -327,32 +324,3 @@ def _module(project: Exported) -> bytes:
             complaint = "; ".join(done.stderr.splitlines()[:3]) or "no complaint"
             raise KernelError(f"zig made no WebAssembly module: {complaint[:500]}")
         return made.read_bytes()
-
-
-def uses(robot: ArmHand) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Everything that compiles something, in words and as what does it."""
-    solver = Solver(robot)
-    q = robot.random(np.random.default_rng(0), 16)  # enough for solves side by side
-
-    def targets() -> tuple[np.ndarray, np.ndarray]:
-        return robot.contacts(q)
-
-    def one() -> object:
-        points, normals = (array[0] for array in targets())
-        pairs = zip(robot.fingers, points, normals, strict=True)
-        return solver.solve(Grasp({name: Contact(*pair) for name, *pair in pairs}))
-
-    def beyond() -> object:
-        points, normals = targets()
-        return solver.solve_batch(points[:1] + 100.0, normals[:1], diagnose=True)
-
-    def logged() -> object:
-        with tempfile.TemporaryDirectory() as place:
-            return solver.solve_batch(*targets(), log=Path(place) / "log.mcap")
-
-    yield "forward kinematics", targets
-    yield "one target", one
-    yield "batches", lambda: solver.solve_batch(*targets())
-    yield "loops that cannot wait", solver.fast
-    yield "logs", logged
-    yield "diagnoses", beyond

@@ -26,6 +26,8 @@ class CancelledError(BaseException):
 
 class _Local(threading.local):
     wanted: threading.Event | None = None
+    cached_only: bool = False
+    virtual: bool = False
 
 
 _local = _Local()
@@ -54,6 +56,36 @@ def stop_if_cancelled() -> None:
     """
     if is_cancelled():
         raise CancelledError
+
+
+@contextmanager
+def cached_only() -> Iterator[None]:
+    """Have this thread take compiled libraries that are there, and build none."""
+    before, _local.cached_only = _local.cached_only, True
+    try:
+        yield
+    finally:
+        _local.cached_only = before
+
+
+def is_cached_only() -> bool:
+    """Whether this thread may build no library."""
+    return _local.cached_only
+
+
+@contextmanager
+def virtual_machine() -> Iterator[None]:
+    """Have this thread make functions that run in CasADi's virtual machine."""
+    before, _local.virtual = _local.virtual, True
+    try:
+        yield
+    finally:
+        _local.virtual = before
+
+
+def is_virtual() -> bool:
+    """Whether functions that this thread makes run in CasADi's virtual machine."""
+    return _local.virtual
 
 
 @contextmanager

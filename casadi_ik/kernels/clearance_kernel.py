@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -16,11 +16,11 @@ from casadi_ik.collision.distances import Table, nearest
 from casadi_ik.collision.model import placed, size_of
 from casadi_ik.collision.solids import C_NAMES
 from casadi_ik.errors import InputError
-from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import SLICE, drive
-from casadi_ik.kernels.codegen import c_struct, define, driver_text, library_source, row_major
+from casadi_ik.kernels.codegen import c_struct, define, driver_text
 from casadi_ik.kernels.function_kernel import FunctionKernel, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import FunctionGraph, recipe
+from casadi_ik.kernels.libraries import load_function
 from casadi_ik.robots import RobotDescription
 
 SYMBOL = "casadi_ik_clearance"
@@ -66,13 +66,14 @@ class ClearanceKernel:
         shapes = self._robot.shapes
         constants = {"N_Q": self._n, "N_CAPSULES": len(shapes.capsules)}
         constants |= {"N_OWN": len(shapes.solids), **C_NAMES}
-        library = load_library(
+        texts = driver_text("clearance_job") + driver_text("clearance")
+        library = load_function(
             f"{self._graph.name}_lanes{lanes}",
-            lambda: row_major(self._graph.function),
-            define(constants) + driver_text("clearance_job") + driver_text("clearance"),
+            lambda: self._graph.function,
+            define(constants) + texts,
             SYMBOL,
-            f"{self._graph.recipe} lanes {lanes}",
-            partial(library_source, lanes=lanes),
+            self._graph.recipe,
+            lanes,
         )
         return None if library is None else library[SYMBOL]
 

@@ -9,7 +9,6 @@ import os
 import shlex
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import warnings
@@ -26,7 +25,7 @@ from casadi_ik.kernels.cancellation import SLICE, stop_if_cancelled
 # but the driver is hidden, so that a function named like one of libc cannot be taken for it.
 FLAGS = ("-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden")
 
-LEVEL, LONG = ("-O2",), 100_000
+LEVEL, LONG = ("-O2",), 60_000
 LEVEL_OF_LONG = ("-O1", "-fexpensive-optimizations", "-finline-small-functions")
 """Optimization, and that of a source with more characters: the passes between the two take time
 that grows with the square of a function's length, a loop's whole compilation 2.5 (14 motors) to 4
@@ -46,9 +45,6 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT) if hasattr(errno, "EDQUOT") else (errno.E
 
 SMALL = 2**20
 """A disk with less room [bytes] counts as full if a compiler failed on it."""
-
-LOAD = "import ctypes, sys; getattr(ctypes.CDLL(sys.argv[1]), sys.argv[2])"
-"""Program that loads a library: a broken one can kill the process that does."""
 
 
 class NoCompilerWarning(RuntimeWarning):
@@ -78,17 +74,15 @@ class Compiler:
         """What decides the produced code, apart from the source."""
         return "\n".join((*self.command, self.version, *LEVEL, *LEVEL_OF_LONG, *self.flags))
 
-    def build(self, source: Path, library: Path, symbol: str) -> None:
-        """Compile one C file to a shared library, and see that it can be loaded.
+    def build(self, source: Path, library: Path) -> None:
+        """Compile one C file to a shared library.
 
         Args:
             source: The file.
             library: Where the library shall stand; the compiler's own files are put beside it.
-            symbol: A function it has to export.
 
         Raises:
             KernelError: The compiler refused; the message has the first lines of its complaint.
-            UnloadableError: It did not, but what it made is no library or lacks the symbol.
             OSError: The disk is full.
             KeyboardInterrupt: Ctrl-C reached the compiler.
             CancelledError: This thread has been told to stop.
@@ -101,7 +95,6 @@ class Compiler:
         except OSError as error:
             raise KernelError(f"compiler {self.command[0]} cannot be run: {error}") from error
         if done.returncode == 0 and library.is_file():
-            self._check(library, symbol)
             return
         if done.returncode == -signal.SIGINT:
             raise KeyboardInterrupt
@@ -118,31 +111,6 @@ class Compiler:
 
     def __str__(self) -> str:
         return shlex.join(self.command)[:SHOWN_CHARACTERS]
-
-    def _check(self, library: Path, symbol: str) -> None:
-        """See that nothing of it is cut off, and have another process load it."""
-        if _cut(library):
-            raise UnloadableError(
-                f"compiler {self} ended well, but what it made is cut off "
-                "(CC=... names another compiler, CC=none does without)"
-            )
-        if not Path(sys.executable or "").name.startswith("python"):
-            return  # part of a program that could not be asked to
-        command = [sys.executable, "-I", "-S", "-c", LOAD, str(library), symbol]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, errors="replace")
-        except OSError:
-            return  # this user may not start it
-        if done.returncode == 0:
-            return
-        if _full(library.parent, ""):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(library.parent))
-        complaint = (done.stderr.splitlines() or [_ending(done.returncode)])[-1]
-        raise UnloadableError(
-            f"compiler {self} ended well, but what it made cannot be loaded "
-            f"(CC=... names another compiler, CC=none does without): "
-            f"{complaint[:SHOWN_CHARACTERS]}"
-        )
 
 
 def _run(
@@ -168,18 +136,6 @@ def _run(
             process.kill()
             raise
     return subprocess.CompletedProcess(command, process.returncode, out, complaint)
-
-
-def _cut(library: Path) -> bool:
-    """Whether a 64-bit ELF file ends before its table of sections does, the last thing in it."""
-    with library.open("rb") as stream:
-        head = stream.read(64)
-        size = stream.seek(0, os.SEEK_END)
-    if len(head) < 64 or head[:5] != b"\x7fELF\x02":
-        return False
-    (table,) = struct.unpack_from("@Q", head, 0x28)
-    width, count = struct.unpack_from("@HH", head, 0x3A)
-    return table + width * count > size
 
 
 def _ending(code: int) -> str:
@@ -281,15 +237,39 @@ def warn_no_compiler(problem: str = "") -> None:
     )
 
 
+POLICY = "CASADI_IK_COMPILE"
+BACKGROUND, WAIT = "background", "wait"
+
+
+def waits() -> bool:
+    """Whether the first answer of a robot waits for the compiler.
+
+    Raises:
+        KernelError: The environment variable says neither.
+    """
+    policy = os.environ.get(POLICY) or BACKGROUND
+    if policy not in (BACKGROUND, WAIT):
+        raise KernelError(
+            f"{POLICY}={policy[:SHOWN_CHARACTERS]!r}: expected {BACKGROUND} or {WAIT}"
+        )
+    return policy == WAIT
+
+
+def tell(text: str) -> None:
+    """Say on stderr what is compiled: anywhere, or if waiting was asked for on a terminal only."""
+    stream = sys.stderr
+    if stream is not None and (not waits() or stream.isatty()):
+        stream.write(f"{text}\n")
+        stream.flush()
+
+
 def announce(name: str, size: int) -> None:
-    """Say on stderr, if it is a terminal, what is compiled and about how long that takes.
+    """Say what is compiled and about how long that takes, if it is long.
 
     Args:
         name: Of the kernel.
         size: Characters of its text.
     """
     # 25,000 to 115,000 characters of C in a second were measured.
-    stream, seconds = sys.stderr, size / 50_000
-    if stream is not None and seconds >= 2.0 and stream.isatty():
-        stream.write(f"compiling {name} (about {seconds:.0f} s, once per machine)\n")
-        stream.flush()
+    if (seconds := size / 50_000) >= 2.0:
+        tell(f"compiling {name} (about {seconds:.0f} s, once per machine)")

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import os
 from collections.abc import Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -16,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, KernelError
-from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, drive, stop_if_cancelled
-from casadi_ik.kernels.codegen import c_struct, define, driver_text, library_source, row_major
+from casadi_ik.kernels.codegen import c_struct, define, driver_text, row_major
 from casadi_ik.kernels.graphs import FunctionGraph
+from casadi_ik.kernels.libraries import load_function, load_library
 
 logger = logging.getLogger(__name__)
 
@@ -92,14 +93,12 @@ def machine_lanes() -> int:
 
     The compiled answer is asked on every machine anew, since several may share a cache.
     """
-    x = ca.SX.sym("x")
-    library = load_library(
-        "machine_lanes",
-        lambda: ca.Function("machine_lanes", [x], [x]),
-        driver_text("registers") + driver_text("machine_lanes"),
-        SYMBOL_MACHINE,
-        "machine_lanes",
-    )
+    if asked := os.environ.get("CASADI_IK_LANES"):
+        if asked not in ("1", "4", "8"):
+            raise KernelError(f"CASADI_IK_LANES={asked[:20]!r}: expected 1, 4 or 8")
+        return int(asked) if asked != "1" else 0
+    text = driver_text("registers") + driver_text("machine_lanes")
+    library = load_library("machine_lanes", lambda: text, SYMBOL_MACHINE, text)
     return 0 if library is None else int(library[SYMBOL_MACHINE]())
 
 
@@ -188,9 +187,10 @@ class FunctionKernel:
 
     def _load(self) -> ctypes.CDLL | None:
         driver = define(self.constants) + driver_text("map_job") + driver_text("map")
-        write = partial(library_source, loops=self._graph.loops)
-        build = (self.name, lambda: self.function, driver, SYMBOL, self._graph.recipe)
-        return load_library(*build, write)
+        graph = self._graph
+        return load_function(
+            self.name, lambda: graph.function, driver, SYMBOL, graph.recipe, loops=graph.loops
+        )
 
     @property
     def constants(self) -> dict[str, int]:
@@ -394,13 +394,9 @@ class MeasureKernel:
         sizes = f"#define SIZES_IN {{{self._n_in}}}\n#define SIZES_OUT {{{self._n_out}}}\n"
         driver = define(constants) + sizes + driver_text("map_job") + driver_text("map_lanes")
         try:
-            library = load_library(
-                f"{self._graph.name}_lanes{lanes}",
-                lambda: row_major(self._graph.function),
-                driver,
-                SYMBOL_LANES,
-                f"{self._graph.recipe} lanes {lanes}" if self._graph.recipe else "",
-                partial(library_source, lanes=lanes),
+            name, graph = f"{self._graph.name}_lanes{lanes}", self._graph
+            library = load_function(
+                name, lambda: graph.function, driver, SYMBOL_LANES, graph.recipe, lanes
             )
         except KernelError as error:
             logger.warning("%s: one sample at a time: %s", self._graph.name, error)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import pickle
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from casadi_ik.errors import InputError
 from casadi_ik.kernels.layout import Layout
@@ -24,27 +23,62 @@ BUILD_NO_GRAPHS = (
 import-linter checks that none of them uses CasADi."""
 
 
+DECIMALS = 12
+"""Numbers [SI units] that agree to so many decimals are the same to a recipe: the last places of a
+description follow the machine that read it."""
+
+
 def recipe(*parts: Any) -> str:
     """A hash of data and of the code that makes graphs from it, 32 hexadecimal digits.
 
+    It is the same on every machine and with every version of Python.
+
     Args:
-        parts: Everything the graph depends on; plain picklable data.
+        parts: Everything the graph depends on: text, numbers, arrays, records, collections and
+            objects of such.
     """
-    digest = hashlib.sha256(_sources())
-    digest.update(pickle.dumps(parts))
+    digest = hashlib.sha256(package_sources().encode())
+    for part in _plain(parts):
+        digest.update(part)
     return digest.hexdigest()[:32]
 
 
+def _plain(value: Any) -> Iterator[bytes]:
+    """Bytes that tell a value from every other."""
+    if value is None or isinstance(value, str | bool | int | np.integer):
+        yield f"{value!r};".encode()
+    elif isinstance(value, float | np.floating | np.ndarray):
+        array = np.asarray(value)
+        if array.dtype.kind == "f":
+            array = np.round(array.astype("<f8"), DECIMALS) + 0.0  # no negative zeros
+        yield f"{array.shape}{array.dtype.str}".encode() + array.tobytes()
+    elif is_dataclass(value):
+        yield type(value).__name__.encode()
+        for item in fields(value):
+            yield from _plain(getattr(value, item.name))
+    elif isinstance(value, Mapping):
+        yield from _plain(list(value.items()))
+    elif isinstance(value, Iterable):
+        items = sorted(value, key=repr) if isinstance(value, Set) else list(value)
+        yield f"{len(items)} of ".encode()
+        for item in items:
+            yield from _plain(item)
+    else:
+        yield type(value).__name__.encode()
+        yield from _plain(value.__getstate__())
+
+
 @cache
-def _sources() -> bytes:
-    digest = hashlib.sha256(f"numpy {version('numpy')}".encode())
+def package_sources() -> str:
+    """A hash of the code that graphs are made with."""
+    digest = hashlib.sha256()
     root = Path(__file__).parents[1]
-    for path in sorted(root.rglob("*.[pc]*")):
+    for path in sorted(root.rglob("*.[pc]*"), key=lambda path: path.parts):
         inside = path.relative_to(root)
         if path.suffix not in (".py", ".c") or inside.parts[0] in BUILD_NO_GRAPHS:
             continue
         digest.update(inside.as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.digest()
+    return digest.hexdigest()[:32]
 
 
 Shape = tuple[int, int]

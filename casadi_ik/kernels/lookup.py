@@ -10,11 +10,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import SLICE, drive, stop_if_cancelled
-from casadi_ik.kernels.codegen import c_struct, define, driver_text, row_major
+from casadi_ik.kernels.codegen import c_struct, define, driver_text
 from casadi_ik.kernels.function_kernel import FunctionKernel, memory
 from casadi_ik.kernels.graphs import FunctionGraph
+from casadi_ik.kernels.libraries import load_function
 
 SYMBOL = "casadi_ik_lookup"
 
@@ -74,9 +74,7 @@ class LookupKernel:
     def _load(self, graph: FunctionGraph) -> ctypes.CDLL | None:
         texts = map(driver_text, ("registers", "lookup_job", "lookup"))
         driver = define(self.constants) + "".join(texts)
-        return load_library(
-            graph.name, lambda: row_major(graph.function), driver, SYMBOL, graph.recipe
-        )
+        return load_function(graph.name, lambda: graph.function, driver, SYMBOL, graph.recipe)
 
     @property
     def constants(self) -> dict[str, int]:

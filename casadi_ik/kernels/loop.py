@@ -9,7 +9,7 @@ import ctypes
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from time import perf_counter
 from typing import Any
 
@@ -18,11 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, KernelError
-from casadi_ik.kernels.cache import load_library
-from casadi_ik.kernels.cancellation import SLICE, DriverCode, check, stop_if_cancelled
-from casadi_ik.kernels.codegen import c_struct, define, driver_text, library_source, row_major
+from casadi_ik.kernels.cancellation import (
+    SLICE,
+    DriverCode,
+    cached_only,
+    check,
+    stop_if_cancelled,
+)
+from casadi_ik.kernels.codegen import c_struct, define, driver_text, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import RUNNING, StepGraph
+from casadi_ik.kernels.libraries import NotCachedError, load_function
 from casadi_ik.kernels.layout import opaque, row_driver, split_rows, store_rows
 
 NON_FINITE = -1
@@ -315,15 +321,13 @@ class LoopKernel:
         self.entry: Any = None if library is None else library[SYMBOL]
         self._rows_each = 0.0
 
-    def _load(self) -> ctypes.CDLL | None:
-        wide = machine_lanes() > 0
-        return load_library(
-            self.step.name,
-            lambda: self.function,
-            self._driver(),
-            SYMBOL,
-            f"{self.step.recipe} wide {wide}" if self.step.recipe else "",
-            partial(library_source, wide=wide),
+    def _load(self, lanes: int = 1) -> ctypes.CDLL | None:
+        """The library of the loop that makes so many solves side by side."""
+        step = self.step
+        name = step.name if lanes == 1 else f"{step.name}_lanes{lanes}"
+        wide = lanes == 1 and machine_lanes() > 0
+        return load_function(
+            name, lambda: step.function, self._driver(), SYMBOL, step.recipe, lanes, wide
         )
 
     @property
@@ -337,36 +341,23 @@ class LoopKernel:
             return None
         return self._at_hand if count < WORTH else self._side_by_side
 
-    @cached_property
+    @property
     def _at_hand(self) -> Any:
         """The loop that makes some solves at a time, if it need not be compiled."""
-        return self._load_lanes(at_hand=True)
+        try:
+            with cached_only():
+                return self._side_by_side
+        except NotCachedError:
+            return None
 
     @cached_property
     def _side_by_side(self) -> Any:
         """The loop that makes some solves at a time; None where there is none."""
-        self.__dict__["_at_hand"] = found = self._load_lanes()
-        return found
-
-    def _load_lanes(self, at_hand: bool = False) -> Any:
-        """That loop, or None.
-
-        Args:
-            at_hand: Whether it is none, too, where it would have to be compiled.
-        """
         lanes = machine_lanes() if self.compiled else 0
         if not lanes:
             return None
         try:
-            library = load_library(
-                f"{self.step.name}_lanes{lanes}",
-                lambda: self.function,
-                self._driver(),
-                SYMBOL,
-                f"{self.step.recipe} lanes {lanes}" if self.step.recipe else "",
-                partial(library_source, lanes=lanes),
-                at_hand=at_hand,
-            )
+            library = self._load(lanes)
         except KernelError as error:
             warnings.warn(f"one solve at a time: {error}", RuntimeWarning, stacklevel=2)
             return None

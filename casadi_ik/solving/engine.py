@@ -39,6 +39,7 @@ from casadi_ik.solving.batch_parts import BatchParts, SolvedPart, judged, worker
 from casadi_ik.solving.by_kinds import PerKinds
 from casadi_ik.solving.by_kinds import run as run_by_kinds
 from casadi_ik.solving.diagnosis.diagnostician import Diagnostician
+from casadi_ik.solving.first_answer import FirstAnswers
 from casadi_ik.solving.run import Run
 from casadi_ik.solving.sensitivity import SensitivityKernel
 from casadi_ik.solving.trials import HandMethod
@@ -75,6 +76,10 @@ class Engine:
         return PerKinds(
             lambda kinds: replace(self, method=self.method.for_kinds(kinds), kinds=kinds)
         )
+
+    @cached_property
+    def _first(self) -> FirstAnswers:
+        return FirstAnswers(self.method if self.compiled else None)
 
     @cached_property
     def _own_hands(self) -> HandMethod | None:
@@ -185,6 +190,8 @@ class Engine:
         method, start, known = self._quick, run.start(self.robot), None
         plain = targets.palms is None and targets.prefer not in RANKED and start.ndim == 1
         if method is not None and plain and run.recorder is None:
+            if (early := self._first.answer(problems, start, self.check)) is not None:
+                return early
             self.method.prepare()
             begin = time.perf_counter()
             found = method.quick(targets, start)

@@ -1,5 +1,10 @@
 /* How many solves this machine can make side by side, 0: vectors are of no use. */
-EXPORT int casadi_ik_machine_lanes(void) {
+#if defined(_WIN32)
+__declspec(dllexport)
+#else
+__attribute__((visibility("default")))
+#endif
+int casadi_ik_machine_lanes(void) {
 #if defined(_WIN32) && !defined(__clang__)
   return 0; /* gcc does not align vectors on the stack there */
 #elif defined(__x86_64__)

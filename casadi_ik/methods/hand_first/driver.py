@@ -22,10 +22,11 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import KernelError
 from casadi_ik.grasps.grasp import LARGE, SMALL, UNIT
 from casadi_ik.kernels import REPEATED, RUNNING, FunctionKernel, LoopKernel
-from casadi_ik.kernels.cache import load_library
 from casadi_ik.kernels.cancellation import SLICE, DriverCode, check
 from casadi_ik.kernels.codegen import define, define_arrays, driver_text, number
 from casadi_ik.kernels.function_kernel import memory
+from casadi_ik.kernels.graphs import recipe
+from casadi_ik.kernels.libraries import load_library
 from casadi_ik.kernels.loop import SLOTS, UNBEGUN, Followed
 from casadi_ik.made import made
 from casadi_ik.methods.common.contact_fit import fresh_fit
@@ -332,9 +333,8 @@ class Searches:
         robot = plan.layouts.robot
         self.plan = plan
         self._name = ca.Function.fix_name(f"hand_first_search_{robot.name}")
-        library = load_library(
-            self._name, _nothing, _text(plan), "casadi_ik_search", write=lambda _, driver: driver
-        )
+        known = recipe(robot, plan.options, plan.layouts.kinds, plan.budget, plan.enforce_limits)
+        library = load_library(self._name, lambda: _text(plan), "casadi_ik_search", known)
         if library is None:
             raise KernelError(f"{self._name}: the compiler that made the other kernels is gone")
         self._search: Any = library["casadi_ik_search"]
@@ -560,9 +560,3 @@ def _text(plan: SearchPlan) -> str:
             *map(source_text, ("seeds", "hand_first", "calls")),
         )
     )
-
-
-def _nothing() -> ca.Function:
-    """The search is no function of CasADi."""
-    x = ca.SX.sym("x")
-    return ca.Function("nothing", [x], [x])

@@ -83,9 +83,20 @@ class HandFirstMethod(LoopedMethod):
             return self
         return HandFirstMethod(self.robot, self.options, self._compiled, kinds)
 
+    def in_virtual_machine(self) -> HandFirstMethod:
+        """The same, never compiled."""
+        return HandFirstMethod(self.robot, self.options, False, self._kinds)
+
+    def __reduce__(self) -> tuple[type[HandFirstMethod], tuple[Any, ...]]:
+        """What it was made from."""
+        return HandFirstMethod, (self.robot, self.options, self._compiled, self._kinds)
+
     def prepare(self) -> None:
-        """Build and compile the loop, and fill the table of the first round."""
-        _ = self.kernel, self.seeds.table, self.first
+        """Build and compile what one target takes, and fill the table of the first round."""
+        _ = self.seeds.table, self.first
+        if self.kernel.compiled:
+            with self._searches.lent(enforce_limits=True):
+                pass
 
     @property
     def jacobians(self) -> Mapping[str, RecordedJacobian]:

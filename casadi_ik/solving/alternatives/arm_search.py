@@ -21,7 +21,7 @@ from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import PARAMETERS, arms_graph
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.kernels.cache import load_library
+from casadi_ik.kernels.libraries import load_library
 from casadi_ik.kernels.cancellation import DriverCode, check
 from casadi_ik.kernels.codegen import driver_text
 from casadi_ik.kernels.function_kernel import MapJob, MeasureKernel, doubles, machine_lanes, memory
@@ -196,7 +196,7 @@ class ArmSearch:
     def _load(self) -> Any:
         parts = map(driver_text, ("map_job", "clearance_job", "arm_search"))
         driver = "".join(("#include <stdint.h>\n", *parts))
-        library = load_library("arm_search", _nothing, driver, SYMBOL, write=lambda _, text: text)
+        library = load_library("arm_search", lambda: driver, SYMBOL, driver)
         return None if library is None else library[SYMBOL]
 
     def choose(
@@ -442,9 +442,3 @@ def _slices(count: int, owner: NDArray[np.int64] | None) -> Iterator[slice]:
 
 def _address(entry: Any) -> int | None:
     return ctypes.cast(entry, ctypes.c_void_p).value
-
-
-def _nothing() -> ca.Function:
-    """The driver calls functions of CasADi, and is none itself."""
-    x = ca.SX.sym("x")
-    return ca.Function("nothing", [x], [x])

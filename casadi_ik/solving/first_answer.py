@@ -1,0 +1,197 @@
+"""A robot's first answers, from CasADi's virtual machine while its C is compiled in the background.
+
+A process of its own compiles into the cache, so that the next program finds what this one asked
+for. It ends by itself; where it is killed, nothing is left that looks like a library. The virtual
+machine answers what the first round of compiled code would answer, the same up to the last places
+of sines and arcs. What that round does not solve waits for the compiler, so an answer does not
+depend on when it was asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import time
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+from casadi_ik.answers.solution import Solution
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.kernels import LoopKernel
+from casadi_ik.kernels.cancellation import cached_only, virtual_machine
+from casadi_ik.kernels.compiler import find_compiler, tell, waits
+from casadi_ik.kernels.libraries import NotCachedError
+from casadi_ik.problem.clearance import SceneCheck
+from casadi_ik.problem.method import Outcome
+from casadi_ik.problem.problems import Problems
+from casadi_ik.robots.description import RobotDescription
+from casadi_ik.solving.batch_parts import judged
+
+LOOK_AGAIN = 0.25
+"""Seconds from one look for compiled code to the next."""
+
+LIFETIME = 900.0
+"""Seconds after which the process in the background ends in any case."""
+
+SECONDS_A_MOTOR = 0.6
+"""What a motor adds to the compiler's work, about (gcc 12, one core of a server of 2023)."""
+
+CHILD = """\
+import sys
+sys.path[:0] = [sys.argv[1]]
+from casadi_ik.solving.first_answer import compile_in_background
+compile_in_background()
+"""
+
+
+class VirtualMethod(Protocol):
+    """A method that can answer in the virtual machine until it is compiled."""
+
+    robot: RobotDescription
+
+    @property
+    def kernel(self) -> LoopKernel:
+        """Its compiled loop."""
+        ...
+
+    def prepare(self) -> None:
+        """Compile all that one target takes."""
+        ...
+
+    def in_virtual_machine(self) -> VirtualMethod:
+        """The same, never compiled."""
+        ...
+
+    def run(
+        self, problems: Problems, q0: Array, seed: int, trace: bool, rounds: int | None = None
+    ) -> Outcome:
+        """Solve a batch by so many rounds."""
+        ...
+
+
+class FirstAnswers:
+    """Answers of a method until its compiled code is there; threads may share it."""
+
+    def __init__(self, method: Any) -> None:
+        """Nothing is done before the first answer.
+
+        Args:
+            method: Any; only a `VirtualMethod` answers early.
+        """
+        able = hasattr(type(method), "in_virtual_machine")
+        self._method: VirtualMethod | None = method if able else None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._looked = 0.0
+        self._lock = threading.Lock()
+
+    def answer(
+        self, problems: Problems, start: Array, check: SceneCheck | None
+    ) -> Solution | None:
+        """The answer of the virtual machine.
+
+        Args:
+            problems: One target.
+            start: (n,) where the robot is.
+            check: What answers must not touch; None: nothing is checked.
+
+        Returns:
+            The answer, or None where compiled code is there, or has to be waited for.
+        """
+        if self._method is None or self._is_ready():
+            return None
+        with virtual_machine():
+            outcome = self._virtual.run(problems, start[None], 0, False, rounds=1)
+            around = None if check is None else self._checked(check).around(problems)
+            batch = judged(self._robot, self._name, problems, outcome, around)
+        return batch.solution(0) if batch.success[0] else None
+
+    def _is_ready(self) -> bool:
+        """Whether the method is compiled, or is to be waited for."""
+        method = self._method
+        if method is None:
+            return True
+        with self._lock:
+            process, now = self._process, time.monotonic()
+            if process is not None and now - self._looked < LOOK_AGAIN:
+                return False
+            self._looked = now
+            try:
+                with cached_only():
+                    method.prepare()
+            except NotCachedError:
+                ready = waits() or (process is not None and process.poll() is not None)
+                if not ready and process is None:
+                    self._process = started(method)
+                    ready = self._process is None
+            else:
+                ready = True
+            if ready:
+                self._method = None
+            return ready
+
+    @cached_property
+    def _virtual(self) -> VirtualMethod:
+        assert self._method is not None
+        return self._method.in_virtual_machine()
+
+    @cached_property
+    def _robot(self) -> ArmHand:
+        """Of its own: its functions are not those of the compiled method."""
+        return ArmHand(self._virtual.robot)
+
+    @property
+    def _name(self) -> str:
+        return str(getattr(self._virtual, "name", ""))
+
+    def _checked(self, check: SceneCheck) -> SceneCheck:
+        return SceneCheck(self._robot, check.scene, compiled=False)
+
+
+def started(method: VirtualMethod) -> subprocess.Popen[bytes] | None:
+    """A process that compiles a method, or None where none can be started."""
+    if not Path(sys.executable or "").name.startswith("python") or find_compiler() is None:
+        return None
+    package = Path(__file__).parents[2]
+    apart: dict[str, Any] = {"start_new_session": True}
+    if sys.platform == "win32":
+        apart = {"creationflags": subprocess.CREATE_NO_WINDOW}
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-c", CHILD, str(package)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            **apart,
+        )
+        assert process.stdin is not None
+        with process.stdin as stream:
+            pickle.dump(method, stream)
+    except OSError:
+        return None
+    seconds = SECONDS_A_MOTOR * len(method.robot.actuators)
+    tell(
+        f"{method.robot.name}: compiled in the background (about {seconds:.0f} s, once per "
+        "machine); until then CasADi's virtual machine answers"
+    )
+    return process
+
+
+def compile_in_background() -> None:
+    """What that process does: for one target first, then for batches."""
+    threading.Thread(target=_end_later, daemon=True).start()
+    method = pickle.load(sys.stdin.buffer)
+    with contextlib.suppress(OSError, AttributeError):
+        os.nice(5)
+    method.prepare()
+    _ = method.kernel.lanes
+
+
+def _end_later() -> None:
+    time.sleep(LIFETIME)
+    os._exit(1)
