@@ -273,6 +273,7 @@ def _kept_or_built(
         try:
             remove_stale(place, "build-*", 1)
             remove_stale(place, ".*.part", -2)
+            remove_stale(place, ".*.lock")
             with _sole_builder(place / f".{stem}.lock"):
                 library = found() or _compiled(place, stem, source, compiler, symbol)
             break

@@ -28,8 +28,8 @@ from casadi_ik.kernels.cancellation import (
 from casadi_ik.kernels.codegen import c_struct, define, driver_text, row_major
 from casadi_ik.kernels.function_kernel import BufferedFunction, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import RUNNING, StepGraph
-from casadi_ik.kernels.libraries import NotCachedError, load_function
 from casadi_ik.kernels.layout import opaque, row_driver, split_rows, store_rows
+from casadi_ik.kernels.libraries import NotCachedError, load_function
 
 NON_FINITE = -1
 """Status of a solve whose state or status became NaN or infinite; its last finite state stays."""

@@ -190,7 +190,7 @@ class Engine:
         method, start, known = self._quick, run.start(self.robot), None
         plain = targets.palms is None and targets.prefer not in RANKED and start.ndim == 1
         if method is not None and plain and run.recorder is None:
-            if (early := self._first.answer(problems, start, self.check)) is not None:
+            if (early := self._first.answer(targets, start, self.check)) is not None:
                 return early
             self.method.prepare()
             begin = time.perf_counter()

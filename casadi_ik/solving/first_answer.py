@@ -29,7 +29,7 @@ from casadi_ik.kernels.compiler import find_compiler, tell, waits
 from casadi_ik.kernels.libraries import NotCachedError
 from casadi_ik.problem.clearance import SceneCheck
 from casadi_ik.problem.method import Outcome
-from casadi_ik.problem.problems import Problems
+from casadi_ik.problem.targets import TargetBatch
 from casadi_ik.robots.description import RobotDescription
 from casadi_ik.solving.batch_parts import judged
 
@@ -69,7 +69,7 @@ class VirtualMethod(Protocol):
         ...
 
     def run(
-        self, problems: Problems, q0: Array, seed: int, trace: bool, rounds: int | None = None
+        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None = None
     ) -> Outcome:
         """Solve a batch by so many rounds."""
         ...
@@ -90,13 +90,11 @@ class FirstAnswers:
         self._looked = 0.0
         self._lock = threading.Lock()
 
-    def answer(
-        self, problems: Problems, start: Array, check: SceneCheck | None
-    ) -> Solution | None:
+    def answer(self, targets: TargetBatch, start: Array, check: SceneCheck | None) -> Solution | None:
         """The answer of the virtual machine.
 
         Args:
-            problems: One target.
+            targets: One target.
             start: (n,) where the robot is.
             check: What answers must not touch; None: nothing is checked.
 
@@ -106,9 +104,9 @@ class FirstAnswers:
         if self._method is None or self._is_ready():
             return None
         with virtual_machine():
-            outcome = self._virtual.run(problems, start[None], 0, False, rounds=1)
-            around = None if check is None else self._checked(check).around(problems)
-            batch = judged(self._robot, self._name, problems, outcome, around)
+            outcome = self._virtual.run(targets, start[None], 0, False, rounds=1)
+            query = None if check is None else self._checked(check).collision_query(targets)
+            batch = judged(self._robot, self._name, targets, outcome, query)
         return batch.solution(0) if batch.success[0] else None
 
     def _is_ready(self) -> bool:
@@ -158,16 +156,16 @@ def started(method: VirtualMethod) -> subprocess.Popen[bytes] | None:
     if not Path(sys.executable or "").name.startswith("python") or find_compiler() is None:
         return None
     package = Path(__file__).parents[2]
-    apart: dict[str, Any] = {"start_new_session": True}
-    if sys.platform == "win32":
-        apart = {"creationflags": subprocess.CREATE_NO_WINDOW}
+    # A process group of its own: Ctrl-C is not meant for it.
+    flags = subprocess.CREATE_NO_WINDOW if sys.platform == "win32" else 0
     try:
         process = subprocess.Popen(
             [sys.executable, "-c", CHILD, str(package)],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            **apart,
+            start_new_session=True,
+            creationflags=flags,
         )
         assert process.stdin is not None
         with process.stdin as stream:

@@ -21,11 +21,11 @@ from casadi_ik.arms.family import ArmFamily
 from casadi_ik.arms.search import PARAMETERS, arms_graph
 from casadi_ik.arrays import Array
 from casadi_ik.kernels import FunctionKernel
-from casadi_ik.kernels.libraries import load_library
 from casadi_ik.kernels.cancellation import DriverCode, check
 from casadi_ik.kernels.codegen import driver_text
 from casadi_ik.kernels.function_kernel import MapJob, MeasureKernel, doubles, machine_lanes, memory
 from casadi_ik.kernels.graphs import recipe
+from casadi_ik.kernels.libraries import load_library
 from casadi_ik.problem.clearance import ROUNDING, CollisionQuery
 from casadi_ik.problem.request import CLEARANCE
 from casadi_ik.symbolic.even_spread import evenly

@@ -1,0 +1,731 @@
+"""Compiled libraries: found again, rebuilt when broken, built once by many, trusted or not."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import hashlib
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import textwrap
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.kernels import (
+    CacheWarning,
+    FunctionKernel,
+    LoopKernel,
+    NoCompilerWarning,
+    cache,
+    cache_directory,
+    compiler,
+    libraries,
+)
+from casadi_ik.kernels.cancellation import cached_only, virtual_machine
+from casadi_ik.kernels.graphs import FunctionGraph, package_sources, recipe
+
+from .graphs import counting_step, needs_compiler
+
+POSIX = pytest.mark.skipif(os.name != "posix", reason="owners and modes are POSIX's")
+SOMEBODY = 54321
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache, of a process that has loaded and said nothing yet."""
+    place = tmp_path / "cache"
+    monkeypatch.setenv("CASADI_IK_CACHE", str(place))
+    monkeypatch.setattr(compiler, "_warned", False)
+    forget(monkeypatch)
+    return place
+
+
+def forget(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(libraries, "_loaded", {})
+    monkeypatch.setattr(cache, "_warned", set())
+
+
+def scaled(factor: float = 2.0, name: str = "scaled") -> ca.Function:
+    x = ca.SX.sym("x")
+    return ca.Function(name, [x], [factor * x])
+
+
+def kernel(build: Callable[[], ca.Function] = scaled, known: str = "recipe") -> FunctionKernel:
+    """A small kernel of a known recipe: it leaves a library and a note."""
+    return FunctionKernel(FunctionGraph("scaled", build, {"x": (1, 1)}, ((1, 1),), known))
+
+
+def works() -> bool:
+    made = kernel()
+    return made.compiled and made(3)[0] == 6
+
+
+def never() -> ca.Function:
+    raise AssertionError("the graph was built")
+
+
+def refuse_to_build(*_: object) -> None:
+    raise AssertionError("built again")
+
+
+def kept(directory: Path, suffix: str) -> list[Path]:
+    return sorted(directory.glob(f"*{suffix}"))
+
+
+@contextmanager
+def script(text: str, **changed: str) -> Iterator[subprocess.Popen[str]]:
+    """Another process, with Python's pipes."""
+    root = str(Path(__file__).parents[2])
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(text)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": root} | changed,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+# What is found again.
+
+
+@needs_compiler
+def test_second_use_builds_nothing(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert works()
+    assert len(kept(directory, ".so")) == len(kept(directory, ".key")) == 1
+    monkeypatch.setattr(compiler.Compiler, "build", refuse_to_build)
+    assert kernel(never)(3)[0] == 6
+    forget(monkeypatch)
+    assert kernel(never)(3)[0] == 6
+    assert FunctionKernel(scaled())(3)[0] == 6  # by its text, without a recipe
+    with pytest.raises(AssertionError, match="the graph was built"):
+        kernel(never, "another recipe")
+
+
+@needs_compiler
+def test_everything_a_library_follows_from_tells_it_apart(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for factor in (2.0, 2.5):
+        assert FunctionKernel(scaled(factor))(3)[0] == 3 * factor
+    LoopKernel(counting_step("scaled"))
+    LoopKernel(counting_step("scaled", offset=1.0))
+    monkeypatch.setenv("CASADI_IK_CFLAGS", "-O1")
+    assert works()
+    before = len([path for path in kept(directory, ".so") if path.name.startswith("scaled")])
+    assert before == 5
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["torn", "empty", "foreign", "other library", "gone"])
+def test_broken_library_is_rebuilt(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    assert works()
+    (path,) = kept(directory, ".so")
+    whole = path.read_bytes()
+    # Never written in place: this process has the file mapped.
+    path.unlink()
+    if damage == "other library":
+        # A whole and loadable file under a name that fits its bytes, but of another driver.
+        LoopKernel(counting_step("other"))
+        (other,) = [one for one in kept(directory, ".so") if one.name.startswith("other")]
+        other.rename(path.with_name(f"{path.stem.rpartition('-')[0]}-{digest(other)}.so"))
+    elif damage != "gone":
+        damaged = {"torn": whole[: len(whole) // 2], "empty": b"", "foreign": b"no library"}
+        path.write_bytes(damaged[damage])
+    forget(monkeypatch)
+    assert works()
+    forget(monkeypatch)
+    monkeypatch.setattr(compiler.Compiler, "build", refuse_to_build)
+    assert works()
+
+
+@needs_compiler
+@pytest.mark.parametrize("note", ["012345", "0" * 32, "\N{SNOWMAN}"])
+def test_broken_note_is_written_again(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, note: str
+) -> None:
+    assert works()
+    kept(directory, ".key")[0].write_text(note, encoding="utf-8")
+    forget(monkeypatch)
+    assert works()
+    forget(monkeypatch)
+    assert kernel(never)(3)[0] == 6
+
+
+def test_recipes_differ_where_their_data_do() -> None:
+    robot, again = (ik.load_robot("kuka_lwr_barrett").description for _ in range(2))
+    moved, machine = (replace(robot, home=robot.home + by) for by in (1e-9, 1e-16))
+    assert recipe(robot, 8) == recipe(again, 8) == recipe(machine, 8)
+    others = [(robot, 9), (moved, 8), (robot, 8.0), (robot, "8"), (robot, (8,)), (robot, None)]
+    assert len({recipe(*parts) for parts in ((robot, 8), *others)}) == 7
+
+
+@needs_compiler
+def test_processes_that_need_the_same_build_it_once(directory: Path) -> None:
+    text = """
+        import sys
+        import casadi as ca
+        from casadi_ik.kernels import FunctionKernel, compiler
+        build = compiler.Compiler.build
+        def counted(*arguments):
+            print("built")
+            build(*arguments)
+        compiler.Compiler.build = counted
+        x = ca.SX.sym("x")
+        sys.stdin.readline()
+        print(FunctionKernel(ca.Function("raced", [x], [ca.sin(x) + 2]))(0)[0])
+    """
+    with script(text) as one, script(text) as two, script(text) as three:
+        for process in (one, two, three):
+            assert process.stdin is not None
+            process.stdin.write("go\n")
+            process.stdin.flush()
+        said = [process.communicate(timeout=300)[0].split() for process in (one, two, three)]
+    assert sorted(said) == [["2.0"], ["2.0"], ["built", "2.0"]]
+    assert sorted(directory.iterdir()) == kept(directory, ".so")
+
+
+# Kernels made ahead, and what may be built when.
+
+
+@needs_compiler
+@pytest.mark.parametrize("made_for", ["these sources", "others"])
+def test_kernels_made_ahead_serve_without_a_compiler(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_for: str
+) -> None:
+    texts: dict[str, str] = {}
+    monkeypatch.setattr(libraries, "on_text", [texts.__setitem__])
+    assert works()
+    folder = tmp_path / "site" / libraries.AHEAD
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").write_text("")
+    (folder / "made_for").write_text(package_sources() if made_for == "these sources" else "0")
+    (name,) = texts
+    kept(directory, ".so")[0].rename(folder / f"{name}.so")
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    libraries.ahead_folder.cache_clear()
+    monkeypatch.setenv("CC", "none")
+    forget(monkeypatch)
+    try:
+        if made_for == "these sources":
+            assert kernel(never)(3)[0] == 6
+            return
+        with pytest.warns(RuntimeWarning) as caught:
+            assert not kernel().compiled
+        assert "its kernels are not used" in str(caught[0].message)
+    finally:
+        libraries.ahead_folder.cache_clear()
+
+
+@needs_compiler
+def test_blocks_that_build_nothing(directory: Path) -> None:
+    with virtual_machine():
+        assert not kernel(never).compiled
+    with cached_only(), pytest.raises(libraries.NotCachedError):
+        kernel(never)
+    assert works()
+    with cached_only():
+        assert kernel(never).compiled
+
+
+# Compilers.
+
+
+@needs_compiler
+def test_compile_error_is_named(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CASADI_IK_CFLAGS", "-include does_not_exist.h")
+    with pytest.raises(ik.errors.KernelError, match=r"(?s)exit code 1.*does_not_exist\.h"):
+        kernel()
+    assert list(directory.iterdir()) == []
+
+
+@pytest.mark.parametrize("cc", ["/nowhere/cc", "false", '"x', "''", "/", "'a b' c", ""])
+def test_without_compiler_one_warning(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cc: str
+) -> None:
+    monkeypatch.setenv("CC", cc)
+    if not cc:
+        monkeypatch.setenv("PATH", str(tmp_path))
+        monkeypatch.setattr(compiler, "_zig", list)
+    with pytest.warns(NoCompilerWarning, match="no C compiler") as caught:
+        made = kernel()
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loop = LoopKernel(counting_step())
+        FunctionKernel(scaled(3))
+    assert not made.compiled
+    assert not loop.compiled
+    np.testing.assert_array_equal(made([1, 2])[0], [2, 4])
+    assert loop.run([[0]], [4], 9).iterations.tolist() == [4]
+    assert not directory.exists()
+
+
+@needs_compiler
+def test_cc_may_have_arguments(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = compiler.find_compiler()
+    assert found is not None
+    monkeypatch.setenv("CC", f"{found.command[0]} -DSOMETHING=1")
+    again = compiler.find_compiler()
+    assert again is not None
+    assert again.command == (found.command[0], "-DSOMETHING=1")
+    assert works()
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "said"),
+    [
+        ("CASADI_IK_CFLAGS", '"x', "CASADI_IK_CFLAGS='\"x': No closing quotation"),
+        ("CASADI_IK_LANES", "3", "CASADI_IK_LANES='3': expected 1, 4 or 8"),
+        ("CASADI_IK_COMPILE", "later", "CASADI_IK_COMPILE='later': expected background or wait"),
+    ],
+)
+def test_malformed_variables(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, variable: str, value: str, said: str
+) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(ik.errors.KernelError, match=said):
+        _ = compiler.find_compiler(), compiler.waits(), LoopKernel(counting_step())
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["qsort_r", "a" * 5000])
+def test_names_of_functions(directory: Path, name: str) -> None:
+    """Of one of the C library, and too long for a file."""
+    made = FunctionKernel(scaled(name=name))
+    assert made.compiled
+    assert made(3)[0] == 6
+    assert not hasattr(ctypes.CDLL(str(kept(directory, ".so")[0])), "casadi_ik_loop")
+
+
+def lie(directory: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    """A compiler in whose hands the library $out has just been made by the real one."""
+    real = compiler.find_compiler()
+    assert real is not None
+    path = directory.parent / "lying cc"
+    path.write_text(
+        f'#!/bin/sh\n{real.command[0]} "$@" || exit\n'
+        'case "$*" in *--version*) exit;; esac\n'
+        'while [ "$1" != -o ]; do shift; done; out=$2\n'
+        f"{what}\n"
+    )
+    path.chmod(0o700)
+    monkeypatch.setenv("CC", f'"{path}"')
+
+
+@POSIX
+@needs_compiler
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        (': > "$out"', "cannot be loaded"),
+        ('rm "$out"', "made no library"),
+        ("kill -9 $$", "failed with SIGKILL"),
+        ('echo "int x;" > "$out.c"; cc -shared -o "$out" "$out.c"', "undefined symbol"),
+        ("seq 100000 >&2; exit 3", "failed with exit code 3"),
+    ],
+)
+def test_a_compiler_that_lies(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, what: str, said: str
+) -> None:
+    lie(directory, monkeypatch, what)
+    with pytest.raises(ik.errors.KernelError, match=said) as caught:
+        kernel()
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+    assert list(directory.iterdir()) == []
+
+
+@POSIX
+@needs_compiler
+@pytest.mark.parametrize("terminal", [True, False])
+@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize("size", [10, 10**6])
+def test_a_long_compilation_is_announced(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, terminal: bool, waits: bool, size: int
+) -> None:
+    """Through a pseudo-terminal or a pipe; in a pipe not to those who asked to wait."""
+    monkeypatch.setenv("CASADI_IK_COMPILE", "wait" if waits else "background")
+    read, write = os.openpty() if terminal else os.pipe()
+    with os.fdopen(write, "w") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        text = '__attribute__((visibility("default"))) int say(void) { return 0; }\n'
+        padded = f"{text}/*{'x' * size}*/\n"
+        for _ in range(2):
+            assert libraries.load_library("named", lambda: padded, "say") is not None
+            forget(monkeypatch)
+        os.set_blocking(read, False)
+        said = ""
+        with suppress(BlockingIOError):
+            said = os.read(read, 1000).decode()
+    os.close(read)
+    expected = size > 1000 and (terminal or not waits)
+    about = r"compiling named \(about 20 s, once per machine\)\s*"
+    assert re.fullmatch(about if expected else "", said)
+
+
+# Whose files are loaded, and places that are no use.
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def give_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a file or folder belong to somebody else."""
+    if os.getuid() == 0:
+        os.chown(path, SOMEBODY, SOMEBODY)
+        return
+    theirs, others = path.lstat().st_ino, cache._others
+
+    def seen(found: os.stat_result, sticky: bool) -> str:
+        if found.st_ino == theirs:
+            found = os.stat_result((*found[:4], SOMEBODY, *found[5:10]))
+        return others(found, sticky)
+
+    monkeypatch.setattr(cache, "_others", seen)
+
+
+def plant(directory: Path) -> Path:
+    """Put a library in the place of the kernel's own that leaves a mark where it is loaded."""
+    (library,) = kept(directory, ".so")
+    source, mark = directory / "evil.c", directory / "mark"
+    source.write_text(
+        "#include <stdio.h>\n#include <stdint.h>\n"
+        f'__attribute__((constructor)) static void run(void) {{ fclose(fopen("{mark}", "w")); }}\n'
+        "int casadi_ik_map(void *job) { (void)job; return 0; }\n"
+    )
+    found = compiler.find_compiler()
+    assert found is not None
+    built = directory / "evil.so"
+    subprocess.run([*found.command, "-fPIC", "-shared", "-o", built, source], check=True)
+    library.unlink()
+    source.unlink()
+    return built.rename(directory / f"{library.stem.rpartition('-')[0]}-{digest(built)}.so")
+
+
+DANGERS = ("their file", "writable file", "link", "their folder", "writable folder", "parent")
+
+
+@POSIX
+@needs_compiler
+@pytest.mark.parametrize("danger", ["none", *DANGERS])
+def test_planted_libraries_are_not_loaded(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, danger: str
+) -> None:
+    """In the user's own hands alone they are: the test means something."""
+    assert works()
+    planted = plant(directory)
+    forget(monkeypatch)
+    if danger == "their file":
+        give_away(planted, monkeypatch)
+    elif danger == "writable file":
+        planted.chmod(0o722)
+    elif danger == "link":
+        elsewhere = planted.rename(directory.parent / "elsewhere.so")
+        planted.symlink_to(elsewhere)
+    elif danger == "their folder":
+        give_away(directory, monkeypatch)
+    elif danger == "writable folder":
+        directory.chmod(0o777)
+    elif danger == "parent":
+        directory.parent.chmod(0o777)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert (works() and works()) == (danger != "none")
+    said = [CacheWarning] if "folder" in danger or danger == "parent" else []
+    assert [warning.category for warning in caught] == said
+    assert (directory / "mark").exists() == (danger == "none")
+    assert not any("\n" in str(warning.message) for warning in caught)
+
+
+@POSIX
+@needs_compiler
+@pytest.mark.parametrize("danger", ["theirs", "writable"])
+def test_a_planted_note_is_not_believed(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, danger: str
+) -> None:
+    assert works()
+    (note,), (library,) = kept(directory, ".key"), kept(directory, ".so")
+    wrong = "0" * 32
+    note.write_text(wrong)
+    library.rename(library.with_name(library.name.replace(library.name.split("-")[1], wrong)))
+    if danger == "writable":
+        note.chmod(0o666)
+    else:
+        give_away(note, monkeypatch)
+    forget(monkeypatch)
+    assert works()
+    assert len(kept(directory, ".so")) == 2  # the one of the note was not taken
+
+
+def test_cache_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path / "own"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache_directory() == tmp_path / "own"
+    monkeypatch.delenv("CASADI_IK_CACHE")
+    assert cache_directory() == tmp_path / "xdg" / "casadi_ik"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache_directory().name == "casadi_ik"
+    assert tmp_path in cache_directory().parents
+
+
+@POSIX
+def test_folders_are_the_users_alone(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made so, whatever the mask; of one above a sticky one is enough."""
+    monkeypatch.setenv("CASADI_IK_CACHE", str(directory / "a"))
+    before = os.umask(0)
+    try:
+        assert cache.trusted_cache() == Path(os.path.realpath(directory / "a"))
+    finally:
+        os.umask(before)
+    assert [place.stat().st_mode & 0o777 for place in (directory, directory / "a")] == [0o700] * 2
+    directory.chmod(0o1777)
+    assert cache.trusted_cache() is not None
+    directory.chmod(0o777)
+    with pytest.warns(CacheWarning, match="can be written by every user"):
+        assert cache.trusted_cache() is None
+
+
+@POSIX
+@needs_compiler
+@pytest.mark.parametrize(
+    "place", ["file in the way", "too long", "dead link", "no name", "unreadable", "read-only"]
+)
+def test_places_that_are_no_use(
+    tmp_path: Path, directory: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    """One line, and a folder of the user's own among temporary files serves: the next finds it."""
+    wanted = directory
+    if place == "file in the way":
+        directory.write_text("")
+        wanted = directory / "cache"
+    elif place == "too long":
+        wanted = directory / ("x" * 5000)
+    elif place == "dead link":
+        directory.symlink_to(tmp_path / "nowhere")
+    elif place == "no name":
+        wanted = Path("/proc/nothing/here")
+    elif os.getuid() == 0:
+        pytest.skip("root may read and write everything")
+    else:
+        directory.mkdir(mode=0 if place == "unreadable" else 0o500)
+    monkeypatch.setenv("CASADI_IK_CACHE", str(wanted))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert works()
+        monkeypatch.setattr(compiler.Compiler, "build", refuse_to_build)
+        monkeypatch.setattr(libraries, "_loaded", {})
+        assert works()
+    (warning,) = caught
+    assert warning.category is CacheWarning
+    assert "cannot be used: " in str(warning.message)
+    assert len(str(warning.message)) < 500
+    assert (tmp_path / f"casadi_ik-{os.getuid()}").stat().st_mode & 0o777 == 0o700
+
+
+@needs_compiler
+def test_a_full_disk(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """First the cache's, so that another place has to do; then every disk."""
+    write = Path.write_text
+
+    def full(path: Path, *arguments: object, **named: object) -> int:
+        if everywhere or directory in path.parents:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, *arguments, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Path, "write_text", full)
+    everywhere = False
+    with pytest.warns(CacheWarning, match="No space left on device"):
+        assert works()
+    forget(monkeypatch)
+    everywhere = True
+    with pytest.warns((CacheWarning, NoCompilerWarning)) as caught:
+        made = kernel()
+    assert caught[-1].category is NoCompilerWarning
+    assert not made.compiled
+    assert made(3)[0] == 6
+    assert list(directory.iterdir()) == []
+
+
+@POSIX
+@needs_compiler
+def test_a_compiler_that_finds_the_disk_full(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lie(directory, monkeypatch, 'echo "as: write error: No space left on device" >&2; exit 1')
+    with pytest.warns((CacheWarning, NoCompilerWarning)) as caught:
+        assert not kernel().compiled
+    assert "No space left on device" in str(caught[0].message)
+
+
+@POSIX
+@needs_compiler
+def test_a_working_folder_that_is_gone(tmp_path: Path) -> None:
+    """A relative place cannot be found then; one line, and the answer is right all the same."""
+    text = f"""
+        import os
+        import casadi as ca
+        from casadi_ik.kernels import FunctionKernel
+        os.chdir({str(tmp_path)!r})
+        os.rmdir(os.getcwd())
+        x = ca.SX.sym("x")
+        kernel = FunctionKernel(ca.Function("scaled", [x], [2 * x]))
+        print(kernel.compiled, kernel(3)[0])
+    """
+    with script(text, CASADI_IK_CACHE="relative") as process:
+        said, complaint = process.communicate(timeout=300)
+    assert said == "True 6.0\n"
+    assert complaint.count("CacheWarning") == 1
+
+
+# Signals, forks, processes that are killed.
+
+
+class Pressed:
+    """Presses Ctrl-C while CasADi converts it, which takes that for a number of the wrong type."""
+
+    def __SX__(self) -> ca.SX:
+        signal.raise_signal(signal.SIGINT)
+        return ca.SX(1)
+
+
+@needs_compiler
+@pytest.mark.parametrize("when", ["graph", "compiler"])
+def test_ctrl_c_leaves_nothing(directory: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    def build() -> ca.Function:
+        with suppress(TypeError):
+            _ = ca.SX.sym("x") * Pressed()  # type: ignore[operator]
+        return scaled()
+
+    if when == "compiler":
+        monkeypatch.setattr(
+            compiler.Compiler, "build", lambda *_: signal.raise_signal(signal.SIGINT)
+        )
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's "&" ignores it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            kernel(build if when == "graph" else scaled)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert list(directory.iterdir()) == []
+
+
+@needs_compiler
+def test_what_killed_compilations_left_goes(directory: Path) -> None:
+    """Of dead processes after an hour, of unknown ones after a day, and nothing else."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    directory.mkdir(mode=0o700)
+    made = {
+        f"build-{gone.pid}-a": (2, False),
+        f"build-{gone.pid}-b": (0, True),
+        f"build-{os.getpid()}-c": (2, True),
+        f"build-{os.getpid()}-d": (30, True),
+        "build-e_old": (30, False),
+        "build-f_young": (2, True),
+        f".x-0.key.{gone.pid}.part": (2, False),
+        f".x-0.key.{os.getpid()}.part": (2, True),
+        "mine": (30, True),
+    }
+    for name, (hours, _) in made.items():
+        path = directory / name
+        if name.startswith("build"):
+            path.mkdir()
+            (path / "kernel.c").write_text("")
+        else:
+            path.write_text("")
+        age(path, 3600 * hours + 60)
+    assert works()
+    left = {path.name for path in directory.iterdir() if not path.name.startswith("scaled")}
+    assert left == {name for name, (_, stays) in made.items() if stays}
+
+
+def age(path: Path, seconds: float) -> None:
+    then = time.time() - seconds
+    for old in (*path.glob("*"), path):
+        os.utime(old, (then, then))
+
+
+@needs_compiler
+def test_a_compilation_that_is_killed(directory: Path) -> None:
+    """What it leaves is no library and holds nobody up: the next one builds."""
+    text = """
+        import casadi as ca
+        from casadi_ik.kernels import FunctionKernel, compiler
+        def build(self, source, library):
+            library.write_bytes(b"half")
+            print("go", flush=True)
+            import time; time.sleep(60)
+        compiler.Compiler.build = build
+        x = ca.SX.sym("x")
+        FunctionKernel(ca.Function("scaled", [x], [2 * x]))
+    """
+    with script(text) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "go\n"
+    (left,) = directory.glob("build-*")
+    assert left.name.startswith(f"build-{process.pid}-")
+    age(left, 3700)
+    assert works()
+    assert not left.exists()
+    assert sorted(directory.iterdir()) == sorted(
+        (*directory.glob("*.so"), *directory.glob("*.key"))
+    )
+
+
+@POSIX
+@needs_compiler
+def test_a_fork_while_another_thread_builds(directory: Path) -> None:
+    """It holds the lock of libraries, and up to Python 3.11 that of a cached property."""
+    building, forked = threading.Event(), threading.Event()
+
+    def slow() -> ca.Function:
+        building.set()
+        forked.wait(60)
+        return scaled(name="slow")
+
+    graph = FunctionGraph("slow", slow, {"x": (1, 1)}, ((1, 1),))
+    thread = threading.Thread(target=FunctionKernel, args=(graph,))
+    thread.start()
+    assert building.wait(60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # a fork of a process with threads
+        child = multiprocessing.get_context("fork").Process(target=works_or_dies)
+        child.start()
+    child.join(30)
+    alive = child.is_alive()
+    if alive:
+        child.kill()
+    forked.set()
+    thread.join()
+    assert not alive
+    assert child.exitcode == 0
+
+
+def works_or_dies() -> None:
+    os._exit(0 if works() else 3)

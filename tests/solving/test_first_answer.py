@@ -1,0 +1,113 @@
+"""The first answers of a robot, while its C is compiled in the background."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.kernels.compiler import find_compiler
+
+pytestmark = pytest.mark.skipif(
+    find_compiler() is None or os.name != "posix", reason="needs a C compiler, and POSIX's signals"
+)
+
+SOLVE = """
+    import sys
+    import casadi_ik as ik
+    solver = ik.Solver(ik.load_robot("kuka_lwr_barrett"), scene={scene})
+    answers = [solver.solve(ik.load_grasp("cup")) for _ in range(3)]
+    assert all(answer.success for answer in answers)
+    print(*answers[-1].q.tolist())
+"""
+
+
+def run(cache: Path, policy: str, scene: str = "None") -> tuple[np.ndarray, str]:
+    """The answer of another process, and what it says."""
+    changed = {"CASADI_IK_CACHE": str(cache), "CASADI_IK_COMPILE": policy}
+    root = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(SOLVE.format(scene=scene))],
+        env=os.environ | changed | root,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=True,
+    )
+    return np.array(done.stdout.split(), dtype=float), done.stderr
+
+
+def loops(cache: Path) -> list[Path]:
+    return list(cache.glob("hand_first_kuka_lwr_barrett*.so"))
+
+
+def workers(cache: Path) -> list[int]:
+    """Processes that compile into a cache."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            about = (place / "environ").read_bytes(), (place / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if f"CASADI_IK_CACHE={cache}\0".encode() in about[0] and b"first_answer" in about[1]:
+            found.append(int(place.name))
+    return found
+
+
+@pytest.mark.parametrize("scene", ["None", "ik.load_scene('table')"])
+def test_the_virtual_machine_answers_until_there_is_compiled_code(
+    tmp_path: Path, scene: str
+) -> None:
+    early, said = run(tmp_path, "background", scene)
+    about = "kuka_lwr_barrett: compiled in the background (about 8 s, once per machine)"
+    assert said.startswith(about)
+    assert said.count("\n") == 1
+    if not Path("/proc/self/environ").exists():
+        pytest.skip("how processes are found is Linux's")
+    until = time.monotonic() + 500
+    while workers(tmp_path) and time.monotonic() < until:
+        time.sleep(0.2)
+    assert len(loops(tmp_path)) == 2  # one after the other, and side by side
+    assert not list(tmp_path.glob("build-*"))
+    late, said = run(tmp_path, "background", scene)
+    assert said == ""
+    np.testing.assert_allclose(late, early, rtol=0, atol=1e-9)
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="how processes are found")
+def test_a_compilation_in_the_background_may_be_killed(tmp_path: Path) -> None:
+    early, _ = run(tmp_path, "background")
+    for number in workers(tmp_path):
+        os.killpg(number, signal.SIGKILL)
+    late, said = run(tmp_path, "wait")
+    assert said == ""
+    np.testing.assert_allclose(late, early, rtol=0, atol=1e-9)
+    assert loops(tmp_path)
+
+
+def test_what_the_first_round_does_not_solve_waits(
+    robot: ik.ArmHand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So nobody's answer depends on when it was asked for."""
+    points, normals = robot.contacts(robot.home)
+    grasp = ik.Grasp(
+        {
+            name: ik.Contact(point + 5.0, normal)
+            for name, point, normal in zip(robot.fingers, points, normals, strict=True)
+        }
+    )
+    expected = ik.Solver(robot).solve(grasp)
+    monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
+    monkeypatch.setenv("CASADI_IK_COMPILE", "background")
+    found = ik.Solver(robot).solve(grasp)
+    assert (found.status, found.q.tobytes()) == (expected.status, expected.q.tobytes())
+    for number in workers(tmp_path):
+        os.killpg(number, signal.SIGKILL)
