@@ -52,6 +52,8 @@ def _plain(value: Any) -> Iterator[bytes]:
         if array.dtype.kind == "f":
             array = np.round(array.astype("<f8"), DECIMALS) + 0.0  # no negative zeros
         yield f"{array.shape}{array.dtype.str}".encode() + array.tobytes()
+    elif isinstance(value, Path):
+        yield value.name.encode()  # of a mesh to be drawn, wherever it is
     elif is_dataclass(value):
         yield type(value).__name__.encode()
         for item in fields(value):

@@ -90,7 +90,9 @@ class FirstAnswers:
         self._looked = 0.0
         self._lock = threading.Lock()
 
-    def answer(self, targets: TargetBatch, start: Array, check: SceneCheck | None) -> Solution | None:
+    def answer(
+        self, targets: TargetBatch, start: Array, check: SceneCheck | None
+    ) -> Solution | None:
         """The answer of the virtual machine.
 
         Args:
