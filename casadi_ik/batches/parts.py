@@ -74,16 +74,17 @@ class SolvedPart:
     faults: dict[int, str]
 
 
-def solve_part(solver: bytes, asked: Asked, part: Part) -> SolvedPart:
+def solve_part(solver: bytes, asked: Asked, part: Part, place: str | None = None) -> SolvedPart:
     """Solve a part.
 
     Args:
         solver: A pickled `Solver`; what it is made to is kept for the next part.
         asked: How.
         part: Its targets.
+        place: Folder for what is there meanwhile; None: that of the system.
     """
-    with tempfile.TemporaryDirectory(prefix="casadi_ik-part-") as place:
-        path = Path(place) / "part.mcap" if asked.log else None
+    with tempfile.TemporaryDirectory(prefix="casadi_ik-part-", dir=place) as folder:
+        path = Path(folder) / "part.mcap" if asked.log else None
         (block,) = _solver(solver).solve_blocks(
             [part.arrays],
             asked.q0,
@@ -216,12 +217,13 @@ class BatchFolder:
             raise InputError(f"{path}: damaged ({error}); remove it and go on") from error
 
     def remove(self) -> None:
-        """Remove the parts and the folder, if there is nothing else in it."""
+        """Remove the parts, and the folders if there is nothing else in them."""
         for number in self.done():
             self.part(number).unlink()
         (self.path / MANIFEST).unlink()
-        if not any(self.path.iterdir()):
-            self.path.rmdir()
+        for folder in filter(None, (self.path, self.logs)):
+            if not any(folder.iterdir()):
+                folder.rmdir()
 
     def _read(self, path: Path) -> dict[str, Any]:
         try:
@@ -272,7 +274,8 @@ def solve_parts(
     if len(done.intersection(range(len(source.sizes)))) == len(source.sizes):
         return
     pickled = pickle.dumps(solver)
-    with backend(jobs, dask):
+    # Removed with all in it, also if workers of this machine are killed in the middle of a part.
+    with tempfile.TemporaryDirectory(prefix="casadi_ik-parts-") as own, backend(jobs, dask):
         import joblib
 
         # A batch of calls would come back, and be lost, as a whole; joblib's annotation of this
@@ -282,7 +285,8 @@ def solve_parts(
         parts = source.without(done)
         if object_pose is not None:
             parts = (replace(part, arrays=moved(part.arrays, object_pose)) for part in parts)
-        calls = (joblib.delayed(solve_part)(pickled, asked, part) for part in parts)
+        place = own if dask is None else None
+        calls = (joblib.delayed(solve_part)(pickled, asked, part, place) for part in parts)
         solved = iter(parallel(calls))
         while True:
             try:

@@ -268,8 +268,11 @@ def _solve_parts(
                 faults.add(part.faults)
                 show(part.count)
         except KeyboardInterrupt:
-            kept = f"{folder.path} has {len(folder.done())} of {len(source.sizes)} parts"
-            say("interrupted", f"{kept}; --resume goes on with them")
+            if done := folder.done():
+                kept = f"{folder.path} has {len(done)} of {len(source.sizes)} parts"
+                say("interrupted", f"{kept}; --resume goes on with them")
+            else:
+                folder.remove()
             raise
     every = ((first, _answers(folder, source, i)) for i, first in enumerate(source.first_rows))
     if not one_file:

@@ -482,18 +482,6 @@ def _origin(about: logs.LogInfo) -> dict[str, str]:
     return {printable(name, 60): printable(text, 2000) for name, text in pairs.items()}
 
 
-def _tolerance(value: Any) -> str:
-    """The fingers' tolerances, once where they are the same."""
-    try:
-        texts = {
-            name: f"{1e3 * one['position']:.4g} mm, {math.degrees(one['angle']):.4g} deg"
-            for name, one in value.items()
-        }
-    except (TypeError, KeyError, AttributeError):  # of another writer
-        return _flat(value)
-    return _flat(texts) if len(set(texts.values())) > 1 else next(iter(texts.values()), "none")
-
-
 def _by_shard(texts: Sequence[str]) -> str:
     """What shards differ in."""
     more = f" | {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""

@@ -276,3 +276,25 @@ def test_answers_are_an_npz_or_a_folder(targets: Path, tmp_path: Path, capsys):
         assert f"{name}', expected OUT.npz or a folder" in error
         assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("wait_for", ["out.npz.parts", "out.npz.parts/part-*.npz"])
+def test_terminated_leaves_nothing_half_written(
+    targets: Path, tmp_path: Path, wait_for: str
+) -> None:
+    """What is left after SIGTERM are whole parts with their logs; without a part, nothing."""
+    out, logs = tmp_path / "out.npz", tmp_path / "logs"
+    process = begun(targets, *ROBOT, *PARTS, "--jobs", 2, "--out", out, "--log", logs)
+    while process.poll() is None and not list(tmp_path.glob(wait_for)):
+        time.sleep(0.01)
+    process.terminate()
+    said = process.communicate(timeout=120)
+    assert process.returncode == 143, said
+    parts = sorted((tmp_path / "out.npz.parts").glob("part-*.npz"))
+    left = {path for path in tmp_path.rglob("*") if path.is_file()}
+    written = set(logs.glob("part-*.mcap"))
+    manifest = {tmp_path / "out.npz.parts" / "batch.json"} if parts else set()
+    assert left == {*parts, *written, *manifest}
+    assert {path.stem for path in written} >= {path.stem for path in parts}
+    assert all(len(answers(part)["q"]) == SIZE for part in parts)
+    assert all(len(ik.logs.open(log).solves()) == SIZE for log in written)
