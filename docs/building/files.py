@@ -41,7 +41,7 @@ def file_reference() -> str:
 
 def quantities() -> str:
     """What may stand for a number, by what it measures."""
-    rows = ["| in the tables | what may stand there |", "|---|---|"]
+    rows = ["| type | value |", "|---|---|"]
     found: dict[str, Any] = {}
     for kind in FILES:
         found |= schema_of(kind)["definitions"]

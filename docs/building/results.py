@@ -14,7 +14,7 @@ FOLDER = ROOT / "studies" / "results"
 
 def results_table() -> str:
     """A Markdown table with a row per report in studies/results."""
-    rows = ["| study | report of | commit |", "|---|---|---|"]
+    rows = ["| report | date | commit |", "|---|---|---|"]
     for report in _reports():
         day, commit = _last_change(report)
         name = report.parent.relative_to(FOLDER).as_posix()

@@ -37,9 +37,15 @@ FILE_NAME = re.compile(r"# (\w+\.yaml)\b")
 WITH_OUTPUT = re.compile(r"^```python\n((?:(?!```).)*)^```\n\n```text\n(.*?)^```", re.M | re.S)
 """A block of Python, and what it prints."""
 
-NOT_PASTED = {"add_a_coupling", "add_a_shape", "add_an_arm_family", "your_robot"}
-"""Their Python belongs into modules of the package, for which each has a test of its own; that of
-`your_robot` stands between commands and is run with them."""
+NOT_PASTED = {
+    "add_a_method",
+    "add_a_coupling",
+    "add_a_shape",
+    "add_an_arm_family",
+    "your_robot",
+}
+"""The others' Python belongs into modules, for which each has a test of its own; that of `your_robot`
+stands between commands and is run with them."""
 
 GRASP = re.compile(r"^( *)contacts:.*\n(?:\1 +\w+: +\{point.*\n)+", re.MULTILINE)
 """A grasp in a docstring."""
