@@ -44,8 +44,8 @@ NOT_PASTED = {
     "add_an_arm_family",
     "your_robot",
 }
-"""The others' Python belongs into modules, for which each has a test of its own; that of `your_robot`
-stands between commands and is run with them."""
+"""Python of the others belongs into modules, for which each has a test of its own; that of
+`your_robot` stands between commands and is run with them."""
 
 GRASP = re.compile(r"^( *)contacts:.*\n(?:\1 +\w+: +\{point.*\n)+", re.MULTILINE)
 """A grasp in a docstring."""
