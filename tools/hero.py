@@ -20,32 +20,33 @@ from PIL import ImageDraw
 import casadi_ik as ik
 from casadi_ik import palette
 from casadi_ik.arrays import Array
+from casadi_ik.drawing.cameras import close_view, whole_view
 from casadi_ik.drawing.drawables import asked_marks, bodies, object_of, placed
 from casadi_ik.views.charts import save_picture
 from casadi_ik.views.pictures import animated
-from casadi_ik.views.stage import Image, Stage, close_view, over, points_of, whole_view
+from casadi_ik.views.stage import Image, Stage, over, points_of
 
 ROBOT, GRASP = "kuka_lwr_barrett", "cup"
 
 WHOLE, CLOSE, BESIDE = (470, 400), (290, 290), 55
 """Of the robot and of the hand from close by [pixels]; how far the second is below the top."""
 
-PICTURES, SECONDS = 60, 5.4
+PICTURES, SECONDS = 72, 6.5
 """Of a round."""
 
-SWAY = np.array([0.09, 0.15, 0.12])
+SWAY = np.array([0.09, -0.15, 0.12])
 """How far the object goes to either side of where the grasp has it [m]."""
 
-TURN = 0.35
+TURN = 0.3
 """By how much it turns about the vertical to either side [rad]."""
 
 
 def path(grasp: ik.Grasp) -> list[ik.Grasp]:
-    """The grasp along a closed way of its object."""
+    """The grasp along a way of its object, slow at both ends."""
     alone, start = grasp.in_object_frame(), grasp.object_pose
     assert start is not None
     found = []
-    for angle in np.linspace(0.0, 2 * np.pi, PICTURES, endpoint=False):
+    for angle in -0.8 * np.pi * np.cos(np.linspace(0.0, np.pi, PICTURES // 2 + 1)):
         pose = start.copy()
         c, s = np.cos(TURN * np.sin(angle)), np.sin(TURN * np.sin(angle))
         pose[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ start[:3, :3]
@@ -144,15 +145,17 @@ def main(arguments: list[str] | None = None) -> None:
     robot = ik.load_robot(ROBOT)
     solver, grasps = ik.Solver(robot), path(ik.load_grasp(GRASP))
     q, found = robot.home, []
-    for grasp in [*grasps, *grasps]:
+    for grasp in grasps:
         solution = solver.solve(grasp, q0=q)
         if not solution.success:
             raise SystemExit(f"{GRASP}: {solution.status.name}")
         q = solution.q
         found.append(q)
-    every_q = np.array(found[PICTURES:])
-    steps = np.abs(np.diff(every_q, axis=0, append=every_q[:1]))
-    print(f"largest step {np.rad2deg(steps.max()):.0f} deg")
+    step = np.rad2deg(np.abs(np.diff(found, axis=0)).max())
+    print(f"{len(grasps)} solves, the largest step {step:.0f} deg")
+    # And the same way back.
+    every_q = np.array(found + found[-2:0:-1])
+    grasps += grasps[-2:0:-1]
     for name, images in zip(("light", "dark"), pictures(robot, grasps, every_q), strict=True):
         file = options.out / f"hero_{name}.gif"
         pause = round(1e3 * SECONDS / PICTURES / 10) * 10

@@ -28,9 +28,16 @@ from casadi_ik.cli.options import Option
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.collision.scene import Scene
 from casadi_ik.datasets import load_candidates
-from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, did_you_mean
+from casadi_ik.errors import (
+    InputError,
+    LogError,
+    MissingExtraError,
+    UnknownNameError,
+    did_you_mean,
+)
 from casadi_ik.files.reading import read_yaml
 from casadi_ik.files.shipped import shipped_names
+from casadi_ik.logs import RecordedMotion, read_motion
 from casadi_ik.logs.solve import OneSolve, one_solve
 
 if TYPE_CHECKING:
@@ -78,6 +85,7 @@ def view(said: Said) -> Answer:
       casadi-ik view ranked.json                answers of `casadi-ik choose`
       casadi-ik view candidates.yaml --robot R  each solved when it is chosen
       casadi-ik view cup.mcap                   play a solve; of two side by side
+      casadi-ik view way.mcap                   play what `reach` or `follow` wrote
       casadi-ik view my_robot.yaml --pads       correct guessed pads by hand
 
     The page stays until Ctrl-C. Only this machine can open it unless --host says
@@ -105,6 +113,18 @@ def opened(said: Said) -> Viewer:
 
     served: dict[str, Any] = {"host": said.host, "port": said.port}
     if all(_is_log(Path(one)) for one in said.what):
+        if len(said.what) == 1 and (motion := _motion(said.what[0])):
+            robot = the_robot(said.robot or motion.robot, Path(said.what[0]))
+            with located(said.what[0]):
+                q = motion.ordered(robot.actuators)
+            return viewing.view_motion(
+                robot,
+                motion.times,
+                q,
+                scene=the_scene(said),
+                label=Path(said.what[0]).stem,
+                **served,
+            )
         with located("view"):
             return viewing.view_log(*_the_logs(said), scene=the_scene(said), **served)
     if len(said.what) > 1:
@@ -136,6 +156,16 @@ def opened(said: Said) -> Viewer:
 
 def _is_log(path: Path) -> bool:
     return path.suffix == ".mcap" or (path.is_dir() and any(path.rglob("*.mcap")))
+
+
+def _motion(file: str) -> RecordedMotion | None:
+    """What `reach` or `follow` wrote; None: a log of solves."""
+    try:
+        return read_motion(file)
+    except LogError as error:
+        if Path(file).is_file() and not str(error).startswith("no motion"):
+            raise
+        return None
 
 
 def _kind(name: str) -> str:

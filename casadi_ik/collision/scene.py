@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -371,12 +372,14 @@ class Item:
         parts: Its solids, each with its (4, 4) pose in the item's frame.
         pose: (4, 4) of the item in the robot's base frame.
         margin: Distance to keep from it [m]; None: the scene's.
+        entry: What a scene file says of it, with whole paths.
     """
 
     name: str
     parts: tuple[tuple[Solid, Array], ...]
     pose: Array
     margin: float | None = None
+    entry: SolidEntry | None = None
 
 
 class Scene:
@@ -465,7 +468,8 @@ class Scene:
         for name, solid in entry.solids.items():
             where = f"{path}: solids.{name}"
             parts = solid.solids(where, path.parent)
-            self.items[name] = Item(name, parts, solid.matrix(where), solid.margin)
+            entry_there = _located(solid, path.parent)
+            self.items[name] = Item(name, parts, solid.matrix(where), solid.margin, entry_there)
         self.grasped = entry.grasped
         if entry.grasped is not None and entry.grasped not in self.items:
             known = ", ".join(self.items) or "none"
@@ -524,15 +528,52 @@ class Scene:
         place = checked_pose(pose, f"pose of {name!r}")
         known = self.items.get(name)
         parts = known.parts if known else tuple(object_solids(name))
-        scene = self._with(Item(name, parts, place, known.margin if known else None))
+        margin, said = (known.margin, known.entry) if known else (None, ObjectEntry(object=name))
+        scene = self._with(Item(name, parts, place, margin, said))
         scene.grasped = name
         return scene
+
+    def text(self) -> str:
+        """The scene as a file that `load_scene` reads, everything where it is now.
+
+        Example:
+            >>> print(ik.load_scene("table").text().splitlines()[0])
+            name: "table"
+        """
+        lines = [f"name: {json.dumps(self.name)}", f"margin: {self.margin:.9g}"]
+        if self.grasped is not None:
+            lines.append(f"grasped: {json.dumps(self.grasped)}")
+        for key, rows in (("touching", self.touching), ("margins", self.margins.items())):
+            lines += [f"{key}:"] if rows else []
+            for row in rows:
+                links, value = (row.links, row.reason) if isinstance(row, Touching) else row
+                said = {"links": sorted(links), "reason" if key == "touching" else "margin": value}
+                lines.append(f"  - {json.dumps(said)}")
+        lines += ["solids:"] if self.items else ["solids: {}"]
+        for name, item in self.items.items():
+            assert item.entry is not None
+            there = ("xyz", "rpy", "quaternion_wxyz", "quaternion_xyzw", "pose")
+            plain = msgspec.to_builtins(item.entry, enc_hook=_plain)
+            kept = {k: v for k, v in plain.items() if k not in there and v is not None}
+            said = json.dumps(kept | {"pose": item.pose.tolist()}, ensure_ascii=False)
+            lines.append(f"  {json.dumps(name)}: {said}")
+        return "\n".join(lines) + "\n"
 
     def _with(self, item: Item) -> Scene:
         scene = Scene.__new__(Scene)
         scene.__dict__.update(self.__dict__)
         scene.items = self.items | {item.name: item}
         return scene
+
+
+def _located(entry: SolidEntry, folder: Path) -> SolidEntry:
+    """The same with whole paths."""
+    names = getattr(entry, "file", None)
+    if not names:
+        return entry
+    many = names if isinstance(names, list) else [names]
+    whole = [str((folder / Path(name).expanduser()).resolve()) for name in many]
+    return msgspec.structs.replace(entry, file=whole if isinstance(names, list) else whole[0])
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from casadi_ik.arm_hand import ArmHand, load_robot
-from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
 from casadi_ik.drawing.drawables import file_meshes
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
@@ -25,10 +25,11 @@ except ImportError as error:
         "pip install 'casadi-ik[view]'"
     ) from error
 
-from casadi_ik.viewing.access import HOST, LOOPBACK, PORT, Viewer, serve
-from casadi_ik.viewing.grasp_page import GraspPage
-from casadi_ik.viewing.log_page import LogPage, track_of
+from casadi_ik.viewing.access import HOST, LOOPBACK, PORT, Server, Viewer, serve
+from casadi_ik.viewing.grasp_page import Candidates, GraspPage
 from casadi_ik.viewing.pad_page import PadPage
+from casadi_ik.viewing.page import Page
+from casadi_ik.viewing.play_page import PlayPage, motion_track, track_of
 from casadi_ik.viewing.request import PageRequest, Settings, request_of
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "request_of",
     "view_grasp",
     "view_log",
+    "view_motion",
     "view_pads",
 ]
 
@@ -51,9 +53,10 @@ def view_grasp(
     q: ArrayLike | None = None,
     scene: Scene | None = None,
     settings: Settings | None = None,
-    candidates: Mapping[str, Callable[[], tuple[PageRequest, Array]]] | None = None,
+    candidates: Candidates | None = None,
     host: str = HOST,
     port: int | None = None,
+    dark: bool = False,
 ) -> Viewer:
     """A page on which contacts, the object and what stands about are dragged.
 
@@ -67,6 +70,7 @@ def view_grasp(
         candidates: Other requests to choose from, by name: each gives it, and a start.
         host: Who may see it; "0.0.0.0": everybody in the network.
         port: Where; None: the first free one from 8080 on.
+        dark: Whether the page is dark at first.
 
     Raises:
         InputError: A finger that the robot has not, or a port that cannot be had.
@@ -74,13 +78,10 @@ def view_grasp(
     """
     start = robot.configuration(q)
     asked = request_of(robot, grasp, start, scene, settings)
-    server = serve(host, port)
-    try:
-        page = GraspPage(server, robot, asked, start, candidates, solved=q is None)
-    except BaseException:
-        server.stop()
-        raise
-    return Viewer(server, page, page.stop)
+    return _shown(
+        serve(host, port),
+        lambda server: GraspPage(server, robot, asked, start, candidates, q is None, dark),
+    )
 
 
 def view_log(
@@ -88,6 +89,7 @@ def view_log(
     scene: Scene | None = None,
     host: str = HOST,
     port: int | None = None,
+    dark: bool = False,
 ) -> Viewer:
     """A page on which one solve plays, or two side by side.
 
@@ -96,6 +98,7 @@ def view_log(
         scene: What stood about the robot, which a log does not tell; None: nothing is drawn.
         host: As for `view_grasp`.
         port: As for `view_grasp`.
+        dark: As for `view_grasp`.
 
     Raises:
         LogError: The log has kept no iterations.
@@ -104,9 +107,39 @@ def view_log(
     if not 1 <= len(solves) <= 2:
         raise InputError(f"found {len(solves)} solves, expected one or two")
     tracks = [track_of(*one) for one in solves]
-    server = serve(host, port)
-    page = LogPage(server, tracks, scene)
-    return Viewer(server, page, page.stop)
+    return _shown(serve(host, port), lambda server: PlayPage(server, tracks, scene, dark))
+
+
+def view_motion(
+    robot: ArmHand,
+    times: ArrayLike,
+    q: ArrayLike,
+    *,
+    grasp: Grasp | None = None,
+    scene: Scene | None = None,
+    label: str = "",
+    host: str = HOST,
+    port: int | None = None,
+    dark: bool = False,
+) -> Viewer:
+    """A page on which a motion plays, with every motor and its velocity over time.
+
+    Args:
+        robot: The robot.
+        times: (k,) increasing [s].
+        q: (k, n) [rad or m].
+        grasp: Contacts that are drawn; None: none.
+        scene: What stood about the robot; None: nothing is drawn.
+        label: What the motion is called.
+        host: As for `view_grasp`.
+        port: As for `view_grasp`.
+        dark: As for `view_grasp`.
+
+    Raises:
+        InputError: Times and positions do not fit, or a port that cannot be had.
+    """
+    track = motion_track(robot, np.asarray(times, float), np.asarray(q, float), label, grasp)
+    return _shown(serve(host, port), lambda server: PlayPage(server, [track], scene, dark))
 
 
 def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None = None) -> Viewer:
@@ -128,6 +161,16 @@ def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None =
         raise DescriptionError(f"{file}: fingers: expected the pads of the fingers, by name")
     surfaces = file_meshes(robot.description)
     writable = host in LOOPBACK
-    server = serve(host, port, secret=writable)
-    page = PadPage(server, robot, file, surfaces, writable)
-    return Viewer(server, page, page.stop)
+    return _shown(
+        serve(host, port, secret=writable),
+        lambda server: PadPage(server, robot, file, surfaces, writable),
+    )
+
+
+def _shown(server: Server, page: Callable[[Server], Page]) -> Viewer:
+    """A page that runs; nothing is served if it cannot be made."""
+    try:
+        return Viewer(server, page(server))
+    except BaseException:
+        server.stop()
+        raise

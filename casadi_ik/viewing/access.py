@@ -11,9 +11,11 @@ import asyncio
 import contextlib
 import errno
 import hmac
+import html
 import io
 import ipaddress
 import logging
+import os
 import secrets
 import socket
 import threading
@@ -21,6 +23,7 @@ import warnings
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from http import HTTPStatus
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -32,6 +35,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from casadi_ik.errors import InputError, UnsupportedError
+from casadi_ik.files.writing import written_whole
 
 logger = logging.getLogger(__name__)
 
@@ -56,17 +60,19 @@ _HOOK = threading.Lock()
 """Pages are made one after the other: what viser calls is exchanged meanwhile."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Access:
-    """Who may open a page.
+    """Who may open a page, and what it is called.
 
     Attributes:
         host: The address it is served at.
         token: First part of the path of every request; "": none is expected.
+        title: On the browser's tab.
     """
 
     host: str
     token: str = ""
+    title: str = "casadi_ik"
 
     def refusal(self, request: Request) -> str:
         """Why a request is refused, "" if it is not."""
@@ -113,7 +119,8 @@ def asking(access: Access) -> Iterator[threading.Event]:
         how["process_request"] = _asking_first(access, how.get("process_request"))
         return plain(_quiet(handler), *rest, **how, logger=connections)
 
-    warnings.filterwarnings("ignore", r"\[viser\]")
+    # Of browsers that are gone before they are answered it says more than anybody needs.
+    warnings.filterwarnings("ignore", r"\[viser\]|Queued a ")
     with _HOOK:
         plain = websocket_server.serve
         websocket_server.serve = serve  # type: ignore[assignment, misc]
@@ -135,15 +142,27 @@ def _asking_first(access: Access, then: Any) -> Any:
         if path.split("?")[0] not in ("", "/"):
             return then(connection, Request(path, request.headers))
         plain = ((k, v) for k, v in request.headers.raw_items() if k.lower() != "accept-encoding")
-        return _titled(then(connection, Request(path or "/", Headers(plain))))
+        return _titled(then(connection, Request(path or "/", Headers(plain))), access.title)
 
     return process_request
 
 
-def _titled(page: Response | None) -> Response | None:
-    """The page itself, with its own name on the browser's tab."""
+WITHOUT = """<noscript>This page needs JavaScript.</noscript><script>
+if (!document.createElement("canvas").getContext("webgl2")) document.addEventListener(
+  "DOMContentLoaded", () => document.body.insertAdjacentHTML("afterbegin",
+  "<p role='alert' style='position:fixed;z-index:9999;margin:1em;padding:1em;background:#fff3cd;"
+  + "color:#333;border-radius:0.4em'>This browser has no WebGL 2, so nothing can be drawn: turn on "
+  + "hardware acceleration in its settings, or use another one.</p>"));
+</script></head>"""
+"""What is said where a browser cannot show the page."""
+
+
+def _titled(page: Response | None, title: str) -> Response | None:
+    """The page itself, with its own name on the browser's tab, and words where nothing is drawn."""
     if page is not None:
-        page.body = page.body.replace(b"<title>Viser</title>", b"<title>casadi_ik</title>")
+        named = f"<title>{html.escape(title)} · casadi_ik</title>"
+        page.body = page.body.replace(b"<title>Viser</title>", named.encode())
+        page.body = page.body.replace(b"</head>", WITHOUT.encode(), 1)
         del page.headers["Content-Length"]
         page.headers["Content-Length"] = str(len(page.body))
     return page
@@ -194,10 +213,12 @@ class Server(viser.ViserServer):
     """viser's server without its public tunnel, which any browser could ask for.
 
     Attributes:
-        token: First part of its address's path; "": it has none.
+        access: Who may open it.
+        camera: Where a browser that opens it looks from; None: not said yet.
     """
 
-    token = ""
+    access: Access
+    camera: Any = None
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Share nothing."""
@@ -214,12 +235,13 @@ class Viewer:
         page: What is on it.
     """
 
-    def __init__(self, server: Server, page: Any, stop: Callable[[], None]) -> None:
-        """Take what runs."""
-        self._server, self._stop, self.page = server, stop, page
+    def __init__(self, server: Server, page: Any) -> None:
+        """Take what runs; a page that another one takes the place of tells by `opened`."""
+        self._server, self.page = server, page
+        page.opened = self._take
         self.url = f"http://{_shown(server.get_host())}:{server.get_port()}"
-        if server.token:
-            self.url += f"/{server.token}/"
+        if server.access.token:
+            self.url += f"/{server.access.token}/"
 
     def __repr__(self) -> str:
         return f"<Viewer {self.url}>"
@@ -228,9 +250,35 @@ class Viewer:
         """In a notebook: the page itself."""
         return f'<iframe src="{self.url}" width="100%" height="600" frameborder="0"></iframe>'
 
+    def _take(self, page: Any) -> None:
+        self.page, page.opened = page, self._take
+
+    def to_html(self, path: str | os.PathLike[str] | None = None, dark: bool = False) -> str:
+        """What is seen as a page that needs no server: it can be turned, not changed.
+
+        Args:
+            path: Where it is written as well, if anywhere.
+            dark: Whether it is dark.
+
+        Returns:
+            The page, about a megabyte of text, for documents and notebooks.
+
+        Example:
+            >>> viewer = robot.view()
+            >>> text = viewer.to_html()
+            >>> viewer.stop()
+        """
+        self.page.work.settle()
+        text = self._server.scene.as_html(dark_mode=dark)
+        text = text.replace("<title>Viser</title>", f"<title>{self._server.access.title}</title>")
+        if path is not None:
+            with written_whole(Path(path)) as part:
+                part.write_text(text, encoding="utf-8")
+        return text
+
     def stop(self) -> None:
         """End the page."""
-        self._stop()
+        self.page.stop()
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -264,7 +312,7 @@ def serve(host: str = HOST, port: int | None = None, secret: bool = False) -> Se
     if not asked.is_set():
         server.stop()
         raise UnsupportedError(f"viser {viser.__version__} cannot be told whom to refuse")
-    server.token = access.token
+    server.access = access
     return server
 
 

@@ -16,6 +16,7 @@ from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
+from casadi_ik.drawing.cameras import axes_of, close_view, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
     asked_marks,
@@ -24,19 +25,21 @@ from casadi_ik.drawing.drawables import (
     item_of,
     merged,
     object_of,
+    placed,
     reached_marks,
 )
-from casadi_ik.drawing.surfaces import sharp
+from casadi_ik.drawing.surfaces import coarser, joined, mesh_of, sharp
 from casadi_ik.grasps.pose import rotations_of
 from casadi_ik.problem.clearance import Closest
 from casadi_ik.problem.verdict import ContactVerdict
+from casadi_ik.viewing.access import Server
 from casadi_ik.viewing.request import Held, PageRequest
 
 OBJECT = "object"
 """What the object is called among the things that can be dragged."""
 
-CONTACT_CONTROL, THING_CONTROL = 0.06, 0.09
-"""Sizes of the controls of contacts and of things [m]."""
+CONTACT_CONTROL, THING_CONTROL = 0.05, 0.07
+"""Sizes of the controls of contacts and of things [m]: smaller than hands are."""
 
 
 def add_drawable(server: viser.ViserServer, name: str, one: Drawable, **look: Any) -> Any:
@@ -233,7 +236,7 @@ class DrawnContacts:
         drags: Drags,
         name: str = "",
         tips: bool = True,
-        size: float = 1.5,
+        size: float = 1.0,
     ) -> None:
         """Draw them.
 
@@ -287,7 +290,7 @@ class _Target:
         size: float,
     ) -> None:
         self.control = Control(
-            server, name, size / 1.5 * CONTACT_CONTROL, lambda pose: drags.pose(finger, pose)
+            server, name, size * CONTACT_CONTROL, lambda pose: drags.pose(finger, pose)
         )
         self._meshes = {
             one.name: add_drawable(server, f"{name}/{one.name}", one, cast_shadow=False)
@@ -469,16 +472,44 @@ class DrawnClosest:
         self._label.text = f"{1e3 * length:.1f} mm"
 
 
+class Ghosts:
+    """A robot several times, each seen through and in a colour of its own."""
+
+    def __init__(self, server: viser.ViserServer, robot: ArmHand) -> None:
+        """Draw nothing yet."""
+        self._server, self._robot, self._drawn = server, robot, []
+
+    def show(self, many: Sequence[tuple[Array, str]]) -> None:
+        """Draw the robot at each q (n,) in a colour; of none nothing."""
+        with self._server.atomic():
+            for one in self._drawn:
+                one.remove()
+            self._drawn = []
+            for i, (q, color) in enumerate(many):
+                parts = [one.surface for one in placed(self._robot, q, bodies(self._robot))]
+                whole = mesh_of(coarser(joined(parts), 4000))
+                ghost = Drawable("ghost", whole, color)
+                look = {"opacity": 0.22, "cast_shadow": False, "receive_shadow": False}
+                self._drawn.append(add_drawable(self._server, f"/ghosts/{i}", ghost, **look))
+
+
 # Light, ground, camera.
 
+FOV = np.deg2rad(40.0)
+"""Of the camera, from below to above [rad]."""
 
-def set_stage(server: viser.ViserServer, title: str, floor: float = 0.0) -> None:
+PHONE = 0.8
+"""Screens that are narrower have the panel below [width by height]."""
+
+
+def set_stage(server: Server, title: str, floor: float, dark: bool) -> None:
     """Daylight, a ground with a grid of 0.1 m and 0.5 m, and the look of the panel.
 
     Args:
         server: The page.
         title: On the panel.
         floor: Height of the ground [m].
+        dark: Whether the page is dark.
     """
     scene, gui = server.scene, server.gui
     scene.set_up_direction("+z")
@@ -495,9 +526,9 @@ def set_stage(server: viser.ViserServer, title: str, floor: float = 0.0) -> None
         height=4.0,
         cell_size=0.1,
         section_size=0.5,
-        cell_color=(226, 228, 231),
-        section_color=(200, 204, 209),
-        shadow_opacity=0.22,
+        cell_color=(52, 58, 66) if dark else (226, 228, 231),
+        section_color=(78, 86, 96) if dark else (200, 204, 209),
+        shadow_opacity=0.35 if dark else 0.22,
         plane_opacity=0.0,
         position=(0.0, 0.0, floor),
     )
@@ -506,26 +537,90 @@ def set_stage(server: viser.ViserServer, title: str, floor: float = 0.0) -> None
         control_width="medium",
         show_logo=False,
         show_share_button=False,
+        dark_mode=dark,
         brand_color=palette.rgb("#2f6db3"),
     )
     gui.set_panel_label(title)
+    server.access.title = title
 
 
-def look_at(server: viser.ViserServer, target: Array, size: float, view: Array) -> None:
-    """Where a browser that opens the page looks from, and what lights what it sees.
+@dataclass(frozen=True)
+class Camera:
+    """Where from, and what.
+
+    Attributes:
+        target: (3,) middle of what is seen [m].
+        radius: Of a ball that holds it [m].
+        view: (3,) unit, from there towards the camera.
+    """
+
+    target: Array
+    radius: float
+    view: Array
+
+    def place(self, aspect: float = 1.0) -> Array:
+        """(3,) where the camera stands, so that all of it is seen on a screen so wide."""
+        half = min(FOV / 2, np.arctan(np.tan(FOV / 2) * aspect))
+        return self.target + self.radius / np.sin(half) * self.view
+
+    def show(self, server: Server) -> None:
+        """Look from there in every browser, and in those that open the page later."""
+        initial = server.initial_camera
+        initial.fov, initial.look_at, initial.position = FOV, self.target, self.place()
+        if server.camera is None:
+            # Those that come later look from where the page then says.
+            server.on_client_connect(lambda client: server.camera.first_on(client))
+        server.camera = self
+        for client in server.get_clients().values():
+            self.on(client)
+
+    def first_on(self, client: Any) -> None:
+        """Look from there in a browser that opens the page, if its screen is upright."""
+        if client.camera.aspect < 1.0:
+            self.on(client)
+
+    def on(self, client: Any) -> None:
+        """Look from there in one browser."""
+        aspect, position = client.camera.aspect, self.place(client.camera.aspect)
+        lower = np.zeros(3)
+        if aspect < PHONE:
+            # The panel covers the lower half there.
+            up = np.array([0.0, 0.0, 1.0]) - self.view[2] * self.view
+            height = np.linalg.norm(position - self.target) * np.tan(FOV / 2)
+            lower = -0.45 * height * up / np.linalg.norm(up)
+        with client.atomic():
+            client.camera.position = position + lower
+            client.camera.look_at = self.target + lower
+
+
+def cameras(
+    robot: ArmHand, q: Array, things: Sequence[Drawable] = (), count: int = 1
+) -> dict[str, Camera]:
+    """Where a robot at q (n,) is seen from: its hand with what it grasps, and the whole of it.
 
     Args:
-        server: The page.
-        target: (3,) middle of what is to be seen [m].
-        size: How large it is [m].
-        view: (3,) from there towards the camera.
+        robot: The robot.
+        q: (n,) [rad or m].
+        things: What is grasped, in the base frame.
+        count: How many robots stand side by side.
     """
-    way = view / np.linalg.norm(view)
-    server.initial_camera.fov = float(np.deg2rad(40.0))
-    server.initial_camera.look_at = target
-    server.initial_camera.position = target + 1.3 * size * way
+    body = placed(robot, q, bodies(robot))
+    hand = [one for one in body if one.role != "arm"]
+    close = close_view(robot, q)
+    whole = whole_view(robot.contacts(q)[0].mean(axis=0), close)
+    found = {}
+    seen = (("Hand", [*hand, *things], close, 1.15), ("Robot", [*body, *things], whole, 1.0))
+    for name, parts, view, room in seen:
+        points = np.concatenate([one.surface.points for one in parts])
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        radius = room * count * float(np.linalg.norm(points - middle, axis=1).max())
+        found[name] = Camera(middle, max(radius, 0.05), axes_of(view)[2])
+    return found
+
+
+def light_lamp(server: viser.ViserServer, camera: Camera) -> None:
+    """Light what a camera sees from above; its shadows cost less than those of a sun."""
     lamp = np.array([0.55, -0.45, 1.9])
-    # For its shadows the scene is drawn once more, for those of a sun three times.
     server.scene.add_light_spot(
         "/light/lamp",
         color=(255, 250, 242),
@@ -533,57 +628,7 @@ def look_at(server: viser.ViserServer, target: Array, size: float, view: Array) 
         decay=0.0,
         angle=0.95,
         penumbra=0.3,
-        position=tuple((target + size * lamp).tolist()),
+        position=tuple((camera.target + 2 * camera.radius * lamp).tolist()),
         direction=tuple((-lamp).tolist()),
         cast_shadow=True,
     )
-
-
-def look_at_robot(server: viser.ViserServer, robot: ArmHand, q: Array, wide: int = 1) -> None:
-    """The robot at q, its hand in the middle and seen from where its fingertips are apart.
-
-    Args:
-        server: The page.
-        robot: The robot.
-        q: (n,) [rad or m].
-        wide: How many robots stand side by side.
-    """
-    links = np.array([pose[:3, 3] for pose in robot.links(q).values()])
-    tips, normals = robot.contacts(q)
-    every = np.concatenate([links, tips])
-    low, high = every.min(axis=0), every.max(axis=0)
-    hand = tips.mean(axis=0)
-    size = wide * max(float(np.linalg.norm(high - low)), 0.3)
-    side = float(np.arctan2(hand[1], hand[0])) if np.hypot(*hand[:2]) > 0.05 else 0.0
-
-    def apart(view: Array) -> float:
-        flat = tips - np.outer(tips @ view, view)
-        gaps = np.linalg.norm(flat[:, None] - flat[None], axis=2)
-        gap = gaps[np.triu_indices(len(tips), 1)].min() if len(tips) > 1 else 0.0
-        return float(gap + 0.03 * (1 - np.abs(normals @ view).max()))
-
-    views = []
-    # Two stand beside each other as seen from where they reach to.
-    turns = [-75, -60, -45, -30, 30, 45, 60, 75] if wide == 1 else [-30, 30]
-    for turn in np.deg2rad(turns):
-        way = np.array([np.cos(side + turn), np.sin(side + turn), 0.36])
-        views.append(way / np.linalg.norm(way))
-    share = 0.62 if wide == 1 else 0.0
-    target = (1 - share) * (low + high) / 2 + share * hand
-    look_at(server, target, (0.72 if wide == 1 else 0.78) * size, max(views, key=apart))
-
-
-def look_at_hand(server: viser.ViserServer, robot: ArmHand, q: Array) -> None:
-    """The hand alone at q, from the side that its thumb's pad is seen from."""
-    links, palm = robot.links(q), robot.palm(q)
-    hand = {joint.child for joint in robot.description.joints if joint.part == "hand"}
-    tips, _ = robot.contacts(q)
-    points = [links[link][:3, 3] for link in links if link in hand]
-    every = np.concatenate([np.array([*points, palm[:3, 3]]), tips])
-    low, high = every.min(axis=0), every.max(axis=0)
-    size = max(float(np.linalg.norm(high - low)), 0.1)
-    # Across the way from palm to thumb, along which the pads are seen from the side.
-    aside = 0.35 * palm[:3, 2] + 0.25 * palm[:3, 1]
-    # Of its two sides the one that is seen from above the ground.
-    view = max(palm[:3, 0] + aside, aside - palm[:3, 0], key=lambda one: one[2])
-    look_at(server, (low + high) / 2, 1.25 * size, view + np.array([0.0, 0.0, 0.3]))

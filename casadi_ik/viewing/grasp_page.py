@@ -1,30 +1,29 @@
-"""The page on which contacts are dragged: the picture, the panel beside it, and what is solved."""
+"""The page on which an object or its contacts are dragged, and arm and hand follow."""
 
 from __future__ import annotations
 
-import io
-import json
-import logging
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
-import imageio.v3 as imageio
 import numpy as np
-import viser
 
 from casadi_ik import palette
 from casadi_ik.answers.solution import Alternative
-from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arm_hand import ArmHand, load_robot
 from casadi_ik.arrays import Array
+from casadi_ik.collision.scene import Scene, load_scene
+from casadi_ik.drawing.drawables import object_of
 from casadi_ik.errors import CasadiIKError
-from casadi_ik.grasps import Grasp, Tolerance
-from casadi_ik.grasps.load import grasp_data
+from casadi_ik.files.shipped import shipped_names
+from casadi_ik.grasps import Tolerance, load_grasp
+from casadi_ik.grasps.load import shipped_grasps
 from casadi_ik.problem.request import CLEARANCE, PREFERENCES
 from casadi_ik.problem.targets import LIMITS
 from casadi_ik.registry import METHODS
+from casadi_ik.viewing.access import Server
 from casadi_ik.viewing.drawn import (
     OBJECT,
     Drags,
@@ -32,27 +31,47 @@ from casadi_ik.viewing.drawn import (
     DrawnContacts,
     DrawnRobot,
     DrawnThings,
-    look_at_robot,
+    Ghosts,
+    cameras,
+    light_lamp,
     lowest,
-    set_stage,
     usable,
 )
-from casadi_ik.viewing.newest import LOOKS, PAUSE, REST, Newest
-from casadi_ik.viewing.request import Answer, Answerer, PageRequest, Settings, failed
-from casadi_ik.viewing.words import bars, block, legend, table, verdict_block
-
-logger = logging.getLogger(__name__)
-
-LEGEND = (
-    (palette.TARGET, "asked for: drag it"),
-    (palette.MET, "reached"),
-    (palette.MISSED, "missed: the nearest that can be reached"),
-    (palette.OBJECT, "object"),
-    (palette.NEAREST, "nearest to touching"),
+from casadi_ik.viewing.newest import LOOKS, PAUSE, REST
+from casadi_ik.viewing.page import DraggedPage
+from casadi_ik.viewing.panel import (
+    Q_FORMATS,
+    bars,
+    block,
+    copied_from,
+    file_name,
+    grasp_text,
+    legend,
+    on_press,
+    on_set,
+    q_text,
+    results_block,
+    save_picture,
+    save_text,
+    table,
+    verdict_block,
+)
+from casadi_ik.viewing.request import (
+    Answer,
+    Answerer,
+    PageRequest,
+    Settings,
+    failed,
+    request_of,
 )
 
-PICTURE = (1000, 1600)
-"""Height and width of a saved picture [pixels]."""
+LEGEND = (
+    (palette.TARGET, "asked for"),
+    (palette.MET, "reached"),
+    (palette.MISSED, "missed"),
+    (palette.OBJECT, "object"),
+    (palette.NEAREST, "smallest clearance"),
+)
 
 NOTHING = "nothing"
 
@@ -62,79 +81,78 @@ USES = ("point and normal", "point", "free")
 PREFER = {
     "q0": "nearest to what is shown",
     "limits": "far from limits",
-    "manipulability": "manipulability",
-    "clearance": "clearance",
+    "manipulability": "high manipulability",
+    "clearance": "large clearance",
 }
 """Which of several solutions, in words."""
 
+SKINS = ("bodies", "collision shapes")
 
-class GraspPage:
-    """A robot, a grasp, a scene; all of it belongs to the thread of `work`.
+MOST_GHOSTS = 16
+
+Candidates = Mapping[str, Callable[[], tuple[PageRequest, Array]]]
+"""Other requests to choose from, by name: each gives it, and a start."""
+
+
+class GraspPage(DraggedPage):
+    """A robot, a grasp, a scene.
 
     Attributes:
-        robot: The robot.
-        asked: What is asked now.
         answer: What is shown.
         solutions: All solutions of what is asked, as far as they are found.
-        work: What everything is done by.
+        candidates: Other requests to choose from.
     """
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: Server,
         robot: ArmHand,
         asked: PageRequest,
         q: Array,
-        candidates: Mapping[str, Callable[[], tuple[PageRequest, Array]]] | None = None,
+        candidates: Candidates | None = None,
         solved: bool = True,
+        dark: bool = False,
     ) -> None:
-        """Draw everything and begin.
+        """Solve, draw everything and begin.
 
         Args:
-            server: The page.
+            server: What serves it.
             robot: The robot.
             asked: What is asked first.
             q: (n,) where the robot is [rad or m].
-            candidates: Other requests to choose from, by name: each gives it, and a start.
+            candidates: Other requests to choose from.
             solved: Whether the first request is solved at once; else q is judged.
+            dark: Whether the page is dark.
         """
-        self.server, self.robot, self.asked = server, robot, asked
-        self._first = asked, q
         self._answerer = Answerer(robot)
         answer = self._answerer.solve if solved else self._answerer.judged
         answer(asked, q)  # what the first one takes is the loading of kernels
         self.answer = answer(asked, q)
+        title = f"{asked.name} · {robot.name}" if asked.name else robot.name
+        super().__init__(server, robot, asked, title, lowest(asked.scene), dark)
+        self._first_q, self.candidates = q, dict(candidates or {})
         self._answered_for: PageRequest | None = asked
         self._listed_for: PageRequest | None = None
         self.solutions: tuple[Alternative, ...] = ()
-        self._dragged, self._by_hand = "", not solved
+        self._by_hand, self._ghostly, self.beside = not solved, False, NOTHING
         self._untold_since: float | None = None
-        set_stage(server, asked.name or robot.name, lowest(asked.scene))
-        look_at_robot(server, robot, self.answer.q)
+        thing = object_of(asked.object)
+        placed = [] if thing is None or asked.object_pose is None else [thing.at(asked.object_pose)]
+        self.cameras = cameras(robot, self.answer.q, placed)
+        self.cameras["Hand"].show(server)
+        light_lamp(server, self.cameras["Robot"])
         self._drawn = DrawnRobot(server, robot)
-        drags = Drags(self.drag_control, self.drag_point, self.drag_normal, self.select)
-        self._contacts = DrawnContacts(server, asked, drags)
-        self._things = DrawnThings(server, asked, replace(drags, pose=self.drag_thing))
+        self._contacts = DrawnContacts(server, asked, self.drags)
+        self._things = DrawnThings(server, asked, replace(self.drags, pose=self.drag_thing))
         self._closest = DrawnClosest(server)
-        self.candidates = dict(candidates or {})
-        self._panel = Panel(self, (*asked.held, *self._things.names))
-        later = (PAUSE, self._show_motors), (REST, self._explain), (LOOKS, self._list_solutions)
-        self.work = Newest(self._refresh, later)
-        self.select(robot.fingers[0])
+        self._ghosts = Ghosts(server, robot)
+        self._other: tuple[DrawnRobot, DrawnContacts] | None = None
+        names = self._things.names
+        self._panel = Panel(self, (*names, *asked.held))
+        self.begin((PAUSE, self._show_motors), (REST, self._explain), (LOOKS, self._list_solutions))
+        self.select(OBJECT if OBJECT in names else robot.fingers[0])
 
     # What a browser asks for: put down, and done when it is its turn.
-
-    def drag_control(self, finger: str, pose: Array) -> None:
-        """A contact dragged by its control to a (4, 4) pose."""
-        self.change(finger, lambda asked: asked.with_control(finger, pose), finger)
-
-    def drag_point(self, finger: str, point: Array) -> None:
-        """A contact dragged by its ball to a point (3,)."""
-        self.change(finger, lambda asked: asked.with_point(finger, point))
-
-    def drag_normal(self, finger: str, normal: Array) -> None:
-        """A contact turned by its arrow to face a way (3,)."""
-        self.change(finger, lambda asked: asked.with_normal(finger, normal))
 
     def drag_thing(self, name: str, pose: Array) -> None:
         """The object or something in the scene dragged to a (4, 4) pose."""
@@ -152,38 +170,51 @@ class GraspPage:
 
         self.work.put("motors", work)
 
-    def change(
-        self, key: str, change: Callable[[PageRequest], PageRequest], dragged: str = ""
-    ) -> None:
-        """Another request; of several changes of a key the newest counts.
+    def choose(self, name: str) -> None:
+        """Another of the candidates."""
 
-        Args:
-            key: What is changed.
-            change: The request as it was to the request as it is.
-            dragged: What the browser has moved already.
+        def work() -> None:
+            self.remember()
+            self.restore(self.candidates[name]())
+
+        self.work.put("candidate", work)
+
+    def open(
+        self, robot: str | None = None, grasp: str | None = None, scene: str | None = None
+    ) -> None:
+        """Another robot, grasp or scene by its name; "" is none.
+
+        A robot comes with the first of its grasps, or as it stands at home.
         """
 
         def work() -> None:
-            self.asked = change(self.asked)
-            self._dragged, self._by_hand = dragged, False
+            try:
+                page = self._opened(robot, grasp, scene)
+            except CasadiIKError as error:
+                for client in self.server.get_clients().values():
+                    client.add_notification("Cannot be opened", str(error), color="red")
+                return
+            self.opened(page)
 
-        self.work.put(key, work)
+        self.work.put("open", work)
 
-    def choose(self, name: str) -> None:
-        """Another of the candidates."""
-        self._begin("candidate", lambda: self.candidates[name]())
-
-    def reset(self) -> None:
-        """Back to what was asked first."""
-        self._begin("reset", lambda: self._first)
-
-    def _begin(self, key: str, request: Callable[[], tuple[PageRequest, Array]]) -> None:
-        def work() -> None:
-            self.asked, q = request()
-            self.answer = self._answerer.judged(self.asked, q)
-            self._by_hand, self._answered_for = False, None
-
-        self.work.put(key, work)
+    def _opened(self, robot: str | None, grasp: str | None, scene: str | None) -> GraspPage:
+        body = self.robot if robot is None else load_robot(robot)
+        asked, q = self.asked, self.answer.q
+        if robot is not None:
+            grasp = next(iter(shipped_grasps(robot)), "")
+        around = asked.scene if scene is None else load_scene(scene) if scene else None
+        if grasp is not None:
+            given, q = (load_grasp(grasp) if grasp else None), body.home
+            asked = request_of(body, given, None, around, asked.settings)
+        else:
+            asked = replace(asked, scene=around)
+        self.ended = True
+        self.server.scene.reset()
+        self.server.gui.reset()
+        page = GraspPage(self.server, body, asked, q, None, solved=True, dark=self.dark)
+        self.work.stop()
+        return page
 
     def show_solution(self, number: int) -> None:
         """One of the solutions, from 0."""
@@ -199,23 +230,51 @@ class GraspPage:
 
         self.work.put("solution", work)
 
-    def select(self, name: str) -> None:
-        """Give something its handles; "" takes them all away."""
+    def show_ghosts(self, on: bool) -> None:
+        """Show all solutions at once, or one."""
 
         def work() -> None:
-            self._contacts.select(name)
-            self._things.select(name)
-            self._panel.selected(name)
+            self._ghostly = on
+            self._draw_ghosts()
 
-        self.work.put("selected", work)
+        self.work.put("ghosts", work)
 
-    def stop(self) -> None:
-        """End its thread."""
-        self.work.stop()
+    def compare(self, method: str) -> None:
+        """Show beside it what another method answers to the same request; "nothing": none."""
+
+        def work() -> None:
+            self.beside = method
+
+        self.work.put("beside", work)
+
+    def show_skin(self, name: str) -> None:
+        """Draw the robot by its bodies, or by what collisions are checked with."""
+        self.work.put("skin", lambda: self._drawn.skin(name))
 
     # What the thread does.
 
-    def _refresh(self) -> None:
+    def changed_by_hand(self) -> None:
+        """What is asked changes, so it is solved."""
+        self._by_hand = False
+
+    def selected(self, name: str) -> None:
+        """Show what has handles."""
+        self._contacts.select(name)
+        self._things.select(name)
+        self._panel.selected(name)
+
+    def state(self) -> tuple[PageRequest, Array]:
+        """What is asked, and where the robot is."""
+        return self.asked, self.answer.q
+
+    def restore(self, state: tuple[PageRequest, Array]) -> None:
+        """Go back to a state."""
+        self.asked, q = state
+        self.answer = self._answerer.judged(self.asked, q)
+        self._by_hand, self._answered_for = False, None
+
+    def refresh(self) -> None:
+        """Solve if it is asked for, and draw."""
         if not self._by_hand and self.asked is not self._answered_for:
             try:
                 self.answer = self._answerer.solve(self.asked, self.answer.q)
@@ -223,6 +282,7 @@ class GraspPage:
                 self.answer = failed(error, self.answer.q)
             self._answered_for = self.asked
             self.solutions = ()
+            self._ghosts.show(())
         self.draw(self.answer)
         # Motors are shown when there is time for it, but never half a second after an answer.
         self._untold_since = self._untold_since or time.monotonic()
@@ -231,7 +291,7 @@ class GraspPage:
 
     def draw(self, answer: Answer) -> None:
         """Show an answer."""
-        frames = dict(zip(self.robot.fingers, self.robot.contact_frames(answer.q), strict=True))
+        frames = self._frames(answer.q)
         with self.server.atomic():
             self._drawn.place(answer.q)
             self._contacts.place(self.asked, self._dragged)
@@ -244,12 +304,45 @@ class GraspPage:
         self.server.flush()
         self._dragged = ""
 
+    def _frames(self, q: Array) -> dict[str, Array]:
+        return dict(zip(self.robot.fingers, self.robot.contact_frames(q), strict=True))
+
     def _explain(self) -> None:
         """What takes longer to find out than a drag may take."""
         if self.answer.unexplained and self.asked is self._answered_for:
             self.answer = self._answerer.explain(self.asked, self.answer.q)
             self.draw(self.answer)
             self._show_motors()
+        self._show_beside()
+
+    def _show_beside(self) -> None:
+        """What another method answers, to the right of the robot."""
+        if self.beside == NOTHING:
+            if self._other is not None:
+                self.server.scene.remove_by_name("/beside")
+                self._other = None
+                self._panel.tell_beside(None)
+            return
+        settings = replace(self.asked.settings, method=self.beside)
+        asked = replace(self.asked, settings=settings)
+        try:
+            answer = self._answerer.solve(asked, self._first_q)
+        except CasadiIKError as error:
+            answer = failed(error, self.answer.q)
+        if self._other is None:
+            camera, name = self.cameras["Robot"], "/beside"
+            frame = self.server.scene.add_frame(name, show_axes=False)
+            right = np.array([-camera.view[1], camera.view[0], 0.0])
+            frame.position = 1.6 * camera.radius * right / np.linalg.norm(right)
+            self._other = (
+                DrawnRobot(self.server, self.robot, f"{name}/robot"),
+                DrawnContacts(self.server, asked, Drags(), name),
+            )
+        drawn, contacts = self._other
+        drawn.place(answer.q)
+        contacts.place(asked)
+        contacts.reach(asked, self._frames(answer.q), answer.contacts)
+        self._panel.tell_beside(answer)
 
     def _list_solutions(self) -> None:
         """All solutions, once nothing moves."""
@@ -261,6 +354,12 @@ class GraspPage:
             found = ()
         self.solutions, self._listed_for = found, self.asked
         self._panel.tell_solutions(found)
+        self._draw_ghosts()
+
+    def _draw_ghosts(self) -> None:
+        """Green far from limits, yellow, red at one."""
+        seen = self.solutions[:MOST_GHOSTS] if self._ghostly else ()
+        self._ghosts.show([(one.q, margin_color(one.margin)) for one in seen])
 
     def _show_motors(self) -> None:
         with self.server.atomic():
@@ -268,8 +367,22 @@ class GraspPage:
         self._untold_since = None
 
 
+def margin_color(margin: float) -> str:
+    """From red at a limit over yellow to green at half of the way to the middle of the range."""
+    stops = np.array([palette.rgb(one) for one in (palette.MISSED, palette.TARGET, palette.MET)])
+    values = [np.interp(margin, [0.0, 0.15, 0.4], channel) for channel in stops.T]
+    return "#" + "".join(f"{round(float(value)):02x}" for value in values)
+
+
+@lru_cache(maxsize=1)
+def robots_offered() -> tuple[str, ...]:
+    """Shipped arm-hands, and those that shipped grasps are for."""
+    of_grasps = {load_grasp(name).robot for name in shipped_names("grasps")}
+    return tuple(sorted(of_grasps | set(shipped_names("arm_hands"))))
+
+
 class Panel:
-    """Everything beside the picture: verdict, settings, solutions, motors, files."""
+    """Everything beside the picture: verdict, what is dragged, results, settings, files."""
 
     def __init__(self, page: GraspPage, names: Sequence[str]) -> None:
         """Build it.
@@ -282,33 +395,43 @@ class Panel:
         gui = self._gui
         self._verdict = gui.add_html(verdict_block(page.answer))
         self._drag = gui.add_dropdown(
-            "Drag",
-            (*names, NOTHING),
-            hint="whose arrows and rings are shown; or click it, or drag ball and arrow themselves",
+            "Drag", (*names, NOTHING), hint="or click it, or drag ball and arrow themselves"
         )
         on_set(self._drag, lambda name: page.select("" if name == NOTHING else name))
-        if page.candidates:
-            on_set(gui.add_dropdown("Candidate", tuple(page.candidates)), page.choose)
+        page.add_steps()
+        camera = gui.add_button_group("Camera", tuple(page.cameras))
+        on_press(camera, lambda client: page.cameras[str(camera.value)].on(client))
         tabs = gui.add_tab_group()
+        with tabs.add_tab("Results"):
+            self._results = gui.add_html(results_block(page.answer))
+            self._beside = gui.add_html("")
+            with gui.add_folder("Solutions", expand_by_default=False):
+                self._slider = gui.add_slider("Solution", 1, 2, 1, 1, disabled=True)
+                on_set(self._slider, lambda number: page.show_solution(int(number) - 1))
+                ghosts = gui.add_checkbox(
+                    "All at once", False, hint="green: far from limits; red: at one"
+                )
+                on_set(ghosts, page.show_ghosts)
+                self._solution = gui.add_html(block("found when nothing moves"))
+            gui.add_html(legend(LEGEND))
         with tabs.add_tab("Solve"):
             self._add_settings(page.asked.settings, page.asked.scene is not None)
-            with gui.add_folder("Fingers", expand_by_default=False):
-                self._add_fingers(page.asked)
-        with tabs.add_tab("Solutions"):
-            self._slider = gui.add_slider("Solution", 1, 2, 1, 1, disabled=True)
-            on_set(self._slider, lambda number: page.show_solution(int(number) - 1))
-            self._solution = gui.add_html(block("found when nothing moves"))
         with tabs.add_tab("Motors"):
             self._add_motors()
         with tabs.add_tab("Files"):
             self._add_files()
-        gui.add_html(legend(LEGEND))
 
     # What is shown.
 
     def tell(self, answer: Answer) -> None:
         """Show a verdict."""
         self._verdict.content = verdict_block(answer)
+        self._results.content = results_block(answer)
+
+    def tell_beside(self, answer: Answer | None) -> None:
+        """Show what another method answers."""
+        found = "" if answer is None else verdict_block(answer) + results_block(answer)
+        self._beside.content = found
 
     def selected(self, name: str) -> None:
         """Show what has handles."""
@@ -349,6 +472,8 @@ class Panel:
                 slider.value = value
         robot = self._page.robot
         self._bars.content = bars(robot.description, robot.joints(q))
+        units = [motor.unit for motor in robot.description.actuators]
+        self._q.content = copied_from(q_text(robot.actuators, q, units, str(self._form.value)))
 
     # What is set.
 
@@ -357,7 +482,7 @@ class Panel:
         words = {PREFER[one]: one for one in PREFERENCES if scene or one != CLEARANCE}
         method = gui.add_dropdown("Method", METHODS, initial_value=settings.method)
         prefer = gui.add_dropdown(
-            "Prefer",
+            "Choose the",
             tuple(words),
             initial_value=PREFER[settings.prefer],
             hint="which of several solutions; methods that cannot choose take no notice",
@@ -377,17 +502,20 @@ class Panel:
 
         for one in (method, prefer, limits, position, angle):
             on_set(one, changed)
-        on_press(gui.add_button("Reset", icon=None), lambda _: page.reset())
+        beside = gui.add_dropdown(
+            "Beside it", (NOTHING, *METHODS), hint="another method's answer to the same request"
+        )
+        on_set(beside, lambda name: page.compare(str(name)))
+        with gui.add_folder("Fingers", expand_by_default=False):
+            for finger, held in page.asked.held.items():
+                self._add_finger(finger, USES[2] if not held.used else USES[not held.normal])
 
-    def _add_fingers(self, asked: PageRequest) -> None:
-        for finger, held in asked.held.items():
-            now = USES[2] if not held.used else USES[0] if held.normal else USES[1]
+    def _add_finger(self, finger: str, now: str) -> None:
+        def changed(use: str) -> None:
+            used, normal = use != USES[2], use == USES[0]
+            self._page.change(f"use {finger}", lambda a: a.with_use(finger, used, normal))
 
-            def changed(use: str, finger: str = finger) -> None:
-                used, normal = use != USES[2], use == USES[0]
-                self._page.change(f"use {finger}", lambda a: a.with_use(finger, used, normal))
-
-            on_set(self._gui.add_dropdown(finger, USES, initial_value=now), changed)
+        on_set(self._gui.add_dropdown(finger, USES, initial_value=now), changed)
 
     def _add_motors(self) -> None:
         gui, page, robot = self._gui, self._page, self._page.robot
@@ -395,6 +523,9 @@ class Panel:
         self._scales = np.array([np.rad2deg(1.0) if m.unit == "rad" else 1e3 for m in motors])
         low, high = self._ranges = robot.lower * self._scales, robot.upper * self._scales
         values = np.clip(page.answer.q * self._scales, low, high)
+        self._form = gui.add_dropdown("q as", Q_FORMATS)
+        self._q = gui.add_html("")
+        on_set(self._form, lambda _: page.work.put("form", lambda: None))
         gui.add_html(block("Moved by hand, nothing is solved; drag a contact to solve again."))
         self._motors: list[Any] = []
 
@@ -405,9 +536,7 @@ class Panel:
         with gui.add_folder("Motors", expand_by_default=True):
             for i, motor in enumerate(motors):
                 name = f"{motor.name} [{'°' if motor.unit == 'rad' else 'mm'}]"
-                first, last = float(low[i]), float(high[i])
-                step = (last - first) / 1000 or 1e-6
-                slider = gui.add_slider(name, first, last, step, float(values[i]))
+                slider = gui.add_slider(name, float(low[i]), float(high[i]), 0.1, float(values[i]))
                 self._motors.append(slider)
                 on_set(slider, moved)
         with gui.add_folder("Joints and their limits", expand_by_default=True):
@@ -415,90 +544,43 @@ class Panel:
         self.tell_motors(page.answer.q)
 
     def _add_files(self) -> None:
-        page, gui = self._page, self._gui
-        grasp = gui.add_button("Save grasp (YAML)", icon=None)
-        on_press(grasp, lambda client: save_grasp(client, page.asked.grasp, page.answer.success))
+        page, gui, robot = self._page, self._gui, self._page.robot
+        names = tuple(dict.fromkeys((robot.name, *robots_offered())))
+        on_set(gui.add_dropdown("Robot", names), lambda name: page.open(robot=str(name)))
+        own = page.asked.name or "at home"
+        grasps = tuple(dict.fromkeys((own, *shipped_grasps(robot.name), "at home")))
+        on_set(
+            gui.add_dropdown("Grasp", grasps),
+            lambda name: page.open(grasp="" if name == "at home" else str(name)),
+        )
+        if page.candidates:
+            on_set(gui.add_dropdown("Candidate", tuple(page.candidates)), page.choose)
+        scene = page.asked.scene
+        here = "none" if scene is None else scene.name
+        scenes = tuple(dict.fromkeys((here, "none", *shipped_names("scenes"))))
+        on_set(
+            gui.add_dropdown("Scene", scenes),
+            lambda name: page.open(scene="" if name == "none" else str(name)),
+        )
+        on_set(gui.add_dropdown("Robot as", SKINS), page.show_skin)
+        page.add_dark()
+        on_press(gui.add_button("Save grasp (YAML)", icon=None), self._save_grasp)
+        if isinstance(scene, Scene):
+            on_press(gui.add_button("Save scene (YAML)", icon=None), self._save_scene)
         picture = gui.add_button("Export picture (PNG)", icon=None)
 
         # The browser draws the picture and sends it: this waits for it, in a thread of its own.
         @picture.on_click
         def _(event: Any) -> None:
-            save_picture(event.client, _file_name(page.asked.name or page.robot.name, "view"))
+            save_picture(event.client, file_name(page.asked.name or page.robot.name, "view"))
 
+    def _save_grasp(self, client: Any) -> None:
+        page = self._page
+        how = "solved." if page.answer.success else "unsolved."
+        text = grasp_text(page.asked.grasp, f"From a page on which contacts are dragged; {how}")
+        save_text(client, f"{file_name(page.asked.name, 'grasp')}.yaml", text)
 
-def on_set(handle: Any, do: Callable[[Any], None]) -> None:
-    """Tell of a control's value when a person, not the program, has changed it."""
-
-    @handle.on_update
-    async def _(event: Any) -> None:
-        if event.client is not None:
-            do(handle.value)
-
-
-def on_press(button: Any, do: Callable[[Any], None]) -> None:
-    """Tell of a button that is pressed in a browser."""
-
-    @button.on_click
-    async def _(event: Any) -> None:
-        do(event.client)
-
-
-# Files that the page hands to the browser it is seen in.
-
-
-def save_grasp(client: Any, grasp: Grasp, solved: bool) -> None:
-    """Send a grasp file."""
-    comment = "From a page on which contacts are dragged; " + ("solved." if solved else "unsolved.")
-    name = _file_name(grasp.name, "grasp")
-    text = grasp_text(grasp, comment).encode()
-    client.send_file_download(f"{name}.yaml", text, save_immediately=True)
-
-
-def save_picture(client: Any, name: str, patience: float = 20.0) -> None:
-    """Send what a browser sees, drawn by it anew in print size, if it does draw in time [s]."""
-    try:
-        image = client.get_render(*PICTURE, transport_format="png", timeout=patience)
-    except Exception as error:  # whatever it sends instead is read by imageio
-        logger.debug("no picture: %s", error)
-        return
-    client.send_file_download(f"{name}.png", png(np.asarray(image)), save_immediately=True)
-
-
-def png(image: np.ndarray) -> bytes:
-    """An image (h, w, 3) or (h, w, 4) of bytes as a PNG file."""
-    written = io.BytesIO()
-    imageio.imwrite(written, image, extension=".png")
-    return written.getvalue()
-
-
-def _file_name(name: str, otherwise: str) -> str:
-    return re.sub(r"\W+", "_", name) or otherwise
-
-
-def grasp_text(grasp: Grasp, comment: str = "") -> str:
-    """A grasp as YAML that `load_grasp` reads back to the last digit.
-
-    Args:
-        grasp: The grasp.
-        comment: A line before it.
-    """
-    lines = [f"# {comment}"] if comment else []
-    for key, value in grasp_data(grasp).items():
-        if key == "contacts":
-            lines.append("contacts:  # points [m] and outward normals of the pads, base frame")
-            for finger, contact in value.items():
-                lines += [f"  {_flow(finger)}:", *_lines(contact, "    ")]
-        elif isinstance(value, dict):
-            lines += [f"{key}:", *_lines(value, "  ")]
-        else:
-            lines.append(f"{key}: {_flow(value)}")
-    return "\n".join(lines) + "\n"
-
-
-def _lines(data: dict[str, Any], indent: str) -> list[str]:
-    keys = {key: key if key.isidentifier() else _flow(key) for key in data}
-    return [f"{indent}{keys[key]}: {_flow(value)}" for key, value in data.items()]
-
-
-def _flow(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False)
+    def _save_scene(self, client: Any) -> None:
+        scene = self._page.asked.scene
+        assert scene is not None
+        save_text(client, f"{file_name(scene.name, 'scene')}.yaml", scene.text())

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import viser
 import yaml
 
 from casadi_ik import palette
@@ -25,11 +24,11 @@ from casadi_ik.files.writing import written_whole
 from casadi_ik.grasps.pose import inverse
 from casadi_ik.importing.surfaces import Surface, together
 from casadi_ik.robots.load import load_description
-from casadi_ik.viewing.drawn import Drags, DrawnContacts, DrawnRobot, look_at_hand, set_stage
-from casadi_ik.viewing.grasp_page import on_press, on_set
-from casadi_ik.viewing.newest import Newest
+from casadi_ik.viewing.access import Server
+from casadi_ik.viewing.drawn import DrawnContacts, DrawnRobot, cameras, light_lamp
+from casadi_ik.viewing.page import DraggedPage
+from casadi_ik.viewing.panel import block, legend, on_press, on_set
 from casadi_ik.viewing.request import PageRequest, request_of
-from casadi_ik.viewing.words import block, legend
 
 GUESS, CORRECTED = "GUESS:", "corrected by hand"
 """What `casadi-ik import` marks a guess with, and what that becomes."""
@@ -48,76 +47,58 @@ class LinkPad:
     normal: Array
 
 
-class PadPage:
-    """A hand whose pads are corrected; all of it belongs to the thread of `work`.
+class PadPage(DraggedPage):
+    """A hand whose pads are corrected, the robot at home.
 
     Attributes:
-        robot: The robot.
         path: Its description.
-        asked: The pads as contacts, in the base frame, the robot at home.
-        work: What everything is done by.
         said: What came of saving.
     """
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: Server,
         robot: ArmHand,
         path: Path,
         surfaces: Mapping[str, Surface],
         writable: bool = True,
+        dark: bool = False,
     ) -> None:
         """Draw it.
 
         Args:
-            server: The page.
+            server: What serves it.
             robot: The robot of the description.
             path: The description.
             surfaces: What its files show, by link.
             writable: Whether whoever sees the page may have the file written.
+            dark: Whether the page is dark.
         """
-        self.server, self.robot, self.path, self.said = server, robot, path, ""
-        self._surfaces = dict(surfaces)
-        self.asked = self._first = request_of(robot, None, None)
-        self._links, self._dragged = robot.links(robot.home), ""
         skin = [one for one in bodies(robot) if one.role != "pad"]
         points = [one.surface.points for one in placed(robot, robot.home, skin)]
         lowest = float(np.concatenate(points)[:, 2].min())
-        set_stage(server, f"pads of {robot.name}", min(lowest, 0.0))
-        look_at_hand(server, robot, robot.home)
+        asked = request_of(robot, None, None)
+        super().__init__(server, robot, asked, f"pads of {robot.name}", min(lowest, 0.0), dark)
+        self.path, self.said, self._first = path, "", asked
+        self._surfaces, self._links = dict(surfaces), robot.links(robot.home)
+        camera = cameras(robot, robot.home)["Hand"]
+        camera.show(server)
+        light_lamp(server, camera)
         self._drawn = DrawnRobot(server, robot, skin=skin)
-        self._contacts = DrawnContacts(
-            server,
-            self.asked,
-            Drags(self.drag_control, self.drag_point, self.drag_normal, self.select),
-            tips=False,
-            size=1.0,
-        )
+        self._contacts = DrawnContacts(server, asked, self.drags, tips=False, size=1.0)
         self._add_panel(writable)
-        self.work = Newest(self._draw)
+        self.begin()
         self.select(robot.fingers[0])
 
-    def drag_control(self, finger: str, pose: Array) -> None:
-        """A pad dragged by its control to a (4, 4) pose."""
-        self._change(finger, lambda asked: asked.with_control(finger, pose), finger)
+    def selected(self, name: str) -> None:
+        """Show which pad has handles."""
+        self._contacts.select(name)
+        if self._chosen.value != name:
+            self._chosen.value = name
 
-    def drag_point(self, finger: str, point: Array) -> None:
-        """A pad dragged by its ball to a point (3,)."""
-        self._change(finger, lambda asked: asked.with_point(finger, point))
-
-    def drag_normal(self, finger: str, normal: Array) -> None:
-        """A pad turned to face a way (3,)."""
-        self._change(finger, lambda asked: asked.with_normal(finger, normal))
-
-    def select(self, finger: str) -> None:
-        """Give a pad its handles."""
-
-        def work() -> None:
-            self._contacts.select(finger)
-            if self._chosen.value != finger:
-                self._chosen.value = finger
-
-        self.work.put("selected", work)
+    def changed_by_hand(self) -> None:
+        """What was said of another state is not said of this one."""
+        self.said = ""
 
     def onto_skin(self, finger: str) -> None:
         """Put a pad where its normal's line meets the skin, and face as the skin does there."""
@@ -140,11 +121,7 @@ class PadPage:
                 self.said = f"{finger}: it is on the skin, and faces as the skin does"
             return moved
 
-        self._change(f"skin {finger}", put)
-
-    def reset(self) -> None:
-        """The pads as the file has them."""
-        self._change("reset", lambda _: self._first)
+        self.change(f"skin {finger}", put)
 
     def save(self) -> None:
         """Write what was changed into the description."""
@@ -182,19 +159,6 @@ class PadPage:
             found[finger] = LinkPad(local[:3, 3], local[:3, 0])
         return found
 
-    def stop(self) -> None:
-        """End its thread."""
-        self.work.stop()
-
-    def _change(
-        self, key: str, change: Callable[[PageRequest], PageRequest], dragged: str = ""
-    ) -> None:
-        def work() -> None:
-            self.said = ""
-            self.asked, self._dragged = change(self.asked), dragged
-
-        self.work.put(key, work)
-
     def _skin(self, link: str) -> Surface | None:
         """All that moves with a link, in its frame."""
         rigid, back = {link}, inverse(self._links[link])
@@ -210,7 +174,7 @@ class PadPage:
         self._told = gui.add_html("")
         self._chosen = gui.add_dropdown("Pad", self.robot.fingers)
         skin = gui.add_button("Put it on the skin", icon=None)
-        back = gui.add_button("As in the file", icon=None, color="gray")
+        self.add_steps()
         self._save = gui.add_button(
             f"Save to {self.path.name}", icon=None, color="green", disabled=not writable
         )
@@ -219,9 +183,10 @@ class PadPage:
             on_press(self._save, lambda _: self.save())
         on_set(self._chosen, lambda finger: self.select(str(finger)))
         on_press(skin, lambda _: self.onto_skin(str(self._chosen.value)))
-        on_press(back, lambda _: self.reset())
+        self.add_dark()
 
-    def _draw(self) -> None:
+    def refresh(self) -> None:
+        """Draw the pads and what is said of them."""
         with self.server.atomic():
             self._contacts.place(self.asked, self._dragged)
             self._told.content = self._words()
@@ -241,7 +206,7 @@ class PadPage:
             link = self.robot.description.finger(finger).link
             point = " ".join(f"{round(1e3 * value, 1) + 0.0:.1f}" for value in pad.point)
             normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal)
-            color = palette.LINES[0] if new else palette.INK
+            color = palette.LINES[0] if new else "inherit"
             rows.append(
                 f'<tr style="color:{color}" class="ik-pad"><td><b>{html.escape(finger)}</b><br>'
                 f'<span style="color:{palette.FAINT}">{html.escape(link)}</span></td>'

@@ -29,8 +29,8 @@ from casadi_ik.registry import METHODS
 NOT_MET = "NOT MET"
 """Said of a configuration that has not all it is asked for."""
 
-TOUCHES = "contacts and limits are met, but something touches; looking for a way out"
-MISSES = "the nearest that was found; why follows when the mouse rests"
+TOUCHES = "Contacts and limits are met, but something collides; looking for a way out."
+MISSES = "The nearest that was found; why follows when the mouse rests."
 """Said until it is known why nothing answers."""
 
 
@@ -229,6 +229,21 @@ class Answer:
     how: str = ""
     unexplained: bool = False
     checked: bool = True
+
+    @property
+    def sentence(self) -> str:
+        """All that in one sentence."""
+        if self.lines:
+            return self.lines[0]
+        missed = [name for name, one in self.contacts.items() if not one.ok]
+        if missed:
+            return f"{' and '.join(missed)} missed, or a joint is beyond a limit."
+        if self.clearance is None:
+            return "Every contact is reached" + (
+                "." if self.checked else "; collision not checked."
+            )
+        word = "reached" if self.clearance >= 0 else "reached, but something collides"
+        return f"Every contact is {word}; clearance {1e3 * self.clearance:.1f} mm."
 
 
 class Answerer:

@@ -22,6 +22,7 @@ from casadi_ik.answers.solution import Alternative, Solution
 from casadi_ik.arm_hand import ArmHand
 from casadi_ik.arrays import Array
 from casadi_ik.collision.scene import Scene
+from casadi_ik.drawing.cameras import View, close_view, whole_view
 from casadi_ik.drawing.drawables import (
     Drawable,
     bodies,
@@ -41,7 +42,7 @@ from casadi_ik.importing.surfaces import Surface
 from casadi_ik.motion.motion import Motion
 from casadi_ik.problem.clearance import closest_points
 from casadi_ik.views.charts import DARK, DPI, LIGHT, Ground, new_figure, save_picture
-from casadi_ik.views.stage import Image, Stage, View, close_view, over, points_of, whole_view
+from casadi_ik.views.stage import Image, Stage, over, points_of
 
 SIZE = (12.0, 6.6)
 """Of a picture with two panels [inch]."""

@@ -144,7 +144,7 @@ def test_a_contact_is_dragged_by_mouse_and_reached(cup: viewing.Viewer, browser:
 def test_two_browsers_see_one_drag_and_save_it(
     cup: viewing.Viewer, browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("casadi_ik.viewing.grasp_page.PICTURE", (200, 320))
+    monkeypatch.setattr("casadi_ik.viewing.panel.PICTURE", (200, 320))
     other, _ = opened(browser, cup)
     page, _ = opened(browser, cup, painted=True)
     shown = cup.page
@@ -183,7 +183,7 @@ def test_guessed_pads_are_corrected_by_mouse_and_saved(description: Path, browse
     time.sleep(1.0)  # the camera comes to rest
     shown = viewer.page
     # One by its arrows, which it has from the beginning, the other's normal by its own arrow.
-    drag_along(page, client, shown.asked.held["first"].control, 0.004, SIZE / 1.5)
+    drag_along(page, client, shown.asked.held["first"].control, 0.004)
     pose = shown.asked.held["second"].control
     tip = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0])
     aside = pixel(page, client, pose[:3, 3] + 0.02 * pose[:3, 0] + 0.012 * pose[:3, 2])
@@ -216,9 +216,9 @@ def test_two_logs_are_played_by_mouse_in_their_scene(
         solves.append((ik.logs.one_solve(ik.logs.open(path)), robot))
     viewer = viewing.view_log(*solves, scene=ik.load_scene("table"))
     page, _ = opened(browser, viewer)
-    assert "iteration 0 of" in said(page, ".ik-iteration")
+    assert "iteration 1 of" in said(page, ".ik-iteration")
     press(page, "Play")
-    last = viewer.page.count - 1
+    last = round(viewer.page.end)
     longer = max(viewer.page.tracks, key=len)
     page.wait(
         "[...document.querySelectorAll('.ik-iteration')]"
@@ -227,7 +227,7 @@ def test_two_logs_are_played_by_mouse_in_their_scene(
     page.wait("document.body.innerText.match(/SOLVED/g)?.length >= 2")
     for track, (drawn, _) in zip(viewer.page.tracks, viewer.page._shown, strict=True):
         assert np.array_equal(drawn.q, track.q[-1])
-    assert len(longer) == last + 1
+    assert len(longer) == last
     assert complaints(page) == []
     viewer.stop()
     page.close()

@@ -102,7 +102,7 @@ def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None
     page = view(*map(str, paths)).page
     page.show(10_000)
     assert page.work.settle()
-    assert page.now == page.count - 1 == max(map(len, page.tracks)) - 1
+    assert page.now == page.end == max(map(len, page.tracks))
     for track, (drawn, _) in zip(page.tracks, page._shown, strict=True):
         assert np.array_equal(drawn.q, track.q[-1])
         assert all(one.ok for one in track.verdicts(len(track) - 1).values())

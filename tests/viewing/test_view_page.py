@@ -85,7 +85,7 @@ def test_an_answer_is_a_turn_a_joint_and_nothing_that_can_wait(
     assert len(drawn) == 1
     assert 0 < len(robot) <= len(page.robot.description.movable)
     # Of the panel the verdict; motors and solutions come once it is drawn.
-    assert kinds[0].count("GuiUpdateMessage") == 1
+    assert kinds[0].count("GuiUpdateMessage") == 2
     assert len(drawn[0]) < len(robot) + 14
 
 
@@ -112,7 +112,7 @@ def test_an_unreachable_contact_shows_why_and_what_is_nearest(cup: viewing.Viewe
     position, _ = robot.errors(answer.q, points, normals)
     shown = [answer.contacts[finger].position_error for finger in robot.fingers]
     assert np.allclose(position, shown)
-    assert "too far for the arm" in page._panel._verdict.content
+    assert "too far for the arm" in page._panel._results.content
 
 
 def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
@@ -124,7 +124,7 @@ def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
     assert page.work.settle()
     at_once, at_rest = drawn
     assert at_once.headline == "NOT MET"
-    assert at_once.lines == ("the nearest that was found; why follows when the mouse rests",)
+    assert at_once.lines == ("The nearest that was found; why follows when the mouse rests.",)
     assert at_once.unexplained
     # What is drawn at once is as near as what the diagnosis comes to.
     far, nearest = (max(one.position_error for one in answer.contacts.values()) for answer in drawn)

@@ -10,10 +10,11 @@ import pyvista as pv
 
 import casadi_ik as ik
 from casadi_ik import palette
+from casadi_ik.drawing.cameras import axes_of, close_view, whole_view
 from casadi_ik.drawing.drawables import Drawable, bodies, contact_marks, placed, target_place
 from casadi_ik.drawing.surfaces import arrow, ball, drum, mesh_of, ring, rod, stretched
 from casadi_ik.views import draw_solution, show
-from casadi_ik.views.stage import Stage, axes_of, close_view, over, whole_view
+from casadi_ik.views.stage import Stage, over
 
 pytestmark = pytest.mark.opengl
 

@@ -1,0 +1,205 @@
+"""What all pages have: a title, a look, a thread; what is dragged, and taken back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from casadi_ik.arm_hand import ArmHand
+from casadi_ik.arrays import Array
+from casadi_ik.viewing.access import Server
+from casadi_ik.viewing.drawn import Drags, set_stage
+from casadi_ik.viewing.newest import REST, Newest, Work
+from casadi_ik.viewing.panel import on_press
+from casadi_ik.viewing.request import PageRequest
+
+KEPT = 200
+"""Steps that can be taken back."""
+
+
+class Page:
+    """What is drawn, and a panel beside it; all of it belongs to the thread of `work`.
+
+    Attributes:
+        server: What serves it.
+        work: What everything is done by.
+        opened: Told of the page that takes the place of this one.
+    """
+
+    opened: Callable[[Page], None]
+
+    def __init__(self, server: Server, title: str, floor: float, dark: bool) -> None:
+        """An empty page in the place of what was there.
+
+        Args:
+            server: What serves it.
+            title: On the panel and on the browser's tab.
+            floor: Height of the ground [m].
+            dark: Whether it is dark.
+        """
+        self.server, self.dark, self.ended = server, dark, False
+        self._stage = title, floor
+        set_stage(server, title, floor, dark)
+
+    def begin(self, *later: tuple[float, Work]) -> None:
+        """Start its thread; `later`: what is done once nothing moves, see `Newest`."""
+        self.work = Newest(lambda: None if self.ended else self.refresh(), later)
+
+    def refresh(self) -> None:
+        """Draw what has changed."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """End its thread."""
+        self.ended = True
+        self.work.stop()
+
+    def add_dark(self) -> None:
+        """A switch between light and dark."""
+        title, floor = self._stage
+        box = self.server.gui.add_checkbox("Dark", self.dark)
+
+        @box.on_update
+        async def _(_: Any) -> None:
+            self.dark = box.value
+            set_stage(self.server, title, floor, box.value)
+
+
+class DraggedPage(Page):
+    """A page whose contacts are dragged, one after the other, and taken back.
+
+    Attributes:
+        robot: The robot.
+        asked: What is asked now.
+    """
+
+    def __init__(
+        self,
+        server: Server,
+        robot: ArmHand,
+        asked: PageRequest,
+        title: str,
+        floor: float,
+        dark: bool,
+    ) -> None:
+        """An empty page, see `Page`."""
+        super().__init__(server, title, floor, dark)
+        self.robot, self.asked, self._dragged = robot, asked, ""
+        self._past: list[Any] = []
+        self._future: list[Any] = []
+        self.drags = Drags(self.drag_control, self.drag_point, self.drag_normal, self.select)
+
+    def begin(self, *later: tuple[float, Work]) -> None:
+        """Start its thread; where it stands is where everything can be taken back to."""
+        self._past = [self.state()]
+        super().begin(*later, (REST, self.remember))
+
+    # What a browser asks for: put down, and done when it is its turn.
+
+    def drag_control(self, finger: str, pose: Array) -> None:
+        """A contact dragged by its control to a (4, 4) pose."""
+        self.change(finger, lambda asked: asked.with_control(finger, pose), finger)
+
+    def drag_point(self, finger: str, point: Array) -> None:
+        """A contact dragged by its ball to a point (3,)."""
+        self.change(finger, lambda asked: asked.with_point(finger, point))
+
+    def drag_normal(self, finger: str, normal: Array) -> None:
+        """A contact turned by its arrow to face a way (3,)."""
+        self.change(finger, lambda asked: asked.with_normal(finger, normal))
+
+    def change(
+        self, key: str, change: Callable[[PageRequest], PageRequest], dragged: str = ""
+    ) -> None:
+        """Another request; of several changes of a key the newest counts.
+
+        Args:
+            key: What is changed.
+            change: The request as it was to the request as it is.
+            dragged: What the browser has moved already.
+        """
+
+        def work() -> None:
+            self.changed_by_hand()
+            self.asked, self._dragged = change(self.asked), dragged
+
+        self.work.put(key, work)
+
+    def select(self, name: str) -> None:
+        """Give something its handles; "" takes them all away."""
+        self.work.put("selected", lambda: self.selected(name))
+
+    def undo(self) -> None:
+        """Take the last step back."""
+
+        def work() -> None:
+            self.remember()
+            if len(self._past) > 1:
+                self._future.append(self._past.pop())
+                self.restore(self._past[-1])
+
+        self.work.put("undo", work)
+
+    def redo(self) -> None:
+        """Do again what was taken back."""
+
+        def work() -> None:
+            self.remember()
+            if self._future:
+                self._past.append(self._future.pop())
+                self.restore(self._past[-1])
+
+        self.work.put("redo", work)
+
+    def reset(self) -> None:
+        """Back to what was asked first; that can be taken back, too."""
+
+        def work() -> None:
+            self.remember()
+            self.restore(self._past[0])
+
+        self.work.put("reset", work)
+
+    def add_steps(self) -> None:
+        """Buttons that take steps back, do them again and begin anew; keys for the first two."""
+        steps = self.server.gui.add_button_group("Steps", ("Undo", "Redo", "Reset"))
+        do = {"Undo": self.undo, "Redo": self.redo, "Reset": self.reset}
+        on_press(steps, lambda _: do[str(steps.value)]())
+        add = self.server.gui.add_command
+        back = add("Undo", hotkey="Z", modifier="cmd/ctrl")
+        again = add("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
+        for command, work in ((back, self.undo), (again, self.redo)):
+
+            @command.on_trigger
+            async def _(_: Any, work: Work = work) -> None:
+                work()
+
+    # What its kinds do each in their way.
+
+    def changed_by_hand(self) -> None:
+        """What is asked is about to change."""
+
+    def selected(self, name: str) -> None:
+        """Show what has handles."""
+
+    def state(self) -> Any:
+        """What can be gone back to."""
+        return self.asked
+
+    def restore(self, state: Any) -> None:
+        """Go back to a state."""
+        self.changed_by_hand()
+        self.asked = state
+
+    def remember(self) -> None:
+        """What stands now is a step."""
+        state = self.state()
+        if not same(state, self._past[-1]):
+            self._past = [self._past[0], *self._past[1:], state][-KEPT:]
+            self._future.clear()
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two states are the same: their requests are, which are never changed in place."""
+    first = one[0] if isinstance(one, tuple) else one
+    return first is (other[0] if isinstance(other, tuple) else other)
