@@ -245,7 +245,7 @@ def track_of(solve: OneSolve, robot: ArmHand) -> SolveTrack:
             contacts[finger] = Contact(direction=normal)
     asked = request_of(robot, Grasp(contacts) if contacts else None, q[0])
     label = f"{solve.method} · solve {solve.solve_id + 1}"
-    return SolveTrack(robot, label, 1.0 + np.arange(len(q)), q, asked, solve)
+    return SolveTrack(robot, label, np.arange(1.0, len(q) + 1.0), q, asked, solve)
 
 
 def motion_track(
