@@ -31,10 +31,9 @@ from casadi_ik.cli.options import Option
 from casadi_ik.cli.outputs import check_outputs, write_output
 from casadi_ik.cli.table import Answer, Said, command
 from casadi_ik.errors import InputError, MissingExtraError, UnknownNameError, printable
-from casadi_ik.logs.compare import Matched, matched, side_by_side
 from casadi_ik.logs.container import NothingWrittenError
 from casadi_ik.logs.events import SERIOUS, plain_name, quantity, told
-from casadi_ik.logs.explanation import explain
+from casadi_ik.logs.explanation import Matched, explain, matched, side_by_side
 from casadi_ik.logs.repair import finish_log, merge_logs
 from casadi_ik.logs.shards import log_files
 from casadi_ik.logs.solve import OneSolve, one_solve

@@ -1,10 +1,9 @@
 """MCAP logs: every iteration into a file, and back."""
 
 from casadi_ik.logs.cdr import RecordedMotion, read_motion
-from casadi_ik.logs.compare import matched, side_by_side
 from casadi_ik.logs.detect import detect_events
 from casadi_ik.logs.events import EventKind, EventRules
-from casadi_ik.logs.explanation import Explanation, explain
+from casadi_ik.logs.explanation import Explanation, explain, matched, side_by_side
 from casadi_ik.logs.format import LogClock
 from casadi_ik.logs.reader import Log, LogInfo
 from casadi_ik.logs.reader import open_log as open  # noqa: A004 - read as `ik.logs.open`

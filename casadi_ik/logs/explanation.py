@@ -1,4 +1,4 @@
-"""Solves in words, from their traces alone: how one ended and what happened on its way.
+"""Solves in words, from their traces alone: how one ended, and two of one target side by side.
 
 Nothing here is a cause that was proven: what is said to have happened together, happened together.
 """
@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.arrays import Array
-from casadi_ik.logs.events import errors_text, listed, number, plain_name, plural
+from casadi_ik.errors import InputError
+from casadi_ik.logs.events import Happening, errors_text, listed, number, plain_name, plural
+from casadi_ik.logs.reader import Log
 from casadi_ik.logs.solve import OneSolve, Stretch
-from casadi_ik.problem.trace import CLEARANCE, SIGMA
+from casadi_ik.problem.contacts import NAMES
+from casadi_ik.problem.trace import CLEARANCE
 
 STRETCHES_SHOWN = 6
 """More stretches than this are told phase by phase."""
@@ -172,49 +175,32 @@ def _entered(inside: NDArray[np.bool_]) -> int:
 
 
 def _singularities(solve: OneSolve) -> Iterator[str]:
-    entries: dict[str, list[int]] = {}
-    thresholds: dict[str, float] = {}
+    entries: dict[str, list[Happening]] = {}
     for event in solve.events:
         if event.kind == "NEAR_SINGULAR":
-            entries.setdefault(event.jacobian, []).append(event.iteration)
-            thresholds[event.jacobian] = event.threshold
-    for jacobian, iterations in entries.items():
-        line = f"{plain_name(jacobian)} near singular from iteration {iterations[0] + 1} on"
-        name = SIGMA + jacobian
-        if name in solve.layout.names and solve.rows[name].ndim == 1:
-            sigma = solve.rows[name].astype(float)
-            below = int((sigma < thresholds[jacobian]).sum())
-            lowest = int(np.nanargmin(sigma))
-            line += (
-                f", {below} iterations in all; smallest singular value {number(sigma[lowest])} in"
-                f" iteration {lowest + 1} (threshold {number(thresholds[jacobian])})"
-            )
-        if len(iterations) > 1:
-            line += f", entered {len(iterations)} times"
-        yield line
-    measured = [name for name in solve.layout.names if name.startswith(SIGMA)]
-    if not measured:
+            entries.setdefault(event.jacobian, []).append(event)
+    if not solve.sigmas:
         yield "singular values: not measured"
-    for name in measured:
-        jacobian = name.removeprefix(SIGMA)
-        if jacobian in entries:
-            continue
-        sigma = solve.columns(name)
+    for jacobian, sigma in solve.sigmas.items():
+        name = plain_name(jacobian)
         if np.isnan(sigma).all():
-            yield f"singular values of the {plain_name(jacobian)}: not measured"
+            yield f"singular values of the {name}: not measured"
             continue
-        lowest, usual = float(np.nanmin(sigma)), float(np.nanmedian(sigma))
-        if lowest < DIP * usual:
-            row = int(np.nanargmin(np.fmin.reduce(sigma, axis=1)))
-            yield (
-                f"smallest singular value of the {plain_name(jacobian)} down to {number(lowest)} in"
-                f" iteration {row + 1} (median {number(usual)})"
+        row, usual, events = int(np.nanargmin(sigma)), np.nanmedian(sigma), entries.get(jacobian)
+        lowest, when = number(sigma[row]), f"in iteration {row + 1}"
+        if events:
+            threshold = events[0].threshold
+            line = (
+                f"{name} near singular from iteration {events[0].iteration + 1} on,"
+                f" {int((sigma < threshold).sum())} iterations in all; smallest singular value"
+                f" {lowest} {when} (threshold {number(threshold)})"
             )
+            yield line + (f", entered {len(events)} times" if len(events) > 1 else "")
+        elif sigma[row] < DIP * usual:
+            about = f"(median {number(float(usual))})"
+            yield f"smallest singular value of the {name} down to {lowest} {when} {about}"
         else:
-            yield (
-                f"{plain_name(jacobian)} never near singular: smallest singular value"
-                f" {number(lowest)}"
-            )
+            yield f"{name} never near singular: smallest singular value {lowest}"
 
 
 def _limits(solve: OneSolve) -> Iterator[str]:
@@ -277,13 +263,11 @@ def _at_the_end(solve: OneSolve) -> Iterator[str]:
     """What held when a solve that failed came to its end."""
     if solve.success:
         return
-    last = len(solve.rows) - 1
     singular = {
         event.jacobian: event.threshold for event in solve.events if event.kind == "NEAR_SINGULAR"
     }
     for jacobian, threshold in singular.items():
-        sigma = solve.columns(SIGMA + jacobian)[last]
-        if np.any(sigma < threshold):
+        if jacobian in solve.sigmas and solve.sigmas[jacobian][-1] < threshold:
             yield f"at its end the {plain_name(jacobian)} is near singular"
     at_limit = limits_held(solve)
     if at_limit:
@@ -381,3 +365,193 @@ def _filled(matrix: Array) -> Array:
     rows = np.arange(len(matrix))[:, None]
     last = np.maximum.accumulate(np.where(np.isnan(matrix), 0, rows), axis=0)
     return np.take_along_axis(matrix, last, axis=0)
+
+
+# Two solves of one target.
+
+SAME = 1e-9
+"""How far targets may be apart and be the same [m, or parts of a unit normal]."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a comparison.
+
+    Attributes:
+        what: What is compared.
+        first: Of the first solve.
+        second: Of the second solve.
+    """
+
+    what: str
+    first: str
+    second: str
+
+
+def target_key(points: Array, normals: Array, more: Mapping[str, Array] | None = None) -> bytes:
+    """Equal for targets that are the same but for rounding.
+
+    Args:
+        points: (f, 3) [m]; NaN where free.
+        normals: (f, 3); NaN where free.
+        more: (f, 3) what they have beside; NaN where free.
+    """
+    free = np.full_like(points, np.nan)
+    others = [free if more is None else more.get(name, free) for name in NAMES]
+    rounded = np.round(np.concatenate([points, normals, *others]).astype(float) / SAME)
+    rounded[np.isnan(rounded)] = np.inf
+    return (rounded + 0.0).tobytes()
+
+
+def side_by_side(first: OneSolve, second: OneSolve) -> list[Line]:
+    """Compare two solves of one target.
+
+    Raises:
+        InputError: They are not of the same target.
+
+    Example:
+        >>> one = ik.logs.one_solve(ik.logs.open("cup.mcap"))
+        >>> len(ik.logs.side_by_side(one, one)) > 0
+        True
+    """
+    keys = [
+        target_key(each.target_points, each.target_normals, each.target_more)
+        for each in (first, second)
+    ]
+    if first.fingers != second.fingers or keys[0] != keys[1]:
+        raise InputError(
+            f"solve {first.solve_id + 1} of {first.method} and solve {second.solve_id + 1} of"
+            f" {second.method}: not the same target"
+        )
+    parts = [_lines(each) for each in (first, second)]
+    names = list(dict.fromkeys(name for part in parts for name in part))
+    return [Line(name, parts[0].get(name, "-"), parts[1].get(name, "-")) for name in names]
+
+
+def _lines(solve: OneSolve) -> dict[str, str]:
+    lines = {
+        "status": solve.status,
+        "iterations": str(solve.iterations),
+        "restarts": str(solve.restarts),
+        "time": f"{1e3 * solve.time:.3g} ms",
+    }
+    for i, finger in enumerate(solve.fingers):
+        lines[f"{finger} off by"] = errors_text(
+            float(solve.position_error[i]), float(solve.angle_error[i])
+        )
+    clearance = solve.clearance
+    lines["collision"] = (
+        "not checked" if clearance is None else f"clearance {1e3 * clearance:.2f} mm"
+    )
+    if len(solve.rows) == 0:
+        return lines
+    counts: Counter[str] = Counter()
+    for stretch in solve.stretches:
+        counts[plain_name(stretch.phase)] += len(stretch)
+    inside = np.flatnonzero(within(solve).all(axis=1))
+    share = worst(solve)
+    nearest = int(np.nanargmin(share))
+    lines |= {
+        "phases": ", ".join(f"{name} {count}" for name, count in counts.items() if name) or "one",
+        "all within tolerance": f"from iteration {inside[0] + 1}" if len(inside) else "never",
+        "nearest": f"{number(float(share[nearest]))} tolerances in iteration {nearest + 1}",
+        **{
+            f"smallest sigma, {plain_name(jacobian)}": f"{number(float(np.nanmin(sigma)))} in"
+            f" iteration {int(np.nanargmin(sigma)) + 1}"
+            for jacobian, sigma in solve.sigmas.items()
+            if not np.isnan(sigma).all()
+        },
+        "limits at the end": ", ".join(limits_held(solve)) or "none",
+    }
+    kinds = Counter(event.kind for event in solve.events)
+    for kind in ("NEAR_SINGULAR", "LIMIT_HIT", "STALL", "OSCILLATION"):
+        lines[plain_name(kind.lower())] = f"{kinds[kind]} times" if kinds[kind] else "never"
+    return lines
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a solve ended, and in which log it is.
+
+    Attributes:
+        log: The log.
+        method: Its method.
+        solve_id: Its number.
+        success: Whether it was solved.
+        iterations: How many it took.
+        time: How long it took [s].
+    """
+
+    log: Log
+    method: str
+    solve_id: int
+    success: bool
+    iterations: int
+    time: float
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Solves of two methods on the same targets, by the number of the first.
+
+    Attributes:
+        first: The first method.
+        second: The second method.
+        pairs: A solve of each.
+    """
+
+    first: str
+    second: str
+    pairs: tuple[tuple[Ending, Ending], ...]
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def of_first(self, solve: int) -> Matched:
+        """Only the pair of a solve of the first method."""
+        pairs = tuple(pair for pair in self.pairs if pair[0].solve_id == solve)
+        return Matched(self.first, self.second, pairs)
+
+
+def matched(logs: Sequence[Log], first: str, second: str) -> Matched:
+    """Find solves of two methods that were asked the same.
+
+    A target that one method was given several times is taken once, the first time.
+
+    Args:
+        logs: Logs to look in.
+        first: A method.
+        second: Another.
+
+    Raises:
+        LogError: A log is damaged.
+
+    Example:
+        >>> log = ik.logs.open("cup.mcap")
+        >>> type(ik.logs.matched([log], "hand-first", "hand-first")).__name__
+        'Matched'
+    """
+    one, other = _endings(logs, first), _endings(logs, second)
+    return Matched(first, second, tuple((one[key], other[key]) for key in one if key in other))
+
+
+def _endings(logs: Sequence[Log], method: str) -> dict[bytes, Ending]:
+    found: dict[bytes, Ending] = {}
+    for log in logs:
+        if method not in log.methods:
+            continue
+        part = log.solves(method=method).part
+        for solve_id, row in zip(part.solve_id.tolist(), part.rows, strict=True):
+            known = row.dtype.names or ()
+            more = {name: row[f"target_{name}"] for name in NAMES if f"target_{name}" in known}
+            key = target_key(row["target_points"], row["target_normals"], more)
+            ending = Ending(
+                log,
+                method,
+                solve_id,
+                bool(row["success"]),
+                int(row["iterations"]),
+                float(row["time"]),
+            )
+            found.setdefault(key, ending)
+    return found

@@ -16,12 +16,13 @@ from casadi_ik.arrays import Array
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.kernels.layout import Field, Layout
 from casadi_ik.logs.detect import bits_of
-from casadi_ik.logs.events import Happening
+from casadi_ik.logs.events import Happening, measured_jacobians
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.tables import MethodRows, Table, element_name, happening, label_of
 from casadi_ik.problem.contacts import NAMES
 from casadi_ik.problem.request import NO_PREFERENCE
 from casadi_ik.problem.targets import Tolerance
+from casadi_ik.problem.trace import SIGMA, TraceFormat
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,17 @@ class OneSolve:
         """The name of an element or bit of a field, or its number."""
         names = self.labels.get(field, ())
         return names[index] if index < len(names) else f"{field} {index}"
+
+    @cached_property
+    def sigmas(self) -> dict[str, Array]:
+        """(k,) smallest singular value in all rows, by Jacobian; NaN where not measured."""
+        form = TraceFormat(self.layout, self.labels)
+        return {
+            name: self.columns(item.name)[:, i]
+            for item in self.layout
+            if item.name.startswith(SIGMA)
+            for i, name in enumerate(measured_jacobians(form, item))
+        }
 
     @cached_property
     def stretches(self) -> tuple[Stretch, ...]:

@@ -20,13 +20,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from mcap.writer import Writer
+from scipy.spatial.transform import Rotation
 
 from casadi_ik import palette
 from casadi_ik.arm_hand import ArmHand
@@ -39,7 +38,6 @@ from casadi_ik.logs.chunks import CDR_HEADER
 from casadi_ik.logs.events import SERIOUS, errors_text, told
 from casadi_ik.logs.format import schema_name, schema_text
 from casadi_ik.logs.solve import OneSolve
-from casadi_ik.symbolic.se3 import quaternion_from_matrix
 
 try:
     from foxglove import Schema
@@ -319,15 +317,17 @@ def vector_of(values: Array) -> fox.Vector3:
 
 
 def quaternion_of(values: Array) -> fox.Quaternion:
-    """A quaternion (4,), scalar first."""
-    w, x, y, z = values.tolist()
+    """A quaternion (4,), scalar last."""
+    x, y, z, w = values.tolist()
     return fox.Quaternion(x=x, y=y, z=z, w=w)
 
 
 def quaternions(rotations: Array) -> Array:
-    """Unit quaternions (k, 4), scalar first, of rotations (k, 3, 3)."""
-    stacked = _quaternion_function().map(len(rotations))(np.hstack(list(rotations)))
-    return np.asarray(stacked, dtype=np.float64).T
+    """Unit quaternions (k, 4), scalar last, of rotations (k, 3, 3); NaN where those are."""
+    known = np.isfinite(rotations).all(axis=(1, 2))
+    found = np.full((len(rotations), 4), np.nan)
+    found[known] = Rotation.from_matrix(rotations[known]).as_quat()
+    return found
 
 
 def along(normals: Array) -> Array:
@@ -337,12 +337,6 @@ def along(normals: Array) -> Array:
     y = y / np.linalg.norm(y, axis=1, keepdims=True)
     z = np.cross(normals, y)
     return np.stack([normals, y, z], axis=2).astype(np.float64)
-
-
-@cache
-def _quaternion_function() -> ca.Function:
-    R = ca.SX.sym("R", 3, 3)
-    return ca.Function("quaternion", [R], [quaternion_from_matrix(R)])
 
 
 def color_of(color: str) -> fox.Color:

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, NamedTuple, Protocol, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
@@ -27,7 +27,6 @@ from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from casadi_ik.answers.recorder import Recorder, SolveBlock
-from casadi_ik.arm_hand import ArmHand
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.in_background import InBackground
 from casadi_ik.logs.chunks import COMPRESSORS, MESSAGE, Run, check_size, fill, packed_chunk
@@ -298,25 +297,14 @@ class McapRecorder:
         return method
 
 
-class Described(Protocol):
-    """What a log says of a solver."""
-
-    robot: ArmHand
-
-    @property
-    def parameters(self) -> Mapping[str, Any]:
-        """Everything that determines a solve but target, start and seed."""
-        ...
-
-
 def recorder_of(
-    solver: Described,
+    solver: Any,
     log: str | os.PathLike[str] | Recorder | None,
     seed: int,
     keep: Keep | None = None,
     compression: Compression = "zstd",
 ) -> contextlib.AbstractContextManager[Recorder | None]:
-    """A recorder for a path, closed in the end; an open one, or None, as it is.
+    """A recorder of a `Solver` for a path, closed in the end; an open one, or None, as it is.
 
     Raises:
         LogError: The log cannot be written.

@@ -275,11 +275,11 @@ def test_targets_are_the_same_but_for_rounding() -> None:
     rng = np.random.default_rng(0)
     points, normals = rng.normal(size=(2, 3, 3))
     normals[1] = np.nan
-    key = logs.compare.target_key(points, normals)
-    assert logs.compare.target_key(points * (1 + 1e-15), normals) == key
-    assert logs.compare.target_key(points + 1e-6, normals) != key
-    assert logs.compare.target_key(points, np.nan_to_num(normals)) != key
-    target_key = logs.compare.target_key
+    key = logs.explanation.target_key(points, normals)
+    assert logs.explanation.target_key(points * (1 + 1e-15), normals) == key
+    assert logs.explanation.target_key(points + 1e-6, normals) != key
+    assert logs.explanation.target_key(points, np.nan_to_num(normals)) != key
+    target_key = logs.explanation.target_key
     assert target_key(np.zeros((3, 3)), normals) == target_key(-np.zeros((3, 3)), normals)
 
 
